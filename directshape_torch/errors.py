@@ -1,0 +1,57 @@
+"""Every error that a user can meet; all derive from `DirectShapeError`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class DirectShapeError(Exception):
+    """Base of all errors raised on purpose by this package."""
+
+
+class InputError(DirectShapeError, ValueError):
+    """An argument has the wrong shape, type or value: names it, says what was expected, what came, and the cure."""
+
+    def __init__(self, name: str, expected: str, got: str, cure: str = "") -> None:
+        super().__init__(f"{name}: expected {expected}, got {got}" + (f"; {cure}" if cure else ""))
+        self.name = name
+
+
+class DataFormatError(DirectShapeError, ValueError):
+    """A file does not hold what its format demands: names file, line number and text where there is one."""
+
+    def __init__(
+        self,
+        path: Path | str,
+        problem: str,
+        *,
+        line_number: int | None = None,
+        line: str | None = None,
+        cure: str = "",
+    ) -> None:
+        where = f"{path}" + (f", line {line_number}" if line_number is not None else "")
+        text = f": {line!r}" if line is not None else ""
+        super().__init__(f"{where}: {problem}{text}" + (f"; {cure}" if cure else ""))
+        self.path = Path(path)
+        self.line_number = line_number
+
+
+class ConfigError(DirectShapeError, ValueError):
+    """A configuration key or value is unknown or out of range."""
+
+
+class MeshError(DirectShapeError, ValueError):
+    """A mesh cannot be read or cannot be made solid."""
+
+
+class ResumeError(DirectShapeError):
+    """An output folder was made by another configuration, prior or input than the present run."""
+
+
+class MissingDependencyError(DirectShapeError, ImportError):
+    """An optional package is needed for what was asked."""
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        super().__init__(
+            f"{purpose} needs the package {package!r}; install it with: pip install 'directshape_torch[{extra}]'"
+        )

@@ -1,0 +1,218 @@
+"""Rigid motions: exponential, logarithm, inverse, adjoint and generators of SE(3).
+
+Twists are `(v, omega)`: metres, then radians, as in the paper's supplement (generators `G_0 .. G_5`).
+All functions broadcast over leading dimensions, keep dtype and device, and have finite values and gradients
+at the identity and near a rotation by pi.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Below this squared angle the trigonometric ratios are replaced by Taylor series; the fourth-order series are then
+# exact to float64 rounding and, unlike the ratios, have finite derivatives of every order at zero.
+_SMALL_ANGLE_SQUARED = 1e-3
+
+
+def hat(vector: Tensor) -> Tensor:
+    """Skew-symmetric matrix of a vector: `hat(a) @ b = a x b`.
+
+    Args:
+        vector: :math:`(*, 3)`.
+
+    Returns:
+        :math:`(*, 3, 3)`.
+
+    Example:
+        >>> hat(torch.tensor([0.0, 0.0, 1.0])) @ torch.tensor([1.0, 0.0, 0.0])
+        tensor([0., 1., 0.])
+    """
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
+    """The six infinitesimal generators of SE(3), translations first (paper, supplement, `G_0 .. G_5`).
+
+    Returns:
+        :math:`(6, 4, 4)`.
+
+    Example:
+        >>> generators()[0, 0, 3]
+        tensor(1., dtype=torch.float64)
+    """
+    basis = torch.zeros(6, 4, 4, dtype=dtype, device=device)
+    identity = torch.eye(3, dtype=dtype, device=device)
+    basis[:3, :3, 3] = identity
+    basis[3:, :3, :3] = hat(identity)
+    return basis
+
+
+def _exp_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`sin(a)/a`, `(1 - cos a)/a^2` and `(a - sin a)/a^3` as smooth functions of `a^2`."""
+    t = angle_squared
+    small = t < _SMALL_ANGLE_SQUARED
+    safe = torch.where(small, torch.ones_like(t), t)
+    angle = safe.sqrt()
+    sine = torch.sin(angle)
+    half = torch.sin(0.5 * angle)
+    a = torch.where(small, 1 - t / 6 * (1 - t / 20 * (1 - t / 42 * (1 - t / 72))), sine / angle)
+    b = torch.where(
+        small, 0.5 * (1 - t / 12 * (1 - t / 30 * (1 - t / 56 * (1 - t / 90)))), 2 * half * half / safe
+    )
+    c = torch.where(
+        small,
+        (1 - t / 20 * (1 - t / 42 * (1 - t / 72 * (1 - t / 110)))) / 6,
+        (angle - sine) / (safe * angle),
+    )
+    return a, b, c
+
+
+def exp(twist: Tensor) -> Tensor:
+    """Exponential map of SE(3).
+
+    Args:
+        twist: :math:`(*, 6)`, `(v, omega)` in metres and radians.
+
+    Returns:
+        Rigid transforms :math:`(*, 4, 4)`.
+
+    Example:
+        >>> exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3]
+        tensor([1., 2., 3.])
+    """
+    v, omega = twist[..., :3], twist[..., 3:]
+    a, b, c = (x[..., None, None] for x in _exp_coefficients((omega * omega).sum(-1)))
+    W = hat(omega)
+    W2 = W @ W
+    identity = torch.eye(3, dtype=twist.dtype, device=twist.device)
+    R = identity + a * W + b * W2
+    V = identity + b * W + c * W2
+    return from_rotation_translation(R, (V @ v[..., None])[..., 0])
+
+
+def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
+    """Homogeneous transforms :math:`(*, 4, 4)` from rotations :math:`(*, 3, 3)` and translations :math:`(*, 3)`.
+
+    Example:
+        >>> from_rotation_translation(torch.eye(3), torch.ones(3))[:3, 3]
+        tensor([1., 1., 1.])
+    """
+    top = torch.cat([R, t[..., None]], dim=-1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def inverse(T: Tensor) -> Tensor:
+    """Inverse of rigid transforms :math:`(*, 4, 4)`, by transposition of the rotation.
+
+    Example:
+        >>> T = exp(torch.tensor([1.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
+        >>> torch.allclose(inverse(T) @ T, torch.eye(4), atol=1e-6)
+        True
+    """
+    R_transposed = T[..., :3, :3].transpose(-1, -2)
+    return from_rotation_translation(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
+
+
+def transform(T_b_a: Tensor, points_a: Tensor) -> Tensor:
+    """Points :math:`(*, 3)` in frame a moved to frame b by :math:`(*, 4, 4)`; leading dimensions broadcast.
+
+    Example:
+        >>> transform(exp(torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])), torch.zeros(5, 3)).shape
+        torch.Size([5, 3])
+    """
+    return (T_b_a[..., :3, :3] @ points_a[..., None])[..., 0] + T_b_a[..., :3, 3]
+
+
+def adjoint(T: Tensor) -> Tensor:
+    """Adjoint :math:`(*, 6, 6)`: `T exp(d) T^-1 = exp(adjoint(T) d)`.
+
+    Example:
+        >>> adjoint(torch.eye(4)).shape
+        torch.Size([6, 6])
+    """
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    top = torch.cat([R, hat(t) @ R], dim=-1)
+    bottom = torch.cat([torch.zeros_like(R), R], dim=-1)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def so3_log(R: Tensor) -> Tensor:
+    """Rotation vector :math:`(*, 3)` of rotations :math:`(*, 3, 3)`, angle in :math:`[0, \\pi]`.
+
+    Goes through the unit quaternion, whose largest component is always found stably: near pi the antisymmetric part
+    of R vanishes and cannot give the axis.
+
+    Example:
+        >>> so3_log(torch.eye(3))
+        tensor([0., 0., 0.])
+    """
+    w, xyz = _quaternion(R)
+    sign = torch.where(w < 0, -torch.ones_like(w), torch.ones_like(w))
+    w, xyz = w * sign, xyz * sign[..., None]
+    s2 = (xyz * xyz).sum(-1)
+    small = s2 < _SMALL_ANGLE_SQUARED
+    safe = torch.where(small, torch.ones_like(s2), s2)
+    s = safe.sqrt()
+    # With x = |xyz| / w: 2 atan(x) / |xyz| = (2 / w) (1 - x^2/3 + x^4/5 - ...), a smooth function of |xyz|^2.
+    w_safe = torch.where(small, w, torch.ones_like(w))
+    q = torch.where(small, s2, torch.zeros_like(s2)) / (w_safe * w_safe)
+    series = 2 / w_safe * (1 - q * (1 / 3 - q * (1 / 5 - q * (1 / 7 - q * (1 / 9 - q / 11)))))
+    factor = torch.where(small, series, 2 * torch.atan2(s, torch.where(small, torch.ones_like(w), w)) / s)
+    return factor[..., None] * xyz
+
+
+def _quaternion(R: Tensor) -> tuple[Tensor, Tensor]:
+    """Real part (*,) and vector part (*, 3) of the unit quaternion (either sign), from its largest component."""
+    m = R
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    four_squared = torch.stack(
+        [
+            1 + trace,
+            1 + 2 * m[..., 0, 0] - trace,
+            1 + 2 * m[..., 1, 1] - trace,
+            1 + 2 * m[..., 2, 2] - trace,
+        ],
+        dim=-1,
+    )
+    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    d, e, f = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2]
+    # Row i is 4 q_i (w, x, y, z): each is proportional to the quaternion; the one with the largest q_i is stable.
+    rows = torch.stack(
+        [
+            torch.stack([four_squared[..., 0], a, b, c], dim=-1),
+            torch.stack([a, four_squared[..., 1], d, e], dim=-1),
+            torch.stack([b, d, four_squared[..., 2], f], dim=-1),
+            torch.stack([c, e, f, four_squared[..., 3]], dim=-1),
+        ],
+        dim=-2,
+    )
+    best = four_squared.argmax(dim=-1)[..., None, None].expand(*rows.shape[:-2], 1, 4)
+    row = rows.gather(-2, best)[..., 0, :]
+    q = row / row.norm(dim=-1, keepdim=True)
+    return q[..., 0], q[..., 1:]
+
+
+def log(T: Tensor) -> Tensor:
+    """Twist :math:`(*, 6)` of rigid transforms :math:`(*, 4, 4)`, the inverse of `exp` for angles below pi.
+
+    Example:
+        >>> twist = torch.tensor([1.0, -2.0, 0.5, 0.1, 0.2, -0.3])
+        >>> torch.allclose(log(exp(twist)), twist, atol=1e-5)
+        True
+    """
+    omega = so3_log(T[..., :3, :3])
+    t = (omega * omega).sum(-1)
+    a, b, c = _exp_coefficients(t)
+    small = t < _SMALL_ANGLE_SQUARED
+    safe = torch.where(small, torch.ones_like(t), t)
+    # (1 - a / (2 b)) / angle^2, whose series at zero is 1/12 + t/720 + t^2/30240 + t^3/1209600.
+    series = (1 + t / 60 * (1 + t / 42 * (1 + t / 40))) / 12
+    d = torch.where(small, series, (1 - a / (2 * b)) / safe)
+    W = hat(omega)
+    V_inverse = torch.eye(3, dtype=T.dtype, device=T.device) - 0.5 * W + d[..., None, None] * (W @ W)
+    return torch.cat([(V_inverse @ T[..., :3, 3:])[..., 0], omega], dim=-1)

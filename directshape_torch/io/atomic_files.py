@@ -1,0 +1,108 @@
+"""Write files so that a reader sees the old content or the new one, never half of it."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The earliest date a zip entry can carry; a constant one makes equal content give equal bytes.
+_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+def write_bytes(path: Path | str, content: bytes) -> None:
+    """Write `content` to `path` by way of a temporary file in the same folder, which is made where it is missing.
+
+    Args:
+        path: the file to make or replace.
+        content: its bytes.
+
+    Raises:
+        OSError: the folder cannot be made or written; the old file, if any, is then untouched.
+
+    Example:
+        >>> folder = tempfile.mkdtemp()
+        >>> write_bytes(Path(folder) / "a.txt", b"done")
+        >>> (Path(folder) / "a.txt").read_bytes()
+        b'done'
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        # mkstemp makes files that only the owner can read; results are for whoever may read the folder.
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write `text` as UTF-8, line ends as they are, like `write_bytes`."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_json(path: Path | str, value: Any) -> None:
+    """Write `value` as JSON with sorted keys and a final newline; NaN and infinity are refused, JSON has none.
+
+    Raises:
+        ValueError: `value` holds a number that JSON cannot express.
+    """
+    write_text(path, json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n")
+
+
+def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a compressed npz whose bytes depend on the arrays alone (`numpy.savez` stores the time of day).
+
+    Raises:
+        ValueError: an array of Python objects, which would need pickle.
+
+    Example:
+        >>> file = Path(tempfile.mkdtemp()) / "a.npz"
+        >>> write_npz(file, {"codes": np.zeros((2, 5))})
+        >>> np.load(file, allow_pickle=False)["codes"].shape
+        (2, 5)
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=_ZIP_DATE)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system = 3  # the same bytes on every operating system
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.asarray(array), allow_pickle=False)
+            archive.writestr(entry, content.getvalue())
+    write_bytes(path, buffer.getvalue())
+
+
+def write_png(path: Path | str, image: NDArray[Any]) -> None:
+    """Write an image, (H, W) grey or (H, W, 3) RGB, uint8 or uint16, as PNG.
+
+    Raises:
+        OSError: OpenCV cannot encode the array.
+    """
+    import cv2
+
+    image = np.asarray(image)
+    encoded, content = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)
+    if not encoded:
+        raise OSError(f"{path}: cannot encode an array of shape {image.shape} and type {image.dtype} as PNG")
+    write_bytes(path, content.tobytes())
+
+
+def _umask() -> int:
+    """The process's file creation mask, which the operating system only tells when it is set."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

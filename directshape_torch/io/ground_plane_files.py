@@ -1,0 +1,77 @@
+"""Ground plane files as AVOD writes them, one a frame, in KITTI's `ref` frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError
+from directshape_torch.io import atomic_files
+from directshape_torch.io.text_files import Line, read_lines
+
+_CURE = "write four lines: '# Plane', 'Width 4', 'Height 1', then a b c d with a x + b y + c z + d = 0"
+
+
+def read_plane(path: Path | str) -> NDArray[np.float64]:
+    """Read a plane `(a, b, c, d)`, `a x_ref + b y_ref + c z_ref + d = 0`, normalised and with its normal up (b < 0).
+
+    Args:
+        path: text file whose last line is `a b c d`; lines before it are a header.
+
+    Returns:
+        (4,) float64: unit normal and offset in metres.
+
+    Raises:
+        DataFormatError: there is no line of four numbers, or the plane is upright.
+    """
+    lines = read_lines(path)
+    if not lines:
+        raise DataFormatError(path, "is empty", cure=_CURE)
+    plane = _four_numbers(path, lines[-1])
+    length = float(np.linalg.norm(plane[:3]))
+    # A ground that leans by more than 60 degrees is a mistake in the order or the frame of the coefficients.
+    if not abs(plane[1]) > 0.5 * length:
+        raise DataFormatError(
+            path,
+            "the normal is not near the vertical y axis",
+            line_number=lines[-1].number,
+            line=lines[-1].text,
+            cure=_CURE,
+        )
+    return plane / (-np.sign(plane[1]) * length)
+
+
+def _four_numbers(path: Path | str, line: Line) -> NDArray[np.float64]:
+    try:
+        values = np.array([float(word) for word in line.text.split()])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != 4 or not np.isfinite(values).all():
+        raise DataFormatError(
+            path, "expected four finite numbers", line_number=line.number, line=line.text, cure=_CURE
+        )
+    return values
+
+
+def plane_ref_to_cam(
+    plane_ref: Sequence[float] | NDArray[np.float64],  # (4,)
+    t_cam_ref: Sequence[float] | NDArray[np.float64],  # (3,) metres
+) -> NDArray[np.float64]:
+    """The same plane in camera coordinates: `d_cam = d_ref - n . t_cam_ref`, as `x_cam = x_ref + t_cam_ref`.
+
+    Example:
+        >>> plane_ref_to_cam([0.0, -1.0, 0.0, 1.65], [0.06, 0.01, 0.0]).round(2).tolist()
+        [0.0, -1.0, 0.0, 1.66]
+    """
+    plane = np.array(plane_ref, dtype=np.float64)
+    plane[3] -= plane[:3] @ np.asarray(t_cam_ref, dtype=np.float64)
+    return plane
+
+
+def write_plane(path: Path | str, plane_ref: Sequence[float] | NDArray[np.float64]) -> None:
+    """Write a plane `(a, b, c, d)` of the `ref` frame in AVOD's four lines."""
+    numbers = " ".join(f"{value:.6e}" for value in plane_ref)
+    atomic_files.write_text(path, f"# Plane\nWidth 4\nHeight 1\n{numbers}\n")

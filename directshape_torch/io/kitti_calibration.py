@@ -1,0 +1,120 @@
+"""KITTI calibration files of the object, tracking and raw layouts, and the stereo camera they describe."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.text_files import read_lines
+from directshape_torch.scene import StereoCamera
+
+# The name of each matrix in the object, the tracking and the raw layout, and its shape.
+_LAYOUTS: dict[str, tuple[str, tuple[int, int]]] = {
+    "P2": ("P2", (3, 4)),
+    "P_rect_02": ("P2", (3, 4)),
+    "P3": ("P3", (3, 4)),
+    "P_rect_03": ("P3", (3, 4)),
+    "R0_rect": ("R0_rect", (3, 3)),
+    "R_rect": ("R0_rect", (3, 3)),
+    "R_rect_00": ("R0_rect", (3, 3)),
+    "Tr_velo_to_cam": ("Tr_velo_to_cam", (3, 4)),
+    "Tr_velo_cam": ("Tr_velo_to_cam", (3, 4)),
+}
+
+
+@dataclass(frozen=True)
+class KittiCalibration:
+    """Matrices of one calibration file, float64.
+
+    Attributes:
+        path: the file.
+        P2, P3: projections of the left and the right colour camera from the `ref` frame, (3, 4), pixels.
+        R0_rect: camera 0 to rectified camera 0, (3, 3), or None.
+        Tr_velo_to_cam: LiDAR to camera 0, (3, 4), metres, or None.
+    """
+
+    path: Path
+    P2: NDArray[np.float64]
+    P3: NDArray[np.float64]
+    R0_rect: NDArray[np.float64] | None = None
+    Tr_velo_to_cam: NDArray[np.float64] | None = None
+
+
+def read_calibration(path: Path | str) -> KittiCalibration:
+    """Read a KITTI calibration file (object `calib/NNNNNN.txt`, tracking `calib.txt`, raw `calib_cam_to_cam.txt`).
+
+    Args:
+        path: text file of lines `name: numbers`, the colon being optional.
+
+    Raises:
+        DataFormatError: a line does not hold as many numbers as its matrix, or P2 or P3 is missing.
+    """
+    matrices: dict[str, NDArray[np.float64]] = {}
+    for line in read_lines(path):
+        words = line.text.split()
+        name, shape = _LAYOUTS.get(words[0].rstrip(":"), (None, (0, 0)))
+        if name is not None:
+            matrices[name] = _parse_matrix(path, line.number, line.text, words[1:], shape)
+    for name in ("P2", "P3"):
+        if name not in matrices:
+            raise DataFormatError(path, f"has no line {name}:", cure="a stereo pair needs the projections P2 and P3")
+    return KittiCalibration(Path(path), **matrices)
+
+
+def _parse_matrix(
+    path: Path | str, number: int, text: str, words: Sequence[str], shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    wanted = shape[0] * shape[1]
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise DataFormatError(path, f"expected {wanted} numbers ({error})", line_number=number, line=text) from error
+    if len(values) != wanted or not np.isfinite(values).all():
+        raise DataFormatError(
+            path, f"expected {wanted} finite numbers, got {len(values)}", line_number=number, line=text
+        )
+    return values.reshape(shape)
+
+
+def to_stereo_camera(
+    calibrations: Sequence[KittiCalibration],
+    disparity_field: DisparityField | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> StereoCamera:
+    """The stereo cameras of F frames: `K = P2[:, :3]`, `x_cam = x_ref + K^-1 P2[:, 3]`, right camera from P3.
+
+    Args:
+        calibrations: one a frame.
+        disparity_field: residual disparity of the rig, shared by the frames, or None.
+        dtype: of the tensors; the arithmetic is float64.
+
+    Raises:
+        DataFormatError: the right camera of a file is not to the right of its left one (flipped baseline).
+    """
+    if not calibrations:
+        raise InputError("calibrations", "at least one frame", "none")
+    for calibration in calibrations:
+        _check_baseline(calibration)
+    P2, P3 = (
+        torch.from_numpy(np.stack([getattr(calibration, name) for calibration in calibrations]))
+        for name in ("P2", "P3")
+    )
+    return StereoCamera.from_projections(P2, P3, disparity_field).to(dtype=dtype)
+
+
+def _check_baseline(calibration: KittiCalibration) -> None:
+    """Name the file: `StereoCamera` would only name the tensor."""
+    baseline_m = calibration.P2[0, 3] / calibration.P2[0, 0] - calibration.P3[0, 3] / calibration.P3[0, 0]
+    if not baseline_m > 0:
+        raise DataFormatError(
+            calibration.path,
+            f"the camera of P3 is not to the right of that of P2 (baseline {baseline_m:.4f} m)",
+            cure="swap P2 and P3, or the sign of their fourth columns",
+        )

@@ -1,0 +1,151 @@
+"""Label and result files of KITTI's object benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import DataFormatError
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.io.text_files import Line, read_lines
+
+_COLUMNS = "type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
+# KITTI writes these where a box has no 3D part (DontCare, 2D detectors).
+_NO_LOCATION_M = -1000.0
+
+
+@dataclass(frozen=True)
+class KittiObject:
+    """One line of a label file (15 columns) or a result file (16 columns, the score last).
+
+    Attributes:
+        type: class name, such as "Car".
+        truncated: share of the object outside the image, -1 where unknown.
+        occluded: 0 visible .. 3 unknown, -1 where not given.
+        alpha: observation angle, radians.
+        box_2d: (u_min, v_min, u_max, v_max) in the left image, pixels.
+        hwl: height, width, length, metres.
+        location_ref: bottom centre of the box in the `ref` frame, metres.
+        rotation_y: heading about the y axis of `ref`, radians.
+        score: the detector's, or None in a label.
+        raw_line: the line as it is in the file, without its newline.
+        line_number: from 1.
+    """
+
+    type: str
+    truncated: float
+    occluded: int
+    alpha: float
+    box_2d: tuple[float, float, float, float]
+    hwl: tuple[float, float, float]
+    location_ref: tuple[float, float, float]
+    rotation_y: float
+    score: float | None
+    raw_line: str
+    line_number: int
+
+    @property
+    def has_box_3d(self) -> bool:
+        """Whether the line carries a 3D box (positive dimensions and a place)."""
+        return min(self.hwl) > 0 and self.location_ref[2] != _NO_LOCATION_M
+
+
+def read_objects(path: Path | str, with_score: bool | None = None) -> list[KittiObject]:
+    """Read a KITTI label or result file; an empty file gives an empty list.
+
+    Args:
+        path: text file, one object a line.
+        with_score: True for results (16 columns), False for labels (15), None for either.
+
+    Raises:
+        DataFormatError: a line has another number of columns or something that is no finite number; names the file,
+            the line and its text.
+    """
+    return [parse_object(path, line, with_score) for line in read_lines(path)]
+
+
+def parse_object(path: Path | str, line: Line, with_score: bool | None = None) -> KittiObject:
+    """One object from a line of the file `path` (named in errors)."""
+    words = line.text.split()
+    _check_column_count(path, line, len(words), with_score)
+    numbers = _finite_numbers(path, line, words[1:])
+    return KittiObject(
+        type=words[0],
+        truncated=numbers[0],
+        occluded=round(numbers[1]),
+        alpha=numbers[2],
+        box_2d=(numbers[3], numbers[4], numbers[5], numbers[6]),
+        hwl=(numbers[7], numbers[8], numbers[9]),
+        location_ref=(numbers[10], numbers[11], numbers[12]),
+        rotation_y=numbers[13],
+        score=numbers[14] if len(numbers) > 14 else None,
+        raw_line=line.raw,
+        line_number=line.number,
+    )
+
+
+def _check_column_count(path: Path | str, line: Line, count: int, with_score: bool | None) -> None:
+    allowed = {None: (15, 16), False: (15,), True: (16,)}[with_score]
+    if count not in allowed:
+        raise DataFormatError(
+            path,
+            f"expected {' or '.join(map(str, allowed))} columns, got {count}",
+            line_number=line.number,
+            line=line.text,
+            cure=f"write one object a line: {_COLUMNS}",
+        )
+
+
+def _finite_numbers(path: Path | str, line: Line, words: Sequence[str]) -> list[float]:
+    numbers = []
+    for column, word in enumerate(words, start=2):
+        try:
+            number = float(word)
+        except ValueError:
+            number = float("nan")
+        if not abs(number) < float("inf"):
+            raise DataFormatError(
+                path,
+                f"column {column} is {word!r}, not a finite number",
+                line_number=line.number,
+                line=line.text,
+                cure=f"write one object a line: {_COLUMNS}",
+            )
+        numbers.append(number)
+    return numbers
+
+
+def poses_ref(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64) -> Tensor:
+    """`T_ref_obj` (B, 4, 4) of the 3D boxes: origin on the ground under the box centre, x forward, y down."""
+    location_ref = torch.tensor([o.location_ref for o in objects], dtype=dtype).reshape(-1, 3)
+    rotation_y = torch.tensor([o.rotation_y for o in objects], dtype=dtype)
+    return pose_from_kitti(location_ref, rotation_y)
+
+
+def poses_cam(
+    objects: Sequence[KittiObject],
+    t_cam_ref: Tensor,  # (3,) metres
+) -> Tensor:
+    """`T_cam_obj` (B, 4, 4) of the 3D boxes, with the dtype and device of `t_cam_ref`; float64 inside.
+
+    Example:
+        >>> line = Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0", "")
+        >>> poses_cam([parse_object("labels", line)], torch.tensor([0.06, 0.0, 0.0]))[0, :3, 3]
+        tensor([ 1.0600,  1.6000, 20.0000])
+    """
+    T_ref_obj = poses_ref(objects).to(t_cam_ref.device)
+    return shift_frame(T_ref_obj, t_cam_ref.double()).to(t_cam_ref.dtype)
+
+
+def shift_frame(
+    T_a_obj: Tensor,  # (B, 4, 4)
+    t_b_a: Tensor,  # (3,) or (B, 3)
+) -> Tensor:
+    """`T_b_obj` (B, 4, 4) for frames with parallel axes, `x_b = x_a + t_b_a` (`ref` to `cam`, or back with `-t`)."""
+    T_b_obj = T_a_obj.clone()
+    T_b_obj[..., :3, 3] += t_b_a
+    return T_b_obj

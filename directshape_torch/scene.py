@@ -1,0 +1,276 @@
+"""What a refinement is given: cameras, ground planes, frames and detections, as plain tensors.
+
+Knows no data set and no solver. Frames of a call are numbered `0 .. F-1`; objects carry the number of their frame.
+Everything is in the left camera frame (`cam`): x right, y down, z forward, metres; pixels are (u, v) = (column, row)
+with the centre of the top-left pixel at (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import DisparityField
+
+
+def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str], cure: str = "") -> None:
+    """Raise `InputError` unless `tensor` has the expected shape; letters stand for any size.
+
+    Example:
+        >>> check_shape("points", torch.zeros(7, 3), ("P", 3))
+    """
+    fits = tensor.ndim == len(expected) and all(
+        isinstance(want, str) or want == have for want, have in zip(expected, tensor.shape, strict=True)
+    )
+    if not fits:
+        wanted = "(" + ", ".join(str(n) for n in expected) + ")"
+        raise InputError(name, f"shape {wanted}", f"{tuple(tensor.shape)}", cure)
+
+
+class _TensorRecord:
+    """Moves every tensor field of a frozen dataclass to a device, and floating ones to a dtype."""
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """A copy on another device and, for floating-point fields, of another dtype."""
+
+        def convert(value: Any) -> Any:
+            if isinstance(value, Tensor):
+                return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+            if isinstance(value, (_TensorRecord, DisparityField)):
+                return value.to(device=device, dtype=dtype)
+            return value
+
+        changed = {f.name: convert(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-type]
+        return replace(self, **changed)  # type: ignore[type-var]
+
+
+@dataclass(frozen=True)
+class StereoCamera(_TensorRecord):
+    """Calibration of the F rectified stereo frames of a call.
+
+    Attributes:
+        K_left: intrinsics of the left camera, (F, 3, 3), pixels.
+        K_right: intrinsics of the right camera, (F, 3, 3), pixels.
+        T_right_cam: left camera to right camera, (F, 4, 4), metres. Any rigid transform: KITTI's right camera is also
+            2.7 mm off vertically.
+        t_cam_ref: `x_cam = x_ref + t_cam_ref`, (F, 3): `ref` is the frame of labels and result files (KITTI: rectified
+            camera 0). Zero where there is no such frame.
+        disparity_field: residual disparity of the rig (measured minus true), or None.
+    """
+
+    K_left: Tensor
+    K_right: Tensor
+    T_right_cam: Tensor
+    t_cam_ref: Tensor
+    disparity_field: DisparityField | None = None
+
+    def __post_init__(self) -> None:
+        check_shape("K_left", self.K_left, ("F", 3, 3))
+        num_frames = len(self.K_left)
+        check_shape("K_right", self.K_right, (num_frames, 3, 3))
+        check_shape("T_right_cam", self.T_right_cam, (num_frames, 4, 4))
+        check_shape("t_cam_ref", self.t_cam_ref, (num_frames, 3))
+
+    @classmethod
+    def from_projections(
+        cls,
+        P_left: Tensor,  # (F, 3, 4)
+        P_right: Tensor,  # (F, 3, 4)
+        disparity_field: DisparityField | None = None,
+    ) -> StereoCamera:
+        """From KITTI's P2 and P3: `K = P[:, :3]`, `t_left = K^-1 P2[:, 3]`, `T_right_cam = [I, t_right - t_left]`.
+
+        Raises:
+            InputError: wrong shapes, or a right camera that is not to the right of the left one.
+
+        Example:
+            >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+            >>> shift = torch.tensor([[-378.0], [0.0], [0.0]])
+            >>> P_left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
+            >>> P_right = torch.cat([K, shift], dim=1)[None]
+            >>> StereoCamera.from_projections(P_left, P_right).baseline
+            tensor([0.5400])
+        """
+        check_shape("P_left", P_left, ("F", 3, 4))
+        check_shape("P_right", P_right, (len(P_left), 3, 4))
+        K_left, K_right = P_left[..., :3], P_right[..., :3]
+        t_left = torch.linalg.solve(K_left, P_left[..., 3:])[..., 0]
+        t_right = torch.linalg.solve(K_right, P_right[..., 3:])[..., 0]
+        T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
+        T_right_cam[:, :3, 3] = t_right - t_left
+        camera = cls(K_left.clone(), K_right.clone(), T_right_cam, t_left, disparity_field)
+        if (camera.baseline <= 0).any():
+            raise InputError(
+                "P_right",
+                "a camera to the right of P_left (positive baseline)",
+                f"baseline {camera.baseline.min().item():.4f} m",
+                "swap the two projections, or the sign of the baseline",
+            )
+        return camera
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.K_left)
+
+    @property
+    def baseline(self) -> Tensor:
+        """Distance of the right camera along the left camera's x axis, (F,), metres, positive."""
+        return -self.T_right_cam[:, 0, 3]
+
+
+@dataclass(frozen=True)
+class GroundPlane(_TensorRecord):
+    """One ground plane a frame: `normal . x_cam + offset = 0`, unit normal pointing up (negative y).
+
+    Attributes:
+        normal: (F, 3).
+        offset: (F,), metres; the height of the camera above the ground.
+        source: where each plane came from, F entries: "file", "stereo", "camera_height", or the caller's own word.
+    """
+
+    normal: Tensor
+    offset: Tensor
+    source: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_shape("normal", self.normal, ("F", 3))
+        check_shape("offset", self.offset, (len(self.normal),))
+        if len(self.source) != len(self.normal):
+            raise InputError("source", f"{len(self.normal)} entries", f"{len(self.source)}")
+        if (self.normal[:, 1] >= 0).any():
+            raise InputError(
+                "normal", "a normal pointing up (negative y)", str(self.normal.tolist()), "flip the plane's signs"
+            )
+        if ((self.normal.norm(dim=-1) - 1).abs() > 1e-3).any():
+            raise InputError("normal", "unit length", str(self.normal.norm(dim=-1).tolist()), "divide the plane by it")
+
+    @classmethod
+    def from_camera_height(cls, height_m: float, num_frames: int = 1) -> GroundPlane:
+        """A level ground `height_m` below the camera, for rigs without plane files.
+
+        Example:
+            >>> GroundPlane.from_camera_height(1.65).offset
+            tensor([1.6500])
+        """
+        normal = torch.tensor([[0.0, -1.0, 0.0]]).repeat(num_frames, 1)
+        return cls(normal, torch.full((num_frames,), height_m), ("camera_height",) * num_frames)
+
+
+@dataclass(frozen=True)
+class FrameBatch(_TensorRecord):
+    """F stereo frames, padded at the right and bottom to one size.
+
+    Attributes:
+        images_left: (F, 3, H, W), RGB in [0, 1].
+        images_right: (F, 3, H, W).
+        sizes: (F, 2) integer (height, width) of each frame without padding.
+        camera: calibration of the frames.
+        ground: a ground plane for each frame, in the left camera frame.
+        frame_ids: a name for each frame.
+    """
+
+    images_left: Tensor
+    images_right: Tensor
+    sizes: Tensor
+    camera: StereoCamera
+    ground: GroundPlane
+    frame_ids: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        check_shape("images_left", self.images_left, ("F", 3, "H", "W"), "stack images as (F, 3, H, W) in [0, 1]")
+        check_shape("images_right", self.images_right, tuple(self.images_left.shape))
+        num_frames, _, height, width = self.images_left.shape
+        check_shape("sizes", self.sizes, (num_frames, 2))
+        if not self.images_left.is_floating_point() or not self.images_right.is_floating_point():
+            raise InputError("images", "floating point in [0, 1]", str(self.images_left.dtype), "divide by 255")
+        if len(self.frame_ids) != num_frames:
+            raise InputError("frame_ids", f"{num_frames} names", f"{len(self.frame_ids)}")
+        for name, count in (("camera", self.camera.num_frames), ("ground", len(self.ground.normal))):
+            if count != num_frames:
+                raise InputError(name, f"{num_frames} frames", f"{count}")
+        if num_frames and bool(((self.sizes > self.sizes.new_tensor([height, width])) | (self.sizes < 1)).any()):
+            raise InputError("sizes", f"(height, width) within (1..{height}, 1..{width})", str(self.sizes.tolist()))
+        field = self.camera.disparity_field
+        if field is not None:
+            for k in range(num_frames):
+                h, w = (int(n) for n in self.sizes[k])
+                field.check_rig(
+                    (w, h), self.camera.K_left[k], self.camera.K_right[k], self.camera.T_right_cam[k]
+                )
+
+    def __len__(self) -> int:
+        return len(self.images_left)
+
+
+@dataclass(frozen=True)
+class Occluders(_TensorRecord):
+    """M further instances (any class) that may hide cars; the detections themselves need not be repeated here.
+
+    Attributes:
+        frame_index: (M,) integer.
+        mask_left, mask_right: (M, H, W), bool or foreground probability in [0, 1].
+        depth_m: (M,) distance along the optical axis, NaN where unknown.
+        bottom_v: (M,) lower edge of the 2D box in the left image, pixels.
+    """
+
+    frame_index: Tensor
+    mask_left: Tensor
+    mask_right: Tensor
+    depth_m: Tensor
+    bottom_v: Tensor
+
+    def __post_init__(self) -> None:
+        check_shape("frame_index", self.frame_index, ("M",))
+        count = len(self.frame_index)
+        check_shape("mask_left", self.mask_left, (count, "H", "W"))
+        check_shape("mask_right", self.mask_right, (count, "H", "W"))
+        check_shape("depth_m", self.depth_m, (count,))
+        check_shape("bottom_v", self.bottom_v, (count,))
+
+
+@dataclass(frozen=True)
+class Detections(_TensorRecord):
+    """B rough 3D boxes with instance masks, over all frames of a call, in any order.
+
+    Attributes:
+        frame_index: (B,) integer, the frame of each object.
+        T_cam_obj: (B, 4, 4) initial pose, object to left camera (KITTI's object frame: x forward, y down, origin on
+            the ground under the box centre).
+        dimensions_hwl: (B, 3) height, width, length of the initial box, metres.
+        box_2d: (B, 4) left-image box (u_min, v_min, u_max, v_max), pixels.
+        score: (B,) the detector's score, any scale.
+        mask_left, mask_right: (B, H, W) foreground probability in [0, 1], floating point or bool.
+        has_mask_left, has_mask_right: (B,) bool; a mask that is absent is never read.
+        occluders: other instances that may hide the cars, or None.
+    """
+
+    frame_index: Tensor
+    T_cam_obj: Tensor
+    dimensions_hwl: Tensor
+    box_2d: Tensor
+    score: Tensor
+    mask_left: Tensor
+    mask_right: Tensor
+    has_mask_left: Tensor
+    has_mask_right: Tensor
+    occluders: Occluders | None = None
+
+    def __post_init__(self) -> None:
+        check_shape("frame_index", self.frame_index, ("B",))
+        count = len(self.frame_index)
+        check_shape("T_cam_obj", self.T_cam_obj, (count, 4, 4))
+        check_shape("dimensions_hwl", self.dimensions_hwl, (count, 3))
+        check_shape("box_2d", self.box_2d, (count, 4))
+        check_shape("score", self.score, (count,))
+        check_shape("mask_left", self.mask_left, (count, "H", "W"))
+        check_shape("mask_right", self.mask_right, tuple(self.mask_left.shape))
+        check_shape("has_mask_left", self.has_mask_left, (count,))
+        check_shape("has_mask_right", self.has_mask_right, (count,))
+
+    def __len__(self) -> int:
+        return len(self.frame_index)

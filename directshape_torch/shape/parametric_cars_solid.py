@@ -1,0 +1,152 @@
+"""The solid of a parametric car: an implicit function, negative inside, made of a bent side view and leaning sides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from directshape_torch.shape.parametric_cars_types import CarParameters
+
+Array = NDArray[np.float64]
+
+_TABLE_SPACING_M = 0.02
+_TABLE_MARGIN_M = 0.6
+_ARCH_GAP_M = 0.045
+_ARCH_DEPTH_M = 0.28
+
+
+@dataclass(frozen=True)
+class _SideView:
+    """Signed distance to the side view's outline, tabulated; x forward from the car's middle, height upwards."""
+
+    distance: Array  # (nx, nh)
+    origin: tuple[float, float]
+
+    def __call__(self, x: Array, height: Array) -> Array:
+        index = [(x - self.origin[0]) / _TABLE_SPACING_M, (height - self.origin[1]) / _TABLE_SPACING_M]
+        return np.asarray(map_coordinates(self.distance, index, order=1, mode="nearest"), dtype=np.float64)
+
+
+def side_outline(car: CarParameters) -> Array:
+    """Outline of the side view without wheels, a closed polygon with rounded corners, (N, 2) of (x forward, height)."""
+    bonnet_middle_u = 0.45 * (car.nose_setback + 0.12) + 0.55 * car.cowl_u
+    bonnet_middle_height = 0.45 * car.nose_height + 0.55 * car.cowl_height + car.bonnet_bulge
+    corners_u_height = np.array(
+        [
+            (0.10, car.bumper_clearance_front),
+            (0.0, 0.5 * (car.bumper_clearance_front + car.nose_height) - 0.08),
+            (0.0, 0.5 * (car.bumper_clearance_front + car.nose_height) + 0.06),
+            (car.nose_setback, car.nose_height),
+            (car.nose_setback + 0.15, car.nose_height + 0.05),
+            (bonnet_middle_u, bonnet_middle_height),
+            (car.cowl_u, car.cowl_height),
+            (car.roof_front_u, car.height - car.roof_front_drop),
+            (car.roof_peak_u, car.height + 0.01),
+            (car.roof_rear_u, car.height - car.roof_rear_drop),
+            (car.rear_glass_base_u, car.rear_glass_base_height),
+            (car.length - car.tail_setback, car.tail_height),
+            (car.length, 0.5 * (car.bumper_clearance_rear + car.tail_height) + 0.05),
+            (car.length, car.bumper_clearance_rear + 0.12),
+            (car.length - 0.10, car.bumper_clearance_rear),
+            (car.front_axle_u + car.wheelbase + 0.1, car.ground_clearance),
+            (car.front_axle_u, car.ground_clearance),
+        ]
+    )
+    x_height = np.stack([0.5 * car.length - corners_u_height[:, 0], corners_u_height[:, 1]], axis=1)
+    return _round_corners(x_height, reach_m=0.35)
+
+
+def _round_corners(polygon: Array, reach_m: float) -> Array:
+    """Replaces each corner of a closed polygon by a parabola that begins at most `reach_m` before and after it."""
+    t = np.linspace(0.0, 1.0, 6)[:, None]
+    arcs = []
+    for before, corner, after in zip(np.roll(polygon, 1, axis=0), polygon, np.roll(polygon, -1, axis=0), strict=True):
+        start, end = (
+            corner + (other - corner) * min(0.45, reach_m / max(float(np.linalg.norm(other - corner)), 1e-9))
+            for other in (before, after)
+        )
+        arcs.append((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
+    return np.concatenate(arcs)
+
+
+def polygon_distance(points: Array, polygon: Array) -> Array:
+    """Signed distance (N,) of points (N, 2) to a closed polygon (M, 2), negative inside."""
+    squared = np.full(len(points), np.inf)
+    inside = np.zeros(len(points), dtype=bool)
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        edge, offset = b - a, points - a
+        along = np.clip(offset @ edge / max(float(edge @ edge), 1e-18), 0.0, 1.0)
+        squared = np.minimum(squared, ((offset - along[:, None] * edge) ** 2).sum(axis=1))
+        crosses = (points[:, 1] < a[1]) != (points[:, 1] < b[1])
+        height_share = (points[:, 1] - a[1]) / (b[1] - a[1] if b[1] != a[1] else 1.0)
+        inside ^= crosses & (points[:, 0] < a[0] + height_share * edge[0])
+    return np.asarray(np.where(inside, -1.0, 1.0) * np.sqrt(squared))
+
+
+@lru_cache(maxsize=16)
+def _side_view(car: CarParameters) -> _SideView:
+    x = np.arange(-0.5 * car.length - _TABLE_MARGIN_M, 0.5 * car.length + _TABLE_MARGIN_M, _TABLE_SPACING_M)
+    height = np.arange(-_TABLE_MARGIN_M, car.height + _TABLE_MARGIN_M, _TABLE_SPACING_M)
+    points = np.stack(np.meshgrid(x, height, indexing="ij"), axis=-1).reshape(-1, 2)
+    distance = polygon_distance(points, side_outline(car)).reshape(len(x), len(height))
+    return _SideView(distance, (float(x[0]), float(height[0])))
+
+
+def half_width(car: CarParameters, x: Array, height: Array) -> Array:
+    """Distance of the body's side from the middle plane at a station x and a height above the ground."""
+    towards_front = np.clip(x / (0.5 * car.length), 0.0, 1.2)
+    towards_rear = np.clip(-x / (0.5 * car.length), 0.0, 1.2)
+    plan = 1.0 - car.taper_front * towards_front**3 - car.taper_rear * towards_rear**3
+    above_belt = np.maximum(height - car.belt_height, 0.0)
+    lean = car.tumblehome * above_belt + 0.25 * above_belt**2
+    shoulder = 0.55 * car.belt_height
+    tuck_low = car.sill_tuck * (np.maximum(shoulder - height, 0.0) / shoulder) ** 2
+    tuck_high = 0.03 * (np.clip(height - shoulder, 0.0, car.belt_height - shoulder) / (car.belt_height - shoulder)) ** 2
+    return 0.5 * car.width * plan - lean - tuck_low - tuck_high
+
+
+def axle_x(car: CarParameters) -> tuple[float, float]:
+    """Front and rear axle, forward of the car's middle."""
+    front = 0.5 * car.length - car.front_axle_u
+    return front, front - car.wheelbase
+
+
+def implicit(car: CarParameters, points_obj: Array) -> Array:
+    """Continuous function (N,) of points (N, 3), negative inside, about a distance; its zero level is the car."""
+    x, height, side = points_obj[:, 0], -points_obj[:, 1], np.abs(points_obj[:, 2])
+    body = _body(car, x, height, side)
+    arches, wheels = _arches_and_wheels(car, x, height, side)
+    return np.minimum(np.maximum(body, -arches), wheels)
+
+
+def _body(car: CarParameters, x: Array, height: Array, side: Array) -> Array:
+    share = np.clip(side / (0.5 * car.width), 0.0, 1.3)
+    bow = share**2.5
+    bent_x = x + bow * (
+        car.bow_front * np.clip(x / (0.3 * car.length), 0.0, 1.0)
+        - car.bow_rear * np.clip(-x / (0.3 * car.length), 0.0, 1.0)
+    )
+    is_upper = np.clip((height - 0.6 * car.belt_height) / 0.2, 0.0, 1.0)
+    profile = _side_view(car)(bent_x, height + is_upper * car.roof_crown * share**2)
+    slope = car.tumblehome * (height > car.belt_height)
+    flank = (side - half_width(car, x, height)) / np.sqrt(1 + slope**2)
+    return rounded_intersection(profile, flank, car.edge_radius)
+
+
+def rounded_intersection(a: Array, b: Array, radius: float) -> Array:
+    """Intersection of two solids whose common edge is rounded with a radius."""
+    outside = np.hypot(np.maximum(a + radius, 0.0), np.maximum(b + radius, 0.0))
+    return np.minimum(np.maximum(a, b), -radius) + outside
+
+
+def _arches_and_wheels(car: CarParameters, x: Array, height: Array, side: Array) -> tuple[Array, Array]:
+    outer = 0.5 * car.width - 0.03
+    from_axle = np.min([np.hypot(x - at, height - car.wheel_radius) for at in axle_x(car)], axis=0)
+    arches = np.maximum(from_axle - car.wheel_radius - _ARCH_GAP_M, 0.5 * car.width - _ARCH_DEPTH_M - side)
+    middle = outer - 0.5 * car.wheel_width
+    wheels = rounded_intersection(from_axle - car.wheel_radius, np.abs(side - middle) - 0.5 * car.wheel_width, 0.03)
+    return arches, wheels

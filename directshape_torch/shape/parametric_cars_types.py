@@ -1,0 +1,239 @@
+"""What a parametric passenger car is: its measures, and how they vary within each body type."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from directshape_torch.errors import InputError
+
+
+@dataclass(frozen=True)
+class CarParameters:
+    """Measures of one car. Lengths in metres; `*_u` are distances behind the front end, `*_height` above the ground.
+
+    Attributes:
+        body_type: one of `BODY_TYPES`.
+        length, width, height: outer measures, without mirrors.
+        ground_clearance: height of the underbody between the axles.
+        bumper_clearance_front, bumper_clearance_rear: height of the lower edge of the bumpers.
+        wheelbase, front_axle_u: position of the wheels.
+        wheel_radius, wheel_width: tyre measures.
+        nose_height: height of the bonnet's leading edge.
+        nose_setback: how far that edge lies behind the bumper.
+        bonnet_bulge: height of the bonnet's arc over its chord.
+        cowl_u, cowl_height: foot of the windscreen.
+        roof_front_u, roof_front_drop: top of the windscreen, and how far it lies below the roof's highest point.
+        roof_peak_u: highest point of the roof.
+        roof_rear_u, roof_rear_drop: rear end of the roof, and how far it lies below the highest point.
+        rear_glass_base_u, rear_glass_base_height: foot of the rear window.
+        tail_height, tail_setback: upper rear edge of the boot or tailgate, and how far it lies before the rear end.
+        belt_height: lower edge of the side windows.
+        tumblehome: inward lean of the side windows, metres per metre of height.
+        sill_tuck: how far the body sides draw in from the belt to the sill.
+        taper_front, taper_rear: share of the half width that the plan view loses towards the ends.
+        bow_front, bow_rear: how far the corners lie behind the middle of the bumper, plan view.
+        roof_crown: how far roof and bonnet fall from the middle towards the sides.
+        edge_radius: rounding of the edges between the sides and roof, bonnet and ends.
+    """
+
+    body_type: str
+    length: float
+    width: float
+    height: float
+    ground_clearance: float
+    bumper_clearance_front: float
+    bumper_clearance_rear: float
+    wheelbase: float
+    front_axle_u: float
+    wheel_radius: float
+    wheel_width: float
+    nose_height: float
+    nose_setback: float
+    bonnet_bulge: float
+    cowl_u: float
+    cowl_height: float
+    roof_front_u: float
+    roof_front_drop: float
+    roof_peak_u: float
+    roof_rear_u: float
+    roof_rear_drop: float
+    rear_glass_base_u: float
+    rear_glass_base_height: float
+    tail_height: float
+    tail_setback: float
+    belt_height: float
+    tumblehome: float
+    sill_tuck: float
+    taper_front: float
+    taper_rear: float
+    bow_front: float
+    bow_rear: float
+    roof_crown: float
+    edge_radius: float
+
+    def as_dict(self) -> dict[str, float | str]:
+        """All measures by name, for a file."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class BodyTypeStatistics:
+    """How one body type is shaped; pairs are (mean, standard deviation).
+
+    Positions are shares of the length, heights (but the drops, in metres) are shares of the height.
+    """
+
+    share: float
+    length: tuple[float, float]
+    width: tuple[float, float]
+    height: tuple[float, float]
+    clearance: float
+    front_axle: tuple[float, float]
+    wheelbase: tuple[float, float]
+    wheel_radius: tuple[float, float]
+    nose_height: tuple[float, float]
+    cowl: tuple[float, float]
+    cowl_height: tuple[float, float]
+    roof_front: tuple[float, float]
+    roof_rear: tuple[float, float]
+    roof_rear_drop: tuple[float, float]
+    rear_glass_base: tuple[float, float]
+    rear_glass_base_height: tuple[float, float]
+    tail_height: tuple[float, float]
+    tumblehome: tuple[float, float]
+
+
+# Typical measures of passenger cars, from general knowledge of the classes (no single model). The shares make the
+# mixture's length, width and height those of KITTI's labelled cars (3.88, 1.63, 1.53 m).
+_STATISTICS: Mapping[str, BodyTypeStatistics] = {
+    "city": BodyTypeStatistics(
+        0.17, (3.40, 0.12), (1.55, 0.06), (1.47, 0.05), 0.17,
+        (0.200, 0.012), (0.665, 0.020), (0.280, 0.012), (0.48, 0.03),
+        (0.235, 0.035), (0.675, 0.03), (0.455, 0.03), (0.875, 0.03), (0.06, 0.03),
+        (0.965, 0.012), (0.64, 0.04), (0.58, 0.06), (0.28, 0.08),
+    ),
+    "hatchback": BodyTypeStatistics(
+        0.35, (3.86, 0.18), (1.64, 0.06), (1.47, 0.06), 0.17,
+        (0.205, 0.012), (0.640, 0.018), (0.298, 0.014), (0.47, 0.03),
+        (0.280, 0.025), (0.665, 0.025), (0.470, 0.025), (0.840, 0.04), (0.08, 0.04),
+        (0.950, 0.020), (0.65, 0.04), (0.60, 0.06), (0.34, 0.08),
+    ),
+    "saloon": BodyTypeStatistics(
+        0.12, (4.35, 0.22), (1.70, 0.06), (1.43, 0.05), 0.16,
+        (0.195, 0.012), (0.595, 0.018), (0.310, 0.014), (0.47, 0.03),
+        (0.300, 0.025), (0.665, 0.025), (0.445, 0.025), (0.705, 0.030), (0.05, 0.02),
+        (0.835, 0.025), (0.71, 0.03), (0.68, 0.03), (0.38, 0.08),
+    ),
+    "estate": BodyTypeStatistics(
+        0.10, (4.38, 0.20), (1.70, 0.06), (1.47, 0.05), 0.16,
+        (0.195, 0.012), (0.595, 0.018), (0.310, 0.014), (0.46, 0.03),
+        (0.290, 0.025), (0.655, 0.025), (0.450, 0.025), (0.900, 0.025), (0.06, 0.03),
+        (0.965, 0.012), (0.64, 0.04), (0.58, 0.06), (0.34, 0.08),
+    ),
+    "suv": BodyTypeStatistics(
+        0.08, (4.25, 0.24), (1.75, 0.07), (1.69, 0.07), 0.23,
+        (0.195, 0.012), (0.605, 0.015), (0.350, 0.018), (0.53, 0.03),
+        (0.270, 0.025), (0.665, 0.020), (0.430, 0.025), (0.890, 0.03), (0.06, 0.03),
+        (0.960, 0.012), (0.64, 0.04), (0.59, 0.05), (0.30, 0.08),
+    ),
+    "van": BodyTypeStatistics(
+        0.09, (4.15, 0.28), (1.72, 0.07), (1.76, 0.09), 0.17,
+        (0.200, 0.012), (0.635, 0.020), (0.310, 0.014), (0.46, 0.03),
+        (0.225, 0.035), (0.620, 0.030), (0.420, 0.03), (0.920, 0.025), (0.05, 0.02),
+        (0.975, 0.010), (0.60, 0.04), (0.53, 0.05), (0.24, 0.08),
+    ),
+    "coupe": BodyTypeStatistics(
+        0.07, (4.10, 0.22), (1.69, 0.06), (1.33, 0.05), 0.14,
+        (0.200, 0.012), (0.600, 0.018), (0.305, 0.014), (0.48, 0.03),
+        (0.330, 0.025), (0.670, 0.025), (0.475, 0.025), (0.670, 0.035), (0.05, 0.02),
+        (0.855, 0.035), (0.71, 0.04), (0.67, 0.04), (0.42, 0.08),
+    ),
+    "pickup": BodyTypeStatistics(
+        0.02, (4.90, 0.20), (1.75, 0.06), (1.72, 0.06), 0.24,
+        (0.180, 0.012), (0.610, 0.015), (0.350, 0.018), (0.52, 0.03),
+        (0.270, 0.020), (0.640, 0.020), (0.395, 0.020), (0.620, 0.030), (0.05, 0.02),
+        (0.665, 0.025), (0.60, 0.02), (0.60, 0.02), (0.28, 0.06),
+    ),
+}  # fmt: skip
+
+BODY_TYPES: tuple[str, ...] = tuple(_STATISTICS)
+
+
+def sample_car(seed: int | np.random.Generator, body_type: str | None = None) -> CarParameters:
+    """Draw a car; the same seed gives the same car.
+
+    Args:
+        seed: integer, or a numpy generator to draw from.
+        body_type: one of `BODY_TYPES`; None draws one by its share of the traffic.
+
+    Raises:
+        InputError: unknown body type.
+
+    Example:
+        >>> sample_car(0, "saloon").body_type
+        'saloon'
+        >>> sample_car(7) == sample_car(7)
+        True
+    """
+    rng = np.random.default_rng(seed)
+    if body_type is None:
+        shares = np.array([statistics.share for statistics in _STATISTICS.values()])
+        body_type = str(rng.choice(BODY_TYPES, p=shares / shares.sum()))
+    if body_type not in _STATISTICS:
+        raise InputError("body_type", f"one of {', '.join(BODY_TYPES)}", repr(body_type))
+    return _draw(rng, body_type, _STATISTICS[body_type])
+
+
+def _draw(rng: np.random.Generator, body_type: str, s: BodyTypeStatistics) -> CarParameters:
+    def draw(mean_and_deviation: tuple[float, float]) -> float:
+        mean, deviation = mean_and_deviation
+        # Cut at two deviations: a rare extreme car would spoil the principal components.
+        return float(mean + deviation * np.clip(rng.standard_normal(), -2.0, 2.0))
+
+    def uniform(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    length, width, height = draw(s.length), draw(s.width), draw(s.height)
+    cowl_height = height * draw(s.cowl_height)
+    roof_front, roof_rear = draw(s.roof_front), draw(s.roof_rear)
+    rear_glass_base_height = height * draw(s.rear_glass_base_height)
+    clearance = s.clearance + uniform(-0.02, 0.03)
+    return CarParameters(
+        body_type=body_type,
+        length=length,
+        width=width,
+        height=height,
+        ground_clearance=clearance,
+        bumper_clearance_front=clearance + uniform(-0.02, 0.08),
+        bumper_clearance_rear=clearance + uniform(0.03, 0.16),
+        wheelbase=length * draw(s.wheelbase),
+        front_axle_u=length * draw(s.front_axle),
+        wheel_radius=draw(s.wheel_radius),
+        wheel_width=uniform(0.17, 0.23),
+        nose_height=height * draw(s.nose_height),
+        nose_setback=uniform(0.04, 0.14),
+        bonnet_bulge=uniform(0.01, 0.06),
+        cowl_u=length * draw(s.cowl),
+        cowl_height=cowl_height,
+        roof_front_u=length * roof_front,
+        roof_front_drop=uniform(0.02, 0.10) * (roof_rear - roof_front) / 0.4,
+        roof_peak_u=length * (roof_front + uniform(0.2, 0.5) * (roof_rear - roof_front)),
+        roof_rear_u=length * roof_rear,
+        roof_rear_drop=max(draw(s.roof_rear_drop), 0.01),
+        rear_glass_base_u=length * draw(s.rear_glass_base),
+        rear_glass_base_height=rear_glass_base_height,
+        tail_height=min(height * draw(s.tail_height), rear_glass_base_height),
+        tail_setback=uniform(0.02, 0.08),
+        belt_height=cowl_height + uniform(-0.06, 0.03),
+        tumblehome=max(draw(s.tumblehome), 0.08),
+        sill_tuck=uniform(0.02, 0.09),
+        taper_front=uniform(0.04, 0.14),
+        taper_rear=uniform(0.02, 0.12),
+        bow_front=uniform(0.10, 0.32),
+        bow_rear=uniform(0.05, 0.22),
+        roof_crown=uniform(0.03, 0.09),
+        edge_radius=uniform(0.05, 0.13),
+    )

@@ -1,0 +1,69 @@
+"""What every shape model offers to ray casting, silhouettes and meshing: a signed distance field bound to a code.
+
+Signed distances are in metres and NEGATIVE inside (the paper's Phi is positive inside: `Phi = -sdf`). Points are in
+the object frame: x forward, y down, origin on the ground under the box centre.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from torch import Tensor
+
+
+class SdfDerivatives(NamedTuple):
+    """Value and first derivatives of a signed distance field at P points, from one lookup."""
+
+    value: Tensor  # (P,) metres
+    gradient: Tensor  # (P, 3) d value / d point_obj
+    J_value_code: Tensor  # (P, K) d value / d code, metres per standard deviation
+
+
+@runtime_checkable
+class BoundShape(Protocol):
+    """Signed distance fields of B objects whose codes are fixed."""
+
+    def value(
+        self,
+        points_obj: Tensor,  # (P, 3)
+        object_index: Tensor,  # (P,) integer in 0..B-1
+    ) -> Tensor:  # (P,)
+        """Signed distance at points, metres."""
+        ...
+
+    def value_and_derivatives(
+        self,
+        points_obj: Tensor,  # (P, 3)
+        object_index: Tensor,  # (P,)
+    ) -> SdfDerivatives:
+        """Signed distance, its spatial gradient and its derivative by the code, in one pass."""
+        ...
+
+
+@runtime_checkable
+class ShapePrior(Protocol):
+    """A family of shapes with a whitened code: component k has standard deviation 1."""
+
+    @property
+    def num_codes(self) -> int: ...
+
+    @property
+    def bounds_obj(self) -> Tensor:
+        """Lower and upper corner of the region where the field is known, (2, 3), metres."""
+        ...
+
+    @property
+    def lipschitz(self) -> float:
+        """Bound of |gradient| over the codes in use, for step lengths of ray tracing."""
+        ...
+
+    def initial_code(self, num_objects: int) -> Tensor:
+        """Codes (B, K) of the mean shape."""
+        ...
+
+    def bind(
+        self,
+        code: Tensor,  # (B, K)
+    ) -> BoundShape:
+        """The fields of B objects with these codes."""
+        ...
