@@ -1,0 +1,99 @@
+"""3D boxes in KITTI's convention, to and from rigid transforms.
+
+The object frame is x forward (length), y down, z = x cross y, origin on the ground under the box centre. With
+`rotation_y = 0` its axes are parallel to the camera's; `rotation_y` turns about the y axis, which points down.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.se3 import from_rotation_translation, transform
+
+
+def rotation_about_y(angle: Tensor) -> Tensor:
+    """Rotation matrices (*, 3, 3) by angles (*,) in radians about the y axis, in KITTI's sense.
+
+    Example:
+        >>> rotation_about_y(torch.tensor(0.0))[0]
+        tensor([1., 0., 0.])
+    """
+    c, s = torch.cos(angle), torch.sin(angle)
+    zero, one = torch.zeros_like(c), torch.ones_like(c)
+    return torch.stack([c, zero, s, zero, one, zero, 0.0 - s, zero, c], dim=-1).unflatten(-1, (3, 3))
+
+
+def pose_from_kitti(
+    location: Tensor,  # (*, 3) bottom centre of the box, metres
+    rotation_y: Tensor,  # (*,) radians
+) -> Tensor:
+    """`T_a_obj` (*, 4, 4) of a KITTI box, in the frame a of its location (`ref` for labels and result files).
+
+    Example:
+        >>> pose_from_kitti(torch.tensor([1.0, 1.6, 20.0]), torch.tensor(0.3))[:3, 3]
+        tensor([ 1.0000,  1.6000, 20.0000])
+    """
+    return from_rotation_translation(rotation_about_y(rotation_y), location)
+
+
+def rotation_y_from_pose(T: Tensor) -> Tensor:
+    """KITTI's heading (*,) of poses (*, 4, 4): `atan2(-R[2, 0], R[0, 0])`, the direction of the car's x axis.
+
+    Example:
+        >>> rotation_y_from_pose(pose_from_kitti(torch.zeros(3), torch.tensor(0.3)))
+        tensor(0.3000)
+    """
+    return torch.atan2(-T[..., 2, 0], T[..., 0, 0])
+
+
+def wrap_angle(angle: Tensor) -> Tensor:
+    """Angles brought into [-pi, pi).
+
+    Example:
+        >>> wrap_angle(torch.tensor(2 * math.pi + 0.5))
+        tensor(0.5000)
+    """
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+def alpha_from_kitti(
+    location_ref: Tensor,  # (*, 3)
+    rotation_y: Tensor,  # (*,)
+) -> Tensor:
+    """KITTI's observation angle (*,): `wrap(rotation_y - atan2(x, z))`.
+
+    Example:
+        >>> alpha_from_kitti(torch.tensor([10.0, 1.6, 10.0]), torch.tensor(0.0))
+        tensor(-0.7854)
+    """
+    return wrap_angle(rotation_y - torch.atan2(location_ref[..., 0], location_ref[..., 2]))
+
+
+def box_corners(
+    T_a_obj: Tensor,  # (*, 4, 4)
+    dimensions_hwl: Tensor,  # (*, 3) height, width, length, metres
+) -> Tensor:
+    """The 8 corners (*, 8, 3) of boxes standing on the origin of their object frame, in frame a.
+
+    Order: the four ground corners (front left of travel first, then round), then the four above them.
+
+    Example:
+        >>> corners = box_corners(torch.eye(4), torch.tensor([1.5, 1.6, 4.0]))
+        >>> corners[0]
+        tensor([ 2.0000,  0.0000, -0.8000])
+    """
+    height, width, length = dimensions_hwl.unbind(-1)
+    sign = dimensions_hwl.new_tensor
+    x = 0.5 * length[..., None] * sign([1, 1, -1, -1, 1, 1, -1, -1])
+    y = -height[..., None] * sign([0, 0, 0, 0, 1, 1, 1, 1])
+    z = 0.5 * width[..., None] * sign([-1, 1, 1, -1, -1, 1, 1, -1])
+    return transform(T_a_obj[..., None, :, :], torch.stack([x, y, z], dim=-1))
+
+
+# Pairs of `box_corners` indices that form the 12 edges of a box.
+BOX_EDGES: tuple[tuple[int, int], ...] = (
+    (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7),
+)  # fmt: skip

@@ -1,0 +1,83 @@
+"""From the left image to the right one: warp with its depth derivative, and rays of the right camera.
+
+Everything that crosses to the right image passes here, so the residual disparity field of a rig is applied here and
+nowhere else (`bias` = measured minus true disparity, so an image point lies at `u_right = pinhole - bias`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.pinhole import rays_from_pixels
+
+
+class RightPixels(NamedTuple):
+    """Where left pixels of known depth appear in the right image."""
+
+    uv_right: Tensor  # (*, 2) pixels
+    J_pixel_depth: Tensor  # (*, 2) d uv_right / d depth, pixels per metre
+    in_front: Tensor  # (*,) bool, false where the point is behind the right camera
+
+
+def warp_to_right(
+    ray_left: Tensor,  # (*, 3) K_left^-1 [u, v, 1]
+    depth: Tensor,  # (*,) depth along the optical axis of the left camera, metres
+    K_right: Tensor,  # (*, 3, 3)
+    T_right_cam: Tensor,  # (*, 4, 4)
+    bias_px: Tensor | None = None,  # (*,) residual disparity at the left pixel
+) -> RightPixels:
+    """Warp left pixels into the right image (paper, supplement, `warp(p, d)` and its derivative by d).
+
+    Example:
+        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+        >>> T_right_cam = torch.eye(4)
+        >>> T_right_cam[0, 3] = -0.5
+        >>> warp_to_right(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(10.0), K, T_right_cam).uv_right
+        tensor([565., 180.])
+    """
+    v = (T_right_cam[..., :3, :3] @ ray_left[..., None])[..., 0]
+    point_right = depth[..., None] * v + T_right_cam[..., :3, 3]
+    homogeneous = (K_right @ point_right[..., None])[..., 0]
+    J_homogeneous_depth = (K_right @ v[..., None])[..., 0]
+    in_front = homogeneous[..., 2] > 1e-6
+    z = torch.where(in_front, homogeneous[..., 2], torch.ones_like(depth))[..., None]
+    uv = homogeneous[..., :2] / z
+    J_pixel_depth = (J_homogeneous_depth[..., :2] - uv * J_homogeneous_depth[..., 2:]) / z
+    if bias_px is not None:
+        uv = torch.stack([uv[..., 0] - bias_px, uv[..., 1]], dim=-1)
+    return RightPixels(uv, J_pixel_depth, in_front)
+
+
+class RightRays(NamedTuple):
+    """Rays of the right camera in the left camera frame: `point_cam = origin_cam + depth_right * direction_cam`."""
+
+    origin_cam: Tensor  # (*, 3) metres
+    direction_cam: Tensor  # (*, 3) unit depth in the right camera
+
+
+def right_rays(
+    uv_right: Tensor,  # (*, 2) pixels of the right image
+    K_right: Tensor,  # (*, 3, 3)
+    T_right_cam: Tensor,  # (*, 4, 4)
+    bias_px: Tensor | None = None,  # (*,) residual disparity at the corresponding left pixel
+) -> RightRays:
+    """Rays of right-image pixels, in the left camera frame; the inverse of the crossing done by `warp_to_right`.
+
+    Example:
+        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+        >>> T_right_cam = torch.eye(4)
+        >>> T_right_cam[0, 3] = -0.5
+        >>> right_rays(torch.tensor([565.0, 180.0]), K, T_right_cam).origin_cam
+        tensor([0.5000, 0.0000, 0.0000])
+    """
+    if bias_px is not None:
+        uv_right = torch.stack([uv_right[..., 0] + bias_px, uv_right[..., 1]], dim=-1)
+    R_cam_right = T_right_cam[..., :3, :3].transpose(-1, -2)
+    ray_right = rays_from_pixels(uv_right, K_right)
+    direction = (R_cam_right @ ray_right[..., None])[..., 0]
+    # `0.0 -` rather than unary minus, which would give negative zeros for a pure baseline.
+    origin = 0.0 - (R_cam_right @ T_right_cam[..., :3, 3:])[..., 0]
+    return RightRays(origin.expand_as(direction), direction)
