@@ -50,9 +50,7 @@ def _four_numbers(path: Path | str, line: Line) -> NDArray[np.float64]:
     except ValueError:
         values = np.empty(0)
     if len(values) != 4 or not np.isfinite(values).all():
-        raise DataFormatError(
-            path, "expected four finite numbers", line_number=line.number, line=line.text, cure=_CURE
-        )
+        raise DataFormatError(path, "expected four finite numbers", line_number=line.number, line=line.text, cure=_CURE)
     return values
 
 

@@ -1,0 +1,96 @@
+"""Several loaded frames as one batch, padded at the right and bottom to one size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from directshape_torch.errors import InputError
+from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
+
+
+def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
+    """One batch of F frames and the detections of all of them, in the order of the frames.
+
+    Args:
+        loaded: F frames; images may differ in size, and are padded with zeros at the right and bottom.
+
+    Returns:
+        The frames, and detections (with occluders) whose `frame_index` counts the frames from 0.
+
+    Raises:
+        InputError: no frames, or frames loaded with different residual disparity fields.
+    """
+    if not loaded:
+        raise InputError("loaded", "at least one frame", "none")
+    size_hw = _largest_size(loaded)
+    frame = FrameBatch(
+        images_left=_padded([item.frame.images_left for item in loaded], size_hw),
+        images_right=_padded([item.frame.images_right for item in loaded], size_hw),
+        sizes=torch.cat([item.frame.sizes for item in loaded]),
+        camera=_cameras([item.frame.camera for item in loaded]),
+        ground=_grounds([item.frame.ground for item in loaded]),
+        frame_ids=tuple(frame_id for item in loaded for frame_id in item.frame.frame_ids),
+    )
+    return frame, _detections([item.detections for item in loaded], size_hw)
+
+
+def _largest_size(loaded: Sequence[LoadedFrame]) -> tuple[int, int]:
+    shapes = [item.frame.images_left.shape for item in loaded]
+    return max(shape[-2] for shape in shapes), max(shape[-1] for shape in shapes)
+
+
+def _padded(images: Sequence[Tensor], size_hw: tuple[int, int]) -> Tensor:
+    height, width = size_hw
+    return torch.cat([pad(image, (0, width - image.shape[-1], 0, height - image.shape[-2])) for image in images])
+
+
+def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:
+    field = cameras[0].disparity_field
+    if any((camera.disparity_field is None) != (field is None) for camera in cameras):
+        raise InputError("loaded", "frames with the same residual disparity field", "some with and some without one")
+    K_left, K_right, T_right_cam, t_cam_ref = (
+        torch.cat([getattr(camera, name) for camera in cameras])
+        for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref")
+    )
+    return StereoCamera(K_left, K_right, T_right_cam, t_cam_ref, field)
+
+
+def _grounds(grounds: Sequence[GroundPlane]) -> GroundPlane:
+    return GroundPlane(
+        torch.cat([ground.normal for ground in grounds]),
+        torch.cat([ground.offset for ground in grounds]),
+        tuple(source for ground in grounds for source in ground.source),
+    )
+
+
+def _detections(parts: Sequence[Detections], size_hw: tuple[int, int]) -> Detections:
+    rows = {
+        name: torch.cat([getattr(part, name) for part in parts])
+        for name in ("T_cam_obj", "dimensions_hwl", "box_2d", "score", "has_mask_left", "has_mask_right")
+    }
+    occluders = [part.occluders for part in parts]
+    return Detections(
+        frame_index=torch.cat([part.frame_index + number for number, part in enumerate(parts)]),
+        mask_left=_padded([part.mask_left for part in parts], size_hw),
+        mask_right=_padded([part.mask_right for part in parts], size_hw),
+        occluders=_occluders(occluders, size_hw),
+        **rows,
+    )
+
+
+def _occluders(parts: Sequence[Occluders | None], size_hw: tuple[int, int]) -> Occluders | None:
+    numbered = [(number, part) for number, part in enumerate(parts) if part is not None]
+    if not numbered:
+        return None
+    return Occluders(
+        frame_index=torch.cat([part.frame_index + number for number, part in numbered]),
+        mask_left=_padded([part.mask_left for _, part in numbered], size_hw),
+        mask_right=_padded([part.mask_right for _, part in numbered], size_hw),
+        depth_m=torch.cat([part.depth_m for _, part in numbered]),
+        bottom_v=torch.cat([part.bottom_v for _, part in numbered]),
+    )

@@ -1,0 +1,147 @@
+"""From the lines of a detection file and the masks of a frame to `Detections`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.io.instance_masks import SIDES, InstanceMask, Side
+from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.io.mask_matching import MaskMatches, drop_duplicates, match_masks, project_boxes
+from directshape_torch.scene import Detections, Occluders, StereoCamera
+
+
+@dataclass(frozen=True)
+class MatchingSummary:
+    """The masks found for B detections.
+
+    Attributes:
+        instance_left, instance_right: (B,) instance ids of the file, -1 for none.
+        overlap_left, overlap_right: (B,) overlap of the boxes that decided, 0 for none.
+    """
+
+    instance_left: tuple[int, ...]
+    instance_right: tuple[int, ...]
+    overlap_left: tuple[float, ...]
+    overlap_right: tuple[float, ...]
+
+
+def build_detections(
+    objects: Sequence[KittiObject],
+    masks: Sequence[InstanceMask],
+    camera: StereoCamera,  # of one frame
+    size_hw: tuple[int, int],
+    classes: Collection[str],
+) -> tuple[Detections, tuple[int, ...], MatchingSummary]:
+    """The objects to refine, with masks matched one to one; all other instances become occluders.
+
+    Returns:
+        The detections; for each input line the index of its detection or -1; and what was matched.
+    """
+    chosen = [o for o in objects if o.type in classes and o.has_box_3d]
+    numbers = iter(range(len(chosen)))
+    rows = tuple(next(numbers) if o.type in classes and o.has_box_3d else -1 for o in objects)
+    dtype = camera.K_left.dtype
+    T_cam_obj = poses_cam(chosen, camera.t_cam_ref[0])
+    dimensions_hwl = torch.tensor([o.hwl for o in chosen], dtype=dtype).reshape(-1, 3)
+    by_side: dict[Side, list[InstanceMask]] = {side: [m for m in masks if m.side == side] for side in SIDES}
+    matches = _match_sides(chosen, T_cam_obj, dimensions_hwl, by_side, camera, size_hw)
+    stacked = {side: _stack(by_side[side], matches[side], size_hw, dtype) for side in SIDES}
+    detections = Detections(
+        frame_index=torch.zeros(len(chosen), dtype=torch.int64),
+        T_cam_obj=T_cam_obj,
+        dimensions_hwl=dimensions_hwl,
+        box_2d=torch.tensor([o.box_2d for o in chosen], dtype=dtype).reshape(-1, 4),
+        score=torch.tensor([1.0 if o.score is None else o.score for o in chosen], dtype=dtype),
+        mask_left=stacked["left"],
+        mask_right=stacked["right"],
+        has_mask_left=torch.from_numpy(matches["left"].mask_of_detection >= 0),
+        has_mask_right=torch.from_numpy(matches["right"].mask_of_detection >= 0),
+        occluders=_occluders(by_side, matches, size_hw, dtype),
+    )
+    return detections, rows, _summary(by_side, matches)
+
+
+def _match_sides(
+    objects: Sequence[KittiObject],
+    T_cam_obj: Tensor,
+    dimensions_hwl: Tensor,
+    by_side: dict[Side, list[InstanceMask]],
+    camera: StereoCamera,
+    size_hw: tuple[int, int],
+) -> dict[Side, MaskMatches]:
+    boxes_left = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
+    projected_left, projected_right = project_boxes(T_cam_obj, dimensions_hwl, camera, size_hw)
+    left = match_masks(boxes_left, by_side["left"])
+    moved = _moved_to_right(by_side["left"], left, projected_left, projected_right)
+    return {"left": left, "right": match_masks(projected_right, by_side["right"], moved)}
+
+
+def _moved_to_right(
+    masks_left: Sequence[InstanceMask],
+    left: MaskMatches,
+    projected_left: NDArray[np.float64],  # (B, 4)
+    projected_right: NDArray[np.float64],  # (B, 4)
+) -> NDArray[np.float64]:  # (B, 4)
+    """The box of each matched left mask, moved by the disparity of the initial 3D box; NaN without a left mask.
+
+    A car behind another shows only a part of its projected box, and about the same part in both images.
+    """
+    moved = np.full((len(left.mask_of_detection), 4), np.nan)
+    for row, index in enumerate(left.mask_of_detection):
+        if index >= 0:
+            shift = projected_right[row] - projected_left[row]
+            moved[row] = np.array(masks_left[index].mask_box) + np.array([shift[0], 0.0, shift[2], 0.0])
+    return moved
+
+
+def _stack(masks: Sequence[InstanceMask], matches: MaskMatches, size_hw: tuple[int, int], dtype: torch.dtype) -> Tensor:
+    """(B, H, W) foreground probability, zero for detections without a mask."""
+    stacked = torch.zeros((len(matches.mask_of_detection), *size_hw), dtype=dtype)
+    for row, index in enumerate(matches.mask_of_detection):
+        if index >= 0:
+            stacked[row] = torch.from_numpy(masks[index].probability).to(dtype)
+    return stacked
+
+
+def _occluders(
+    by_side: dict[Side, list[InstanceMask]],
+    matches: dict[Side, MaskMatches],
+    size_hw: tuple[int, int],
+    dtype: torch.dtype,
+) -> Occluders:
+    """Every instance that is no detection's, one entry each, with the other image's mask empty.
+
+    The two images are rectified, so the lower edge of a box has the same row in both.
+    """
+    rest = {
+        side: drop_duplicates(by_side[side], [int(k) for k in matches[side].mask_of_detection if k >= 0])
+        for side in SIDES
+    }
+    entries = [mask for side in SIDES for mask in rest[side]]
+    planes = {side: torch.zeros((len(entries), *size_hw), dtype=dtype) for side in SIDES}
+    for index, mask in enumerate(entries):
+        planes[mask.side][index] = torch.from_numpy(mask.probability).to(dtype)
+    return Occluders(
+        frame_index=torch.zeros(len(entries), dtype=torch.int64),
+        mask_left=planes["left"],
+        mask_right=planes["right"],
+        depth_m=torch.full((len(entries),), float("nan"), dtype=dtype),
+        bottom_v=torch.tensor([mask.box[3] for mask in entries], dtype=dtype),
+    )
+
+
+def _summary(by_side: dict[Side, list[InstanceMask]], matches: dict[Side, MaskMatches]) -> MatchingSummary:
+    def ids(side: Side) -> tuple[int, ...]:
+        masks = by_side[side]
+        return tuple(masks[k].instance_id if k >= 0 else -1 for k in matches[side].mask_of_detection)
+
+    def overlaps(side: Side) -> tuple[float, ...]:
+        return tuple(float(value) for value in matches[side].overlap)
+
+    return MatchingSummary(ids("left"), ids("right"), overlaps("left"), overlaps("right"))
