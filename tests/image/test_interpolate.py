@@ -1,0 +1,140 @@
+"""Bilinear lookup: hand-derived numbers, an independent reference, autograd, borders and padding."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.image.interpolate import bilinear_with_gradient
+
+
+def random_images(seed: int, shape: tuple[int, int, int], dtype: torch.dtype = torch.float64) -> Tensor:
+    return 255 * torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def random_uv(seed: int, shape: tuple[int, ...], height: int, width: int) -> Tensor:
+    unit = torch.rand((*shape, 2), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return unit * torch.tensor([width - 1.0, height - 1.0], dtype=torch.float64)
+
+
+def test_hand_derived_cell() -> None:
+    # f(u, v) = 1 (1-u)(1-v) + 5 u (1-v) + 11 (1-u) v + 31 u v at u = 0.25, v = 0.5:
+    # value = 0.375 + 0.625 + 4.125 + 3.875 = 9; df/du = 4 * 0.5 + 20 * 0.5 = 12; df/dv = 10 * 0.75 + 26 * 0.25 = 14.
+    image = torch.tensor([[[1.0, 5.0], [11.0, 31.0]]], dtype=torch.float64)
+    value, gradient, inside = bilinear_with_gradient(image, torch.tensor([0]), torch.tensor([[0.25, 0.5]]).double())
+    assert value.item() == 9.0
+    assert gradient.tolist() == [[12.0, 14.0]]
+    assert inside.tolist() == [True]
+
+
+def test_values_at_pixel_centres_are_the_pixels() -> None:
+    images = random_images(0, (2, 4, 5))
+    frame, row, column = torch.meshgrid(torch.arange(2), torch.arange(4), torch.arange(5), indexing="ij")
+    uv = torch.stack([column, row], dim=-1).double()
+    value, _, inside = bilinear_with_gradient(images, frame, uv)
+    torch.testing.assert_close(value, images, rtol=0, atol=1e-12)
+    assert inside.all()
+
+
+def test_equals_grid_sample() -> None:
+    images = random_images(1, (3, 7, 9))
+    uv = random_uv(2, (3, 50), 7, 9)
+    value, _, _ = bilinear_with_gradient(images, torch.arange(3)[:, None], uv)
+    grid = (2 * uv / torch.tensor([8.0, 6.0], dtype=torch.float64) - 1)[:, None]
+    expected = torch.nn.functional.grid_sample(images[:, None], grid, align_corners=True)[:, 0, 0]
+    torch.testing.assert_close(value, expected, rtol=0, atol=1e-10)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), height=st.integers(1, 6), width=st.integers(1, 6), padding=st.sampled_from([0, 3]))
+def test_gradient_is_autograds(seed: int, height: int, width: int, padding: int) -> None:
+    images = random_images(seed, (2, height + padding, width + padding))
+    sizes = torch.tensor([[height, width]] * 2) if padding else None
+    # A third of the points outside, so that the clamped derivative is compared too.
+    uv = (1.5 * random_uv(seed + 1, (2, 30), height + 1, width + 1) - 0.5).requires_grad_()
+    value, gradient, _ = bilinear_with_gradient(images, torch.arange(2)[:, None], uv, sizes)
+    (from_autograd,) = torch.autograd.grad(value.sum(), uv)
+    torch.testing.assert_close(gradient, from_autograd, rtol=0, atol=1e-9)
+
+
+def test_gradcheck_in_uv_and_images() -> None:
+    images = random_images(3, (2, 4, 5)).requires_grad_()
+    frame_index = torch.tensor([0, 1, 1, 0, 1, 0])
+    # Away from grid lines, where the lookup has a kink; one point outside on each axis.
+    uv = torch.tensor([[0.3, 0.6], [2.5, 1.2], [3.7, 2.9], [1.1, 0.4], [5.5, 1.3], [2.2, -0.7]], dtype=torch.float64)
+    uv.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda im, x: bilinear_with_gradient(im, frame_index, x)[:2], (images, uv), eps=1e-5, atol=1e-6
+    )
+
+
+def test_outside_is_clamped_flagged_and_flat() -> None:
+    image = torch.tensor([[[1.0, 2.0], [5.0, 9.0]]], dtype=torch.float64)
+    uv = torch.tensor([[-3.0, 0.5], [9.0, 0.5], [0.5, -1.0], [0.5, 4.0], [torch.inf, -torch.inf]], dtype=torch.float64)
+    value, gradient, inside = bilinear_with_gradient(image, torch.zeros(5, dtype=torch.long), uv)
+    assert not inside.any()
+    assert value.tolist() == [3.0, 5.5, 1.5, 7.0, 2.0]
+    # Along the clamped coordinate the lookup is constant, along the other it is not.
+    assert gradient.tolist() == [[0.0, 4.0], [0.0, 7.0], [1.0, 0.0], [4.0, 0.0], [0.0, 0.0]]
+
+
+def test_last_row_and_column_are_inside() -> None:
+    image = torch.tensor([[[1.0, 2.0], [5.0, 9.0]]], dtype=torch.float64)
+    value, gradient, inside = bilinear_with_gradient(image, torch.tensor(0), torch.tensor([1.0, 1.0]).double())
+    assert inside.item()
+    assert value.item() == 9.0
+    assert gradient.tolist() == [4.0, 7.0]
+
+
+def test_nan_coordinates_are_flagged_and_finite() -> None:
+    uv = torch.tensor([[torch.nan, 0.5], [0.5, 0.5]])
+    value, gradient, inside = bilinear_with_gradient(torch.rand(1, 3, 3), torch.zeros(2, dtype=torch.long), uv)
+    assert inside.tolist() == [False, True]
+    assert value.isfinite().all()
+    assert gradient.isfinite().all()
+
+
+def test_padding_changes_nothing() -> None:
+    images = random_images(4, (2, 4, 5))
+    padded = torch.full((2, 6, 9), torch.nan, dtype=torch.float64)
+    padded[:, :4, :5] = images
+    uv = 2 * random_uv(5, (2, 40), 4, 5) - 1
+    frame_index = torch.arange(2)[:, None]
+    plain = bilinear_with_gradient(images, frame_index, uv)
+    with_padding = bilinear_with_gradient(padded, frame_index, uv, torch.tensor([[4, 5], [4, 5]]))
+    for expected, got in zip(plain, with_padding, strict=True):
+        torch.testing.assert_close(got, expected, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("shape", [(0,), (7,), (0, 8), (7, 8), (2, 0, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_shapes_and_dtypes(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    uv = random_uv(6, shape, 5, 6).to(dtype)
+    frame_index = torch.zeros((*shape[:-1], 1) if len(shape) > 1 else shape, dtype=torch.long)
+    value, gradient, inside = bilinear_with_gradient(random_images(7, (1, 5, 6), dtype), frame_index, uv)
+    assert (value.shape, gradient.shape, inside.shape) == (shape, (*shape, 2), shape)
+    assert value.dtype == gradient.dtype == dtype
+
+
+def test_float32_is_close_to_float64() -> None:
+    images, uv = random_images(8, (1, 30, 40)), random_uv(9, (200,), 30, 40)
+    index = torch.zeros(200, dtype=torch.long)
+    exact, exact_gradient, _ = bilinear_with_gradient(images, index, uv)
+    value, gradient, _ = bilinear_with_gradient(images.float(), index, uv.float())
+    # A pixel coordinate below 64 has a float32 step of 4e-6; slopes are below 255 grey levels.
+    torch.testing.assert_close(value.double(), exact, rtol=0, atol=5e-3)
+    torch.testing.assert_close(gradient.double(), exact_gradient, rtol=0, atol=5e-3)
+
+
+def test_wrong_input_is_named() -> None:
+    index = torch.zeros(3, dtype=torch.long)
+    with pytest.raises(InputError, match=r"images: expected shape \(F, H, W\), got \(2, 3, 4, 5\)"):
+        bilinear_with_gradient(torch.zeros(2, 3, 4, 5), index, torch.zeros(3, 2))
+    with pytest.raises(InputError, match=r"uv: expected shape \(\.\.\., 2\), got \(3, 3\)"):
+        bilinear_with_gradient(torch.zeros(2, 4, 5), index, torch.zeros(3, 3))
+    with pytest.raises(InputError, match=r"frame_index: .*got \(3,\); for neighbourhoods"):
+        bilinear_with_gradient(torch.zeros(2, 4, 5), index, torch.zeros(3, 8, 2))
