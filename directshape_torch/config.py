@@ -1,0 +1,302 @@
+"""Settings: one frozen dataclass per concern, units in the names. The defaults are `configs/default.yaml`."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from directshape_torch.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One stage, coarse to fine.
+
+    Attributes:
+        contour_width_px: softness of the projected contour; zeta = f / (z_input * contour_width_px).
+        image_level: pyramid level of the photometric term; 0 is full resolution.
+        max_iterations: Gauss-Newton iterations at most.
+    """
+
+    contour_width_px: float = 0.5
+    image_level: int = 0
+    max_iterations: int = 20
+
+
+@dataclass(frozen=True)
+class SolverConfig:
+    """Damping, acceptance and convergence of the Gauss-Newton loop.
+
+    Attributes:
+        initial_damping: Marquardt's mu at the start of a stage; 0 is pure Gauss-Newton.
+        damping_decrease, damping_increase: factors after an accepted and a refused step.
+        min_damping, max_damping: bounds of mu; a car refused at the upper bound has converged.
+        accept_every_step: accept uphill steps too and return the best state seen (the paper's way).
+        cost_tolerance: relative decrease of the cost below which a car has converged.
+        step_tolerance: largest step, as a share of the trust region, below which a car has converged.
+        block_iterations: iterations between two looks at which cars go on.
+        max_step_translation_m, max_step_rotation_rad, max_step_code: trust region; the whole step is scaled.
+        max_code: bound of |code|, in standard deviations.
+        jacobian: hand-derived ("analytic") or from automatic differentiation ("autograd"), for the same steps.
+    """
+
+    initial_damping: float = 1e-2
+    damping_decrease: float = 0.3
+    damping_increase: float = 8.0
+    min_damping: float = 1e-7
+    max_damping: float = 1e5
+    accept_every_step: bool = False
+    cost_tolerance: float = 1e-4
+    step_tolerance: float = 1e-3
+    block_iterations: int = 4
+    max_step_translation_m: float = 0.5
+    max_step_rotation_rad: float = 0.15
+    max_step_code: float = 1.0
+    max_code: float = 3.0
+
+
+@dataclass(frozen=True)
+class SilhouetteConfig:
+    """Silhouette term, left and right.
+
+    Attributes:
+        weight: lambda_silh.
+        form: "closest_approach" (default) or "product" (the paper's; it dilates the contour).
+        samples_per_ray: coarse samples inside the prior's bounds.
+        probability_floor: foreground probabilities are clamped to [floor, 1 - floor].
+        residual_floor: smallest residual in the reweighting 1/r.
+        min_zeta_per_m, max_zeta_per_m: bounds of zeta.
+        saturation: |zeta * sdf| beyond which the projection counts as certain and has no gradient.
+    """
+
+    weight: float = 12.0
+    form: Literal["closest_approach", "product"] = "closest_approach"
+    samples_per_ray: int = 32
+    probability_floor: float = 0.01
+    residual_floor: float = 0.01
+    min_zeta_per_m: float = 4.0
+    max_zeta_per_m: float = 400.0
+    saturation: float = 16.0
+
+
+@dataclass(frozen=True)
+class PhotometricConfig:
+    """Photometric term, left to right, in grey levels 0..255.
+
+    Attributes:
+        weight: factor of the term (the paper: 1).
+        huber_grey_levels: corner of the Huber norm (gamma).
+        gradient_constant_grey_levels: c of the gradient weight c^2 / (c^2 + |grad I_l|^2).
+        lost_grey_levels: a pixel of the set that loses its hit or leaves the right image pays the Huber norm of this.
+        pixel_set: "hit" (the paper) or "hit_and_mask" (hit and p_fg > 0.5).
+        min_ray_cosine: rays closer to the surface's tangent are grazing and lost.
+        gain: match brightness and contrast of the two images per car at the start of each stage.
+    """
+
+    weight: float = 1.0
+    huber_grey_levels: float = 9.0
+    gradient_constant_grey_levels: float = 50.0
+    lost_grey_levels: float = 30.0
+    pixel_set: Literal["hit", "hit_and_mask"] = "hit_and_mask"
+    min_ray_cosine: float = 0.1
+    gain: bool = True
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Priors on shape and pose.
+
+    Attributes:
+        shape_weight: lambda_1, on the whitened code.
+        height_weight: lambda_2, on the object origin's height above the ground plane in metres.
+        tilt_weight: lambda_3.
+        tilt_form: "normal" (two components of the ground normal in the object frame) or "cosine" (the paper's, whose
+            Jacobian vanishes at its optimum).
+        dimensions_weight: on the difference between the shape's dimensions and the detector's, in units of
+            dimensions_sigma_m; 0 switches it off (the paper).
+        dimensions_sigma_m: standard deviation of the detector's height, width and length.
+    """
+
+    shape_weight: float = 1.0
+    height_weight: float = 10.0
+    tilt_weight: float = 100.0
+    tilt_form: Literal["normal", "cosine"] = "normal"
+    dimensions_weight: float = 0.0
+    dimensions_sigma_m: tuple[float, float, float] = (0.1, 0.1, 0.4)
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Which pixels are used.
+
+    Attributes:
+        mode: "adaptive" (both rounds of the paper), "round_one", "uniform" or "dense".
+        density: share of the region's pixels.
+        min_pixels, max_pixels: bounds of the number of cells.
+        region_margin_px, region_margin_share: the region is grown by the larger of the two.
+        occlusion_order: "depth" (default) or "box_bottom" (the paper).
+        min_usable_pixels: cars with fewer pixels get the status too_few_pixels.
+        occlusion: leave out pixels that a nearer instance hides.
+    """
+
+    mode: Literal["adaptive", "round_one", "uniform", "dense"] = "adaptive"
+    density: float = 0.05
+    min_pixels: int = 100
+    max_pixels: int = 3000
+    region_margin_px: float = 4.0
+    region_margin_share: float = 0.1
+    occlusion_order: Literal["depth", "box_bottom"] = "depth"
+    min_usable_pixels: int = 20
+    occlusion: bool = True
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """States tried before the first step; the cheapest one is kept (the input is always among them).
+
+    Attributes:
+        disparity_offsets_px: the car is moved along its viewing ray by these disparities.
+        yaw_offsets_deg: and turned by these angles.
+    """
+
+    disparity_offsets_px: tuple[float, ...] = ()
+    yaw_offsets_deg: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class RefinerConfig:
+    """Everything `DirectShapeRefiner` can be told."""
+
+    stages: tuple[StageConfig, ...] = (
+        StageConfig(contour_width_px=2.0, image_level=1, max_iterations=12),
+        StageConfig(contour_width_px=0.5, image_level=0, max_iterations=16),
+    )
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
+    photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
+    priors: PriorConfig = field(default_factory=PriorConfig)
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+
+
+_ConfigT = TypeVar("_ConfigT")
+
+
+def config_from_mapping(cls: type[_ConfigT], mapping: Mapping[str, Any], where: str = "") -> _ConfigT:
+    """A configuration dataclass from nested mappings; missing keys keep their defaults.
+
+    Raises:
+        ConfigError: an unknown key (naming the nearest one) or a value of the wrong kind.
+
+    Example:
+        >>> config_from_mapping(RefinerConfig, {"silhouette": {"weight": 6}}).silhouette.weight
+        6.0
+    """
+    if not isinstance(mapping, Mapping):
+        raise ConfigError(f"{where or 'configuration'}: expected keys and values, got {mapping!r}")
+    hints = typing.get_type_hints(cls)
+    for key in mapping:
+        if key not in hints:
+            nearest = difflib.get_close_matches(str(key), hints, n=1, cutoff=0.0)
+            raise ConfigError(f"unknown key {where}{key!s}; the nearest known one is {where}{nearest[0]}")
+    return cls(**{key: _convert(hints[key], value, f"{where}{key}") for key, value in mapping.items()})
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return config_from_mapping(hint, value, f"{where}.")
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is tuple:
+        if isinstance(value, (str, Mapping)) or not isinstance(value, Sequence):
+            raise ConfigError(f"{where}: expected a list, got {value!r}")
+        kinds = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
+        if len(kinds) != len(value):
+            raise ConfigError(f"{where}: expected {len(kinds)} entries, got {value!r}")
+        return tuple(_convert(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(kinds, value, strict=True)))
+    if origin is Literal:
+        if value not in arguments:
+            raise ConfigError(f"{where}: expected one of {', '.join(map(str, arguments))}, got {value!r}")
+        return value
+    return _convert_scalar(hint, value, where)
+
+
+def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if hint is float and isinstance(value, str):
+        # YAML 1.1 reads 1e7 (no point) as text.
+        try:
+            return float(value)
+        except ValueError as error:
+            raise ConfigError(f"{where}: expected a number, got {value!r}") from error
+    if hint is float and is_number:
+        return float(value)
+    if hint is int and is_number and float(value).is_integer():
+        return int(value)
+    if hint in (bool, str) and isinstance(value, hint):
+        return value
+    name = hint.__name__ if isinstance(hint, (type, types.GenericAlias)) else str(hint)
+    raise ConfigError(f"{where}: expected {name}, got {value!r}")
+
+
+def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> RefinerConfig:
+    """Read a YAML file and apply `key.sub=value` overrides (values in YAML).
+
+    Args:
+        path: the file; None for the defaults.
+        overrides: for example `["silhouette.weight=6", "solver.max_code=2.5"]`.
+
+    Raises:
+        ConfigError: unreadable file, unknown key, wrong kind of value.
+
+    Example:
+        >>> load_config(None, ["solver.max_code=2.5"]).solver.max_code
+        2.5
+    """
+    import yaml
+
+    mapping: dict[str, Any] = {}
+    if path is not None:
+        try:
+            mapping = yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {}
+        except (OSError, yaml.YAMLError) as error:
+            raise ConfigError(f"{path}: cannot be read as a YAML configuration: {error}") from error
+        if not isinstance(mapping, dict):
+            raise ConfigError(f"{path}: expected keys and values, got {mapping!r}")
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {override}: expected key=value")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {override}: the value is not YAML") from error
+        _set_nested(mapping, key.strip().split("."), value, override)
+    return config_from_mapping(RefinerConfig, mapping)
+
+
+def _set_nested(mapping: dict[str, Any], keys: Sequence[str], value: Any, override: str) -> None:
+    for key in keys[:-1]:
+        mapping = mapping.setdefault(key, {})
+        if not isinstance(mapping, dict):
+            raise ConfigError(f"--set {override}: {key} holds no keys of its own")
+    mapping[keys[-1]] = value
+
+
+def config_to_mapping(config: Any) -> Any:
+    """Nested plain values of a configuration, for YAML, JSON and hashes.
+
+    Example:
+        >>> config_to_mapping(StageConfig())["image_level"]
+        0
+    """
+    if dataclasses.is_dataclass(config):
+        return {f.name: config_to_mapping(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, tuple):
+        return [config_to_mapping(item) for item in config]
+    return config

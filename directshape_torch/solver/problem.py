@@ -1,0 +1,91 @@
+"""What the solver sees of a batch of B independent least-squares problems of D unknowns each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, Self, TypeVar
+
+import torch
+from torch import Tensor
+
+
+class Linearisation(NamedTuple):
+    """Cost, gradient and Gauss-Newton matrix of each problem at one state, in float64."""
+
+    cost: Tensor  # (B,)
+    gradient: Tensor  # (B, D)
+    hessian: Tensor  # (B, D, D)
+
+
+class State(Protocol):
+    """A named tuple of tensors whose first dimension is the problem."""
+
+    def __iter__(self) -> object: ...
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of a minimisation during which pixel sets, counts and zeta are fixed, so that costs are comparable.
+
+    Attributes:
+        contour_width_px: softness of the projected contour.
+        image_level: pyramid level of the photometric term, 0 is full resolution.
+        max_iterations: Gauss-Newton iterations at most.
+    """
+
+    contour_width_px: float
+    image_level: int
+    max_iterations: int
+
+
+StateT = TypeVar("StateT", bound=tuple[Tensor, ...])
+
+
+class Problem(Protocol[StateT]):
+    """B problems that share nothing but the batch."""
+
+    def stages(self) -> Sequence[Stage]: ...
+
+    def begin_stage(self, stage: Stage, state: StateT) -> None:
+        """Fix everything that must not change while costs are compared."""
+        ...
+
+    def cost(self, state: StateT) -> Tensor:
+        """Cost (B,) of a state in the present stage."""
+        ...
+
+    def linearise(self, state: StateT) -> Linearisation:
+        """Cost, gradient and Gauss-Newton matrix in the present stage."""
+        ...
+
+    def retract(self, state: StateT, step: Tensor) -> StateT:
+        """The state moved by tangent vectors (B, D): the only place where a state changes."""
+        ...
+
+    def step_limits(self) -> Tensor:
+        """Largest trusted step of each unknown, (D,)."""
+        ...
+
+    def compact(self, keep: Tensor) -> Self:
+        """The same problems without those where `keep` (B,) is false."""
+        ...
+
+
+def take_rows(state: StateT, index: Tensor) -> StateT:
+    """Rows of every tensor of a state."""
+    return type(state)(*(x[index] for x in state))
+
+
+def put_rows(state: StateT, index: Tensor, rows: StateT) -> StateT:
+    """A copy of the state with some rows replaced."""
+    return type(state)(*(x.index_copy(0, index, y) for x, y in zip(state, rows, strict=True)))
+
+
+def where_rows(condition: Tensor, a: StateT, b: StateT) -> StateT:
+    """Rows of `a` where the condition (B,) holds, else of `b`."""
+
+    def pick(x: Tensor, y: Tensor) -> Tensor:
+        return torch.where(condition.view(-1, *[1] * (x.ndim - 1)), x, y)
+
+    return type(a)(*(pick(x, y) for x, y in zip(a, b, strict=True)))

@@ -1,0 +1,36 @@
+"""How the refinement of a car ended; the value is the message, with advice."""
+
+from __future__ import annotations
+
+import enum
+
+
+class Status(enum.Enum):
+    """Outcome for one car. `converged` and `max_iterations` carry a refined state; all others the input's."""
+
+    converged = "the cost settled"
+    max_iterations = "the iterations ran out before the cost settled; the state is the best one found"
+    no_mask = "no instance mask in either image matches this detection; check masks, boxes and the matching threshold"
+    too_few_pixels = "fewer usable pixels than the configured minimum; the car is tiny, cut off or hidden"
+    behind_camera = "the initial box lies behind or at the camera, or upside down; check frame and units of the pose"
+    singular = "the normal equations are singular; add a prior, more pixels, or damping"
+    non_finite = "the cost or its derivatives are not finite at the input; look for NaN in images, masks or pose"
+    rejected_worse = "the result had a higher cost than the input, which is returned instead"
+
+    @property
+    def code(self) -> int:
+        """Stable number of the status, for tensors and files."""
+        return _CODES[self]
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether the state differs from the input by refinement."""
+        return self in (Status.converged, Status.max_iterations)
+
+    @classmethod
+    def from_code(cls, code: int) -> Status:
+        return _BY_CODE[code]
+
+
+_BY_CODE = tuple(Status)
+_CODES = {status: code for code, status in enumerate(_BY_CODE)}
