@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -45,13 +46,16 @@ def decode_segmentation(path: Path, index: int, segmentation: Any, size_hw: tupl
             cure='write {"size": [H, W], "counts": ..}',
         )
     try:
-        return np.asarray(pycocotools.mask.decode(rle), dtype=np.bool_)
+        with warnings.catch_warnings():
+            # pycocotools 2.0.11 does not yet know numpy 2's `copy` keyword; its result is right all the same.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return np.asarray(pycocotools.mask.decode(rle), dtype=np.bool_)
     except (ValueError, TypeError) as error:
         raise DataFormatError(path, f"entry {index}: run lengths cannot be decoded ({error})") from error
 
 
 def _compressed(path: Path, index: int, rle: Mapping[str, Any]) -> dict[str, Any]:
-    """The compressed form of an RLE, its runs checked, as the decoder writes whatever it is given."""
+    """The compressed form of an RLE, its runs checked: the decoder fills what too few runs leave with stray memory."""
     import pycocotools.mask
 
     try:

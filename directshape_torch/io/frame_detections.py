@@ -12,7 +12,7 @@ from torch import Tensor
 
 from directshape_torch.io.instance_masks import SIDES, InstanceMask, Side
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
-from directshape_torch.io.mask_matching import MaskMatches, drop_duplicates, match_masks, project_boxes
+from directshape_torch.io.mask_matching import MaskMatches, match_masks, project_boxes, without_duplicates
 from directshape_torch.scene import Detections, Occluders, StereoCamera
 
 
@@ -50,7 +50,8 @@ def build_detections(
     T_cam_obj = poses_cam(chosen, camera.t_cam_ref[0])
     dimensions_hwl = torch.tensor([o.hwl for o in chosen], dtype=dtype).reshape(-1, 3)
     by_side: dict[Side, list[InstanceMask]] = {side: [m for m in masks if m.side == side] for side in SIDES}
-    matches = _match_sides(chosen, T_cam_obj, dimensions_hwl, by_side, camera, size_hw)
+    matches = _match_sides(chosen, by_side, camera, size_hw)
+    others = [o for o in objects if o.type not in classes and o.has_box_3d]
     stacked = {side: _stack(by_side[side], matches[side], size_hw, dtype) for side in SIDES}
     detections = Detections(
         frame_index=torch.zeros(len(chosen), dtype=torch.int64),
@@ -62,24 +63,25 @@ def build_detections(
         mask_right=stacked["right"],
         has_mask_left=torch.from_numpy(matches["left"].mask_of_detection >= 0),
         has_mask_right=torch.from_numpy(matches["right"].mask_of_detection >= 0),
-        occluders=_occluders(by_side, matches, size_hw, dtype),
+        occluders=_occluders(by_side, matches, _known_depths(others, by_side, camera, size_hw), size_hw, dtype),
     )
     return detections, rows, _summary(by_side, matches)
 
 
 def _match_sides(
     objects: Sequence[KittiObject],
-    T_cam_obj: Tensor,
-    dimensions_hwl: Tensor,
     by_side: dict[Side, list[InstanceMask]],
     camera: StereoCamera,
     size_hw: tuple[int, int],
+    cars: bool = True,
 ) -> dict[Side, MaskMatches]:
+    T_cam_obj = poses_cam(objects, camera.t_cam_ref[0])
+    dimensions_hwl = torch.tensor([o.hwl for o in objects], dtype=T_cam_obj.dtype).reshape(-1, 3)
     boxes_left = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
     projected_left, projected_right = project_boxes(T_cam_obj, dimensions_hwl, camera, size_hw)
-    left = match_masks(boxes_left, by_side["left"])
+    left = match_masks(boxes_left, by_side["left"], cars=cars)
     moved = _moved_to_right(by_side["left"], left, projected_left, projected_right)
-    return {"left": left, "right": match_masks(projected_right, by_side["right"], moved)}
+    return {"left": left, "right": match_masks(projected_right, by_side["right"], moved, cars=cars)}
 
 
 def _moved_to_right(
@@ -109,9 +111,27 @@ def _stack(masks: Sequence[InstanceMask], matches: MaskMatches, size_hw: tuple[i
     return stacked
 
 
+def _known_depths(
+    others: Sequence[KittiObject],
+    by_side: dict[Side, list[InstanceMask]],
+    camera: StereoCamera,
+    size_hw: tuple[int, int],
+) -> dict[Side, NDArray[np.float64]]:
+    """Depth of each mask where a detection of another class (a pedestrian, say) stands, metres, else NaN."""
+    matches = _match_sides(others, by_side, camera, size_hw, cars=False)
+    shift_z = float(camera.t_cam_ref[0, 2])
+    depths = {side: np.full(len(by_side[side]), np.nan) for side in SIDES}
+    for side in SIDES:
+        for row, index in enumerate(matches[side].mask_of_detection):
+            if index >= 0:
+                depths[side][index] = others[row].location_ref[2] + shift_z
+    return depths
+
+
 def _occluders(
     by_side: dict[Side, list[InstanceMask]],
     matches: dict[Side, MaskMatches],
+    depths: dict[Side, NDArray[np.float64]],
     size_hw: tuple[int, int],
     dtype: torch.dtype,
 ) -> Occluders:
@@ -119,20 +139,20 @@ def _occluders(
 
     The two images are rectified, so the lower edge of a box has the same row in both.
     """
-    rest = {
-        side: drop_duplicates(by_side[side], [int(k) for k in matches[side].mask_of_detection if k >= 0])
+    rest = [
+        (by_side[side][index], depths[side][index])
         for side in SIDES
-    }
-    entries = [mask for side in SIDES for mask in rest[side]]
-    planes = {side: torch.zeros((len(entries), *size_hw), dtype=dtype) for side in SIDES}
-    for index, mask in enumerate(entries):
-        planes[mask.side][index] = torch.from_numpy(mask.probability).to(dtype)
+        for index in without_duplicates(by_side[side], matches[side].mask_of_detection[matches[side].overlap > 0])
+    ]
+    stacked = {side: torch.zeros((len(rest), *size_hw), dtype=dtype) for side in SIDES}
+    for row, (mask, _) in enumerate(rest):
+        stacked[mask.side][row] = torch.from_numpy(mask.probability).to(dtype)
     return Occluders(
-        frame_index=torch.zeros(len(entries), dtype=torch.int64),
-        mask_left=planes["left"],
-        mask_right=planes["right"],
-        depth_m=torch.full((len(entries),), float("nan"), dtype=dtype),
-        bottom_v=torch.tensor([mask.box[3] for mask in entries], dtype=dtype),
+        frame_index=torch.zeros(len(rest), dtype=torch.int64),
+        mask_left=stacked["left"],
+        mask_right=stacked["right"],
+        depth_m=torch.tensor([depth for _, depth in rest], dtype=dtype),
+        bottom_v=torch.tensor([mask.box[3] for mask, _ in rest], dtype=dtype),
     )
 
 

@@ -41,7 +41,7 @@ def read_plane(path: Path | str) -> NDArray[np.float64]:
             line=lines[-1].text,
             cure=_CURE,
         )
-    return plane / (-np.sign(plane[1]) * length)
+    return np.asarray(plane / (-np.sign(plane[1]) * length))
 
 
 def _four_numbers(path: Path | str, line: Line) -> NDArray[np.float64]:

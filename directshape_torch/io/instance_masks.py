@@ -155,7 +155,7 @@ class CocoFileMasks:
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         masks = []
-        for side, path in (("left", self.left), ("right", self.right)):
+        for side, path in zip(SIDES, (self.left, self.right), strict=True):
             if path is not None:
                 for index, entry in self._entries(side, path).get(_frame_number(frame_id), []):
                     masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))

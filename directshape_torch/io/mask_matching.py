@@ -6,7 +6,7 @@ numbers of the file, which few tools share between the two images.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,6 +83,7 @@ def match_masks(
     boxes_2d: NDArray[np.float64],  # (B, 4) in the image of the masks, pixels
     masks: Sequence[InstanceMask],
     further_boxes_2d: NDArray[np.float64] | None = None,  # (B, 4) a second opinion, NaN where there is none
+    cars: bool = True,
     min_overlap: float = MIN_OVERLAP,
 ) -> MaskMatches:
     """Match masks of one image to 2D boxes, by the larger of the overlaps with the file's box and the mask's own.
@@ -92,8 +93,9 @@ def match_masks(
 
     Args:
         boxes_2d: where each detection is expected.
-        masks: instances of one side; those that are no cars are never matched.
+        masks: instances of one side.
         further_boxes_2d: another expectation for each detection; the larger overlap counts.
+        cars: whether masks of cars are to be matched, or those of all other classes.
         min_overlap: pairs below are never made.
     """
     file_boxes, mask_boxes = (
@@ -103,7 +105,7 @@ def match_masks(
     expected = [boxes_2d] if further_boxes_2d is None else [boxes_2d, further_boxes_2d]
     overlaps = [np.nan_to_num(box_iou(a, b)) for a in expected for b in (file_boxes, mask_boxes)]
     overlap = np.maximum.reduce(overlaps)
-    overlap[:, [not mask.is_car for mask in masks]] = 0.0
+    overlap[:, [mask.is_car != cars for mask in masks]] = 0.0
     return match_one_to_one(overlap, min_overlap)
 
 
@@ -156,16 +158,16 @@ def _enclosing_box(uv: Tensor, valid: Tensor, size_hw: tuple[int, int]) -> NDArr
     return np.asarray(torch.cat([low, high], dim=-1).cpu().numpy())
 
 
-def drop_duplicates(masks: Sequence[InstanceMask], matched: Sequence[int]) -> list[InstanceMask]:
-    """The masks that belong to no detection and are no second mask of a matched car.
+def without_duplicates(masks: Sequence[InstanceMask], matched: Iterable[int]) -> list[int]:
+    """Indices of the masks that belong to no detection and are no second mask of a matched car.
 
     Args:
         masks: instances of one side.
         matched: indices of those that belong to a detection.
     """
-    taken = set(matched)
-    rest = [mask for index, mask in enumerate(masks) if index not in taken]
-    return [mask for mask in rest if not any(_mask_iou(mask, masks[k]) > DUPLICATE_MASK_IOU for k in taken)]
+    taken = {int(index) for index in matched}
+    rest = [index for index in range(len(masks)) if index not in taken]
+    return [i for i in rest if not any(_mask_iou(masks[i], masks[k]) > DUPLICATE_MASK_IOU for k in taken)]
 
 
 def _mask_iou(a: InstanceMask, b: InstanceMask) -> float:

@@ -1,0 +1,192 @@
+"""What a refinement leaves behind for each frame: a KITTI result file, and states with shapes as npz (schema 1)."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io import atomic_files
+from directshape_torch.io.kitti_labels import KittiObject
+
+SHAPES_SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class RefinedBox:
+    """The part of a result line that a refinement changes.
+
+    Attributes:
+        hwl: height, width, length of the refined zero level along the object axes, metres.
+        location_ref: bottom centre of that level in the `ref` frame, metres.
+        rotation_y: heading about the y axis of `ref`, radians.
+        alpha: observation angle, radians.
+    """
+
+    hwl: tuple[float, float, float]
+    location_ref: tuple[float, float, float]
+    rotation_y: float
+    alpha: float
+
+
+def result_line(source: KittiObject, refined: RefinedBox) -> str:
+    """The input line with its 3D box and alpha replaced; every other column keeps the text it had.
+
+    Example:
+        >>> from directshape_torch.io.kitti_labels import parse_object
+        >>> from directshape_torch.io.text_files import Line
+        >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
+        >>> box = RefinedBox((1.4, 1.7, 4.1), (1.1, 1.65, 19.5), 0.02, -0.0363)
+        >>> result_line(parse_object("results", Line(1, raw, raw)), box)
+        'Car -1 -1 -0.0363 5.25 6 70 80.5 1.4000 1.7000 4.1000 1.1000 1.6500 19.5000 0.0200 0.930'
+    """
+    words = source.raw_line.split()
+    numbers = [refined.alpha, *refined.hwl, *refined.location_ref, refined.rotation_y]
+    if not np.isfinite(numbers).all():
+        raise InputError("refined", "finite numbers", str(numbers), "keep the input line of a car that failed")
+    alpha, *box_3d = (_decimal(number) for number in numbers)
+    line = " ".join([*words[:3], alpha, *words[4:8], *box_3d, *words[15:]])
+    return line + ("\r" if source.raw_line.endswith("\r") else "")
+
+
+def write_result_text(
+    path: Path | str, input_objects: Sequence[KittiObject], refined: Mapping[int, RefinedBox]
+) -> None:
+    """Write a KITTI result file: one line per input line, in the same order.
+
+    Args:
+        path: usually `OUT/data/NNNNNN.txt`.
+        input_objects: the lines of the detection file.
+        refined: for indices into `input_objects` the refined box; all other lines are copied byte for byte.
+
+    Raises:
+        InputError: an index without an input line, or a box that is not finite.
+    """
+    unknown = sorted(set(refined) - set(range(len(input_objects))))
+    if unknown:
+        raise InputError("refined", f"indices of the {len(input_objects)} input lines", str(unknown))
+    lines = (
+        result_line(source, refined[index]) if index in refined else source.raw_line
+        for index, source in enumerate(input_objects)
+    )
+    atomic_files.write_text(path, "".join(f"{line}\n" for line in lines))
+
+
+@dataclass(frozen=True)
+class ShapeArrays:
+    """Content of `OUT/shapes/NNNNNN.npz` for the B refined lines of a frame; K codes, D = 6 + K, T terms.
+
+    Attributes:
+        frame_id: the frame.
+        prior_sha256: of the shape prior whose codes these are.
+        ground_source: "file", "stereo" or "camera_height".
+        input_lines: (B,) line numbers in the detection file, from 1.
+        T_cam_obj, T_ref_obj: (B, 4, 4) object to left camera, and to the frame of the labels.
+        boxes_hwl: (B, 3) metres.
+        boxes_location_ref: (B, 3) bottom centres, metres.
+        boxes_rotation_y: (B,) radians.
+        codes: (B, K) standard deviations.
+        covariances: (B, D, D) in the tangent (v, omega, code) of the solver; NaN where there is none.
+        covariances_ref: (B, 4, 4) of (x, y, z, yaw) in `ref`, metres and radians.
+        statuses, messages: (B,) text.
+        term_names: (T,) text.
+        costs_before, costs_after: (B, T) cost of each term.
+        iterations: (B,).
+    """
+
+    frame_id: str
+    prior_sha256: str
+    ground_source: str
+    input_lines: NDArray[np.int64]
+    T_cam_obj: NDArray[np.floating[Any]]
+    T_ref_obj: NDArray[np.floating[Any]]
+    boxes_hwl: NDArray[np.floating[Any]]
+    boxes_location_ref: NDArray[np.floating[Any]]
+    boxes_rotation_y: NDArray[np.floating[Any]]
+    codes: NDArray[np.floating[Any]]
+    covariances: NDArray[np.floating[Any]]
+    covariances_ref: NDArray[np.floating[Any]]
+    statuses: tuple[str, ...]
+    messages: tuple[str, ...]
+    term_names: tuple[str, ...]
+    costs_before: NDArray[np.floating[Any]]
+    costs_after: NDArray[np.floating[Any]]
+    iterations: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        B, T = len(self.input_lines), len(self.term_names)
+        K = self.codes.shape[-1]
+        expected = {
+            "input_lines": (B,),
+            "T_cam_obj": (B, 4, 4),
+            "T_ref_obj": (B, 4, 4),
+            "boxes_hwl": (B, 3),
+            "boxes_location_ref": (B, 3),
+            "boxes_rotation_y": (B,),
+            "codes": (B, K),
+            "covariances": (B, 6 + K, 6 + K),
+            "covariances_ref": (B, 4, 4),
+            "statuses": (B,),
+            "messages": (B,),
+            "costs_before": (B, T),
+            "costs_after": (B, T),
+            "iterations": (B,),
+        }
+        for name, shape in expected.items():
+            got = np.shape(getattr(self, name))
+            if got != shape:
+                raise InputError(name, f"shape {shape}", f"{got}")
+
+
+def write_shapes(path: Path | str, shapes: ShapeArrays) -> None:
+    """Write the states and shapes of a frame; equal content gives equal bytes, no pickle inside."""
+    arrays: dict[str, NDArray[Any]] = {"schema_version": np.array(SHAPES_SCHEMA_VERSION)}
+    for entry in fields(shapes):
+        value = getattr(shapes, entry.name)
+        arrays[entry.name] = np.array(value, dtype=np.str_) if isinstance(value, (str, tuple)) else np.asarray(value)
+    atomic_files.write_npz(path, arrays)
+
+
+def read_shapes(path: Path | str) -> ShapeArrays:
+    """Read a file of `write_shapes`.
+
+    Raises:
+        DataFormatError: it is no such file, or of another schema version.
+    """
+    arrays = _load_npz(path)
+    version = arrays.pop("schema_version", None)
+    if version is None or int(version) != SHAPES_SCHEMA_VERSION:
+        raise DataFormatError(
+            path,
+            f"has shape schema {version}, this version reads {SHAPES_SCHEMA_VERSION}",
+            cure="refine the frame again",
+        )
+    names = {entry.name for entry in fields(ShapeArrays)}
+    if set(arrays) != names:
+        raise DataFormatError(path, f"has the fields {sorted(arrays)}, expected {sorted(names)}")
+    return ShapeArrays(**{name: _from_text(array) for name, array in arrays.items()})
+
+
+def _load_npz(path: Path | str) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, AttributeError) as error:
+        raise DataFormatError(path, f"is no readable npz file ({error})", cure="refine the frame again") from error
+
+
+def _from_text(array: NDArray[Any]) -> Any:
+    if array.dtype.kind != "U":
+        return array
+    return str(array) if array.ndim == 0 else tuple(array.tolist())
+
+
+def _decimal(number: float) -> str:
+    """Four decimals, a tenth of a millimetre, without a negative zero."""
+    return f"{round(float(number), 4) + 0.0:.4f}"

@@ -1,0 +1,160 @@
+"""`summary.json` of a run (schema 1): what made its results, and how each frame ended, so that a run can resume.
+
+    {"schema_version": 1, "package_version": "0.1.0",
+     "config": {..},                      every setting of the run
+     "sha256": {"prior": .., ..},         of the files that serve all frames
+     "inputs": {"000107": {"image_left": .., ..}, ..},     sha256 of the files of each frame
+     "frames": {"000107": {"state": "done" | "failed", "reason": .., ..}, ..}}
+
+Nothing in it depends on the time, the machine or where the files lie.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from directshape_torch.errors import DataFormatError, ResumeError
+from directshape_torch.io import atomic_files
+from directshape_torch.io.image_files import read_file_bytes
+
+MANIFEST_SCHEMA_VERSION = 1
+_CURE = "choose another output folder, or remove this one to start again"
+
+
+@dataclass(frozen=True)
+class RunManifest:
+    """What a run was made of and how far it came.
+
+    Attributes:
+        package_version: of this package.
+        config: every setting that bears on the results, nested as in the configuration file.
+        sha256: hashes of the files that serve all frames, by their role ("prior", "stereo_bias").
+        inputs: for each frame the hashes of its files, by their role.
+        frames: for each finished frame at least {"state": "done"} or {"state": "failed", "reason": text}.
+    """
+
+    package_version: str
+    config: Mapping[str, Any]
+    sha256: Mapping[str, str | None]
+    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
+    frames: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def is_done(self, frame_id: str) -> bool:
+        """Whether the frame was refined; failed frames are tried again."""
+        return self.frames.get(frame_id, {}).get("state") == "done"
+
+
+def hash_bytes(content: bytes) -> str:
+    """The sha256 of some bytes, hexadecimal.
+
+    Example:
+        >>> hash_bytes(b"")[:8]
+        'e3b0c442'
+    """
+    return hashlib.sha256(content).hexdigest()
+
+
+def hash_file(path: Path | str) -> str:
+    """The sha256 of a file, hexadecimal.
+
+    Raises:
+        DataFormatError: it cannot be read.
+    """
+    return hash_bytes(read_file_bytes(path))
+
+
+def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
+    """The sha256 of several files by their role, such as those of `KittiStereoDataset.input_files`."""
+    return {role: hash_file(path) for role, path in files.items()}
+
+
+def write_manifest(path: Path | str, manifest: RunManifest) -> None:
+    """Write `summary.json`."""
+    atomic_files.write_json(path, {"schema_version": MANIFEST_SCHEMA_VERSION, **vars(manifest)})
+
+
+def read_manifest(path: Path | str) -> RunManifest | None:
+    """The manifest of an earlier run, or None where there is no such file.
+
+    Raises:
+        DataFormatError: the file is no manifest.
+        ResumeError: it is of another schema version.
+    """
+    if not Path(path).is_file():
+        return None
+    try:
+        content = json.loads(read_file_bytes(path))
+        version = content.pop("schema_version")
+        if version != MANIFEST_SCHEMA_VERSION:
+            raise ResumeError(
+                f"{path}: schema version is {version}, this program writes {MANIFEST_SCHEMA_VERSION}; {_CURE}"
+            )
+        return RunManifest(**content)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DataFormatError(path, f"is no summary of a run ({error!r})", cure=_CURE) from error
+
+
+def check_resume(previous: RunManifest, current: RunManifest) -> None:
+    """Refuse to mix results of different settings or files in one folder.
+
+    Args:
+        previous: read from the output folder.
+        current: of the run that is about to start; its `inputs` may cover any of the frames.
+
+    Raises:
+        ResumeError: names the first setting or file that differs, with both values.
+    """
+    _check_same("package version", previous.package_version, current.package_version)
+    _check_mapping("setting", flatten(previous.config), flatten(current.config))
+    _check_mapping("sha256 of", previous.sha256, current.sha256)
+    for frame_id, hashes in current.inputs.items():
+        check_inputs(previous, frame_id, hashes)
+
+
+def check_inputs(previous: RunManifest, frame_id: str, hashes: Mapping[str, str]) -> None:
+    """Refuse to resume where the files of a refined frame have changed; failed frames may have been mended.
+
+    Raises:
+        ResumeError: names the frame and the file.
+    """
+    if previous.is_done(frame_id):
+        _check_mapping(f"frame {frame_id}: sha256 of", previous.inputs.get(frame_id, {}), hashes)
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings as one level with dotted names.
+
+    Example:
+        >>> flatten({"solver": {"iterations": 20}, "device": "cpu"})
+        {'solver.iterations': 20, 'device': 'cpu'}
+    """
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        key = f"{prefix}{name}"
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{key}.")
+        else:
+            # As JSON gives it back, which knows no tuples.
+            flat[key] = list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+    return flat
+
+
+def _check_mapping(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    for name in sorted({*before, *now}):
+        _check_same(f"{what} {name!r}", before.get(name, "absent"), now.get(name, "absent"))
+
+
+def _check_same(what: str, before: Any, now: Any) -> None:
+    if before != now:
+        raise ResumeError(f"cannot resume: {what} was {_short(before)}, now is {_short(now)}; {_CURE}")
+
+
+def _short(value: Any) -> str:
+    """The first twelve letters of a hash tell two files apart; settings are shown in full."""
+    is_hash = isinstance(value, str) and len(value) == hashlib.sha256().digest_size * 2
+    return value[:12] if is_hash else repr(value)
