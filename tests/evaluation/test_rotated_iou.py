@@ -1,0 +1,184 @@
+"""Overlap of rotated boxes: hand-derived numbers, an independent reference, laws."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.errors import InputError
+from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, bev_iou_matrix, iou_3d, iou_3d_matrix
+from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+
+
+def _boxes(*rows: tuple[float, ...]) -> torch.Tensor:
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def _random_boxes(count: int, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    unit = torch.rand(count, 5, generator=generator, dtype=torch.float64)
+    low, high = _boxes((-3, 17, 0.3, 0.3, -4))[0], _boxes((3, 23, 5, 3, 4))[0]
+    return low + unit * (high - low)
+
+
+def _corners(box: torch.Tensor) -> np.ndarray:
+    """Ground corners of a footprint by way of the package's 3D boxes, an independent piece of code."""
+    x, z, length, width, yaw = box
+    pose = pose_from_kitti(torch.stack([x, torch.zeros_like(x), z]), yaw)
+    dimensions = torch.stack([torch.ones_like(x), width, length])
+    return box_corners(pose, dimensions)[:4, [0, 2]].numpy()
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
+def _reference_intersection(corners_a: np.ndarray, corners_b: np.ndarray) -> float:
+    """Textbook Sutherland-Hodgman on Python floats."""
+    orientation = np.sign(_cross(corners_b[1] - corners_b[0], corners_b[2] - corners_b[1]))
+    polygon = [tuple(p) for p in corners_a]
+    for k in range(4):
+        p, q = corners_b[k], corners_b[(k + 1) % 4]
+        clipped = []
+        for i, end in enumerate(polygon):
+            start = polygon[i - 1]
+            side = [orientation * _cross(q - p, np.array(point) - p) for point in (start, end)]
+            if side[0] * side[1] < 0:
+                t = side[0] / (side[0] - side[1])
+                clipped.append(tuple(np.array(start) + t * (np.array(end) - np.array(start))))
+            if side[1] >= 0:
+                clipped.append(end)
+        polygon = clipped
+    if len(polygon) < 3:
+        return 0.0
+    x, y = np.array(polygon).T
+    return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
+
+
+HAND_DERIVED = [
+    # (a, b, overlap)
+    pytest.param((0, 10, 4, 2, 0), (0, 10, 4, 2, 0), 1.0, id="identical"),
+    pytest.param((0, 10, 4, 2, 0.7), (0, 10, 4, 2, 0.7), 1.0, id="identical-turned"),
+    pytest.param((0, 10, 4, 2, 0.7), (0, 10, 4, 2, 0.7 + math.pi), 1.0, id="identical-but-reversed"),
+    pytest.param((0, 10, 4, 2, 0), (0, 10, 2, 4, math.pi / 2), 1.0, id="length-and-width-swapped"),
+    # Shift by half the length: 2 x 2 shared, union 8 + 8 - 4.
+    pytest.param((0, 10, 4, 2, 0), (2, 10, 4, 2, 0), 4 / 12, id="half-length"),
+    pytest.param((0, 10, 4, 2, 0), (4, 10, 4, 2, 0), 0.0, id="touching-edges"),
+    pytest.param((0, 10, 4, 2, 0), (4, 12, 4, 2, 0), 0.0, id="touching-corners"),
+    pytest.param((0, 10, 4, 2, 0), (0, 30, 4, 2, 0.3), 0.0, id="apart"),
+    # A unit square well inside, at any heading: 1 / 8.
+    pytest.param((0.2, 10, 1, 1, 0.4), (0, 10, 4, 2, 0), 1 / 8, id="contained"),
+    pytest.param((0, 10, 4, 2, 0), (0.2, 10, 1, 1, 0.4), 1 / 8, id="contains"),
+    # Two unit squares at 45 degrees share a regular octagon of inradius 1/2: area 8 r^2 tan(22.5 deg).
+    pytest.param(
+        (0, 0, 1, 1, 0),
+        (0, 0, 1, 1, math.pi / 4),
+        (2 * math.tan(math.pi / 8)) / (2 - 2 * math.tan(math.pi / 8)),
+        id="octagon",
+    ),
+    # A cross of 4 x 2 and 2 x 4: 4 shared of 12.
+    pytest.param((0, 0, 4, 2, 0), (0, 0, 4, 2, math.pi / 2), 4 / 12, id="cross"),
+    # Yaw sign: with rotation_y = +45 deg the length runs along (x, z) = (1, -1). The small square there is inside.
+    pytest.param((0, 0, 4, 1, math.pi / 4), (1.2, -1.2, 0.2, 0.2, 0), 0.04 / 4, id="yaw-sign"),
+    pytest.param((0, 0, 4, 1, math.pi / 4), (1.2, 1.2, 0.2, 0.2, 0), 0.0, id="yaw-sign-other-side"),
+    pytest.param((0, 0, 0, 0, 0.3), (0, 0, 0, 0, 0.1), 0.0, id="two-points"),
+    pytest.param((0, 0, 4, 0, 0.3), (0, 0, 4, 0, 0.3), 0.0, id="two-lines"),
+    pytest.param((0, 0, 0, 2, 0.3), (0, 0, 4, 2, 0.1), 0.0, id="line-in-box"),
+    pytest.param((0, 0, -4, 2, 0.0), (0, 0, 4, 2, 0.0), 0.0, id="negative-size-is-empty"),
+]
+
+
+@pytest.mark.parametrize(("a", "b", "overlap"), HAND_DERIVED)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-6)])
+def test_hand_derived(a: tuple[float, ...], b: tuple[float, ...], overlap: float, dtype: torch.dtype, tolerance: float):
+    first, second = _boxes(a).to(dtype), _boxes(b).to(dtype)
+    for pair in ((first, second), (second, first)):
+        got = bev_iou(*pair)
+        assert got.dtype == dtype
+        assert got.item() == pytest.approx(overlap, abs=tolerance)
+
+
+def test_equals_sutherland_hodgman_on_random_boxes():
+    a, b = _random_boxes(400, seed=1), _random_boxes(400, seed=2)
+    shared = np.array([_reference_intersection(_corners(p), _corners(q)) for p, q in zip(a, b, strict=True)])
+    areas = (a[:, 2] * a[:, 3]).numpy(), (b[:, 2] * b[:, 3]).numpy()
+    expected = shared / (areas[0] + areas[1] - shared)
+    assert (shared > 0).mean() > 0.3  # the comparison is not one of zeros
+    np.testing.assert_allclose(bev_iou(a, b).numpy(), expected, atol=1e-12)
+
+
+def test_equals_opencv_on_random_boxes():
+    a, b = _random_boxes(100, seed=3), _random_boxes(100, seed=4)
+    for p, q, overlap in zip(a, b, bev_iou(a, b).tolist(), strict=True):
+        shared, _ = cv2.intersectConvexConvex(_corners(p).astype(np.float32), _corners(q).astype(np.float32))
+        areas = float(p[2] * p[3]), float(q[2] * q[3])
+        assert overlap == pytest.approx(shared / (areas[0] + areas[1] - shared), abs=1e-4)
+
+
+_coordinate = st.floats(-50, 50)
+_box = st.tuples(_coordinate, _coordinate, st.floats(0.1, 20), st.floats(0.1, 20), st.floats(-7, 7))
+
+
+@settings(max_examples=60, deadline=None)
+@given(a=_box, b=_box, shift=st.tuples(_coordinate, _coordinate), turn=st.floats(-4, 4))
+def test_laws(a: tuple[float, ...], b: tuple[float, ...], shift: tuple[float, float], turn: float):
+    first, second = _boxes(a), _boxes(b)
+    overlap = bev_iou(first, second).item()
+    assert 0 <= overlap <= 1
+    assert bev_iou(second, first).item() == pytest.approx(overlap, abs=1e-9)
+    assert bev_iou(first, first).item() == pytest.approx(1, abs=1e-12)
+
+    def move(boxes: torch.Tensor) -> torch.Tensor:
+        x, z = boxes[:, 0], boxes[:, 1]
+        c, s = math.cos(turn), math.sin(turn)
+        place = [c * x + s * z + shift[0], -s * x + c * z + shift[1]]
+        return torch.stack([*place, boxes[:, 2], boxes[:, 3], boxes[:, 4] + turn], dim=-1)
+
+    assert bev_iou(move(first), move(second)).item() == pytest.approx(overlap, abs=1e-9)
+
+
+@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (1, 1), (4, 3)])
+def test_matrix_equals_pairs(n: int, m: int):
+    a, b = _random_boxes(n, seed=5), _random_boxes(m, seed=6)
+    matrix = bev_iou_matrix(a, b)
+    assert matrix.shape == (n, m)
+    pairs = [bev_iou(a[i : i + 1], b[j : j + 1]) for i in range(n) for j in range(m)]
+    expected = torch.cat(pairs).reshape(n, m) if pairs else torch.zeros(n, m, dtype=torch.float64)
+    torch.testing.assert_close(matrix, expected, atol=1e-14, rtol=0)
+    assert bev_iou(a, a).shape == (n,)
+
+
+def test_iou_3d_hand_derived():
+    # Footprints 4 x 2 shifted by 2 share 4; heights 1.5 (y 0.1 .. 1.6) and 2.0 (y -0.9 .. 1.1) share 1.0.
+    a, b = _boxes((0, 1.6, 10, 1.5, 2, 4, 0)), _boxes((2, 1.1, 10, 2.0, 2, 4, 0))
+    expected = 4.0 / (8 * 1.5 + 8 * 2.0 - 4.0)
+    assert iou_3d(a, b).item() == pytest.approx(expected, abs=1e-12)
+    assert iou_3d_matrix(a, b).item() == pytest.approx(expected, abs=1e-12)
+    assert iou_3d(a, a).item() == pytest.approx(1, abs=1e-12)
+    above = _boxes((0, 0.1, 10, 1.5, 2, 4, 0))  # stands exactly on top of a
+    assert iou_3d(a, above).item() == 0
+    flat = _boxes((0, 1.6, 10, 0.0, 2, 4, 0))
+    assert iou_3d(a, flat).item() == 0
+    assert iou_3d(flat, flat).item() == 0
+
+
+def test_bev_boxes_reorders_columns():
+    assert bev_boxes(_boxes((1, 2, 3, 4, 5, 6, 7))).tolist() == [[1, 3, 6, 5, 7]]
+
+
+def test_gradient_of_the_overlap():
+    a, b = _boxes((0.1, 10, 4, 2, 0.2)), _boxes((0.6, 10.3, 3.5, 1.8, 0.5))
+    assert torch.autograd.gradcheck(bev_iou, (a.requires_grad_(), b.requires_grad_()))
+
+
+def test_wrong_shapes_are_named():
+    with pytest.raises(InputError, match=r"boxes_a: expected shape \(N, 5\), got \(2, 7\)"):
+        bev_iou(torch.zeros(2, 7), torch.zeros(2, 5))
+    with pytest.raises(InputError, match=r"boxes_b: expected shape \(2, 5\), got \(3, 5\)"):
+        bev_iou(torch.zeros(2, 5), torch.zeros(3, 5))
+    with pytest.raises(InputError, match=r"boxes_b: expected shape \(1, 7\)"):
+        iou_3d(torch.zeros(1, 7), torch.zeros(2, 7))
