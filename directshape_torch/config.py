@@ -43,7 +43,6 @@ class SolverConfig:
         block_iterations: iterations between two looks at which cars go on.
         max_step_translation_m, max_step_rotation_rad, max_step_code: trust region; the whole step is scaled.
         max_code: bound of |code|, in standard deviations.
-        jacobian: hand-derived ("analytic") or from automatic differentiation ("autograd"), for the same steps.
     """
 
     initial_damping: float = 1e-2

@@ -1,0 +1,53 @@
+"""What the terms know of each car beside its pixels: cameras, ground, detector's box. Fixed for a whole refinement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+from torch import Tensor
+
+from directshape_torch.scene import Detections, FrameBatch
+
+
+@dataclass(frozen=True)
+class CarBatch:
+    """Per-car constants of B cars.
+
+    Attributes:
+        frame_index: (B,) frame of each car.
+        focal_over_depth: (B,) focal length over INPUT depth, pixels per metre: zeta comes from the input depth for the
+            whole call, for a zeta that follows the state would let a car lower its cost by moving.
+        K_right: (B, 3, 3).
+        T_right_cam: (B, 4, 4).
+        K_left: (B, 3, 3).
+        ground_normal_cam: (B, 3).
+        ground_offset: (B,).
+        detector_hwl: (B, 3).
+    """
+
+    frame_index: Tensor
+    focal_over_depth: Tensor
+    K_left: Tensor
+    K_right: Tensor
+    T_right_cam: Tensor
+    ground_normal_cam: Tensor
+    ground_offset: Tensor
+    detector_hwl: Tensor
+
+    @classmethod
+    def from_scene(cls, frames: FrameBatch, detections: Detections) -> CarBatch:
+        f = detections.frame_index
+        depth = detections.T_cam_obj[:, 2, 3]
+        return cls(
+            frame_index=f,
+            focal_over_depth=frames.camera.K_left[f, 0, 0] / depth,
+            K_left=frames.camera.K_left[f],
+            K_right=frames.camera.K_right[f],
+            T_right_cam=frames.camera.T_right_cam[f],
+            ground_normal_cam=frames.ground.normal[f],
+            ground_offset=frames.ground.offset[f],
+            detector_hwl=detections.dimensions_hwl,
+        )
+
+    def of_objects(self, keep: Tensor) -> CarBatch:
+        return replace(self, **{x.name: getattr(self, x.name)[keep] for x in fields(self)})

@@ -1,0 +1,93 @@
+"""B cars as a problem for the solver: a list of terms over shared projections."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.energy.car_state import CarState, retract
+from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.solver.problem import Linearisation, Stage
+
+
+class CarProblem:
+    """The energy of B cars (paper, E): a `Problem[CarState]`.
+
+    Args:
+        prior: the family of shapes.
+        terms: summands of the energy.
+        left, right: packed pixels whose rays the terms share.
+        config: stages, trust region, samples per ray.
+    """
+
+    def __init__(
+        self,
+        prior: ShapePrior,
+        terms: Sequence[Term],
+        left: PixelSamples,
+        right: PixelSamples,
+        config: RefinerConfig,
+    ) -> None:
+        self.prior = prior
+        self.terms = list(terms)
+        self.left, self.right = left, right
+        self.config = config
+
+    def stages(self) -> list[Stage]:
+        return [Stage(s.contour_width_px, s.image_level, s.max_iterations) for s in self.config.stages]
+
+    def begin_stage(self, stage: Stage, state: CarState) -> None:
+        projected = self.project(state)
+        self.terms = [term.at_stage(stage, projected) for term in self.terms]
+
+    def project(self, state: CarState) -> ProjectedState:
+        """Everything that the terms share at a state."""
+        return ProjectedState(self.prior, state, self.left, self.right, self.config.silhouette.samples_per_ray)
+
+    def cost(self, state: CarState) -> Tensor:
+        return self.term_costs(state).sum(dim=1)
+
+    def term_costs(self, state: CarState) -> Tensor:
+        """Cost (B, T) of each term; differentiable by autograd."""
+        projected = self.project(state)
+        return torch.stack([term.cost(projected) for term in self.terms], dim=1)
+
+    def linearise(self, state: CarState) -> Linearisation:
+        parts = self.linearise_terms(state)
+        return Linearisation(
+            sum_of([p.cost for p in parts]), sum_of([p.gradient for p in parts]), sum_of([p.hessian for p in parts])
+        )
+
+    def linearise_terms(self, state: CarState, with_fisher: bool = False) -> list[TermLinearisation]:
+        """The linearisation of each term by itself."""
+        projected = self.project(state)
+        return [term.linearise(projected, with_fisher) for term in self.terms]
+
+    def retract(self, state: CarState, step: Tensor) -> CarState:
+        return retract(state, step, self.config.solver.max_code)
+
+    def step_limits(self) -> Tensor:
+        s = self.config.solver
+        limits = [s.max_step_translation_m] * 3 + [s.max_step_rotation_rad] * 3
+        limits += [s.max_step_code] * self.prior.num_codes
+        return torch.tensor(limits, dtype=torch.float64, device=self.left.uv.device)
+
+    def compact(self, keep: Tensor) -> CarProblem:
+        return CarProblem(
+            self.prior,
+            [term.of_objects(keep) for term in self.terms],
+            self.left.of_objects(keep),
+            self.right.of_objects(keep),
+            self.config,
+        )
+
+
+def sum_of(tensors: Sequence[Tensor]) -> Tensor:
+    """Sum of tensors of one shape, in order."""
+    return torch.stack(list(tensors)).sum(dim=0)

@@ -1,0 +1,35 @@
+"""State of B cars and the one place where it is updated."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry import se3
+
+
+class CarState(NamedTuple):
+    """Pose and shape of B cars."""
+
+    T_obj_cam: Tensor  # (B, 4, 4) left camera to object
+    code: Tensor  # (B, K) standard deviations
+
+
+def retract(state: CarState, delta: Tensor, max_code: float = torch.inf) -> CarState:
+    """`T_obj_cam <- exp(delta[:6]) T_obj_cam`, `code <- code + delta[6:]`, the code bounded.
+
+    Args:
+        state: B cars.
+        delta: (B, 6 + K), `(v, omega, dcode)` in metres, radians and standard deviations.
+        max_code: largest magnitude of a code component.
+
+    Example:
+        >>> state = CarState(torch.eye(4)[None], torch.zeros(1, 2))
+        >>> retract(state, torch.tensor([[1.0, 0, 0, 0, 0, 0, 0.5, 9.0]]), max_code=3.0).code
+        tensor([[0.5000, 3.0000]])
+    """
+    delta = delta.to(state.code.dtype)
+    T_obj_cam = se3.exp(delta[:, :6]) @ state.T_obj_cam
+    return CarState(T_obj_cam, (state.code + delta[:, 6:]).clamp(-max_code, max_code))

@@ -1,0 +1,94 @@
+"""The method "direct" as a list of terms: silhouettes, photometry and priors (paper, E)."""
+
+from __future__ import annotations
+
+import torch
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.photometric_term import GreyPair, PhotometricTerm
+from directshape_torch.energy.prior_terms import PriorTerm
+from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.silhouette_term import silhouette_term
+from directshape_torch.energy.term import Term
+from directshape_torch.image.gradients import grey_levels
+from directshape_torch.observation.occlusion import occlusion_crops
+from directshape_torch.observation.packing import Observation
+from directshape_torch.residuals.priors import (
+    PriorResidual,
+    dimensions_prior,
+    height_prior,
+    shape_prior,
+    tilt_prior_cosine,
+    tilt_prior_normal,
+)
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+def direct_terms(
+    config: RefinerConfig,
+    prior: PCAShapePrior,
+    frames: FrameBatch,
+    detections: Detections,
+    cars: CarBatch,
+    observation: Observation,
+) -> list[Term]:
+    """Terms of weight zero are left out, so ablations cost nothing."""
+    terms: list[Term] = []
+    if config.silhouette.weight > 0:
+        terms.append(silhouette_term("left", config.silhouette, cars, observation.left))
+        terms.append(silhouette_term("right", config.silhouette, cars, observation.right))
+    if config.photometric.weight > 0:
+        terms.append(_photometric_term(config, frames, detections, cars, observation))
+    return terms + prior_terms(config, prior, cars)
+
+
+def prior_terms(config: RefinerConfig, prior: PCAShapePrior, cars: CarBatch) -> list[Term]:
+    """Shape, height, tilt and dimensions, those of weight zero left out."""
+    p = config.priors
+
+    def shape(cars: CarBatch, at: ProjectedState) -> PriorResidual:
+        return shape_prior(at.state.code)
+
+    def height(cars: CarBatch, at: ProjectedState) -> PriorResidual:
+        T, num_codes = at.state.T_obj_cam, at.state.code.shape[1]
+        return height_prior(T, cars.ground_normal_cam, cars.ground_offset, num_codes)
+
+    def tilt(cars: CarBatch, at: ProjectedState) -> PriorResidual:
+        form = tilt_prior_normal if p.tilt_form == "normal" else tilt_prior_cosine
+        return form(at.state.T_obj_cam, cars.ground_normal_cam, at.state.code.shape[1])
+
+    def dimensions(cars: CarBatch, at: ProjectedState) -> PriorResidual:
+        code = at.state.code
+        sigma = torch.tensor(p.dimensions_sigma_m, dtype=code.dtype, device=code.device)
+        return dimensions_prior(
+            code, cars.detector_hwl, prior.dimensions_mean_hwl, prior.dimensions_basis_hwl, sigma
+        )
+
+    all_terms = [
+        PriorTerm("shape", p.shape_weight, cars, shape),
+        PriorTerm("height", p.height_weight, cars, height),
+        PriorTerm("tilt", p.tilt_weight, cars, tilt),
+        PriorTerm("dimensions", p.dimensions_weight, cars, dimensions),
+    ]
+    return [term for term in all_terms if term.weight > 0]
+
+
+def _photometric_term(
+    config: RefinerConfig, frames: FrameBatch, detections: Detections, cars: CarBatch, observation: Observation
+) -> PhotometricTerm:
+    pyramid = [GreyPair(grey_levels(frames.images_left), grey_levels(frames.images_right), frames.sizes, 1.0)]
+    for _ in range(max(stage.image_level for stage in config.stages)):
+        pyramid.append(pyramid[-1].halved())
+    hidden = None
+    if config.sampling.occlusion:
+        hidden = occlusion_crops(detections, "right", observation.region_right, config.sampling.occlusion_order)
+    return PhotometricTerm(
+        config=config.photometric,
+        cars=cars,
+        pixels=observation.left,
+        pyramid=tuple(pyramid),
+        hidden_right=hidden,
+        crop_index=torch.arange(len(detections), device=cars.frame_index.device),
+    )

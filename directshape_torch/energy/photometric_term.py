@@ -1,0 +1,236 @@
+"""Photometric term: `1 / (|Omega'| N) sum_p sum_p~ w_p ||r_photo||_gamma` (paper, E_photo).
+
+Within a stage the pixel set is fixed: a pixel that loses its hit, leaves the right image, grazes the surface or comes
+to lie under a nearer car pays a constant with zero Jacobian instead of vanishing from the mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import PhotometricConfig
+from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.term import TermLinearisation
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.image.interpolate import bilinear_with_gradient
+from directshape_torch.image.pyramid import halve, halve_sizes
+from directshape_torch.observation.occlusion import OcclusionCrops
+from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.residuals import robust
+from directshape_torch.residuals.photometric import (
+    DSO_PATTERN,
+    PhotometricResidual,
+    depth_state_jacobian,
+    photometric_residual,
+    surface_slope,
+)
+from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root, attached_depth, first_crossing
+from directshape_torch.solver.normal_equations import Segments
+from directshape_torch.solver.problem import Stage
+
+# Matching brightness is for exposure and gain, which differ by a few percent; more is a wrong pose.
+_GAIN_BOUNDS = (0.8, 1.25)
+
+
+@dataclass(frozen=True)
+class GreyPair:
+    """Grey levels of both images at one pyramid level."""
+
+    left: Tensor  # (F, H, W)
+    right: Tensor  # (F, H, W)
+    sizes: Tensor  # (F, 2)
+    scale: float  # level pixels per full-resolution pixel
+
+    def halved(self) -> GreyPair:
+        both = halve(torch.stack([self.left, self.right], dim=1))
+        return GreyPair(both[:, 0], both[:, 1], halve_sizes(self.sizes), 0.5 * self.scale)
+
+
+class _Fixed(NamedTuple):
+    """What a stage fixes for its pixel set of Q pixels."""
+
+    pixel_index: Tensor  # (Q,) rows of the packed left pixels, ascending
+    object_index: Tensor  # (Q,)
+    intensity_left: Tensor  # (Q, N) brought to the brightness of the right image
+    rays_left: Tensor  # (Q, N, 3)
+    gradient_weight: Tensor  # (Q,)
+    images: GreyPair
+    segments: Segments
+
+
+class _Surface(NamedTuple):
+    """Where the rays of the pixel set enter the shape."""
+
+    rays: ObjectRays
+    root: Root
+
+
+@dataclass(frozen=True)
+class PhotometricTerm:
+    """See module. Before the first stage the pixel set is undefined."""
+
+    config: PhotometricConfig
+    cars: CarBatch
+    pixels: PixelSamples  # of the left image
+    pyramid: tuple[GreyPair, ...]
+    hidden_right: OcclusionCrops | None
+    crop_index: Tensor  # (B,) row of each car in `hidden_right`
+    fixed: _Fixed | None = None
+
+    @property
+    def name(self) -> str:
+        return "photometric"
+
+    def at_stage(self, stage: Stage, projected: ProjectedState) -> PhotometricTerm:
+        images = self.pyramid[stage.image_level]
+        candidates = torch.arange(len(self.pixels), device=self.pixels.uv.device)
+        if self.config.pixel_set == "hit_and_mask":
+            candidates = candidates[self.pixels.foreground > 0.5]
+        trial = replace(self, fixed=self._fix(candidates, images))
+        usable, residual = trial._usable_and_residual(projected)
+        fixed = self._fix(candidates[usable], images)
+        if self.config.gain:
+            gain = self._gain(fixed, residual.residual[usable] + trial._require().intensity_left[usable])
+            fixed = fixed._replace(intensity_left=fixed.intensity_left * gain[fixed.object_index, None])
+        return replace(self, fixed=fixed)
+
+    def cost(self, projected: ProjectedState) -> Tensor:
+        fixed = self._require()
+        return fixed.segments.sum(self.pixel_cost(projected)) * self._weight()
+
+    def pixel_cost(self, projected: ProjectedState) -> Tensor:
+        """Weighted Huber norm (Q,), summed over the neighbourhood, of each pixel of the set; differentiable."""
+        usable, residual = self._usable_and_residual(projected, attached=True)
+        rho = robust.huber(residual.residual, self.config.huber_grey_levels).rho
+        return torch.where(usable, rho.sum(dim=1), self._lost_cost()) * self._require().gradient_weight
+
+    def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
+        fixed = self._require()
+        surface = self._surface(projected)
+        points = surface.rays.at(surface.root.depth)
+        at = projected.shape.value_and_derivatives(points, surface.rays.object_index)
+        depth = depth_state_jacobian(points, at, surface.rays.direction_obj, self.config.min_ray_cosine)
+        residual = self._residual(surface.root.depth)
+        usable = self._is_usable(surface.root.found & ~depth.grazing, residual)
+        norm = robust.huber(residual.residual, self.config.huber_grey_levels)
+        weight = torch.where(usable, fixed.gradient_weight, torch.zeros_like(fixed.gradient_weight))
+        # All neighbours share one depth, so their rows are multiples of one: sum the multiples first.
+        J = residual.J_residual_depth
+        first = weight * (norm.gradient_weight * J).sum(dim=1)
+        second = weight * (norm.hessian_weight * J * J).sum(dim=1)
+        gradient, hessian = fixed.segments.accumulate(depth.J_depth_state, first, second)
+        rho = torch.where(usable, norm.rho.sum(dim=1), self._lost_cost()) * fixed.gradient_weight
+        c = self._weight()
+        # The neighbourhoods of neighbouring samples overlap: a pixel counts once, with its neighbourhood's mean.
+        per_pixel = fixed.segments.counts.to(torch.float64) / self.config.huber_grey_levels**2 / self.config.weight
+        fisher = (c * per_pixel)[:, None, None] * hessian
+        cost = fixed.segments.sum(rho) * c
+        return TermLinearisation(cost, c[:, None] * gradient, c[:, None, None] * hessian, fisher)
+
+    def of_objects(self, keep: Tensor) -> PhotometricTerm:
+        pixels = self.pixels.of_objects(keep)
+        reduced = replace(
+            self, cars=self.cars.of_objects(keep), pixels=pixels, crop_index=self.crop_index[keep], fixed=None
+        )
+        if self.fixed is None:
+            return reduced
+        kept_pixel = keep[self.pixels.object_index]
+        new_row = torch.cumsum(kept_pixel.long(), 0) - 1
+        chosen = kept_pixel[self.fixed.pixel_index]
+        rows = new_row[self.fixed.pixel_index[chosen]]
+        object_index = pixels.object_index[rows]
+        fixed = self.fixed._replace(
+            pixel_index=rows,
+            object_index=object_index,
+            intensity_left=self.fixed.intensity_left[chosen],
+            rays_left=self.fixed.rays_left[chosen],
+            gradient_weight=self.fixed.gradient_weight[chosen],
+            segments=Segments.from_sorted_index(object_index, int(keep.sum())),
+        )
+        return replace(reduced, fixed=fixed)
+
+    def _require(self) -> _Fixed:
+        if self.fixed is None:
+            raise RuntimeError("the photometric term has no pixel set before a stage begins: call at_stage first")
+        return self.fixed
+
+    def _weight(self) -> Tensor:
+        counts = self._require().segments.counts.clamp_min(1).to(torch.float64)
+        return self.config.weight / (counts * len(DSO_PATTERN))
+
+    def _lost_cost(self) -> Tensor:
+        """What a pixel of the set pays that cannot be compared any more: the Huber norm truncated there."""
+        lost = torch.tensor(self.config.lost_grey_levels, dtype=self.pixels.uv.dtype, device=self.pixels.uv.device)
+        return robust.huber(lost, self.config.huber_grey_levels).rho * len(DSO_PATTERN)
+
+    def _fix(self, pixel_index: Tensor, images: GreyPair) -> _Fixed:
+        """The pixels of a set with the left image's side of their residuals."""
+        chosen = self.pixels.select(pixel_index)
+        frame = self.cars.frame_index[chosen.object_index]
+        pattern = torch.tensor(DSO_PATTERN, dtype=chosen.uv.dtype, device=chosen.uv.device)
+        uv_level = ((chosen.uv + 0.5) * images.scale - 0.5)[:, None] + pattern
+        intensity, _, _ = bilinear_with_gradient(images.left, frame[:, None], uv_level, images.sizes)
+        uv_full = (uv_level + 0.5) / images.scale - 0.5
+        rays = rays_from_pixels(uv_full, self.cars.K_left[chosen.object_index][:, None])
+        c2 = self.config.gradient_constant_grey_levels**2
+        weight = c2 / (c2 + chosen.gradient_magnitude**2)
+        segments = Segments.from_sorted_index(chosen.object_index, len(self.cars.frame_index))
+        return _Fixed(pixel_index, chosen.object_index, intensity, rays, weight, images, segments)
+
+    def _gain(self, fixed: _Fixed, intensity_right: Tensor) -> Tensor:
+        """Brightness (B,) of the right image relative to the left one, over each car's pixel set."""
+        left = fixed.segments.sum(fixed.intensity_left.mean(dim=1))
+        right = fixed.segments.sum(intensity_right.mean(dim=1))
+        gain = torch.where(left > 0, right / torch.where(left > 0, left, torch.ones_like(left)), torch.ones_like(left))
+        return gain.clamp(*_GAIN_BOUNDS).to(fixed.intensity_left.dtype)
+
+    def _surface(self, projected: ProjectedState) -> _Surface:
+        view = projected.left
+        rows = self._require().pixel_index
+        rays = view.rays.select(rows)
+        marched = RayMarch(*(x[rows] for x in view.march))
+        return _Surface(rays, first_crossing(projected.shape, rays, marched, view.closest_depth[rows]))
+
+    def _residual(self, depth: Tensor) -> PhotometricResidual:
+        fixed = self._require()
+        cars = self.cars
+        return photometric_residual(
+            fixed.images.right,
+            fixed.images.sizes,
+            fixed.images.scale,
+            cars.frame_index[fixed.object_index],
+            fixed.intensity_left,
+            fixed.rays_left,
+            depth,
+            cars.K_right[fixed.object_index],
+            cars.T_right_cam[fixed.object_index],
+            self.pixels.bias_px[fixed.pixel_index],
+            DSO_PATTERN.index((0, 0)),
+        )
+
+    def _is_usable(self, on_surface: Tensor, residual: PhotometricResidual) -> Tensor:
+        usable = on_surface & residual.inside
+        if self.hidden_right is None:
+            return usable
+        crop = self.crop_index[self._require().object_index]
+        return usable & ~self.hidden_right.at(crop, residual.uv_right.detach())
+
+    def _usable_and_residual(
+        self, projected: ProjectedState, attached: bool = False
+    ) -> tuple[Tensor, PhotometricResidual]:
+        surface = self._surface(projected)
+        at = projected.shape.value_and_derivatives(
+            surface.rays.at(surface.root.depth).detach(), surface.rays.object_index
+        )
+        _, grazing = surface_slope(at.gradient.detach(), surface.rays.direction_obj.detach(), self.config.min_ray_cosine)
+        on_surface = surface.root.found & ~grazing
+        depth = surface.root.depth
+        if attached:
+            depth = attached_depth(projected.shape, surface.rays, depth, on_surface)
+        residual = self._residual(depth)
+        return self._is_usable(on_surface, residual), residual

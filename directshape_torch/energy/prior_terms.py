@@ -1,0 +1,49 @@
+"""Prior terms: `lambda r^2 / 2` for shape, height, tilt and the detector's dimensions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.term import TermLinearisation
+from directshape_torch.residuals.priors import PriorResidual
+from directshape_torch.solver.problem import Stage
+
+
+@dataclass(frozen=True)
+class PriorTerm:
+    """`weight * sum_i r_i^2 / 2` of a prior residual of the state.
+
+    Attributes:
+        name: of the term.
+        weight: lambda.
+        cars: constants of the cars.
+        residual_of: the residual with its Jacobian, from the constants and a projected state.
+    """
+
+    name: str
+    weight: float
+    cars: CarBatch
+    residual_of: Callable[[CarBatch, ProjectedState], PriorResidual]
+
+    def at_stage(self, stage: Stage, projected: ProjectedState) -> PriorTerm:
+        return self
+
+    def cost(self, projected: ProjectedState) -> Tensor:
+        r = self.residual_of(self.cars, projected).residual.to(torch.float64)
+        return 0.5 * self.weight * (r * r).sum(dim=1)
+
+    def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
+        prior = self.residual_of(self.cars, projected)
+        r, J = prior.residual.to(torch.float64), prior.J_residual_state.to(torch.float64)
+        gradient = self.weight * (J.transpose(1, 2) @ r[..., None])[..., 0]
+        hessian = self.weight * J.transpose(1, 2) @ J
+        return TermLinearisation(0.5 * self.weight * (r * r).sum(dim=1), gradient, hessian, hessian)
+
+    def of_objects(self, keep: Tensor) -> PriorTerm:
+        return replace(self, cars=self.cars.of_objects(keep))

@@ -1,0 +1,156 @@
+"""Silhouette term of one image side: `lambda / |Omega| sum_p r_silh(p)` (paper, E_silh)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import SilhouetteConfig
+from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
+from directshape_torch.energy.term import TermLinearisation
+from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.residuals import robust
+from directshape_torch.residuals.silhouette import (
+    clamp_foreground,
+    project_closest_approach,
+    project_product,
+    residual_derivative_closest_approach,
+    residual_derivative_product,
+    silhouette_residual,
+)
+from directshape_torch.residuals.state_chain import sdf_state_jacobian
+from directshape_torch.shape.shape_prior import BoundShape
+from directshape_torch.solver.normal_equations import Segments
+from directshape_torch.solver.problem import Stage
+
+# Samples of the product form whose derivative is below exp(-46) = 1e-20 of zeta do not change a float64 sum.
+_NEGLIGIBLE_LOG_WEIGHT = -46.0
+
+
+@dataclass(frozen=True)
+class SilhouetteTerm:
+    """See module. Build with `silhouette_term`."""
+
+    side: Literal["left", "right"]
+    config: SilhouetteConfig
+    cars: CarBatch
+    pixels: PixelSamples
+    segments: Segments
+    foreground: Tensor  # (P,) clamped
+    zeta: Tensor  # (P,) per metre
+
+    @property
+    def name(self) -> str:
+        return f"silhouette_{self.side}"
+
+    def at_stage(self, stage: Stage, projected: ProjectedState) -> SilhouetteTerm:
+        zeta = self.cars.focal_over_depth / stage.contour_width_px
+        zeta = zeta.clamp(self.config.min_zeta_per_m, self.config.max_zeta_per_m)
+        return replace(self, zeta=zeta[self.pixels.object_index])
+
+    def cost(self, projected: ProjectedState) -> Tensor:
+        return self.segments.sum(self.pixel_residual(projected)) * self._weight()
+
+    def pixel_residual(self, projected: ProjectedState) -> Tensor:
+        """Residual (P,) of every pixel, differentiable with the sample depths frozen."""
+        view = self._view(projected)
+        if self.config.form == "product":
+            marched = view.march
+            num_samples = marched.depths.shape[1]
+            sdf = torch.stack(
+                [
+                    projected.shape.value(view.rays.at(marched.depths[:, s]), view.rays.object_index)
+                    for s in range(num_samples)
+                ],
+                dim=1,
+            )
+            projection = project_product(sdf, self.zeta)
+        else:
+            sdf = projected.shape.value(view.rays.at(view.closest_depth), view.rays.object_index)
+            projection = project_closest_approach(sdf, self.zeta, self.config.saturation)
+        residual = silhouette_residual(projection, self.foreground)
+        return torch.where(view.march.crosses_bounds, residual, self._residual_of_a_miss())
+
+    def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
+        view = self._view(projected)
+        form = self._rows_product if self.config.form == "product" else self._rows_closest_approach
+        residual, rows = form(projected.shape, view)
+        crosses = view.march.crosses_bounds
+        residual = torch.where(crosses, residual, self._residual_of_a_miss())
+        rows = torch.where(crosses[:, None], rows, torch.zeros_like(rows))
+        norm = robust.identity(residual, self.config.residual_floor)
+        gradient, hessian = self.segments.accumulate(rows, norm.gradient_weight, norm.hessian_weight)
+        fisher = torch.zeros_like(hessian)
+        if with_fisher:
+            fisher = self.segments.accumulate(rows, norm.gradient_weight, torch.ones_like(residual))[1]
+        weight = self._weight()
+        cost = self.segments.sum(norm.rho) * weight
+        return TermLinearisation(cost, weight[:, None] * gradient, weight[:, None, None] * hessian, fisher)
+
+    def of_objects(self, keep: Tensor) -> SilhouetteTerm:
+        rows = keep[self.pixels.object_index]
+        pixels = self.pixels.of_objects(keep)
+        return replace(
+            self,
+            cars=self.cars.of_objects(keep),
+            pixels=pixels,
+            segments=Segments.from_sorted_index(pixels.object_index, int(keep.sum())),
+            foreground=self.foreground[rows],
+            zeta=self.zeta[rows],
+        )
+
+    def _view(self, projected: ProjectedState) -> ProjectedView:
+        return projected.left if self.side == "left" else projected.right
+
+    def _weight(self) -> Tensor:
+        return self.config.weight / self.segments.counts.clamp_min(1).to(torch.float64)
+
+    def _residual_of_a_miss(self) -> Tensor:
+        return -torch.log1p(-self.foreground)
+
+    def _rows_closest_approach(self, shape: BoundShape, view: ProjectedView) -> tuple[Tensor, Tensor]:
+        """By the envelope theorem the Jacobian of the least distance is that of the one point where it is taken."""
+        points = view.rays.at(view.closest_depth)
+        at = shape.value_and_derivatives(points, view.rays.object_index)
+        residual, J_residual_sdf = residual_derivative_closest_approach(
+            at.value, self.zeta, self.config.saturation, self.foreground
+        )
+        return residual, J_residual_sdf[:, None] * sdf_state_jacobian(points, at)
+
+    def _rows_product(self, shape: BoundShape, view: ProjectedView) -> tuple[Tensor, Tensor]:
+        """Sums over the samples of each ray one sample at a time: a Jacobian per sample is never kept."""
+        marched = view.march
+        residual, J_residual_sdf = residual_derivative_product(marched.sdf, self.zeta, self.foreground)
+        relevant = J_residual_sdf.abs() > self.zeta[:, None] * torch.exp(
+            torch.as_tensor(_NEGLIGIBLE_LOG_WEIGHT, dtype=self.zeta.dtype)
+        )
+        rows = None
+        for s in range(marched.depths.shape[1]):
+            index = relevant[:, s].nonzero()[:, 0]
+            rays = view.rays.select(index)
+            points = rays.at(marched.depths[index, s])
+            at = shape.value_and_derivatives(points, rays.object_index)
+            J = J_residual_sdf[index, s, None] * sdf_state_jacobian(points, at)
+            rows = J.new_zeros(len(residual), J.shape[1]) if rows is None else rows
+            rows = rows.index_add(0, index, J)
+        assert rows is not None
+        return residual, rows
+
+
+def silhouette_term(
+    side: Literal["left", "right"], config: SilhouetteConfig, cars: CarBatch, pixels: PixelSamples
+) -> SilhouetteTerm:
+    """The term for the packed pixels of one side; zeta is set when a stage begins."""
+    return SilhouetteTerm(
+        side=side,
+        config=config,
+        cars=cars,
+        pixels=pixels,
+        segments=Segments.from_sorted_index(pixels.object_index, len(cars.frame_index)),
+        foreground=clamp_foreground(pixels.foreground, config.probability_floor),
+        zeta=torch.ones_like(pixels.foreground),
+    )

@@ -1,0 +1,46 @@
+"""A term of the energy: cost of each car, its gradient and its Gauss-Newton matrix."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, Self
+
+from torch import Tensor
+
+from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.solver.problem import Stage
+
+
+class TermLinearisation(NamedTuple):
+    """Contribution of one term, float64.
+
+    `fisher` is the same matrix with statistical weights: sums over effective pixels instead of means, silhouette
+    weight 1 instead of 1/r; its sum over the terms is the inverse covariance up to one calibration factor.
+    """
+
+    cost: Tensor  # (B,)
+    gradient: Tensor  # (B, D)
+    hessian: Tensor  # (B, D, D)
+    fisher: Tensor  # (B, D, D)
+
+
+class Term(Protocol):
+    """One summand of the energy. Terms are immutable: a new stage makes a new term."""
+
+    @property
+    def name(self) -> str: ...
+
+    def at_stage(self, stage: Stage, projected: ProjectedState) -> Self:
+        """The term with its pixel set, counts and zeta fixed at a state, for the length of a stage."""
+        ...
+
+    def cost(self, projected: ProjectedState) -> Tensor:
+        """Cost (B,) of a state; differentiable by autograd through pose and code."""
+        ...
+
+    def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
+        """Cost with hand-derived gradient and Gauss-Newton matrix."""
+        ...
+
+    def of_objects(self, keep: Tensor) -> Self:
+        """The term of those cars where `keep` (B,) holds."""
+        ...

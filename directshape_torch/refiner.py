@@ -1,0 +1,256 @@
+"""`DirectShapeRefiner`: from frames and rough boxes to refined poses and shapes, in one batched Gauss-Newton."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.covariance import covariance_xyz_yaw, tangent_covariance
+from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.direct_terms import direct_terms
+from directshape_torch.energy.term import Term
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.initial_search import search_start
+from directshape_torch.observation.packing import Observation, pack_pixels
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.solver.gauss_newton import minimise
+from directshape_torch.status import Status
+
+# A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
+_MIN_DEPTH_M = 1.0
+
+
+class DirectShapeRefiner(nn.Module):
+    """Refines pose and shape of cars in stereo frames (paper: DirectShape).
+
+    Args:
+        prior: family of shapes; default the bundled prior of parametric cars. It is a submodule: its grids are
+            buffers that move with `.to(...)` and live in the `state_dict`.
+        config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
+
+    Example:
+        >>> refiner = DirectShapeRefiner()
+        >>> refiner.prior.num_codes == refiner.prior.basis.shape[-1]
+        True
+    """
+
+    def __init__(self, prior: PCAShapePrior | None = None, config: RefinerConfig | None = None) -> None:
+        super().__init__()
+        self.prior = PCAShapePrior.load_bundled() if prior is None else prior
+        self.config = RefinerConfig() if config is None else config
+
+    def forward(self, frames: FrameBatch, detections: Detections) -> RefinementResult:
+        """Refine every car of one or several frames.
+
+        Args:
+            frames: F frames; dtype and device must be those of the prior.
+            detections: B cars in any order.
+
+        Returns:
+            Poses, shapes, statuses, costs and covariances, in the order of the detections. Cars that cannot be refined
+            keep their input pose and say why; they touch no other car.
+
+        Raises:
+            InputError: frames, detections and prior do not fit together.
+        """
+        _check_fit(frames, detections, self.prior)
+        with torch.no_grad():
+            return self._refine(frames, detections)
+
+    def _refine(self, frames: FrameBatch, detections: Detections) -> RefinementResult:
+        input_state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
+        observation, failure = self._observe(frames, detections)
+        usable = failure < 0
+        rows = usable.nonzero()[:, 0]
+        state, status = input_state, failure.clone()
+        outcome = None
+        if len(rows):
+            outcome = self._minimise(frames, _take(detections, rows), observation, usable)
+            state = CarState(
+                *(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True))
+            )
+            status = status.index_copy(0, rows, outcome.status)
+        return _assemble(self.prior, frames, detections, state, status, rows, outcome)
+
+    def problem(self, frames: FrameBatch, detections: Detections) -> tuple[CarProblem, CarState]:
+        """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
+        _check_fit(frames, detections, self.prior)
+        observation = pack_pixels(frames, detections, self.config.sampling)
+        terms = self._terms(frames, detections, observation)
+        state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
+        return CarProblem(self.prior, terms, observation.left, observation.right, self.config), state
+
+    def _initial_code(self, detections: Detections) -> Tensor:
+        return self.prior.initial_code(len(detections)).to(detections.T_cam_obj)
+
+    def _observe(self, frames: FrameBatch, detections: Detections) -> tuple[Observation | None, Tensor]:
+        """Packed pixels of all cars and, for each car, the code of the status that forbids its refinement, or -1."""
+        code = torch.full((len(detections),), -1, device=detections.T_cam_obj.device)
+        if not len(detections):
+            return None, code
+        T = detections.T_cam_obj
+        finite = T.isfinite().all(-1).all(-1)
+        upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
+        in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
+        has_mask = detections.has_mask_left | detections.has_mask_right
+        safe = _replace_poses(detections, in_front)
+        observation = pack_pixels(frames, safe, self.config.sampling)
+        counts = sum(
+            torch.bincount(side.object_index, minlength=len(detections)) for side in (observation.left, observation.right)
+        )
+        too_few = counts < self.config.sampling.min_usable_pixels
+        for condition, status in (
+            (too_few, Status.too_few_pixels),
+            (~has_mask, Status.no_mask),
+            (~in_front, Status.behind_camera),
+            (~finite, Status.non_finite),
+        ):
+            code = torch.where(condition, torch.full_like(code, status.code), code)
+        return observation, code
+
+    def _terms(self, frames: FrameBatch, detections: Detections, observation: Observation) -> list[Term]:
+        cars = CarBatch.from_scene(frames, detections)
+        return direct_terms(self.config, self.prior, frames, detections, cars, observation)
+
+    def _minimise(
+        self, frames: FrameBatch, detections: Detections, observation: Observation | None, usable: Tensor
+    ) -> _Outcome:
+        assert observation is not None
+        reduced = Observation(
+            observation.left.of_objects(usable),
+            observation.right.of_objects(usable),
+            observation.region_left[usable],
+            observation.region_right[usable],
+        )
+        terms = self._terms(frames, detections, reduced)
+        problem = CarProblem(self.prior, terms, reduced.left, reduced.right, self.config)
+        initial = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
+        start = search_start(problem, initial, frames, detections, self.config.search)
+        minimum = minimise(problem, start, self.config.solver)
+        cost_before, cost_after = problem.term_costs(initial), problem.term_costs(minimum.state)
+        worse = ~(cost_after.sum(1) <= cost_before.sum(1))
+        kept = torch.full_like(minimum.status, Status.rejected_worse.code)
+        status = torch.where(worse & _is_refined(minimum.status), kept, minimum.status)
+        back = ~_is_refined(status)
+        state = CarState(
+            torch.where(back[:, None, None], initial.T_obj_cam, minimum.state.T_obj_cam),
+            torch.where(back[:, None], initial.code, minimum.state.code),
+        )
+        cost_after = torch.where(back[:, None], cost_before, cost_after)
+        covariance = tangent_covariance(problem, state)
+        return _Outcome(
+            state,
+            status,
+            minimum.iterations,
+            minimum.cost_history,
+            tuple(term.name for term in terms),
+            cost_before,
+            cost_after,
+            covariance,
+            covariance_xyz_yaw(covariance, state.T_obj_cam),
+        )
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """Result of the cars that could be refined."""
+
+    state: CarState
+    status: Tensor
+    iterations: Tensor
+    cost_history: Tensor
+    term_names: tuple[str, ...]
+    cost_before: Tensor
+    cost_after: Tensor
+    covariance: Tensor
+    covariance_xyz_yaw: Tensor
+
+
+def _is_refined(status: Tensor) -> Tensor:
+    return (status == Status.converged.code) | (status == Status.max_iterations.code)
+
+
+def _take(detections: Detections, rows: Tensor) -> Detections:
+    from dataclasses import fields, replace
+
+    changed = {
+        f.name: getattr(detections, f.name)[rows] for f in fields(detections) if f.name != "occluders"
+    }
+    return replace(detections, **changed)
+
+
+def _replace_poses(detections: Detections, good: Tensor) -> Detections:
+    """Harmless poses for cars that will not be refined, so that their numbers can disturb nothing."""
+    from dataclasses import replace
+
+    harmless = torch.eye(4, dtype=detections.T_cam_obj.dtype, device=detections.T_cam_obj.device)
+    harmless[2, 3] = 10.0
+    return replace(detections, T_cam_obj=torch.where(good[:, None, None], detections.T_cam_obj, harmless))
+
+
+def _check_fit(frames: FrameBatch, detections: Detections, prior: PCAShapePrior) -> None:
+    for name, tensor in (("frames", frames.images_left), ("detections", detections.T_cam_obj)):
+        if tensor.dtype != prior.mean.dtype or tensor.device != prior.mean.device:
+            raise InputError(
+                name,
+                f"dtype {prior.mean.dtype} on {prior.mean.device}, like the refiner",
+                f"{tensor.dtype} on {tensor.device}",
+                "move them together with .to(device, dtype)",
+            )
+    if len(detections):
+        if detections.mask_left.shape[1:] != frames.images_left.shape[2:]:
+            raise InputError(
+                "detections.mask_left",
+                f"masks of the (padded) image size {tuple(frames.images_left.shape[2:])}",
+                f"{tuple(detections.mask_left.shape[1:])}",
+            )
+        lowest, highest = int(detections.frame_index.min()), int(detections.frame_index.max())
+        if lowest < 0 or highest >= len(frames):
+            raise InputError("detections.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
+
+
+def _assemble(
+    prior: PCAShapePrior,
+    frames: FrameBatch,
+    detections: Detections,
+    state: CarState,
+    status: Tensor,
+    rows: Tensor,
+    outcome: _Outcome | None,
+) -> RefinementResult:
+    count, unknowns = len(detections), 6 + prior.num_codes
+    names = () if outcome is None else outcome.term_names
+
+    def spread(part: Tensor | None, *shape: int) -> Tensor:
+        full = torch.full((count, *shape), torch.nan, dtype=torch.float64, device=status.device)
+        return full if part is None else full.index_copy(0, rows, part.to(torch.float64))
+
+    iterations = torch.zeros(count, dtype=torch.long, device=status.device)
+    steps = 0 if outcome is None else outcome.cost_history.shape[1]
+    if outcome is not None:
+        iterations = iterations.index_copy(0, rows, outcome.iterations)
+    refined = _is_refined(status)[:, None, None]
+    # The input pose is returned to the bit for cars that were not refined, not inverted twice.
+    T_cam_obj = torch.where(refined, se3.inverse(state.T_obj_cam), detections.T_cam_obj)
+    return RefinementResult(
+        T_cam_obj=T_cam_obj,
+        code=state.code,
+        status_code=status,
+        iterations=iterations,
+        term_names=names,
+        cost_before=spread(outcome and outcome.cost_before, len(names)),
+        cost_after=spread(outcome and outcome.cost_after, len(names)),
+        covariance=spread(outcome and outcome.covariance, unknowns, unknowns),
+        covariance_xyz_yaw=spread(outcome and outcome.covariance_xyz_yaw, 4, 4),
+        cost_history=spread(outcome and outcome.cost_history, steps),
+        t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
+        prior=prior,
+    )

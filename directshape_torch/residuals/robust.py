@@ -1,0 +1,51 @@
+"""Robust norms: value and the two weights that Gauss-Newton needs, together, so that they cannot drift apart."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class RobustValue(NamedTuple):
+    """`rho(r)`, `rho'(r)` for the gradient and `rho'(r) / r` for the Gauss-Newton matrix."""
+
+    rho: Tensor
+    gradient_weight: Tensor
+    hessian_weight: Tensor
+
+
+def quadratic(residual: Tensor) -> RobustValue:
+    """`rho = r^2 / 2`.
+
+    Example:
+        >>> quadratic(torch.tensor(2.0)).rho
+        tensor(2.)
+    """
+    return RobustValue(0.5 * residual * residual, residual, torch.ones_like(residual))
+
+
+def huber(residual: Tensor, corner: float) -> RobustValue:
+    """Huber's norm: `r^2 / 2` inside the corner, `corner (|r| - corner / 2)` outside.
+
+    Example:
+        >>> huber(torch.tensor(3.0), 2.0).rho
+        tensor(4.)
+    """
+    magnitude = residual.abs()
+    inside = magnitude <= corner
+    safe = torch.where(inside, torch.full_like(magnitude, corner), magnitude)
+    rho = torch.where(inside, 0.5 * residual * residual, corner * (magnitude - 0.5 * corner))
+    weight = torch.where(inside, torch.ones_like(safe), corner / safe)
+    return RobustValue(rho, weight * residual, weight)
+
+
+def identity(residual: Tensor, floor: float) -> RobustValue:
+    """`rho = r` for non-negative residuals, as reweighted least squares: weight 1/r, r floored (paper, E_silh as IRLS).
+
+    Example:
+        >>> identity(torch.tensor(0.5), 0.01).hessian_weight
+        tensor(2.)
+    """
+    return RobustValue(residual, torch.ones_like(residual), 1 / residual.clamp_min(floor))

@@ -1,0 +1,118 @@
+"""What a refinement gives back for every car."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.zero_level import zero_level_extents
+from directshape_torch.status import Status
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+@dataclass(frozen=True)
+class KittiBoxes:
+    """Boxes in KITTI's convention, measured on the refined zero level.
+
+    Attributes:
+        dimensions_hwl: (B, 3) height, width, length, metres.
+        location_ref: (B, 3) bottom centre in the reference frame of labels, metres.
+        rotation_y: (B,) radians.
+        alpha: (B,) radians.
+    """
+
+    dimensions_hwl: Tensor
+    location_ref: Tensor
+    rotation_y: Tensor
+    alpha: Tensor
+
+
+@dataclass(frozen=True)
+class RefinementResult:
+    """Outcome of a refinement of B cars, in the order of the detections.
+
+    Attributes:
+        T_cam_obj: (B, 4, 4) refined poses; the input's where the status says so.
+        code: (B, K) shape codes, standard deviations.
+        status_code: (B,) integer, see `status`.
+        iterations: (B,) Gauss-Newton iterations.
+        term_names: names of the T terms.
+        cost_before, cost_after: (B, T) cost of each term for input and output, both at the final stage; NaN for cars
+            that were not refined at all.
+        covariance: (B, 6 + K, 6 + K) in the tangent `(v, omega, dcode)` of the object frame; uncalibrated (relative).
+            NaN for cars that were not refined.
+        covariance_xyz_yaw: (B, 4, 4) of the object origin (x, y, z) in the reference frame and the heading.
+        cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across stages.
+        t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
+        prior: the shapes.
+    """
+
+    T_cam_obj: Tensor
+    code: Tensor
+    status_code: Tensor
+    iterations: Tensor
+    term_names: tuple[str, ...]
+    cost_before: Tensor
+    cost_after: Tensor
+    covariance: Tensor
+    covariance_xyz_yaw: Tensor
+    cost_history: Tensor
+    t_cam_ref: Tensor
+    prior: PCAShapePrior
+
+    def __len__(self) -> int:
+        return len(self.T_cam_obj)
+
+    @property
+    def status(self) -> list[Status]:
+        """How each car ended; `status.value` is the message."""
+        return [Status.from_code(code) for code in self.status_code.tolist()]
+
+    @property
+    def refined(self) -> Tensor:
+        """(B,) bool: cars whose state is a refined one."""
+        codes = torch.tensor([s.code for s in Status if s.is_refined], device=self.status_code.device)
+        return torch.isin(self.status_code, codes)
+
+    @property
+    def T_ref_obj(self) -> Tensor:
+        """Poses (B, 4, 4) in the reference frame of labels and result files."""
+        shift = torch.zeros_like(self.T_cam_obj)
+        shift[:, :3, 3] = self.t_cam_ref
+        return self.T_cam_obj - shift
+
+    def boxes(self) -> KittiBoxes:
+        """KITTI boxes of the refined zero level, sub-voxel; the location is the level's own bottom centre.
+
+        Location is `T_ref_obj` of (mid x, max y, mid z) of the level, not the object origin.
+        """
+        values = self.prior.values(self.code)
+        extents = zero_level_extents(values, self.prior.origin, self.prior.spacing_m)
+        lower, upper = extents.unbind(1)
+        length, height, width = (upper - lower).unbind(-1)
+        middle = 0.5 * (lower + upper)
+        bottom_obj = torch.stack([middle[:, 0], upper[:, 1], middle[:, 2]], dim=-1)
+        T_ref_obj = self.T_ref_obj
+        location = se3.transform(T_ref_obj, bottom_obj)
+        rotation_y = rotation_y_from_pose(T_ref_obj)
+        dimensions = torch.stack([height, width, length], dim=-1)
+        return KittiBoxes(dimensions, location, rotation_y, alpha_from_kitti(location, rotation_y))
+
+    def mesh(self, index: int) -> trimesh.Trimesh:
+        """Surface of one car in the left camera frame, metres, outward normals.
+
+        Raises:
+            IndexError: no such car.
+        """
+        from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+
+        values = self.prior.values(self.code[index : index + 1])[0]
+        return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, T_cam_obj=self.T_cam_obj[index])
