@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
 
@@ -51,13 +52,19 @@ def _padded(images: Sequence[Tensor], size_hw: tuple[int, int]) -> Tensor:
 
 def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:
     field = cameras[0].disparity_field
-    if any((camera.disparity_field is None) != (field is None) for camera in cameras):
-        raise InputError("loaded", "frames with the same residual disparity field", "some with and some without one")
+    if any(not _same_field(camera.disparity_field, field) for camera in cameras):
+        raise InputError("loaded", "frames with the same residual disparity field", "frames that differ in it")
     K_left, K_right, T_right_cam, t_cam_ref = (
         torch.cat([getattr(camera, name) for camera in cameras])
         for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref")
     )
     return StereoCamera(K_left, K_right, T_right_cam, t_cam_ref, field)
+
+
+def _same_field(a: DisparityField | None, b: DisparityField | None) -> bool:
+    if a is None or b is None:
+        return a is b
+    return torch.equal(a.coefficients, b.coefficients)
 
 
 def _grounds(grounds: Sequence[GroundPlane]) -> GroundPlane:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io import atomic_files
+from directshape_torch.io.image_files import read_file_bytes
 from directshape_torch.io.kitti_labels import KittiObject
 
 SHAPES_SCHEMA_VERSION = 1
@@ -38,13 +40,14 @@ class RefinedBox:
 def result_line(source: KittiObject, refined: RefinedBox) -> str:
     """The input line with its 3D box and alpha replaced; every other column keeps the text it had.
 
-    Example:
-        >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.io.text_files import Line
-        >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
-        >>> box = RefinedBox((1.4, 1.7, 4.1), (1.1, 1.65, 19.5), 0.02, -0.0363)
-        >>> result_line(parse_object("results", Line(1, raw, raw)), box)
-        'Car -1 -1 -0.0363 5.25 6 70 80.5 1.4000 1.7000 4.1000 1.1000 1.6500 19.5000 0.0200 0.930'
+        Example:
+            >>> from directshape_torch.io.image_files import read_file_bytes
+    from directshape_torch.io.kitti_labels import parse_object
+            >>> from directshape_torch.io.text_files import Line
+            >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
+            >>> box = RefinedBox((1.4, 1.7, 4.1), (1.1, 1.65, 19.5), 0.02, -0.0363)
+            >>> result_line(parse_object("results", Line(1, raw, raw)), box)
+            'Car -1 -1 -0.0363 5.25 6 70 80.5 1.4000 1.7000 4.1000 1.1000 1.6500 19.5000 0.0200 0.930'
     """
     words = source.raw_line.split()
     numbers = [refined.alpha, *refined.hwl, *refined.location_ref, refined.rotation_y]
@@ -174,10 +177,12 @@ def read_shapes(path: Path | str) -> ShapeArrays:
 
 
 def _load_npz(path: Path | str) -> dict[str, NDArray[Any]]:
+    # From memory: numpy leaves the file open when it turns out to be no archive.
+    content = io.BytesIO(read_file_bytes(path))
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with np.load(content, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, AttributeError) as error:
+    except (ValueError, zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:
         raise DataFormatError(path, f"is no readable npz file ({error})", cure="refine the frame again") from error
 
 

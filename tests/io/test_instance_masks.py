@@ -1,0 +1,213 @@
+"""Every form of mask file gives the same instances; damaged ones are named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io.atomic_files import write_png
+from directshape_torch.io.coco_segmentation import decode_segmentation
+from directshape_torch.io.instance_masks import (
+    CocoFileMasks,
+    FrameJsonMasks,
+    InstancePngMasks,
+    mask_source,
+    tight_box,
+)
+
+SIZE_HW = (6, 9)
+# Rows 1..3 of columns 4..5: off-diagonal in every sense, so a transposed mask shows.
+MASK = np.zeros(SIZE_HW, bool)
+MASK[1:4, 4:6] = True
+# Column-major: 4 columns of 6 and one row are off (25), 3 on, 3 off, 3 on, and the rest of 54.
+RUNS = [25, 3, 3, 3, 20]
+
+
+def encoded(mask: NDArray[np.bool_]) -> str:
+    import pycocotools.mask
+
+    counts: bytes = pycocotools.mask.encode(np.asfortranarray(mask.astype(np.uint8)))["counts"]
+    return counts.decode("ascii")
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    return {"category_id": 3, "segmentation": {"size": list(SIZE_HW), "counts": RUNS}, **changes}
+
+
+def write_json(path: Path, content: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    "segmentation",
+    [
+        {"size": list(SIZE_HW), "counts": RUNS},
+        {"size": list(SIZE_HW), "counts": encoded(MASK)},
+        {"size": list(SIZE_HW), "counts": encoded(MASK).encode()},
+        [[4, 1, 6, 1, 6, 4, 4, 4]],
+    ],
+    ids=["list", "text", "bytes", "polygon"],
+)
+def test_segmentation_forms(segmentation: Any) -> None:
+    np.testing.assert_array_equal(decode_segmentation(Path("a.json"), 0, segmentation, SIZE_HW), MASK)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 40), st.floats(0, 1))
+def test_compressed_masks_of_any_content_pass_the_check(seed: int, height: int, width: int, share: float) -> None:
+    mask = np.random.default_rng(seed).random((height, width)) < share
+    segmentation = {"size": [height, width], "counts": encoded(mask)}
+    np.testing.assert_array_equal(decode_segmentation(Path("a.json"), 0, segmentation, (height, width)), mask)
+
+
+@pytest.mark.parametrize(
+    ("segmentation", "message"),
+    [
+        (None, "entry 7: 'segmentation' is neither RLE nor a list of polygons"),
+        ([[1, 2]], "neither RLE nor a list"),
+        ({"size": [6, 9], "counts": [25, 3]}, "entry 7: run lengths cover 28 pixels, expected 6 x 9 = 54"),
+        ({"size": [6, 9], "counts": encoded(MASK)[:-2]}, r"entry 7: run lengths cover \d+ pixels"),
+        ({"size": [6, 9], "counts": "~~"}, "entry 7: bad run lengths .*'~' is not part"),
+        ({"size": [6, 9], "counts": "o"}, "ends inside a number"),
+        ({"size": [6], "counts": RUNS}, "bad run lengths"),
+        ({"size": [6, 9], "counts": 5.5}, "bad run lengths"),
+    ],
+)
+def test_bad_segmentations(segmentation: Any, message: str) -> None:
+    with pytest.raises(DataFormatError, match=rf"a\.json: .*{message}" if "entry" not in message else message):
+        decode_segmentation(Path("a.json"), 7, segmentation, SIZE_HW)
+
+
+@pytest.mark.parametrize("folder", ["", "data"])
+def test_frame_json(tmp_path: Path, folder: str) -> None:
+    entries = [
+        entry(image="left", instance_id=7, bbox=[3, 1, 4, 3], score=0.5),
+        entry(image="right", category_id=1),
+    ]
+    write_json(tmp_path / folder / "000004.json", entries)
+    left, right = mask_source(tmp_path).read("000004", SIZE_HW)
+    assert (left.side, left.instance_id, left.is_car, left.score) == ("left", 7, True, 0.5)
+    # [x, y, w, h] covers columns 3..6 and rows 1..3; the mask itself columns 4..5.
+    assert left.box == (3, 1, 6, 3)
+    assert left.mask_box == (4, 1, 5, 3)
+    assert (right.side, right.is_car, right.box) == ("right", False, (4, 1, 5, 3))
+    np.testing.assert_array_equal(right.probability, MASK)
+
+
+def test_soft_probability_replaces_the_binary_mask(tmp_path: Path) -> None:
+    soft = np.zeros(SIZE_HW, np.uint8)
+    soft[2, 3:6] = [51, 204, 255]
+    write_png(tmp_path / "soft" / "a.png", soft)
+    write_json(tmp_path / "000000.json", [entry(image="left", soft_probability="soft/a.png")])
+    source = FrameJsonMasks(tmp_path)
+    (mask,) = source.read("000000", SIZE_HW)
+    assert mask.probability.dtype == np.float32
+    np.testing.assert_allclose(mask.probability[2, 3:6], [0.2, 0.8, 1.0])
+    assert mask.mask_box == (4, 2, 5, 2)
+    assert source.files("000000") == (tmp_path / "000000.json", tmp_path / "soft" / "a.png")
+
+
+def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
+    write_json(tmp_path / "000000.json", [entry(image="left", segmentation={"size": [6, 9], "counts": [54]})])
+    assert FrameJsonMasks(tmp_path).read("000000", SIZE_HW) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({}, r"000000\.json: is not a list of COCO results"),
+        ([entry(image="middle")], "entry 0: 'image' is 'middle', expected 'left' or 'right'"),
+        ([{"image": "left", "segmentation": {"size": [6, 9], "counts": RUNS}}], "entry 0: bad or missing field .*cat"),
+        ([entry(image="left", bbox=[1, 2])], "entry 0: bad or missing field"),
+        (
+            [entry(image="left", segmentation={"size": [9, 6], "counts": RUNS})],
+            r"000000\.json: the mask of entry 0 has 6 x 9 pixels \(width x height\), its image 9 x 6",
+        ),
+    ],
+)
+def test_bad_frame_json(tmp_path: Path, content: Any, message: str) -> None:
+    write_json(tmp_path / "000000.json", content)
+    with pytest.raises(DataFormatError, match=message):
+        FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
+
+
+def test_soft_mask_of_another_size(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", np.zeros((3, 4), np.uint8))
+    write_json(tmp_path / "000000.json", [entry(image="left", soft_probability="a.png")])
+    with pytest.raises(DataFormatError, match=r"a\.png: the soft mask has 4 x 3 pixels .* its image 9 x 6"):
+        FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
+
+
+def test_broken_and_missing_json(tmp_path: Path) -> None:
+    (tmp_path / "000000.json").write_text("[{")
+    with pytest.raises(DataFormatError, match=r"000000\.json: is not valid JSON"):
+        FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
+    with pytest.raises(DataFormatError, match=r"000001\.json: cannot be read"):
+        FrameJsonMasks(tmp_path).read("000001", SIZE_HW)
+
+
+@pytest.mark.parametrize(("car", "other", "nothing"), [(1003, 2001, 10000), (26003, 24000, 7)])
+def test_instance_png_of_mots_and_cityscapes(tmp_path: Path, car: int, other: int, nothing: int) -> None:
+    ids = np.zeros(SIZE_HW, np.uint16)
+    ids[MASK] = car
+    ids[5, :2] = other
+    ids[0, 7:] = nothing
+    write_png(tmp_path / "instance_2" / "000000.png", ids)
+    write_png(tmp_path / "instance_3" / "000000.png", np.zeros(SIZE_HW, np.uint16))
+    source = mask_source(tmp_path)
+    assert isinstance(source, InstancePngMasks)
+    found = {mask.instance_id: mask for mask in source.read("000000", SIZE_HW)}
+    assert set(found) == {car, other}
+    assert found[car].is_car
+    assert not found[other].is_car
+    assert found[car].mask_box == (4, 1, 5, 3)
+    np.testing.assert_array_equal(found[car].probability, MASK)
+    cars_of_another_class = mask_source(tmp_path, car_ids=[other // 1000]).read("000000", SIZE_HW)
+    assert [mask.instance_id for mask in cars_of_another_class if mask.is_car] == [other]
+
+
+def test_instance_png_of_another_size(tmp_path: Path) -> None:
+    for folder in ("instance_2", "instance_3"):
+        write_png(tmp_path / folder / "000000.png", np.zeros((3, 4), np.uint16))
+    with pytest.raises(DataFormatError, match=r"000000\.png: the instance image has 4 x 3 pixels .*its image 9 x 6"):
+        mask_source(tmp_path).read("000000", SIZE_HW)
+
+
+def test_plain_coco_files_of_a_whole_data_set(tmp_path: Path) -> None:
+    left = write_json(tmp_path / "l.json", [entry(image_id=8), entry(image_id=107, score=0.25), entry(image_id="8")])
+    right = write_json(tmp_path / "r.json", [entry(image_id=107)])
+    source = CocoFileMasks(left, right)
+    assert [(m.side, m.score) for m in source.read("000107", SIZE_HW)] == [("left", 0.25), ("right", 1.0)]
+    assert [m.instance_id for m in source.read("000008", SIZE_HW)] == [0, 2]
+    assert source.read("000009", SIZE_HW) == []
+    assert [m.side for m in CocoFileMasks(None, right).read("000107", SIZE_HW)] == ["right"]
+
+
+def test_plain_coco_files_that_do_not_fit(tmp_path: Path) -> None:
+    source = CocoFileMasks(write_json(tmp_path / "l.json", [entry()]), None)
+    with pytest.raises(DataFormatError, match=r"l\.json: entry 0: 'image_id' is None, expected the frame's number"):
+        source.read("000107", SIZE_HW)
+    source = CocoFileMasks(write_json(tmp_path / "k.json", []), None)
+    with pytest.raises(InputError, match=r"frame_id: expected a number.*'first'"):
+        source.read("first", SIZE_HW)
+    with pytest.raises(InputError, match="at least one COCO result file"):
+        CocoFileMasks(None, None)
+
+
+def test_mask_folder_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(DataFormatError, match="nowhere: is not a folder of masks"):
+        mask_source(tmp_path / "nowhere")
+
+
+def test_tight_box_of_nothing_is_none() -> None:
+    assert tight_box(np.full(SIZE_HW, 0.5, np.float32)) is None

@@ -1,0 +1,85 @@
+"""Calibration files: layouts, hand-derived offsets, and complaints that name the line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
+
+# The projections of KITTI's first recording day.
+P2 = "721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884"
+P3 = "721.5377 0 609.5593 -339.5242 0 721.5377 172.854 2.199936 0 0 1 0.002729905"
+R0 = "1 0 0 0 1 0 0 0 1"
+TR = "0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3"
+
+OBJECT = f"P0: {P2}\nP2: {P2}\nP3: {P3}\nR0_rect: {R0}\nTr_velo_to_cam: {TR}\nTr_imu_to_velo: {TR}\n\n"
+TRACKING = f"P2: {P2}  \nP3: {P3}  \nR_rect {R0}\nTr_velo_cam {TR}\nTr_imu_velo {TR}\n"
+RAW = f"calib_time: 09-Jan-2012 13:57:47\nP_rect_02: {P2}\nP_rect_03: {P3}\nR_rect_00: {R0}\n"
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "000000.txt"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("text", [OBJECT, TRACKING, RAW])
+def test_layouts_give_the_same_projections(tmp_path: Path, text: str) -> None:
+    calibration = read_calibration(write(tmp_path, text))
+    assert calibration.P2[0].tolist() == [721.5377, 0, 609.5593, 44.85728]
+    assert calibration.P3[1, 3] == 2.199936
+    assert calibration.R0_rect is not None
+    assert calibration.R0_rect.shape == (3, 3)
+
+
+def test_velodyne_is_none_where_the_file_has_none(tmp_path: Path) -> None:
+    assert read_calibration(write(tmp_path, RAW)).Tr_velo_to_cam is None
+    tracking = read_calibration(write(tmp_path, TRACKING))
+    assert tracking.Tr_velo_to_cam is not None
+    assert tracking.Tr_velo_to_cam[:, 3].tolist() == [0.1, 0.2, 0.3]
+
+
+def test_offsets_by_hand(tmp_path: Path) -> None:
+    calibration = read_calibration(write(tmp_path, OBJECT))
+    camera = to_stereo_camera([calibration, calibration], dtype=torch.float64)
+    # K t = P[:, 3] solved from the last row upwards: t_z = P[2,3], t_x = (P[0,3] - c_x t_z) / f, and so on.
+    t2_z, t3_z = 0.002745884, 0.002729905
+    t2 = [(44.85728 - 609.5593 * t2_z) / 721.5377, (0.2163791 - 172.854 * t2_z) / 721.5377, t2_z]
+    t3 = [(-339.5242 - 609.5593 * t3_z) / 721.5377, (2.199936 - 172.854 * t3_z) / 721.5377, t3_z]
+    assert camera.num_frames == 2
+    torch.testing.assert_close(camera.t_cam_ref[1], torch.tensor(t2, dtype=torch.float64), rtol=0, atol=1e-12)
+    expected = torch.tensor(t3, dtype=torch.float64) - torch.tensor(t2, dtype=torch.float64)
+    torch.testing.assert_close(camera.T_right_cam[0, :3, 3], expected, rtol=0, atol=1e-12)
+    # KITTI's right camera is 2.7 mm off vertically.
+    assert camera.T_right_cam[0, 1, 3].item() == pytest.approx(0.0027, abs=1e-4)
+    assert to_stereo_camera([calibration]).K_left.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (f"P3: {P3}", "P3: 1 2 3", r"000000\.txt, line 3: expected 12 finite numbers, got 3: 'P3: 1 2 3'"),
+        ("44.85728", "4x", r"line 2: expected 12 numbers \(could not convert string to float: '4x'\): 'P2: "),
+        ("44.85728", "nan", r"line 2: expected 12 finite numbers"),
+        (f"P3: {P3}", "", r"000000\.txt: has no line P3:"),
+    ],
+)
+def test_bad_lines(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = OBJECT.replace(f"P0: {P2}", "P0: " + "0 " * 12).replace(old, new)
+    with pytest.raises(DataFormatError, match=message):
+        read_calibration(write(tmp_path, text))
+
+
+def test_flipped_baseline_names_the_file(tmp_path: Path) -> None:
+    text = f"P2: {P3}\nP3: {P2}\n"
+    with pytest.raises(DataFormatError, match=r"000000\.txt: the camera of P3 is not to the right .*-0\.53\d\d m"):
+        to_stereo_camera([read_calibration(write(tmp_path, text))])
+
+
+def test_no_frames() -> None:
+    with pytest.raises(InputError, match="calibrations: expected at least one frame"):
+        to_stereo_camera([])

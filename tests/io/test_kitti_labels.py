@@ -1,0 +1,116 @@
+"""Label and result lines, and box frames there and back."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.errors import DataFormatError
+from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
+from directshape_torch.io.kitti_labels import poses_cam, poses_ref, read_objects, shift_frame
+
+LABEL = "Car 0.81 0 -2.08 812.76 184.44 1241.00 374.00 1.46 1.56 4.11 2.54 1.55 4.31 -1.58"
+RESULT = "Car -1 -1 -1.60 531.91 208.03 694.61 347.11 1.40 1.62 3.92 0.17 1.77 8.35 -1.58 0.9550"
+DONT_CARE = "DontCare -1 -1 -10 579.44 175.79 595.04 188.10 -1 -1 -1 -1000 -1000 -1000 -10"
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "000107.txt"
+    path.write_bytes(text.encode())
+    return path
+
+
+def test_fields_of_a_label_and_a_result(tmp_path: Path) -> None:
+    label, result = read_objects(write(tmp_path, f"{LABEL}\n\n{RESULT}"))
+    assert (label.type, label.truncated, label.occluded, label.alpha) == ("Car", 0.81, 0, -2.08)
+    assert label.box_2d == (812.76, 184.44, 1241.0, 374.0)
+    assert label.hwl == (1.46, 1.56, 4.11)
+    assert label.location_ref == (2.54, 1.55, 4.31)
+    assert (label.rotation_y, label.score, label.line_number) == (-1.58, None, 1)
+    assert (result.score, result.occluded, result.line_number) == (0.955, -1, 3)
+    assert result.raw_line == RESULT
+
+
+def test_empty_file_is_an_empty_list(tmp_path: Path) -> None:
+    assert read_objects(write(tmp_path, "")) == []
+
+
+def test_dont_care_has_no_3d_box(tmp_path: Path) -> None:
+    dont_care, car = read_objects(write(tmp_path, f"{DONT_CARE}\n{LABEL}\n"))
+    assert not dont_care.has_box_3d
+    assert car.has_box_3d
+
+
+@pytest.mark.parametrize(
+    ("line", "with_score", "message"),
+    [
+        (
+            LABEL.rsplit(" ", 1)[0],
+            None,
+            r"000107\.txt, line 2: expected 15 or 16 columns, got 14: 'Car 0\.81 .*'; write",
+        ),
+        (LABEL, True, "line 2: expected 16 columns, got 15"),
+        (RESULT, False, "line 2: expected 15 columns, got 16"),
+        (LABEL.replace("4.31", "4,31"), None, "line 2: column 14 is '4,31', not a finite number"),
+        (LABEL.replace("4.31", "nan"), None, "column 14 is 'nan'"),
+        (LABEL.replace("4.31", "-inf"), None, "column 14 is '-inf'"),
+    ],
+)
+def test_bad_lines_name_file_number_and_text(tmp_path: Path, line: str, with_score: bool | None, message: str) -> None:
+    good = RESULT if with_score else LABEL
+    with pytest.raises(DataFormatError, match=message):
+        read_objects(write(tmp_path, f"{good}\n{line}\n"), with_score)
+
+
+def test_binary_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes(b"Car \xff\xfe")
+    with pytest.raises(DataFormatError, match="is not UTF-8 text"):
+        read_objects(path)
+
+
+def test_rotation_y_minus_half_pi_points_away_from_the_camera(tmp_path: Path) -> None:
+    """KITTI: a car that drives straight ahead has rotation_y = -pi/2."""
+    line = f"Car 0 0 0 0 0 9 9 1.5 1.6 4.0 1.0 1.7 20.0 {-math.pi / 2}"
+    T_ref_obj = poses_ref(read_objects(write(tmp_path, line)))
+    front_ref = T_ref_obj[0, :3, :3] @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(front_ref, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    corners = box_corners(T_ref_obj, torch.tensor([[1.5, 1.6, 4.0]], dtype=torch.float64))[0]
+    # Half the width to either side of x = 1, height 1.5 above the bottom at y = 1.7, half the length about z = 20.
+    low, high = torch.tensor([0.2, 0.2, 18.0]).double(), torch.tensor([1.8, 1.7, 22.0]).double()
+    torch.testing.assert_close(corners.amin(0), low)
+    torch.testing.assert_close(corners.amax(0), high)
+
+
+def test_camera_frame_there_and_back(tmp_path: Path) -> None:
+    objects = read_objects(write(tmp_path, f"{LABEL}\n{RESULT}\n"))
+    t_cam_ref = torch.tensor([0.0598, -0.0004, 0.0027], dtype=torch.float64)
+    T_cam_obj = poses_cam(objects, t_cam_ref)
+    torch.testing.assert_close(T_cam_obj[0, :3, 3], torch.tensor([2.5998, 1.5496, 4.3127], dtype=torch.float64))
+    torch.testing.assert_close(shift_frame(T_cam_obj, -t_cam_ref), poses_ref(objects))
+
+
+def test_no_objects_have_poses_of_the_right_shape() -> None:
+    assert poses_cam([], torch.zeros(3)).shape == (0, 4, 4)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.floats(-20, 20),
+    st.floats(1, 60),
+    st.floats(-3.14, 3.14),
+)
+def test_heading_and_alpha_come_back(tmp_path_factory: pytest.TempPathFactory, x: float, z: float, ry: float) -> None:
+    path = tmp_path_factory.mktemp("labels") / "a.txt"
+    path.write_text(f"Car 0 0 0 0 0 9 9 1.5 1.6 4.0 {x} 1.7 {z} {ry}")
+    T_ref_obj = poses_ref(read_objects(path))
+    assert rotation_y_from_pose(T_ref_obj).item() == pytest.approx(ry, abs=1e-9)
+    alpha = alpha_from_kitti(T_ref_obj[:, :3, 3], rotation_y_from_pose(T_ref_obj)).item()
+    assert -math.pi <= alpha <= math.pi
+    difference = alpha - (ry - math.atan2(x, z))
+    assert math.cos(difference) == pytest.approx(1.0, abs=1e-12)

@@ -1,0 +1,131 @@
+"""One-to-one matching by geometry, in the left and through the camera in the right image."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.instance_masks import InstanceMask
+from directshape_torch.io.mask_matching import (
+    box_iou,
+    match_masks,
+    match_one_to_one,
+    project_boxes,
+    without_duplicates,
+)
+from directshape_torch.scene import StereoCamera
+
+SIZE_HW = (200, 600)
+
+
+def camera(bias_px: float | None = None) -> StereoCamera:
+    K = torch.tensor([[500.0, 0, 300], [0, 500, 100], [0, 0, 1]], dtype=torch.float64)
+    T_right_cam = torch.eye(4, dtype=torch.float64)
+    T_right_cam[:3, 3] = torch.tensor([-0.5, 0.01, 0.0])
+    field = None if bias_px is None else DisparityField.constant(bias_px, SIZE_HW[::-1], K, K, T_right_cam)
+    return StereoCamera(K[None], K[None], T_right_cam[None], torch.zeros(1, 3, dtype=torch.float64), field)
+
+
+def mask(
+    box: tuple[int, int, int, int], *, is_car: bool = True, file_box: tuple[int, ...] | None = None
+) -> InstanceMask:
+    pixels = np.zeros(SIZE_HW, bool)
+    pixels[box[1] : box[3] + 1, box[0] : box[2] + 1] = True
+    whole = tuple(float(n) for n in box)
+    from_file = whole if file_box is None else tuple(float(n) for n in file_box)
+    return InstanceMask("left", 1, 3 if is_car else 1, is_car, from_file, whole, pixels, 1.0)  # type: ignore[arg-type]
+
+
+def test_iou_by_hand() -> None:
+    a = np.array([[0.0, 0, 4, 2], [5, 5, 5, 9]])  # the second has no area
+    b = np.array([[2.0, 0, 6, 2], [0, 0, 4, 2], [10, 10, 12, 12]])
+    np.testing.assert_allclose(box_iou(a, b), [[4 / 12, 1, 0], [0, 0, 0]])
+    assert box_iou(a[:0], b).shape == (0, 3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000), st.integers(0, 4), st.integers(0, 4))
+def test_assignment_equals_the_best_of_all(seed: int, num_detections: int, num_masks: int) -> None:
+    overlap = np.random.default_rng(seed).random((num_detections, num_masks))
+    matches = match_one_to_one(overlap, min_overlap=0.3)
+    used = matches.mask_of_detection[matches.mask_of_detection >= 0]
+    assert len(set(used.tolist())) == len(used)
+    assert (matches.overlap[matches.mask_of_detection >= 0] >= 0.3).all()
+    padded = np.hstack([np.where(overlap >= 0.3, overlap, 0.0), np.zeros((num_detections, num_detections))])
+    best = max(
+        sum(padded[row, column] for row, column in enumerate(columns))
+        for columns in itertools.permutations(range(padded.shape[1]), num_detections)
+    )
+    assert matches.overlap.sum() == pytest.approx(best)
+
+
+def test_the_larger_of_file_box_and_mask_box_counts() -> None:
+    box = np.array([[100.0, 50, 200, 100]])
+    hidden_half = mask((100, 50, 120, 100))  # a fifth is visible: IoU 0.2 alone
+    assert match_masks(box, [hidden_half]).mask_of_detection.tolist() == [-1]
+    with_box = mask((100, 50, 120, 100), file_box=(100, 50, 200, 100))
+    assert match_masks(box, [with_box]).overlap.tolist() == [1.0]
+    wrong_file_box = mask((100, 50, 200, 100), file_box=(0, 0, 10, 10))
+    assert match_masks(box, [wrong_file_box]).overlap.tolist() == [1.0]
+
+
+def test_other_classes_never_match_a_car_and_the_reverse() -> None:
+    box = np.array([[100.0, 50, 200, 100]])
+    pedestrian = mask((100, 50, 200, 100), is_car=False)
+    car = mask((100, 50, 190, 100))
+    assert match_masks(box, [pedestrian, car]).mask_of_detection.tolist() == [1]
+    assert match_masks(box, [pedestrian, car], cars=False).mask_of_detection.tolist() == [0]
+
+
+def test_second_opinion_is_used_where_it_is_there() -> None:
+    boxes = np.array([[0.0, 0, 10, 10], [0, 0, 10, 10]])
+    second = np.array([[np.nan] * 4, [300, 50, 400, 90]])
+    assert match_masks(boxes, [mask((300, 50, 400, 90))], second).mask_of_detection.tolist() == [-1, 0]
+
+
+def test_no_detections_and_no_masks() -> None:
+    assert len(match_masks(np.zeros((0, 4)), [mask((1, 1, 5, 5))]).mask_of_detection) == 0
+    assert match_masks(np.array([[0.0, 0, 9, 9]]), []).mask_of_detection.tolist() == [-1]
+
+
+def test_projected_boxes_by_hand() -> None:
+    T = pose_from_kitti(torch.tensor([[1.0, 1.5, 20.0]]).double(), torch.zeros(1).double())
+    left, right = project_boxes(T, torch.tensor([[1.5, 2.0, 4.0]]), camera(), SIZE_HW)
+    # Nearest face at z = 19, farthest at 21; x from -1 to 3, y from 0 to 1.5.
+    np.testing.assert_allclose(left, [[300 - 500 / 19, 100, 300 + 1500 / 19, 100 + 750 / 19]])
+    # x is 0.5 less, y 0.01 more.
+    expected = [[300 - 750 / 19, 100 + 5 / 21, 300 + 1250 / 19, 100 + 755 / 19]]
+    np.testing.assert_allclose(right, expected)
+
+
+def test_right_box_goes_through_the_disparity_field() -> None:
+    T = pose_from_kitti(torch.tensor([[1.0, 1.5, 20.0]]).double(), torch.zeros(1).double())
+    size = torch.tensor([[1.5, 2.0, 4.0]])
+    (_, plain), (_, biased) = (project_boxes(T, size, camera(bias), SIZE_HW) for bias in (None, -0.8))
+    # Measured minus true disparity is -0.8: the car appears 0.8 px farther right.
+    np.testing.assert_allclose(biased - plain, [[0.8, 0, 0.8, 0]], atol=1e-9)
+
+
+def test_boxes_that_reach_behind_the_camera_are_cut_and_hidden_ones_have_no_area() -> None:
+    z = torch.tensor([[2.0, 1.5, 1.0], [0.0, 1.5, -20.0]]).double()
+    T = pose_from_kitti(z, torch.full((2,), -torch.pi / 2).double())
+    left, right = project_boxes(T, torch.tensor([[1.5, 1.6, 4.0]] * 2), camera(), SIZE_HW)
+    assert np.isfinite(left).all()
+    assert np.isfinite(right).all()
+    # The car beside the camera: its nearest visible part is at z = 0.5 and far out to the right.
+    assert left[0, 2] == SIZE_HW[1] - 1
+    assert left[0, 0] == pytest.approx(300 + 500 * 1.2 / 3.0)
+    np.testing.assert_array_equal(box_iou(left[1:], np.array([[0.0, 0, 599, 199]])), [[0.0]])
+
+
+def test_second_mask_of_a_matched_car_is_no_occluder() -> None:
+    car, again, neighbour = mask((10, 10, 50, 50)), mask((12, 10, 50, 50)), mask((40, 10, 90, 50))
+    assert without_duplicates([car, again, neighbour], [0]) == [2]
+    assert without_duplicates([car, again, neighbour], []) == [0, 1, 2]

@@ -1,0 +1,158 @@
+"""Result text keeps what it must keep; shapes come back and refuse what is no such file."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io.atomic_files import write_npz
+from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.io.result_files import (
+    RefinedBox,
+    ShapeArrays,
+    read_shapes,
+    write_result_text,
+    write_shapes,
+)
+
+CAR = "Car -1.00 -1 -2.2941 766.19 174.53 1241.00 374.00 1.5047 1.6292 4.0765 2.4780 1.5201 4.3034 -1.7716 0.90000"
+WALKER = "Pedestrian  0 0 0.5 1 2 3 4 1.8 0.6 0.6 1 1.7 9 0 1e-3\t"
+BOX = RefinedBox((1.5, 1.61, 3.9), (2.5, -1e-6, 4.25), -1.75, -2.0)
+
+
+def test_lines_keep_order_scores_and_text(tmp_path: Path) -> None:
+    source = tmp_path / "in.txt"
+    source.write_text(f"{WALKER}\n{CAR}\n{CAR}")
+    write_result_text(tmp_path / "out" / "data" / "000000.txt", read_objects(source), {1: BOX})
+    walker, refined, kept, end = (tmp_path / "out" / "data" / "000000.txt").read_text().split("\n")
+    assert walker == WALKER
+    assert refined == (
+        "Car -1.00 -1 -2.0000 766.19 174.53 1241.00 374.00 1.5000 1.6100 3.9000 2.5000 0.0000 4.2500 -1.7500 0.90000"
+    )
+    assert kept == CAR
+    assert end == ""
+
+
+def test_result_reads_back_as_the_refined_box(tmp_path: Path) -> None:
+    (tmp_path / "in.txt").write_text(CAR)
+    objects = read_objects(tmp_path / "in.txt")
+    write_result_text(tmp_path / "out.txt", objects, {0: BOX})
+    (again,) = read_objects(tmp_path / "out.txt", with_score=True)
+    assert again.hwl == BOX.hwl
+    assert again.location_ref == (2.5, 0.0, 4.25)
+    assert (again.rotation_y, again.alpha, again.score) == (-1.75, -2.0, 0.9)
+    assert again.box_2d == objects[0].box_2d
+
+
+def test_nothing_refined_is_a_copy_byte_for_byte(tmp_path: Path) -> None:
+    content = f"{CAR}\r\n{WALKER}\r\n".encode()
+    (tmp_path / "in.txt").write_bytes(content)
+    write_result_text(tmp_path / "out.txt", read_objects(tmp_path / "in.txt"), {})
+    assert (tmp_path / "out.txt").read_bytes() == content
+    write_result_text(tmp_path / "out.txt", read_objects(tmp_path / "in.txt"), {0: BOX})
+    assert all(line.endswith(b"\r") for line in (tmp_path / "out.txt").read_bytes().split(b"\n")[:-1])
+
+
+def test_empty_input_is_an_empty_result(tmp_path: Path) -> None:
+    write_result_text(tmp_path / "out.txt", [], {})
+    assert (tmp_path / "out.txt").read_bytes() == b""
+
+
+def test_a_label_without_score_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "in.txt").write_text(CAR.rsplit(" ", 1)[0])
+    write_result_text(tmp_path / "out.txt", read_objects(tmp_path / "in.txt"), {0: BOX})
+    assert len((tmp_path / "out.txt").read_text().split()) == 15
+
+
+def test_wrong_refinements_leave_no_file(tmp_path: Path) -> None:
+    (tmp_path / "in.txt").write_text(CAR)
+    objects = read_objects(tmp_path / "in.txt")
+    with pytest.raises(InputError, match=r"refined: expected indices of the 1 input lines, got \[1\]"):
+        write_result_text(tmp_path / "out.txt", objects, {1: BOX})
+    with pytest.raises(InputError, match="refined: expected finite numbers"):
+        write_result_text(tmp_path / "out.txt", objects, {0: dataclasses.replace(BOX, alpha=float("nan"))})
+    assert not (tmp_path / "out.txt").exists()
+
+
+def shapes(num_cars: int) -> ShapeArrays:
+    random = np.random.default_rng(num_cars)
+    B, K, T = num_cars, 5, 2
+    return ShapeArrays(
+        frame_id="000107",
+        prior_sha256="ab" * 32,
+        ground_source="file",
+        input_lines=np.arange(B, dtype=np.int64) + 1,
+        T_cam_obj=random.random((B, 4, 4)),
+        T_ref_obj=random.random((B, 4, 4)),
+        boxes_hwl=random.random((B, 3)),
+        boxes_location_ref=random.random((B, 3)),
+        boxes_rotation_y=random.random(B),
+        codes=random.random((B, K)).astype(np.float32),
+        covariances=np.full((B, 6 + K, 6 + K), np.nan),
+        covariances_ref=random.random((B, 4, 4)),
+        statuses=("converged", "no_mask", "max_iterations")[:B],
+        messages=("", "no mask in either image", "")[:B],
+        term_names=("silhouette", "shape prior"),
+        costs_before=random.random((B, T)),
+        costs_after=random.random((B, T)),
+        iterations=np.full(B, 7, dtype=np.int64),
+    )
+
+
+@pytest.mark.parametrize("num_cars", [0, 1, 3])
+def test_shapes_round_trip_and_equal_bytes(tmp_path: Path, num_cars: int) -> None:
+    written = shapes(num_cars)
+    write_shapes(tmp_path / "a.npz", written)
+    write_shapes(tmp_path / "b.npz", written)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    read = read_shapes(tmp_path / "a.npz")
+    for entry in dataclasses.fields(ShapeArrays):
+        before, after = getattr(written, entry.name), getattr(read, entry.name)
+        if isinstance(before, np.ndarray):
+            assert before.dtype == after.dtype
+            np.testing.assert_array_equal(before, after)
+        else:
+            assert before == after
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
+        assert int(archive["schema_version"]) == 1
+
+
+def test_shapes_of_wrong_size() -> None:
+    with pytest.raises(InputError, match=r"covariances: expected shape \(3, 11, 11\), got \(3, 5, 5\)"):
+        dataclasses.replace(shapes(3), covariances=np.zeros((3, 5, 5)))
+    with pytest.raises(InputError, match=r"statuses: expected shape \(3,\), got \(2,\)"):
+        dataclasses.replace(shapes(3), statuses=("converged", "no_mask"))
+
+
+def test_files_that_are_no_shapes(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with pytest.raises(DataFormatError, match=r"a\.npz: cannot be read"):
+        read_shapes(path)
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(DataFormatError, match=r"a\.npz: is no readable npz file"):
+        read_shapes(path)
+    path.write_bytes(b"PK\x03\x04 broken")
+    with pytest.raises(DataFormatError, match="is no readable npz file"):
+        read_shapes(path)
+    write_npz(path, {"codes": np.zeros(3)})
+    with pytest.raises(DataFormatError, match="has shape schema None, this version reads 1"):
+        read_shapes(path)
+    write_npz(path, {"schema_version": np.array(2)})
+    with pytest.raises(DataFormatError, match="has shape schema 2, this version reads 1"):
+        read_shapes(path)
+    write_npz(path, {"schema_version": np.array(1), "codes": np.zeros(3)})
+    with pytest.raises(DataFormatError, match=r"has the fields \['codes'\], expected"):
+        read_shapes(path)
+
+
+def test_truncated_shapes(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    write_shapes(path, shapes(2))
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(DataFormatError, match="is no readable npz file"):
+        read_shapes(path)

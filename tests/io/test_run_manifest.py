@@ -1,0 +1,99 @@
+"""A run resumes only into results of the same settings and files, and says what differs."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from directshape_torch.errors import DataFormatError, ResumeError
+from directshape_torch.io.run_manifest import (
+    RunManifest,
+    check_inputs,
+    check_resume,
+    hash_file,
+    hash_files,
+    read_manifest,
+    write_manifest,
+)
+
+A, B = "a" * 64, "b" * 64
+
+
+def manifest() -> RunManifest:
+    return RunManifest(
+        package_version="0.1.0",
+        config={"solver": {"iterations": 20, "damping": 0.01}, "classes": ("Car",)},
+        sha256={"prior": A, "stereo_bias": None},
+        inputs={"000001": {"image_left": A, "masks_0": A}, "000002": {"image_left": A}},
+        frames={"000001": {"state": "done", "cars": 3}, "000002": {"state": "failed", "reason": "cut short"}},
+    )
+
+
+def test_round_trip_resumes(tmp_path: Path) -> None:
+    path = tmp_path / "summary.json"
+    assert read_manifest(path) is None
+    write_manifest(path, manifest())
+    previous = read_manifest(path)
+    assert previous is not None
+    check_resume(previous, manifest())
+    assert previous.is_done("000001")
+    assert not previous.is_done("000002")
+    assert not previous.is_done("000003")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"package_version": "0.2.0"}, "package version was '0.1.0', now is '0.2.0'"),
+        (
+            {"config": {"solver": {"iterations": 30, "damping": 0.01}, "classes": ("Car",)}},
+            r"cannot resume: setting 'solver\.iterations' was 20, now is 30; choose another output folder",
+        ),
+        (
+            {"config": {"solver": {"iterations": 20}, "classes": ("Car",)}},
+            r"setting 'solver\.damping' was 0\.01, now is 'absent'",
+        ),
+        ({"config": {**manifest().config, "new": 1}}, "setting 'new' was 'absent', now is 1"),
+        ({"config": {**manifest().config, "classes": ["Car", "Van"]}}, r"setting 'classes' was \['Car'\], now is"),
+        ({"sha256": {"prior": B, "stereo_bias": None}}, "sha256 of 'prior' was aaaaaaaaaaaa, now is bbbbbbbbbbbb"),
+        ({"sha256": {"prior": A, "stereo_bias": B}}, "sha256 of 'stereo_bias' was None, now is bbbb"),
+        (
+            {"inputs": {"000001": {"image_left": A, "masks_0": B}}},
+            "frame 000001: sha256 of 'masks_0' was aaaaaaaaaaaa, now is bbbbbbbbbbbb",
+        ),
+    ],
+)
+def test_differences_are_named(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ResumeError, match=message):
+        check_resume(manifest(), dataclasses.replace(manifest(), **changes))  # type: ignore[arg-type]
+
+
+def test_new_frames_and_mended_failures_may_differ() -> None:
+    more = dataclasses.replace(manifest(), inputs={"000002": {"image_left": B}, "000003": {"image_left": B}})
+    check_resume(manifest(), more)
+    with pytest.raises(ResumeError, match="frame 000001"):
+        check_inputs(manifest(), "000001", {"image_left": A})
+
+
+def test_schema_and_damage(tmp_path: Path) -> None:
+    path = tmp_path / "summary.json"
+    write_manifest(path, manifest())
+    path.write_text(path.read_text().replace('"schema_version": 1', '"schema_version": 9'))
+    with pytest.raises(ResumeError, match="schema version is 9, this program writes 1"):
+        read_manifest(path)
+    for content in ("{", "[]", "{}", '{"schema_version": 1, "x": 2}'):
+        path.write_text(content)
+        with pytest.raises(DataFormatError, match=r"summary\.json: is no summary of a run"):
+            read_manifest(path)
+
+
+def test_hashes(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"abc")
+    # FIPS 180-2, appendix B.1
+    assert hash_file(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert hash_files({"one": path}) == {"one": hash_file(path)}
+    with pytest.raises(DataFormatError, match="missing: cannot be read"):
+        hash_file(tmp_path / "missing")
