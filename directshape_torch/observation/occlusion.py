@@ -1,0 +1,209 @@
+"""Which pixels of a car are hidden by instances in front of it (paper, section "Occlusion Handling").
+
+Occluders of a car are all instances of the same frame that stand in front of it and have a mask on that side: the
+other detections, and `Detections.occluders` of any class. An occluder hides where its probability exceeds 0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.observation.pixel_sampling import MASK_THRESHOLD, region_pixels
+from directshape_torch.scene import Detections
+
+Side = Literal["left", "right"]
+OcclusionOrder = Literal["depth", "box_bottom"]
+
+
+def hidden_pixels(
+    detections: Detections,
+    side: Side,
+    object_index: Tensor,  # (P,)
+    uv: Tensor,  # (P, 2)
+    order: OcclusionOrder = "depth",
+) -> Tensor:
+    """Whether each pixel of an object is covered by the mask of an instance in front of it.
+
+    Args:
+        detections: B objects, with further occluders or without.
+        side: image that the pixels and the masks belong to.
+        object_index: (P,) integer, the object that each pixel belongs to.
+        uv: (P, 2) integer pixels (column, row). Pixels outside the mask images are not hidden.
+        order: see `instances_in_front`.
+
+    Returns:
+        (P,) bool.
+
+    Raises:
+        InputError: wrong shapes, non-integer pixels, unknown side or order.
+    """
+    if uv.ndim != 2 or uv.shape[-1] != 2 or uv.is_floating_point():
+        raise InputError("uv", "integer pixels (P, 2)", f"{tuple(uv.shape)} {uv.dtype}", "round them")
+    if object_index.shape != uv.shape[:1]:
+        raise InputError("object_index", f"shape ({len(uv)},)", f"{tuple(object_index.shape)}", "one entry a pixel")
+    height, width = detections.mask_left.shape[1:]
+    inside = (uv >= 0).all(dim=1) & (uv[:, 0] < width) & (uv[:, 1] < height)
+    pixel = torch.where(inside, uv[:, 1] * width + uv[:, 0], 0)
+    in_front = instances_in_front(detections, side, order)
+    hidden = torch.zeros_like(inside)
+    first = 0
+    for masks in _masks(detections, side):
+        covered = _covered(masks, in_front[first : first + len(masks)], object_index, pixel)
+        hidden |= covered
+        first += len(masks)
+    return hidden & inside
+
+
+def instances_in_front(
+    detections: Detections,
+    side: Side,
+    order: OcclusionOrder = "depth",
+) -> Tensor:
+    """Which instance stands in front of which detection and has a mask that may hide it.
+
+    Args:
+        detections: B objects and M further occluders.
+        side: image whose masks are asked for.
+        order: "depth": smaller depth of the object's origin; a pair of which one depth is unknown (NaN, or not in
+            front of the camera) falls back to the boxes. "box_bottom": lower bottom edge of the left 2D box, as in the
+            paper. Equals, and comparisons with NaN, hide nothing.
+
+    Returns:
+        (B + M, B) bool: instance i (detections first, then occluders) is in front of detection j.
+
+    Raises:
+        InputError: unknown side or order.
+    """
+    if order not in ("depth", "box_bottom"):
+        raise InputError("order", "'depth' or 'box_bottom'", repr(order))
+    count = len(detections)
+    frame, depth_m, bottom_v, present = _instances(detections, side)
+    in_front = bottom_v[:, None] > bottom_v[None, :count]
+    if order == "depth":
+        known = depth_m > 0  # False for NaN
+        nearer = depth_m[:, None] < depth_m[None, :count]
+        in_front = torch.where(known[:, None] & known[None, :count], nearer, in_front)
+    return in_front & (frame[:, None] == frame[None, :count]) & present[:, None]
+
+
+@dataclass(frozen=True)
+class OcclusionCrops:
+    """Union of the masks in front of each object, within a region of each object: memory follows the regions.
+
+    Attributes:
+        regions: (B, 4) integer (u0, v0, u1, v1), half open, pixels.
+        start: (B,) first entry of each object in `hidden`.
+        hidden: (A,) bool, all regions' pixels, row-major, packed.
+    """
+
+    regions: Tensor
+    start: Tensor
+    hidden: Tensor
+
+    def at(
+        self,
+        object_index: Tensor,  # (...)
+        uv: Tensor,  # (..., 2)
+    ) -> Tensor:
+        """Whether the nearest pixel of each point is hidden; False outside of the object's region.
+
+        Args:
+            object_index: integer, broadcastable to (...).
+            uv: (..., 2) pixels, integer or floating point (rounded half to even); NaN is not hidden.
+
+        Returns:
+            (...) bool.
+        """
+        rounded = uv.round() if uv.is_floating_point() else uv
+        u0, v0, u1, v1 = self.regions[object_index].unbind(-1)
+        u, v = rounded.unbind(-1)
+        inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
+        if not len(self.hidden):
+            return inside  # no region has a pixel, so nothing is inside
+        offset = (torch.where(inside, v, v0).long() - v0) * (u1 - u0) + torch.where(inside, u, u0).long() - u0
+        entry = torch.where(inside, self.start[object_index] + offset, 0)
+        return self.hidden[entry] & inside
+
+    def crop(self, index: int) -> Tensor:
+        """The occlusion mask of one object in its region, (v1 - v0, u1 - u0) bool, for pictures."""
+        u0, v0, u1, v1 = self.regions[index].tolist()
+        start = int(self.start[index])
+        return self.hidden[start : start + (v1 - v0) * (u1 - u0)].reshape(v1 - v0, u1 - u0)
+
+
+def occlusion_crops(
+    detections: Detections,
+    side: Side,
+    regions: Tensor,  # (B, 4)
+    order: OcclusionOrder = "depth",
+) -> OcclusionCrops:
+    """The paper's occlusion mask of every object within its region, for repeated lookups and for pictures.
+
+    Args:
+        detections: B objects.
+        side: image whose masks are used.
+        regions: (B, 4) integer (u0, v0, u1, v1), half open, as `region_boxes` gives them.
+        order: see `instances_in_front`.
+
+    Raises:
+        InputError: `regions` is not (B, 4); unknown side or order.
+    """
+    if regions.shape != (len(detections), 4):
+        raise InputError("regions", f"shape ({len(detections)}, 4)", f"{tuple(regions.shape)}", "use region_boxes")
+    object_index, uv = region_pixels(regions)
+    areas = (regions[:, 2] - regions[:, 0]) * (regions[:, 3] - regions[:, 1])
+    start = areas.cumsum(0) - areas
+    return OcclusionCrops(regions, start, hidden_pixels(detections, side, object_index, uv, order))
+
+
+def _instances(detections: Detections, side: Side) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Frame, depth in metres, box bottom and presence of a mask of the B detections and then the M occluders."""
+    frame = detections.frame_index
+    depth_m, bottom_v = detections.T_cam_obj[:, 2, 3], detections.box_2d[:, 3]
+    present = detections.has_mask_left if side == "left" else detections.has_mask_right
+    others = detections.occluders
+    if others is None:
+        return frame, depth_m, bottom_v, present
+    return (
+        torch.cat([frame, others.frame_index]),
+        torch.cat([depth_m, others.depth_m.to(depth_m.dtype)]),
+        torch.cat([bottom_v, others.bottom_v.to(bottom_v.dtype)]),
+        torch.cat([present, present.new_ones(len(others.frame_index))]),
+    )
+
+
+def _masks(detections: Detections, side: Side) -> list[Tensor]:
+    if side not in ("left", "right"):
+        raise InputError("side", "'left' or 'right'", repr(side))
+    name = f"mask_{side}"
+    sources = [detections] if detections.occluders is None else [detections, detections.occluders]
+    masks: list[Tensor] = [getattr(source, name) for source in sources]
+    if masks[-1].shape[1:] != masks[0].shape[1:]:
+        raise InputError("occluders", f"masks of {tuple(masks[0].shape[1:])}", f"{tuple(masks[-1].shape[1:])}")
+    return masks
+
+
+def _covered(
+    masks: Tensor,  # (I, H, W)
+    in_front: Tensor,  # (I, B)
+    object_index: Tensor,  # (P,)
+    pixel: Tensor,  # (P,) row-major within an image
+) -> Tensor:
+    """Whether any instance in front covers each pixel: as many lookups as the worst car has occluders."""
+    covered = torch.zeros_like(pixel, dtype=torch.bool)
+    num_ranks = int(in_front.sum(dim=0).max()) if in_front.numel() else 0
+    if not len(pixel) or not num_ranks:
+        return covered
+    occluders = in_front.to(torch.uint8).argsort(dim=0, descending=True, stable=True)[:num_ranks]
+    exists = in_front.gather(0, occluders)
+    flat, image_size = masks.reshape(-1), masks.shape[1] * masks.shape[2]
+    for instance, is_real in zip(occluders, exists, strict=True):
+        (concerned,) = is_real[object_index].nonzero(as_tuple=True)
+        entry = instance[object_index[concerned]] * image_size + pixel[concerned]
+        covered[concerned] |= flat.index_select(0, entry) > MASK_THRESHOLD
+    return covered
