@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -52,6 +53,7 @@ def build_detections(
     by_side: dict[Side, list[InstanceMask]] = {side: [m for m in masks if m.side == side] for side in SIDES}
     matches = _match_sides(chosen, by_side, camera, size_hw)
     others = [o for o in objects if o.type not in classes and o.has_box_3d]
+    depths = _known_depths(others, by_side, matches, camera, size_hw)
     stacked = {side: _stack(by_side[side], matches[side], size_hw, dtype) for side in SIDES}
     detections = Detections(
         frame_index=torch.zeros(len(chosen), dtype=torch.int64),
@@ -63,7 +65,7 @@ def build_detections(
         mask_right=stacked["right"],
         has_mask_left=torch.from_numpy(matches["left"].mask_of_detection >= 0),
         has_mask_right=torch.from_numpy(matches["right"].mask_of_detection >= 0),
-        occluders=_occluders(by_side, matches, _known_depths(others, by_side, camera, size_hw), size_hw, dtype),
+        occluders=_occluders(by_side, matches, depths, size_hw, dtype),
     )
     return detections, rows, _summary(by_side, matches)
 
@@ -73,15 +75,16 @@ def _match_sides(
     by_side: dict[Side, list[InstanceMask]],
     camera: StereoCamera,
     size_hw: tuple[int, int],
-    cars: bool = True,
+    eligible: Mapping[Side, Sequence[bool] | None] = MappingProxyType({"left": None, "right": None}),
 ) -> dict[Side, MaskMatches]:
     T_cam_obj = poses_cam(objects, camera.t_cam_ref[0])
     dimensions_hwl = torch.tensor([o.hwl for o in objects], dtype=T_cam_obj.dtype).reshape(-1, 3)
     boxes_left = np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
     projected_left, projected_right = project_boxes(T_cam_obj, dimensions_hwl, camera, size_hw)
-    left = match_masks(boxes_left, by_side["left"], cars=cars)
+    left = match_masks(boxes_left, by_side["left"], eligible=eligible["left"])
     moved = _moved_to_right(by_side["left"], left, projected_left, projected_right)
-    return {"left": left, "right": match_masks(projected_right, by_side["right"], moved, cars=cars)}
+    right = match_masks(projected_right, by_side["right"], moved, eligible=eligible["right"])
+    return {"left": left, "right": right}
 
 
 def _moved_to_right(
@@ -114,15 +117,17 @@ def _stack(masks: Sequence[InstanceMask], matches: MaskMatches, size_hw: tuple[i
 def _known_depths(
     others: Sequence[KittiObject],
     by_side: dict[Side, list[InstanceMask]],
+    matches: dict[Side, MaskMatches],
     camera: StereoCamera,
     size_hw: tuple[int, int],
 ) -> dict[Side, NDArray[np.float64]]:
-    """Depth of each mask where a detection of another class (a pedestrian, say) stands, metres, else NaN."""
-    matches = _match_sides(others, by_side, camera, size_hw, cars=False)
+    """Depth of each mask that is left over and fits a detection of another class (a van, a pedestrian), else NaN."""
+    free = {side: [k not in matches[side].mask_of_detection for k in range(len(by_side[side]))] for side in SIDES}
+    further = _match_sides(others, by_side, camera, size_hw, free)
     shift_z = float(camera.t_cam_ref[0, 2])
     depths = {side: np.full(len(by_side[side]), np.nan) for side in SIDES}
     for side in SIDES:
-        for row, index in enumerate(matches[side].mask_of_detection):
+        for row, index in enumerate(further[side].mask_of_detection):
             if index >= 0:
                 depths[side][index] = others[row].location_ref[2] + shift_z
     return depths

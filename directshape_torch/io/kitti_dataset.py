@@ -148,7 +148,7 @@ class KittiStereoDataset:
 
     def _choose_frames(self, split: Path | str | None, frames: Iterable[str | int] | None) -> tuple[str, ...]:
         if split is not None:
-            known = [line.text for line in read_lines(split)]
+            known = list(dict.fromkeys(line.text for line in read_lines(split)))
         else:
             folder = self.detections_dir / "data"
             known = sorted(path.stem for path in (folder if folder.is_dir() else self.detections_dir).glob("*.txt"))

@@ -83,7 +83,7 @@ def match_masks(
     boxes_2d: NDArray[np.float64],  # (B, 4) in the image of the masks, pixels
     masks: Sequence[InstanceMask],
     further_boxes_2d: NDArray[np.float64] | None = None,  # (B, 4) a second opinion, NaN where there is none
-    cars: bool = True,
+    eligible: Sequence[bool] | None = None,
     min_overlap: float = MIN_OVERLAP,
 ) -> MaskMatches:
     """Match masks of one image to 2D boxes, by the larger of the overlaps with the file's box and the mask's own.
@@ -95,7 +95,7 @@ def match_masks(
         boxes_2d: where each detection is expected.
         masks: instances of one side.
         further_boxes_2d: another expectation for each detection; the larger overlap counts.
-        cars: whether masks of cars are to be matched, or those of all other classes.
+        eligible: which masks may be matched; default those of cars.
         min_overlap: pairs below are never made.
     """
     file_boxes, mask_boxes = (
@@ -105,7 +105,8 @@ def match_masks(
     expected = [boxes_2d] if further_boxes_2d is None else [boxes_2d, further_boxes_2d]
     overlaps = [np.nan_to_num(box_iou(a, b)) for a in expected for b in (file_boxes, mask_boxes)]
     overlap = np.maximum.reduce(overlaps)
-    overlap[:, [mask.is_car != cars for mask in masks]] = 0.0
+    allowed = [mask.is_car for mask in masks] if eligible is None else eligible
+    overlap[:, ~np.array(allowed, dtype=bool)] = 0.0
     return match_one_to_one(overlap, min_overlap)
 
 

@@ -40,14 +40,13 @@ class RefinedBox:
 def result_line(source: KittiObject, refined: RefinedBox) -> str:
     """The input line with its 3D box and alpha replaced; every other column keeps the text it had.
 
-        Example:
-            >>> from directshape_torch.io.image_files import read_file_bytes
-    from directshape_torch.io.kitti_labels import parse_object
-            >>> from directshape_torch.io.text_files import Line
-            >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
-            >>> box = RefinedBox((1.4, 1.7, 4.1), (1.1, 1.65, 19.5), 0.02, -0.0363)
-            >>> result_line(parse_object("results", Line(1, raw, raw)), box)
-            'Car -1 -1 -0.0363 5.25 6 70 80.5 1.4000 1.7000 4.1000 1.1000 1.6500 19.5000 0.0200 0.930'
+    Example:
+        >>> from directshape_torch.io.kitti_labels import parse_object
+        >>> from directshape_torch.io.text_files import Line
+        >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
+        >>> box = RefinedBox((1.4, 1.7, 4.1), (1.1, 1.65, 19.5), 0.02, -0.0363)
+        >>> result_line(parse_object("results", Line(1, raw, raw)), box)
+        'Car -1 -1 -0.0363 5.25 6 70 80.5 1.4000 1.7000 4.1000 1.1000 1.6500 19.5000 0.0200 0.930'
     """
     words = source.raw_line.split()
     numbers = [refined.alpha, *refined.hwl, *refined.location_ref, refined.rotation_y]

@@ -15,6 +15,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +61,21 @@ def hash_bytes(content: bytes) -> str:
 
 
 def hash_file(path: Path | str) -> str:
-    """The sha256 of a file, hexadecimal.
+    """The sha256 of a file, hexadecimal; remembered while its size and time of change stay the same.
 
     Raises:
         DataFormatError: it cannot be read.
     """
+    path = Path(path)
+    if not path.is_file():
+        return hash_bytes(read_file_bytes(path))
+    state = path.stat()
+    return _hash_in_state(path, state.st_size, state.st_mtime_ns)
+
+
+# Mask files of a whole data set serve every frame, and may be large.
+@lru_cache(maxsize=256)
+def _hash_in_state(path: Path, _size_bytes: int, _changed_ns: int) -> str:
     return hash_bytes(read_file_bytes(path))
 
 

@@ -167,6 +167,17 @@ def test_occluder_with_a_detection_of_its_class_has_a_depth(root: Path) -> None:
     assert occluders.depth_m.tolist() == pytest.approx([9.003])
 
 
+def test_left_over_car_mask_takes_its_depth_from_a_van(root: Path) -> None:
+    path = root / "detections" / "data" / "000000.txt"
+    path.write_text(path.read_text().replace("Car -1 -1 0", "Van -1 -1 0", 1))
+    detections = dataset(root).load("000000").detections
+    assert len(detections) == 1
+    assert detections.occluders is not None
+    depths = detections.occluders.depth_m.tolist()
+    assert sorted(depth for depth in depths if depth == depth) == pytest.approx([30.003, 30.003])
+    assert len(depths) == 3
+
+
 def test_no_cars_in_the_frame(root: Path) -> None:
     (root / "detections" / "data" / "000000.txt").write_text("")
     loaded = dataset(root).load("000000")

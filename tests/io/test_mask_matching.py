@@ -76,12 +76,12 @@ def test_the_larger_of_file_box_and_mask_box_counts() -> None:
     assert match_masks(box, [wrong_file_box]).overlap.tolist() == [1.0]
 
 
-def test_other_classes_never_match_a_car_and_the_reverse() -> None:
+def test_other_classes_match_only_where_they_are_asked_for() -> None:
     box = np.array([[100.0, 50, 200, 100]])
     pedestrian = mask((100, 50, 200, 100), is_car=False)
     car = mask((100, 50, 190, 100))
     assert match_masks(box, [pedestrian, car]).mask_of_detection.tolist() == [1]
-    assert match_masks(box, [pedestrian, car], cars=False).mask_of_detection.tolist() == [0]
+    assert match_masks(box, [pedestrian, car], eligible=[True, False]).mask_of_detection.tolist() == [0]
 
 
 def test_second_opinion_is_used_where_it_is_there() -> None:

@@ -95,5 +95,8 @@ def test_hashes(tmp_path: Path) -> None:
     # FIPS 180-2, appendix B.1
     assert hash_file(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert hash_files({"one": path}) == {"one": hash_file(path)}
+    path.write_bytes(b"")
+    # FIPS 180-2 for the empty message: the changed file is hashed anew.
+    assert hash_file(path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     with pytest.raises(DataFormatError, match="missing: cannot be read"):
         hash_file(tmp_path / "missing")
