@@ -7,29 +7,15 @@ with the centre of the top-left pixel at (0, 0).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
+from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-
-
-def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str], cure: str = "") -> None:
-    """Raise `InputError` unless `tensor` has the expected shape; letters stand for any size.
-
-    Example:
-        >>> check_shape("points", torch.zeros(7, 3), ("P", 3))
-    """
-    fits = tensor.ndim == len(expected) and all(
-        isinstance(want, str) or want == have for want, have in zip(expected, tensor.shape, strict=True)
-    )
-    if not fits:
-        wanted = "(" + ", ".join(str(n) for n in expected) + ")"
-        raise InputError(name, f"shape {wanted}", f"{tuple(tensor.shape)}", cure)
 
 
 class _TensorRecord:
