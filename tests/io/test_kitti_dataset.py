@@ -147,6 +147,23 @@ def test_a_mask_in_one_image_only_and_none_at_all(root: Path) -> None:
     assert not without.has_mask_right.any()
 
 
+def test_right_mask_of_a_hidden_car_is_found_by_way_of_the_left_one(root: Path) -> None:
+    """A quarter of the car shows in both images: too little for its projected box, but the same part in both."""
+    left, right = boxes(CARS["near"])
+    quarter_left, quarter_right = left.copy(), right.copy()
+    quarter_left[2] = left[0] + 0.25 * (left[2] - left[0])
+    quarter_right[2] = right[0] + 0.25 * (right[2] - right[0])
+    seen_left = instance("left", quarter_left, 1)
+    seen_left["bbox"] = [left[0], left[1], left[2] - left[0] + 1, left[3] - left[1] + 1]
+    path = root / "masks" / "000000.json"
+    path.write_text(json.dumps([seen_left, instance("right", quarter_right, 9)]))
+    loaded = dataset(root).load("000000")
+    assert loaded.matching.instance_left == (-1, 1)
+    assert loaded.matching.instance_right == (-1, 9)
+    path.write_text(json.dumps([instance("right", quarter_right, 9)]))
+    assert dataset(root).load("000000").matching.instance_right == (-1, -1)
+
+
 def test_other_instances_are_occluders(root: Path) -> None:
     occluders = dataset(root).load("000000").detections.occluders
     assert occluders is not None
