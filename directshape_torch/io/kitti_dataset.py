@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -74,7 +74,7 @@ class KittiStereoDataset:
 
     Raises:
         DataFormatError: a folder or the split file is missing.
-        InputError: no frames, or frames without a detection file.
+        InputError: no frames, frames without a detection file, or an unknown `ground`.
     """
 
     def __init__(
@@ -91,6 +91,8 @@ class KittiStereoDataset:
         disparity_field: DisparityField | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
+        if ground not in get_args(GroundSource):
+            raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
         self.training = _existing_folder(Path(root) / "training", "holds no folder 'training' in KITTI's layout")
         self.detections_dir = _existing_folder(Path(detections_dir), "is no folder of detections")
         self.masks = mask_source(masks) if isinstance(masks, (str, Path)) else masks

@@ -253,6 +253,8 @@ def test_ground_source_can_be_forced(root: Path, monkeypatch: pytest.MonkeyPatch
     fake_estimator(monkeypatch, (torch.tensor([0.0, -1.0, 0.0]), torch.tensor(1.7)))
     assert dataset(root, ground="stereo").load("000000").frame.ground.source == ("stereo",)
     assert dataset(root, ground="camera_height").load("000000").frame.ground.source == ("camera_height",)
+    with pytest.raises(InputError, match="ground: expected one of auto, file, stereo, camera_height, got 'lidar'"):
+        dataset(root, ground="lidar")
     (root / "training" / "planes" / "000000.txt").unlink()
     with pytest.raises(DataFormatError, match=r"planes/000000\.txt: cannot be read"):
         dataset(root, ground="file").load("000000")

@@ -1,0 +1,108 @@
+"""The result of a refinement as the files of each frame: `data/NNNNNN.txt` and `shapes/NNNNNN.npz`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.box3d import alpha_from_kitti
+from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.io.result_files import RefinedBox, ShapeArrays, write_result_text, write_shapes
+from directshape_torch.result import RefinementResult
+
+
+def result_path(out_dir: Path | str, frame_id: str) -> Path:
+    """The KITTI result file of a frame."""
+    return Path(out_dir) / "data" / f"{frame_id}.txt"
+
+
+def shapes_path(out_dir: Path | str, frame_id: str) -> Path:
+    """The file of states and shapes of a frame."""
+    return Path(out_dir) / "shapes" / f"{frame_id}.npz"
+
+
+def write_refinement(
+    out_dir: Path | str, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, first_row: int = 0
+) -> None:
+    """Write both files of a frame.
+
+    Args:
+        out_dir: the output folder.
+        loaded: the frame as it was read.
+        result: of a call with this frame's detections, alone or in a batch (`collate`).
+        prior_sha256: of the shape prior.
+        first_row: where the frame's detections begin in `result`.
+
+    Raises:
+        InputError: the result does not cover the frame's detections.
+    """
+    num_cars = len(loaded.detections)
+    if first_row + num_cars > len(result):
+        raise InputError("result", f"at least {first_row + num_cars} cars", f"{len(result)}")
+    rows = torch.arange(first_row, first_row + num_cars, device=result.T_cam_obj.device)
+    shapes = shape_arrays(loaded, result, prior_sha256, rows)
+    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
+    # The text last: where it exists, the frame is complete.
+    boxes = refined_boxes(loaded, shapes, result.refined[rows].tolist())
+    write_result_text(result_path(out_dir, loaded.frame_id), loaded.input_objects, boxes)
+
+
+def refined_boxes(loaded: LoadedFrame, shapes: ShapeArrays, refined: Sequence[bool]) -> dict[int, RefinedBox]:
+    """The new box of each input line whose car was refined; all others keep their line."""
+    location_ref, rotation_y = (
+        torch.from_numpy(array).double() for array in (shapes.boxes_location_ref, shapes.boxes_rotation_y)
+    )
+    alpha = alpha_from_kitti(location_ref, rotation_y).tolist()
+    return {
+        line: RefinedBox(
+            hwl=_triple(shapes.boxes_hwl[car]),
+            location_ref=_triple(shapes.boxes_location_ref[car]),
+            rotation_y=float(shapes.boxes_rotation_y[car]),
+            alpha=alpha[car],
+        )
+        for car, line in enumerate(loaded.row_of_detection)
+        if refined[car]
+    }
+
+
+def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, rows: Tensor) -> ShapeArrays:
+    """What `shapes/NNNNNN.npz` holds, for the given rows of a result."""
+    boxes = result.boxes()
+    statuses = [result.status[row] for row in rows.tolist()]
+    lines = [loaded.input_objects[row].line_number for row in loaded.row_of_detection]
+    return ShapeArrays(
+        frame_id=loaded.frame_id,
+        prior_sha256=prior_sha256,
+        ground_source=loaded.frame.ground.source[0],
+        input_lines=np.array(lines, dtype=np.int64),
+        T_cam_obj=_numpy(result.T_cam_obj[rows]),
+        T_ref_obj=_numpy(result.T_ref_obj[rows]),
+        boxes_hwl=_numpy(boxes.dimensions_hwl[rows]),
+        boxes_location_ref=_numpy(boxes.location_ref[rows]),
+        boxes_rotation_y=_numpy(boxes.rotation_y[rows]),
+        codes=_numpy(result.code[rows]),
+        covariances=_numpy(result.covariance[rows]),
+        covariances_ref=_numpy(result.covariance_xyz_yaw[rows]),
+        statuses=tuple(status.name for status in statuses),
+        messages=tuple(status.value for status in statuses),
+        term_names=result.term_names,
+        costs_before=_numpy(result.cost_before[rows]),
+        costs_after=_numpy(result.cost_after[rows]),
+        iterations=_numpy(result.iterations[rows]).astype(np.int64),
+    )
+
+
+def _numpy(tensor: Tensor) -> NDArray[Any]:
+    return np.asarray(tensor.detach().cpu().numpy())
+
+
+def _triple(values: NDArray[Any]) -> tuple[float, float, float]:
+    first, second, third = (float(value) for value in values)
+    return first, second, third
