@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -75,3 +76,14 @@ def test_exact_masks_and_boxes_pair_with_their_own_label() -> None:
         expected = [1001 + row for row in frame.row_of_detection]
         for found in (frame.matching.instance_left, frame.matching.instance_right):
             assert [a == b or a == -1 for a, b in zip(found, expected, strict=True)] == [True] * len(expected)
+
+
+def test_ground_of_a_real_stereo_pair_is_near_the_plane_of_its_file() -> None:
+    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
+    folders = root, root / "detections" / "noisy_stereo"
+    from_stereo, from_file = (
+        KittiStereoDataset(*folders, ground=source).load("000107").frame.ground for source in ("stereo", "file")
+    )
+    assert (from_stereo.source, from_file.source) == (("stereo",), ("file",))
+    assert float((from_stereo.normal * from_file.normal).sum()) > math.cos(math.radians(1.0))
+    assert float((from_stereo.offset - from_file.offset).abs()) < 0.05
