@@ -78,7 +78,7 @@ def box_corners(
 ) -> Tensor:
     """The 8 corners (*, 8, 3) of boxes standing on the origin of their object frame, in frame a.
 
-    Order: the four ground corners (front left of travel first, then round), then the four above them.
+    Order: the four ground corners (front right of travel first, then round), then the four above them.
 
     Example:
         >>> corners = box_corners(torch.eye(4), torch.tensor([1.5, 1.6, 4.0]))

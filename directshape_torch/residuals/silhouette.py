@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import logsigmoid, softplus
+from torch.nn.functional import logsigmoid
 
 
 class Projection(NamedTuple):
@@ -47,7 +47,8 @@ def project_product(
         >>> project_product(torch.zeros(1, 1), torch.ones(1)).log_miss.exp()
         tensor([0.5000])
     """
-    log_miss = -softplus(-zeta[:, None] * sdf).sum(dim=1)
+    # -softplus(-x) = logsigmoid(x), which has no cut-off, unlike `softplus`.
+    log_miss = logsigmoid(zeta[:, None] * sdf).sum(dim=1)
     return Projection(log_one_minus_exp(log_miss), log_miss)
 
 

@@ -104,27 +104,34 @@ def first_crossing(
 def _false_position(
     shape: BoundShape, rays: ObjectRays, a: Tensor, b: Tensor, value_a: Tensor, value_b: Tensor, iterations: int
 ) -> Tensor:
-    root = b
+    best, best_value = b, value_b
+    previous = torch.zeros_like(b, dtype=torch.int8)
     for _ in range(iterations):
         slope = value_a - value_b
         share = torch.where(slope > 0, value_a / torch.where(slope > 0, slope, torch.ones_like(slope)), slope + 0.5)
         root = a + share.clamp(0, 1) * (b - a)
         value = shape.value(rays.at(root), rays.object_index)
         below = value < 0
-        # Illinois: halving the value of the end that stays makes the convergence superlinear.
-        a, value_a = torch.where(below, a, root), torch.where(below, value_a * 0.5, value)
-        b, value_b = torch.where(below, root, b), torch.where(below, value, value_b * 0.5)
-    return root
+        nearer = value.abs() < best_value.abs()
+        best, best_value = torch.where(nearer, root, best), torch.where(nearer, value, best_value)
+        side = torch.where(below, -1, 1).to(torch.int8)
+        # Illinois: halving the value of an end that stays a second time makes the convergence superlinear.
+        stale = torch.where(side == previous, 0.5, 1.0).to(value.dtype)
+        a, value_a = torch.where(below, a, root), torch.where(below, value_a * stale, value)
+        b, value_b = torch.where(below, root, b), torch.where(below, value, value_b * stale)
+        previous = side
+    return best
 
 
 def attached_depth(shape: BoundShape, rays: ObjectRays, root: Tensor, usable: Tensor) -> Tensor:
     """The depth of the root as a differentiable function of rays and shape: two Newton steps from the detached root.
 
-    One step has the right first derivative but a wrong second one. Values stay what they are to rounding.
+    One step has the right first derivative but a wrong second one. The value is that of the detached root to the bit,
+    so a differentiable cost equals the linearised one.
     """
     depth = root
     for _ in range(2):
         at = shape.value_and_derivatives(rays.at(depth), rays.object_index)
         slope = (at.gradient * rays.direction_obj).sum(-1)
         depth = depth - torch.where(usable, at.value / torch.where(usable, slope, torch.ones_like(slope)), 0 * slope)
-    return depth
+    return root + (depth - depth.detach())

@@ -87,7 +87,8 @@ class GridShape:
     def _cells(self, points_obj: Tensor) -> _Cells:
         position = (points_obj - self.origin) * (1 / self.spacing_m)
         clamped = torch.minimum(position.clamp_min(0), self._last_node)
-        lower = torch.minimum(clamped.detach().floor(), self._last_node - 1)
+        # `fmin` and not `minimum`: a NaN point gets a valid cell and a NaN value, so it cannot disturb other points.
+        lower = torch.fmin(clamped.detach().floor(), self._last_node - 1)
         nx, ny, nz = lower.long().unbind(-1)
         flat = nx * self._strides[0] + ny * self._strides[1] + nz
         return _Cells(flat, clamped - lower, position - clamped)

@@ -14,20 +14,21 @@ _BLOCK = 64
 class Segments:
     """Rows of several objects, sorted by object, cut into blocks of equal size for batched products.
 
-    Sums over blocks are products of matrices of fixed shape, hence the same to the bit from run to run on any device;
-    an atomic `index_add_` on a GPU would not be.
+    Blocks are products of matrices of fixed shape, and the blocks of an object are added in a fixed order, hence the
+    sums are the same to the bit from run to run on any device; an atomic `index_add_` on a GPU would not be. No row
+    enters the sum of another object, not even with weight zero: NaN in one object stays there.
 
     Attributes:
         object_index: (P,) object of each row, ascending.
         counts: (B,) rows of each object.
         block_rows: (M, 64) row numbers; P stands for an empty place.
-        block_owner: (B, M) float64, one where a block belongs to an object.
+        object_blocks: (B, 2^n) block numbers of each object, in order; M stands for an empty place.
     """
 
     object_index: Tensor
     counts: Tensor
     block_rows: Tensor
-    block_owner: Tensor
+    object_blocks: Tensor
 
     @classmethod
     def from_sorted_index(cls, object_index: Tensor, num_objects: int) -> Segments:
@@ -45,8 +46,11 @@ class Segments:
         block_in_object = torch.arange(len(owner), device=counts.device) - first_block[owner]
         place = block_in_object[:, None] * _BLOCK + torch.arange(_BLOCK, device=counts.device)
         rows = torch.where(place < counts[owner][:, None], first_row[owner][:, None] + place, len(object_index))
-        member = owner[None] == torch.arange(num_objects, device=counts.device)[:, None]
-        return cls(object_index, counts, rows, member.to(torch.float64))
+        # A power of two for the pairwise sums; its shape is known from the longest object.
+        longest = int(num_blocks.max()) if num_objects else 0
+        place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=counts.device)
+        blocks = torch.where(place < num_blocks[:, None], first_block[:, None] + place, len(owner))
+        return cls(object_index, counts, rows, blocks)
 
     @property
     def num_objects(self) -> int:
@@ -56,9 +60,17 @@ class Segments:
         padded = torch.cat([rows, rows.new_zeros(1, *rows.shape[1:])])
         return padded[self.block_rows].to(torch.float64)
 
+    def _over_blocks(self, per_block: Tensor) -> Tensor:
+        """Sums (B, ...) of the blocks (M, ...) of each object, pairwise: empty places change no bit."""
+        padded = torch.cat([per_block, per_block.new_zeros(1, *per_block.shape[1:])])
+        part = padded[self.object_blocks]
+        while part.shape[1] > 1:
+            part = part[:, 0::2] + part[:, 1::2]
+        return part[:, 0]
+
     def sum(self, values: Tensor) -> Tensor:
         """Sum (B,) of values (P,) over the rows of each object, float64; differentiable."""
-        return self.block_owner @ self._blocks(values).sum(dim=1)
+        return self._over_blocks(self._blocks(values).sum(dim=1))
 
     def accumulate(
         self,
@@ -70,6 +82,4 @@ class Segments:
         J = self._blocks(rows)
         weighted = J * self._blocks(hessian_weight)[..., None]
         gradient = (self._blocks(gradient_weight)[:, None] @ J)[:, 0]
-        hessian = weighted.transpose(1, 2) @ J
-        d = rows.shape[1]
-        return self.block_owner @ gradient, (self.block_owner @ hessian.reshape(-1, d * d)).reshape(-1, d, d)
+        return self._over_blocks(gradient), self._over_blocks(weighted.transpose(1, 2) @ J)
