@@ -93,6 +93,7 @@ class PhotometricConfig:
         huber_grey_levels: corner of the Huber norm (gamma).
         gradient_constant_grey_levels: c of the gradient weight c^2 / (c^2 + |grad I_l|^2).
         lost_grey_levels: a pixel of the set that loses its hit or leaves the right image pays the Huber norm of this.
+        truncated: residuals beyond lost_grey_levels (reflections, wrong matches) cost no more than a lost pixel.
         pixel_set: "hit" (the paper) or "hit_and_mask" (hit and p_fg > 0.5).
         min_ray_cosine: rays closer to the surface's tangent are grazing and lost.
         gain: match brightness and contrast of the two images per car at the start of each stage.
@@ -101,7 +102,8 @@ class PhotometricConfig:
     weight: float = 1.0
     huber_grey_levels: float = 9.0
     gradient_constant_grey_levels: float = 50.0
-    lost_grey_levels: float = 30.0
+    lost_grey_levels: float = 15.0
+    truncated: bool = False
     pixel_set: Literal["hit", "hit_and_mask"] = "hit_and_mask"
     min_ray_cosine: float = 0.1
     gain: bool = True

@@ -106,7 +106,7 @@ class PhotometricTerm:
     def pixel_cost(self, projected: ProjectedState) -> Tensor:
         """Weighted Huber norm (Q,), summed over the neighbourhood, of each pixel of the set; differentiable."""
         usable, residual = self._usable_and_residual(projected, attached=True)
-        rho = robust.huber(residual.residual, self.config.huber_grey_levels).rho
+        rho = self._norm(residual.residual).rho
         return torch.where(usable, rho.sum(dim=1), self._lost_cost()) * self._require().gradient_weight
 
     def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
@@ -117,7 +117,7 @@ class PhotometricTerm:
         depth = depth_state_jacobian(points, at, surface.rays.direction_obj, self.config.min_ray_cosine)
         residual = self._residual(surface.root.depth)
         usable = self._is_usable(surface.root.found & ~depth.grazing, residual)
-        norm = robust.huber(residual.residual, self.config.huber_grey_levels)
+        norm = self._norm(residual.residual)
         weight = torch.where(usable, fixed.gradient_weight, torch.zeros_like(fixed.gradient_weight))
         # All neighbours share one depth, so their rows are multiples of one: sum the multiples first.
         J = residual.J_residual_depth
@@ -162,6 +162,11 @@ class PhotometricTerm:
     def _weight(self) -> Tensor:
         counts = self._require().segments.counts.clamp_min(1).to(torch.float64)
         return self.config.weight / (counts * len(DSO_PATTERN))
+
+    def _norm(self, residual: Tensor) -> robust.RobustValue:
+        if self.config.truncated:
+            return robust.truncated_huber(residual, self.config.huber_grey_levels, self.config.lost_grey_levels)
+        return robust.huber(residual, self.config.huber_grey_levels)
 
     def _lost_cost(self) -> Tensor:
         """What a pixel of the set pays that cannot be compared any more: the Huber norm truncated there."""

@@ -41,6 +41,18 @@ def huber(residual: Tensor, corner: float) -> RobustValue:
     return RobustValue(rho, weight * residual, weight)
 
 
+def truncated_huber(residual: Tensor, corner: float, limit: float) -> RobustValue:
+    """Huber's norm that stays constant beyond `limit`: a reflection is no worse than a pixel that is lost.
+
+    Example:
+        >>> truncated_huber(torch.tensor(99.0), 2.0, 3.0).rho
+        tensor(4.)
+    """
+    norm = huber(residual.clamp(-limit, limit), corner)
+    beyond = residual.abs() >= limit
+    return RobustValue(norm.rho, norm.gradient_weight.masked_fill(beyond, 0), norm.hessian_weight.masked_fill(beyond, 0))
+
+
 def identity(residual: Tensor, floor: float) -> RobustValue:
     """`rho = r` for non-negative residuals, as reweighted least squares: weight 1/r, r floored (paper, E_silh as IRLS).
 
