@@ -208,7 +208,7 @@ def cell_thresholds(
     wanted = torch.ones(num_frames, rows, columns, dtype=torch.bool, device=magnitude.device)
     if needed is not None:
         # Smoothing reads the neighbours of a needed cell.
-        wanted = torch.nn.functional.max_pool2d(needed.to(magnitude.dtype), 3, stride=1, padding=1) > 0
+        wanted = torch.nn.functional.max_pool2d(needed.to(magnitude.dtype)[:, None], 3, stride=1, padding=1)[:, 0] > 0
     medians = magnitude.new_full((num_frames, rows, columns), torch.nan)
     medians[wanted] = _cell_medians(magnitude, sizes, wanted, settings.threshold_cell_px)
     return _mean_of_neighbours(medians) + settings.threshold_offset_grey

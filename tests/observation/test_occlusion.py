@@ -1,0 +1,179 @@
+"""Occlusion: order, hidden pixels, crops, against hand-made scenes and a slow reference."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.observation.occlusion import hidden_pixels, instances_in_front, occlusion_crops
+from directshape_torch.observation.pixel_sampling import region_pixels
+from directshape_torch.scene import Detections, Occluders
+
+HEIGHT, WIDTH = 20, 30
+
+
+def scene(
+    depth_m: list[float],
+    bottom_v: list[float],
+    masks: Tensor | None = None,
+    frame: list[int] | None = None,
+    occluders: Occluders | None = None,
+) -> Detections:
+    count = len(depth_m)
+    T_cam_obj = torch.eye(4).repeat(count, 1, 1)
+    T_cam_obj[:, 2, 3] = torch.tensor(depth_m)
+    box = torch.zeros(count, 4)
+    box[:, 3] = torch.tensor(bottom_v)
+    masks = torch.zeros(count, HEIGHT, WIDTH) if masks is None else masks
+    present = torch.ones(count, dtype=torch.bool)
+    return Detections(
+        frame_index=torch.tensor(frame or [0] * count, dtype=torch.long),
+        T_cam_obj=T_cam_obj,
+        dimensions_hwl=torch.ones(count, 3),
+        box_2d=box,
+        score=torch.ones(count),
+        mask_left=masks,
+        mask_right=masks.roll(3, dims=2),
+        has_mask_left=present,
+        has_mask_right=present,
+        occluders=occluders,
+    )
+
+
+def squares(*boxes: tuple[int, int, int, int]) -> Tensor:
+    masks = torch.zeros(len(boxes), HEIGHT, WIDTH)
+    for mask, (u0, v0, u1, v1) in zip(masks, boxes, strict=True):
+        mask[v0:v1, u0:u1] = 1.0
+    return masks
+
+
+def all_pixels(count: int) -> tuple[Tensor, Tensor]:
+    return region_pixels(torch.tensor([[0, 0, WIDTH, HEIGHT]] * count))
+
+
+def test_depth_and_box_order_disagree() -> None:
+    detections = scene([10.0, 20.0], [150.0, 180.0])
+    assert instances_in_front(detections, "left", "depth").tolist() == [[False, True], [False, False]]
+    assert instances_in_front(detections, "left", "box_bottom").tolist() == [[False, False], [True, False]]
+
+
+@pytest.mark.parametrize("unknown", [torch.nan, -3.0])
+def test_unknown_depth_falls_back_to_the_box(unknown: float) -> None:
+    # The pair 0, 1 has depths; every pair with 2 goes by the boxes: 2 is in front of 0 (bottom 150), behind 1 (180).
+    in_front = instances_in_front(scene([10.0, 20.0, unknown], [150.0, 180.0, 160.0]), "left")
+    assert in_front.nonzero().tolist() == [[0, 1], [1, 2], [2, 0]]
+
+
+def test_equals_other_frames_and_absent_masks_hide_nothing() -> None:
+    assert not instances_in_front(scene([10.0, 10.0], [1.0, 2.0]), "left").any()
+    assert not instances_in_front(scene([10.0, 20.0], [2.0, 1.0], frame=[0, 1]), "left").any()
+    blind = replace(scene([10.0, 20.0], [2.0, 1.0]), has_mask_left=torch.tensor([False, True]))
+    assert not instances_in_front(blind, "left").any()
+    assert instances_in_front(blind, "right").any()
+
+
+def test_hidden_pixels_are_the_mask_in_front() -> None:
+    masks = squares((5, 5, 15, 15), (10, 8, 25, 18))
+    detections = scene([10.0, 20.0], [15.0, 18.0], masks)
+    object_index, uv = all_pixels(2)
+    for side, expected in (("left", masks[0]), ("right", masks[0].roll(3, dims=1))):
+        hidden = hidden_pixels(detections, side, object_index, uv).reshape(2, HEIGHT, WIDTH)
+        assert not hidden[0].any()
+        assert torch.equal(hidden[1], expected > 0.5)
+
+
+def test_half_probability_does_not_hide() -> None:
+    masks = squares((0, 0, 4, 4), (0, 0, 4, 4))
+    masks[0] *= 0.5
+    masks[0, 1, 2] = 0.51
+    object_index, uv = all_pixels(2)
+    hidden = hidden_pixels(scene([5.0, 9.0], [0.0, 0.0], masks), "left", object_index, uv)
+    assert uv[hidden].tolist() == [[2, 1]]
+
+
+def test_other_classes_hide() -> None:
+    pedestrian = squares((2, 2, 6, 12))
+    occluders = Occluders(
+        frame_index=torch.tensor([0]),
+        mask_left=pedestrian > 0.5,  # bool beside the cars' probabilities
+        mask_right=pedestrian > 0.5,
+        depth_m=torch.tensor([torch.nan]),
+        bottom_v=torch.tensor([17.0]),
+    )
+    detections = scene([10.0, 20.0], [18.0, 15.0], squares((0, 0, 1, 1), (0, 0, 30, 20)), occluders=occluders)
+    assert instances_in_front(detections, "left").nonzero().tolist() == [[0, 1], [2, 1]]
+    hidden = hidden_pixels(
+        detections, "left", torch.tensor([1, 1, 1, 0]), torch.tensor([[2, 2], [6, 2], [0, 0], [2, 2]])
+    )
+    assert hidden.tolist() == [True, False, True, False]
+
+
+def test_random_scenes_equal_a_loop() -> None:
+    generator = torch.Generator().manual_seed(0)
+    count = 7
+    masks = (torch.rand(count, HEIGHT, WIDTH, generator=generator) > 0.7).float()
+    depth = [12.0, torch.nan, 9.0, 30.0, 8.0, 15.0, -1.0]
+    frame = [0, 0, 1, 0, 1, 0, 0]
+    detections = scene(depth, [100.0, 90.0, 95.0, 80.0, 99.0, 97.0, 85.0], masks, frame)
+    in_front = instances_in_front(detections, "left")
+    object_index, uv = all_pixels(count)
+    hidden = hidden_pixels(detections, "left", object_index, uv).reshape(count, HEIGHT, WIDTH)
+    for j in range(count):
+        expected = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+        for i in range(count):
+            if in_front[i, j]:
+                expected |= masks[i] > 0.5
+        assert torch.equal(hidden[j], expected)
+    permutation = torch.tensor([3, 0, 6, 2, 5, 1, 4])
+    permuted = scene(
+        [depth[i] for i in permutation],
+        [[100.0, 90.0, 95.0, 80.0, 99.0, 97.0, 85.0][i] for i in permutation],
+        masks[permutation],
+        [frame[i] for i in permutation],
+    )
+    assert torch.equal(hidden_pixels(permuted, "left", object_index, uv).reshape_as(hidden), hidden[permutation])
+
+
+def test_crops_equal_hidden_pixels() -> None:
+    detections = scene([10.0, 20.0, 30.0], [15.0, 18.0, 9.0], squares((5, 5, 15, 15), (10, 8, 25, 18), (0, 0, 30, 20)))
+    regions = torch.tensor([[4, 4, 16, 16], [8, 6, 27, 20], [0, 0, 0, 0]])
+    crops = occlusion_crops(detections, "left", regions)
+    assert crops.crop(1).shape == (14, 19)
+    expected = torch.zeros(14, 19, dtype=torch.bool)
+    expected[:9, :7] = True  # square 5..14 seen from the corner (8, 6)
+    assert torch.equal(crops.crop(1), expected)
+    # Nearest pixel of a real-valued point; outside of the region, and an empty region, hide nothing.
+    uv = torch.tensor([[14.4, 14.4], [14.6, 14.4], [5.0, 5.0], [torch.nan, 9.0], [torch.inf, 9.0]])
+    assert crops.at(torch.tensor(1), uv).tolist() == [True, False, False, False, False]
+    assert not crops.at(torch.tensor(2), uv).any()
+    assert crops.at(torch.tensor([[0], [1]]), uv.expand(2, 5, 2)).shape == (2, 5)
+
+
+def test_outside_the_image_and_no_objects() -> None:
+    detections = scene([10.0, 20.0], [0.0, 0.0], torch.ones(2, HEIGHT, WIDTH))
+    uv = torch.tensor([[-1, 0], [0, -1], [WIDTH, 0], [0, HEIGHT], [WIDTH - 1, HEIGHT - 1]])
+    hidden = hidden_pixels(detections, "left", torch.ones(5, dtype=torch.long), uv)
+    assert hidden.tolist() == [False, False, False, False, True]
+    nobody = scene([], [], torch.zeros(0, HEIGHT, WIDTH))
+    none = torch.zeros(0, dtype=torch.long)
+    assert hidden_pixels(nobody, "left", none, none.reshape(0, 2)).shape == (0,)
+    assert occlusion_crops(nobody, "left", none.reshape(0, 4)).hidden.shape == (0,)
+
+
+def test_wrong_input_is_named() -> None:
+    detections = scene([10.0], [0.0])
+    index, uv = torch.tensor([0]), torch.tensor([[0, 0]])
+    with pytest.raises(InputError, match="uv: expected integer pixels"):
+        hidden_pixels(detections, "left", index, uv.float())
+    with pytest.raises(InputError, match=r"object_index: expected shape \(1,\), got \(0,\)"):
+        hidden_pixels(detections, "left", index[:0], uv)
+    with pytest.raises(InputError, match="order: expected 'depth' or 'box_bottom', got 'height'"):
+        hidden_pixels(detections, "left", index, uv, "height")
+    with pytest.raises(InputError, match="side: expected 'left' or 'right', got 'top'"):
+        hidden_pixels(detections, "top", index, uv)
+    with pytest.raises(InputError, match=r"regions: expected shape \(1, 4\)"):
+        occlusion_crops(detections, "left", torch.zeros(2, 4).long())
