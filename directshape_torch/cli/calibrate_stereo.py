@@ -1,0 +1,116 @@
+"""`directshape calibrate-stereo`: fit the residual disparity field of a rig."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from directshape_torch.calibration.fit_disparity_field import FitStatistics
+    from directshape_torch.calibration.kitti_observations import RigFrame, TruthSource
+
+_DESCRIPTION = """Fit the residual disparity field of a stereo rig, measured minus true disparity as a smooth function
+of the left pixel, and write it to a JSON file for 'directshape refine --stereo-bias'. True disparities come from maps (training/disp_noc_0 or disp_occ_0), LiDAR scans (training/velodyne), or, much weaker, 3D box labels
+(training/label_2)."""
+
+
+# argparse's own type for this argument is private, hence the generic `_SubParsersAction` in quotes.
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its options."""
+    parser = subparsers.add_parser(
+        "calibrate-stereo", help="fit the residual disparity field of a stereo rig", description=_DESCRIPTION
+    )
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="ROOT", help="folder with training/ in KITTI's layout"
+    )
+    parser.add_argument(
+        "--from",
+        dest="source",
+        choices=("disparity", "lidar", "labels"),
+        required=True,
+        help="where the truth comes from",
+    )
+    parser.add_argument("--frames", nargs="+", metavar="ID", help="frame ids; default all that have such a file")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.json", help="field to write")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="picture of the fit; default beside --out")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, write the field and its picture, report; 0, or 1 where nothing could be fitted.
+
+    Raises:
+        DirectShapeError: a missing or damaged file, frames of several rigs, or too few observations.
+    """
+    # Imported here so that `directshape --help` does not wait for torch.
+    from directshape_torch.calibration.disparity_observations import concatenate
+    from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
+    from directshape_torch.calibration.kitti_observations import check_one_rig
+    from directshape_torch.io.atomic_files import write_png
+    from directshape_torch.visualize.disparity_field_picture import draw_disparity_field
+
+    frames = _observe(args.data, args.source, args.frames)
+    if not frames:
+        print("error: no frame could be read", file=sys.stderr)
+        return 1
+    check_one_rig(frames)
+    observations = concatenate([frame.observations for frame in frames])
+    names = tuple(frame.frame_id for frame in frames)
+    fit = fit_disparity_field(observations, frames[0].size_wh, frames[0].camera, args.source, names)
+    picture = args.picture or args.out.with_suffix(".png")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    fit.field.save(args.out)
+    write_png(picture, draw_disparity_field(fit.field, observations.uv_left, observations.bias_px))
+    print(report(fit.statistics, args.source, len(frames)))
+    print(f"wrote {args.out} and {picture}")
+    return 0
+
+
+def _observe(root: Path, source: TruthSource, wanted: list[str] | None) -> list[RigFrame]:
+    """Every frame that can be read; one that cannot is reported and left out."""
+    from tqdm import tqdm
+
+    from directshape_torch.calibration.kitti_observations import choose_frames, observe_frame, truth_files
+    from directshape_torch.errors import DataFormatError
+
+    files = truth_files(root, source)
+    frames = []
+    for frame_id in tqdm(choose_frames(files, wanted), desc="frames", unit="frame", disable=not sys.stderr.isatty()):
+        try:
+            frames.append(observe_frame(root, frame_id, files[frame_id], source))
+        except DataFormatError as error:
+            print(f"frame {frame_id} left out: {error}", file=sys.stderr)
+    return frames
+
+
+def report(statistics: FitStatistics, source: TruthSource, num_frames: int) -> str:
+    """What was fitted, how well, and where the image is not covered, as text."""
+    lines = [
+        f"{statistics.num_points} points of {num_frames} frame(s), truth from {source}",
+        "measured - true disparity [px]     median     MAD",
+        f"  before                         {statistics.median_before_px:+8.3f} {statistics.mad_before_px:7.3f}",
+        f"  after                          {statistics.median_after_px:+8.3f} {statistics.mad_after_px:7.3f}",
+    ]
+    if source == "labels":
+        lines.append(
+            "note: boxes are not cars; expect 0.1 to 0.3 px, and prefer disparity maps or LiDAR where there are any"
+        )
+    if statistics.uncovered_cells:
+        lines.append(
+            f"warning: {100 * statistics.uncovered_share:.0f} % of the image (8 x 4 cells) has no data; "
+            "the field there is that of the nearest data:"
+        )
+        lines += [f"  {text}" for text in _cells_by_row(statistics.uncovered_cells)]
+    return "\n".join(lines)
+
+
+def _cells_by_row(cells: tuple[tuple[int, int], ...]) -> list[str]:
+    """Such as "row 1 of 4 (top): columns 1 2 3", counted from 1."""
+    place = {0: " (top)", 3: " (bottom)"}
+    return [
+        f"row {row + 1} of 4{place.get(row, '')}: columns {' '.join(str(column + 1) for _, column in group)} of 8"
+        for row, group in groupby(cells, key=lambda cell: cell[0])
+    ]
