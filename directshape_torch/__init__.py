@@ -1,1 +1,43 @@
 """Joint 3D pose and shape refinement of cars from stereo images (DirectShape), in PyTorch."""
+
+from directshape_torch.config import RefinerConfig, load_config
+from directshape_torch.errors import (
+    ConfigError,
+    DataFormatError,
+    DirectShapeError,
+    InputError,
+    MeshError,
+    MissingDependencyError,
+    ResumeError,
+)
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import KittiBoxes, RefinementResult
+from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.status import Status
+
+__all__ = [
+    "ConfigError",
+    "DataFormatError",
+    "Detections",
+    "DirectShapeError",
+    "DirectShapeRefiner",
+    "DisparityField",
+    "FrameBatch",
+    "GroundPlane",
+    "InputError",
+    "KittiBoxes",
+    "MeshError",
+    "MissingDependencyError",
+    "Occluders",
+    "PCAShapePrior",
+    "RefinementResult",
+    "RefinerConfig",
+    "ResumeError",
+    "ShapePrior",
+    "Status",
+    "StereoCamera",
+    "load_config",
+]
