@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor, nn
@@ -74,9 +74,7 @@ class DirectShapeRefiner(nn.Module):
         outcome = None
         if len(rows):
             outcome = self._minimise(frames, _take(detections, rows), observation, usable)
-            state = CarState(
-                *(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True))
-            )
+            state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
         return _assemble(self.prior, frames, detections, state, status, rows, outcome)
 
@@ -103,10 +101,10 @@ class DirectShapeRefiner(nn.Module):
         has_mask = detections.has_mask_left | detections.has_mask_right
         safe = _replace_poses(detections, in_front)
         observation = pack_pixels(frames, safe, self.config.sampling)
-        counts = sum(
-            torch.bincount(side.object_index, minlength=len(detections)) for side in (observation.left, observation.right)
+        left, right = (
+            torch.bincount(x.object_index, minlength=len(safe)) for x in (observation.left, observation.right)
         )
-        too_few = counts < self.config.sampling.min_usable_pixels
+        too_few = left + right < self.config.sampling.min_usable_pixels
         for condition, status in (
             (too_few, Status.too_few_pixels),
             (~has_mask, Status.no_mask),
@@ -134,28 +132,18 @@ class DirectShapeRefiner(nn.Module):
         problem = CarProblem(self.prior, terms, reduced.left, reduced.right, self.config)
         initial = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
         start = search_start(problem, initial, frames, detections, self.config.search)
-        minimum = minimise(problem, start, self.config.solver)
-        cost_before, cost_after = problem.term_costs(initial), problem.term_costs(minimum.state)
-        worse = ~(cost_after.sum(1) <= cost_before.sum(1))
-        kept = torch.full_like(minimum.status, Status.rejected_worse.code)
-        status = torch.where(worse & _is_refined(minimum.status), kept, minimum.status)
-        back = ~_is_refined(status)
-        state = CarState(
-            torch.where(back[:, None, None], initial.T_obj_cam, minimum.state.T_obj_cam),
-            torch.where(back[:, None], initial.code, minimum.state.code),
-        )
-        cost_after = torch.where(back[:, None], cost_before, cost_after)
-        covariance = tangent_covariance(problem, state)
+        minimum = minimise(problem, initial, self.config.solver, start)
+        covariance = tangent_covariance(problem, minimum.state)
         return _Outcome(
-            state,
-            status,
+            minimum.state,
+            minimum.status,
             minimum.iterations,
             minimum.cost_history,
             tuple(term.name for term in terms),
-            cost_before,
-            cost_after,
+            problem.term_costs(initial),
+            problem.term_costs(minimum.state),
             covariance,
-            covariance_xyz_yaw(covariance, state.T_obj_cam),
+            covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
         )
 
 
@@ -174,23 +162,28 @@ class _Outcome:
     covariance_xyz_yaw: Tensor
 
 
+def _no_outcome(state: CarState, unknowns: int) -> _Outcome:
+    """The outcome of no cars at all."""
+    nothing = state.code.new_zeros(0, 0, dtype=torch.float64)
+    none = nothing.long()[:, 0:0].reshape(0)
+    square = nothing.reshape(0, unknowns, unknowns)
+    poses = nothing.reshape(0, 4, 4)
+    return _Outcome(
+        CarState(state.T_obj_cam[:0], state.code[:0]), none, none, nothing, (), nothing, nothing, square, poses
+    )
+
+
 def _is_refined(status: Tensor) -> Tensor:
     return (status == Status.converged.code) | (status == Status.max_iterations.code)
 
 
 def _take(detections: Detections, rows: Tensor) -> Detections:
-    from dataclasses import fields, replace
-
-    changed = {
-        f.name: getattr(detections, f.name)[rows] for f in fields(detections) if f.name != "occluders"
-    }
+    changed = {f.name: getattr(detections, f.name)[rows] for f in fields(detections) if f.name != "occluders"}
     return replace(detections, **changed)
 
 
 def _replace_poses(detections: Detections, good: Tensor) -> Detections:
     """Harmless poses for cars that will not be refined, so that their numbers can disturb nothing."""
-    from dataclasses import replace
-
     harmless = torch.eye(4, dtype=detections.T_cam_obj.dtype, device=detections.T_cam_obj.device)
     harmless[2, 3] = 10.0
     return replace(detections, T_cam_obj=torch.where(good[:, None, None], detections.T_cam_obj, harmless))
@@ -227,16 +220,14 @@ def _assemble(
     outcome: _Outcome | None,
 ) -> RefinementResult:
     count, unknowns = len(detections), 6 + prior.num_codes
-    names = () if outcome is None else outcome.term_names
+    if outcome is None:
+        outcome = _no_outcome(state, unknowns)
 
-    def spread(part: Tensor | None, *shape: int) -> Tensor:
-        full = torch.full((count, *shape), torch.nan, dtype=torch.float64, device=status.device)
-        return full if part is None else full.index_copy(0, rows, part.to(torch.float64))
+    def spread(part: Tensor) -> Tensor:
+        full = torch.full((count, *part.shape[1:]), torch.nan, dtype=torch.float64, device=status.device)
+        return full.index_copy(0, rows, part.to(torch.float64))
 
-    iterations = torch.zeros(count, dtype=torch.long, device=status.device)
-    steps = 0 if outcome is None else outcome.cost_history.shape[1]
-    if outcome is not None:
-        iterations = iterations.index_copy(0, rows, outcome.iterations)
+    iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
     refined = _is_refined(status)[:, None, None]
     # The input pose is returned to the bit for cars that were not refined, not inverted twice.
     T_cam_obj = torch.where(refined, se3.inverse(state.T_obj_cam), detections.T_cam_obj)
@@ -245,12 +236,12 @@ def _assemble(
         code=state.code,
         status_code=status,
         iterations=iterations,
-        term_names=names,
-        cost_before=spread(outcome and outcome.cost_before, len(names)),
-        cost_after=spread(outcome and outcome.cost_after, len(names)),
-        covariance=spread(outcome and outcome.covariance, unknowns, unknowns),
-        covariance_xyz_yaw=spread(outcome and outcome.covariance_xyz_yaw, 4, 4),
-        cost_history=spread(outcome and outcome.cost_history, steps),
+        term_names=outcome.term_names,
+        cost_before=spread(outcome.cost_before),
+        cost_after=spread(outcome.cost_after),
+        covariance=spread(outcome.covariance),
+        covariance_xyz_yaw=spread(outcome.covariance_xyz_yaw),
+        cost_history=spread(outcome.cost_history),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
         prior=prior,
     )

@@ -185,9 +185,7 @@ class FrameBatch(_TensorRecord):
         if field is not None:
             for k in range(num_frames):
                 h, w = (int(n) for n in self.sizes[k])
-                field.check_rig(
-                    (w, h), self.camera.K_left[k], self.camera.K_right[k], self.camera.T_right_cam[k]
-                )
+                field.check_rig((w, h), self.camera.K_left[k], self.camera.K_right[k], self.camera.T_right_cam[k])
 
     def __len__(self) -> int:
         return len(self.images_left)

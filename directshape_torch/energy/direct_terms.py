@@ -48,7 +48,7 @@ def prior_terms(config: RefinerConfig, prior: PCAShapePrior, cars: CarBatch) -> 
     """Shape, height, tilt and dimensions, those of weight zero left out."""
     p = config.priors
 
-    def shape(cars: CarBatch, at: ProjectedState) -> PriorResidual:
+    def shape(_: CarBatch, at: ProjectedState) -> PriorResidual:
         return shape_prior(at.state.code)
 
     def height(cars: CarBatch, at: ProjectedState) -> PriorResidual:
@@ -62,9 +62,7 @@ def prior_terms(config: RefinerConfig, prior: PCAShapePrior, cars: CarBatch) -> 
     def dimensions(cars: CarBatch, at: ProjectedState) -> PriorResidual:
         code = at.state.code
         sigma = torch.tensor(p.dimensions_sigma_m, dtype=code.dtype, device=code.device)
-        return dimensions_prior(
-            code, cars.detector_hwl, prior.dimensions_mean_hwl, prior.dimensions_basis_hwl, sigma
-        )
+        return dimensions_prior(code, cars.detector_hwl, prior.dimensions_mean_hwl, prior.dimensions_basis_hwl, sigma)
 
     all_terms = [
         PriorTerm("shape", p.shape_weight, cars, shape),

@@ -232,7 +232,9 @@ class PhotometricTerm:
         at = projected.shape.value_and_derivatives(
             surface.rays.at(surface.root.depth).detach(), surface.rays.object_index
         )
-        _, grazing = surface_slope(at.gradient.detach(), surface.rays.direction_obj.detach(), self.config.min_ray_cosine)
+        _, grazing = surface_slope(
+            at.gradient.detach(), surface.rays.direction_obj.detach(), self.config.min_ray_cosine
+        )
         on_surface = surface.root.found & ~grazing
         depth = surface.root.depth
         if attached:

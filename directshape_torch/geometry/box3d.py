@@ -23,7 +23,8 @@ def rotation_about_y(angle: Tensor) -> Tensor:
     """
     c, s = torch.cos(angle), torch.sin(angle)
     zero, one = torch.zeros_like(c), torch.ones_like(c)
-    return torch.stack([c, zero, s, zero, one, zero, 0.0 - s, zero, c], dim=-1).unflatten(-1, (3, 3))
+    rows = torch.stack([c, zero, s, zero, one, zero, 0.0 - s, zero, c], dim=-1)
+    return rows.reshape(*angle.shape, 3, 3)
 
 
 def pose_from_kitti(

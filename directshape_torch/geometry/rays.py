@@ -37,12 +37,8 @@ def ray_box_interval(
     to_lower, to_upper = (bounds[0] - origin) * inverse, (bounds[1] - origin) * inverse
     infinity = torch.full_like(to_lower, torch.inf)
     inside_slab = (origin >= bounds[0]) & (origin <= bounds[1])
-    entry = torch.where(
-        parallel, torch.where(inside_slab, -infinity, infinity), torch.minimum(to_lower, to_upper)
-    )
-    leave = torch.where(
-        parallel, torch.where(inside_slab, infinity, -infinity), torch.maximum(to_lower, to_upper)
-    )
+    entry = torch.where(parallel, torch.where(inside_slab, -infinity, infinity), torch.minimum(to_lower, to_upper))
+    leave = torch.where(parallel, torch.where(inside_slab, infinity, -infinity), torch.maximum(to_lower, to_upper))
     near = entry.amax(dim=-1).clamp_min(minimum)
     far = leave.amin(dim=-1)
     hit = (far > near) & near.isfinite() & far.isfinite()

@@ -31,7 +31,7 @@ def hat(vector: Tensor) -> Tensor:
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     rows = (zero, -z, y, z, zero, -x, -y, x, zero)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+    return torch.stack(rows, dim=-1).reshape(*vector.shape[:-1], 3, 3)
 
 
 def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
@@ -60,9 +60,7 @@ def _exp_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     sine = torch.sin(angle)
     half = torch.sin(0.5 * angle)
     a = torch.where(small, 1 - t / 6 * (1 - t / 20 * (1 - t / 42 * (1 - t / 72))), sine / angle)
-    b = torch.where(
-        small, 0.5 * (1 - t / 12 * (1 - t / 30 * (1 - t / 56 * (1 - t / 90)))), 2 * half * half / safe
-    )
+    b = torch.where(small, 0.5 * (1 - t / 12 * (1 - t / 30 * (1 - t / 56 * (1 - t / 90)))), 2 * half * half / safe)
     c = torch.where(
         small,
         (1 - t / 20 * (1 - t / 42 * (1 - t / 72 * (1 - t / 110)))) / 6,
@@ -207,7 +205,7 @@ def log(T: Tensor) -> Tensor:
     """
     omega = so3_log(T[..., :3, :3])
     t = (omega * omega).sum(-1)
-    a, b, c = _exp_coefficients(t)
+    a, b, _ = _exp_coefficients(t)
     small = t < _SMALL_ANGLE_SQUARED
     safe = torch.where(small, torch.ones_like(t), t)
     # (1 - a / (2 b)) / angle^2, whose series at zero is 1/12 + t/720 + t^2/30240 + t^3/1209600.

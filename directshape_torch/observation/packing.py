@@ -93,11 +93,11 @@ def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConf
     return Observation(left, right, *regions)
 
 
-def input_bias(frames: FrameBatch, detections: Detections, uv_left: Tensor, object_index: Tensor) -> Tensor:
+def bias_at(frames: FrameBatch, uv_left: Tensor) -> Tensor:
     """Residual disparity (P,) at left pixels; zero without a field."""
     field = frames.camera.disparity_field
     if field is None:
-        return torch.zeros(len(object_index), dtype=uv_left.dtype, device=uv_left.device)
+        return torch.zeros_like(uv_left[:, 0])
     return field.bias(uv_left)
 
 
@@ -174,7 +174,7 @@ def _rays_left(
 ) -> tuple[Tensor, Tensor, Tensor]:
     K = frames.camera.K_left[detections.frame_index[object_index]]
     ray = rays_from_pixels(uv, K)
-    return torch.zeros_like(ray), ray, input_bias(frames, detections, uv, object_index)
+    return torch.zeros_like(ray), ray, bias_at(frames, uv)
 
 
 def _rays_right(
@@ -186,6 +186,6 @@ def _rays_right(
     z_input = detections.T_cam_obj[object_index, 2, 3]
     shift = camera.K_left[frame, 0, 0] * camera.baseline[frame] / z_input
     uv_left = torch.stack([uv[:, 0] + shift, uv[:, 1]], dim=-1)
-    bias = input_bias(frames, detections, uv_left, object_index)
+    bias = bias_at(frames, uv_left)
     rays = right_rays(uv, camera.K_right[frame], camera.T_right_cam[frame], bias)
     return rays.origin_cam, rays.direction_cam, bias

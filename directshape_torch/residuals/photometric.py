@@ -48,7 +48,8 @@ def depth_state_jacobian(
         tensor(-1.)
     """
     slope, grazing = surface_slope(at.gradient, direction_obj, min_cosine)
-    d_depth_sdf = torch.where(grazing, torch.zeros_like(slope), -1 / torch.where(grazing, torch.ones_like(slope), slope))
+    safe_slope = torch.where(grazing, torch.ones_like(slope), slope)
+    d_depth_sdf = torch.where(grazing, torch.zeros_like(slope), -1 / safe_slope)
     return SurfaceDepth(d_depth_sdf[:, None] * sdf_state_jacobian(points_obj, at), grazing)
 
 
@@ -84,6 +85,4 @@ def photometric_residual(
     intensity, gradient, in_image = bilinear_with_gradient(image_right, frame_index[:, None], uv_level, sizes)
     J_residual_depth = (gradient * warped.J_pixel_depth).sum(-1) * level_scale
     inside = (in_image & warped.in_front).all(dim=1)
-    return PhotometricResidual(
-        intensity - intensity_left, J_residual_depth, inside, warped.uv_right[:, centre]
-    )
+    return PhotometricResidual(intensity - intensity_left, J_residual_depth, inside, warped.uv_right[:, centre])

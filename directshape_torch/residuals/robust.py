@@ -50,7 +50,9 @@ def truncated_huber(residual: Tensor, corner: float, limit: float) -> RobustValu
     """
     norm = huber(residual.clamp(-limit, limit), corner)
     beyond = residual.abs() >= limit
-    return RobustValue(norm.rho, norm.gradient_weight.masked_fill(beyond, 0), norm.hessian_weight.masked_fill(beyond, 0))
+    zero = torch.zeros_like(residual)
+    first, second = (torch.where(beyond, zero, w) for w in (norm.gradient_weight, norm.hessian_weight))
+    return RobustValue(norm.rho, first, second)
 
 
 def identity(residual: Tensor, floor: float) -> RobustValue:

@@ -47,18 +47,21 @@ class _Progress(Generic[StateT]):
     iterations: Tensor  # (B,)
 
 
-def minimise(problem: Problem[StateT], initial: StateT, config: SolverConfig) -> Minimum[StateT]:
+def minimise(
+    problem: Problem[StateT], initial: StateT, config: SolverConfig, start: StateT | None = None
+) -> Minimum[StateT]:
     """Run the stages of a problem one after the other, then compare the outcome with the input.
 
     Numerical trouble never raises: the problem concerned gets a status and its input state, the others go on.
 
     Args:
         problem: B problems.
-        initial: their states.
+        initial: their input states, returned where a problem fails and compared with the outcome.
         config: damping, acceptance, convergence.
+        start: where the iterations begin; default the input states.
     """
     with torch.no_grad():
-        state = initial
+        state = initial if start is None else start
         num_problems = len(initial[0])
         device = initial[0].device
         failure = torch.full((num_problems,), -1, device=device)
@@ -99,9 +102,7 @@ def _run_stage(
         # The only synchronisation of a block: which problems go on.
         keep = progress.running
         if not bool(keep.all()):
-            state, converged, failure, iterations = _scatter(
-                progress, rows, state, converged, failure, iterations
-            )
+            state, converged, failure, iterations = _scatter(progress, rows, state, converged, failure, iterations)
             index = keep.nonzero()[:, 0]
             rows = rows[index]
             part = part.compact(keep)
@@ -110,9 +111,7 @@ def _run_stage(
     return state, converged, failure, iterations
 
 
-def _begin(
-    problem: Problem[StateT], state: StateT, failure: Tensor, config: SolverConfig
-) -> _Progress[StateT]:
+def _begin(problem: Problem[StateT], state: StateT, failure: Tensor, config: SolverConfig) -> _Progress[StateT]:
     at_state = problem.linearise(state)
     finite = _is_finite(at_state)
     code = torch.full_like(failure, Status.non_finite.code)
