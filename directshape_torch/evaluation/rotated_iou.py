@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.scene import check_shape
+from directshape_torch.checks import check_shape
 
 _BEV_LAYOUT = "columns are x, z, length, width, rotation_y"
 _BOX_LAYOUT = "columns are x, y, z (bottom centre), height, width, length, rotation_y"
@@ -101,9 +101,7 @@ def _iou_3d(a: Tensor, b: Tensor) -> Tensor:
     bottom = torch.minimum(a[..., 1], b[..., 1])
     top = torch.maximum(a[..., 1] - a[..., 3].clamp_min(0), b[..., 1] - b[..., 3].clamp_min(0))
     shared = _intersection_area(footprint_a, footprint_b) * (bottom - top).clamp_min(0)
-    return _ratio(
-        shared, _area(footprint_a) * a[..., 3].clamp_min(0), _area(footprint_b) * b[..., 3].clamp_min(0)
-    )
+    return _ratio(shared, _area(footprint_a) * a[..., 3].clamp_min(0), _area(footprint_b) * b[..., 3].clamp_min(0))
 
 
 def _area(footprint: Tensor) -> Tensor:

@@ -1,0 +1,237 @@
+"""Result files before and after a refinement, judged against labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.evaluation.car_identity import CarTracks, read_tracks
+from directshape_torch.evaluation.comparison_summary import (
+    BootstrapSettings,
+    CarErrors,
+    ComparedCar,
+    GroupSummary,
+    summarise,
+)
+from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
+from directshape_torch.io.instance_masks import file_of_frame
+from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.text_files import read_lines
+
+# Depth of the label along the optical axis, metres; the last bin is open.
+DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))
+
+# Whether a detection, given by frame id and line number from 1, takes part.
+LineFilter = Callable[[str, int], bool]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Everything `compare_results` finds.
+
+    Attributes:
+        cars: every counted label with a detection, in the order of frames and detection lines.
+        overall: figures over detections.
+        per_car: the same with one vote for each physical car.
+        by_depth: figures for each bin of `DEPTH_BINS_M`.
+        by_car: figures for each physical car, only where tracks are known.
+        by_drive: figures for each drive, only where drives are known.
+        num_frames: frames compared.
+        num_labels_counted: labels that count, found by a detection or not.
+        num_filtered_out: found labels whose detection was left out by the line filter.
+        tracks_known: whether physical cars are known; else every label is taken for a car of its own.
+    """
+
+    cars: tuple[ComparedCar, ...]
+    overall: GroupSummary
+    per_car: GroupSummary
+    by_depth: tuple[GroupSummary, ...]
+    by_car: tuple[GroupSummary, ...]
+    by_drive: tuple[GroupSummary, ...]
+    num_frames: int
+    num_labels_counted: int
+    num_filtered_out: int
+    tracks_known: bool
+
+
+def compare_results(
+    labels_dir: Path | str,
+    before_dir: Path | str,
+    after_dir: Path | str,
+    *,
+    split: Path | str | None = None,
+    frames: Iterable[str | int] | None = None,
+    tracks: CarTracks | Path | str | None = None,
+    keep_line: LineFilter | None = None,
+    counted: CountedLabels | None = None,
+    bootstrap: BootstrapSettings | None = None,
+) -> Comparison:
+    """Compare two sets of result files line by line against labels.
+
+    Args:
+        labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`).
+        before_dir, after_dir: folders of result files `NNNNNN.txt`, or above a folder `data` with them. The files of a
+            frame have the same lines in the same order; a detection takes its label by the 2D box of `before`.
+        split: file with one frame id a line; default every frame of `before_dir`.
+        frames: ids of the frames to compare, instead of `split`.
+        tracks: which labels show the same physical car; default none known.
+        keep_line: leaves detections out (see `lines_with_left_mask`); they still take their labels.
+        counted: which labels count.
+        bootstrap: settings of the confidence intervals.
+
+    Raises:
+        DataFormatError: a file is missing or damaged, or the two result files of a frame do not have the same lines.
+        InputError: no frames.
+    """
+    counted = CountedLabels() if counted is None else counted
+    known = read_tracks(tracks) if isinstance(tracks, (str, Path)) else tracks
+    folders = Path(labels_dir), Path(before_dir), Path(after_dir)
+    frame_ids = _choose_frames(folders[1], split, frames)
+    pairs: list[_Pair] = []
+    num_counted = 0
+    for frame_id in frame_ids:
+        found, count = _pairs_of_frame(folders, frame_id, counted)
+        pairs += found
+        num_counted += count
+    kept = [p for p in pairs if keep_line is None or keep_line(p.frame_id, p.before.line_number)]
+    cars = _compared_cars(kept, CarTracks({}) if known is None else known)
+    return _group(cars, len(frame_ids), num_counted, len(pairs) - len(kept), known is not None, bootstrap)
+
+
+def lines_with_left_mask(shapes_dir: Path | str) -> LineFilter:
+    """A filter for `compare_results`: detections that had an instance mask, by the shape files of the refinement.
+
+    Args:
+        shapes_dir: `OUT/shapes` with `NNNNNN.npz`. Lines with status `no_mask`, and lines that were only copied, are
+            left out.
+    """
+    lines: dict[str, frozenset[int]] = {}
+
+    def keep(frame_id: str, line: int) -> bool:
+        if frame_id not in lines:
+            shapes = read_shapes(Path(shapes_dir) / f"{frame_id}.npz")
+            pairs = zip(shapes.input_lines.tolist(), shapes.statuses, strict=True)
+            lines[frame_id] = frozenset(number for number, status in pairs if status != "no_mask")
+        return line in lines[frame_id]
+
+    return keep
+
+
+@dataclass(frozen=True)
+class _Pair:
+    frame_id: str
+    label: KittiObject
+    before: KittiObject
+    after: KittiObject
+
+
+def _choose_frames(before_dir: Path, split: Path | str | None, frames: Iterable[str | int] | None) -> tuple[str, ...]:
+    if frames is not None and split is not None:
+        raise InputError("frames", "frames or split", "both", "give one of them")
+    if frames is not None:
+        chosen = [f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames]
+    elif split is not None:
+        chosen = [line.text for line in read_lines(split)]
+    else:
+        nested = before_dir / "data"
+        chosen = sorted(path.stem for path in (nested if nested.is_dir() else before_dir).glob("*.txt"))
+    if not chosen:
+        raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
+    return tuple(dict.fromkeys(chosen))
+
+
+def _pairs_of_frame(folders: tuple[Path, Path, Path], frame_id: str, counted: CountedLabels) -> tuple[list[_Pair], int]:
+    """Counted labels of a frame that have a detection, and the number of those that count at all."""
+    label_path, before_path, after_path = (file_of_frame(folder, f"{frame_id}.txt") for folder in folders)
+    labels = read_objects(label_path)
+    before, after = read_objects(before_path), read_objects(after_path)
+    _check_same_lines(before_path, before, after_path, after)
+    rows = [row for row, o in enumerate(before) if o.type in counted.types and o.has_box_3d]
+    partners = match_to_labels([before[row] for row in rows], labels)
+    pairs = [
+        _Pair(frame_id, labels[index], before[row], after[row])
+        for row, index in zip(rows, partners, strict=True)
+        if index >= 0 and counted.counts(labels[index])
+    ]
+    return pairs, sum(counted.counts(label) for label in labels)
+
+
+def _check_same_lines(
+    before_path: Path, before: Sequence[KittiObject], after_path: Path, after: Sequence[KittiObject]
+) -> None:
+    cure = "compare the files that went into a refinement with those that came out of it"
+    if len(before) != len(after):
+        raise DataFormatError(after_path, f"has {len(after)} lines, {before_path} has {len(before)}", cure=cure)
+    for old, new in zip(before, after, strict=True):
+        if old.type != new.type or (old.has_box_3d and not new.has_box_3d):
+            problem = f"does not belong to line {old.line_number} of {before_path} ({old.raw_line!r})"
+            raise DataFormatError(after_path, problem, line_number=new.line_number, line=new.raw_line, cure=cure)
+
+
+def _compared_cars(pairs: Sequence[_Pair], tracks: CarTracks) -> tuple[ComparedCar, ...]:
+    true_boxes = boxes_of([p.label for p in pairs])
+    before = _rows(pose_errors(boxes_of([p.before for p in pairs]), true_boxes))
+    after = _rows(pose_errors(boxes_of([p.after for p in pairs]), true_boxes))
+    cars = []
+    for pair, errors_before, errors_after in zip(pairs, before, after, strict=True):
+        identity = tracks.identity(pair.frame_id, pair.label.line_number)
+        cars.append(
+            ComparedCar(
+                frame_id=pair.frame_id,
+                detection_line=pair.before.line_number,
+                label_line=pair.label.line_number,
+                car=identity.car,
+                drive=identity.drive,
+                depth_m=pair.label.location_ref[2],
+                height_px=pair.label.box_2d[3] - pair.label.box_2d[1],
+                score=pair.before.score,
+                before=errors_before,
+                after=errors_after,
+            )
+        )
+    return tuple(cars)
+
+
+def _rows(errors: PoseErrors) -> list[CarErrors]:
+    columns = asdict(errors)
+    table = torch.stack(list(columns.values()), dim=-1).tolist()
+    return [CarErrors(**dict(zip(columns, row, strict=True))) for row in table]
+
+
+def _group(
+    cars: tuple[ComparedCar, ...],
+    num_frames: int,
+    num_counted: int,
+    num_filtered_out: int,
+    tracks_known: bool,
+    bootstrap: BootstrapSettings | None,
+) -> Comparison:
+    settings = BootstrapSettings() if bootstrap is None else bootstrap
+    names = sorted({car.car for car in cars}) if tracks_known else []
+    drives = sorted({car.drive for car in cars if car.drive is not None})
+    return Comparison(
+        cars=cars,
+        overall=summarise("all detections", cars, settings),
+        per_car=summarise("all cars, one vote each", cars, settings, cars_weigh_equally=True),
+        by_depth=tuple(
+            summarise(_bin_name(low, high), [c for c in cars if low <= c.depth_m < high], settings)
+            for low, high in pairwise(DEPTH_BINS_M)
+        ),
+        by_car=tuple(summarise(name, [c for c in cars if c.car == name], settings) for name in names),
+        by_drive=tuple(summarise(drive, [c for c in cars if c.drive == drive], settings) for drive in drives),
+        num_frames=num_frames,
+        num_labels_counted=num_counted,
+        num_filtered_out=num_filtered_out,
+        tracks_known=tracks_known,
+    )
+
+
+def _bin_name(low: float, high: float) -> str:
+    return f"{low:.0f}-{high:.0f} m" if high < float("inf") else f"over {low:.0f} m"

@@ -1,0 +1,134 @@
+"""A comparison as text, CSV and JSON (schema 1)."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from directshape_torch.evaluation.bootstrap import Estimate
+from directshape_torch.evaluation.comparison import Comparison
+from directshape_torch.evaluation.comparison_summary import (
+    METRICS,
+    WORSE_BY_BEV_IOU,
+    CarErrors,
+    ComparedCar,
+    GroupSummary,
+    Metric,
+)
+from directshape_torch.io import atomic_files
+
+COMPARISON_SCHEMA_VERSION = 1
+_GROUP_METRICS = ("bev_iou_mean", "iou_3d_mean", "bev_iou_good_share", "centre_m_median", "yaw_deg_median")
+
+
+def format_comparison(comparison: Comparison) -> str:
+    """Tables for reading: figures overall, and one line a group."""
+    parts = [_heading(comparison), _overall_table(comparison.overall)]
+    groups = [comparison.overall, comparison.per_car, *comparison.by_depth, *comparison.by_drive, *comparison.by_car]
+    parts.append(_group_table([group for group in groups if group.num_detections]))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def write_comparison_json(path: Path | str, comparison: Comparison) -> None:
+    """Write every group, without the single detections, as JSON: estimates as value, low, high."""
+    content = {f.name: getattr(comparison, f.name) for f in fields(comparison) if f.name != "cars"}
+    atomic_files.write_json(
+        path, {"schema_version": COMPARISON_SCHEMA_VERSION} | {k: _plain(v) for k, v in content.items()}
+    )
+
+
+def write_comparison_csv(path: Path | str, cars: Sequence[ComparedCar]) -> None:
+    """Write one line for each detection; columns are the fields of `ComparedCar`, errors as `<error>_before/_after`."""
+    errors = [f.name for f in fields(CarErrors)]
+    plain = [f.name for f in fields(ComparedCar) if f.name not in ("before", "after")]
+    columns = plain + [f"{name}_{when}" for name in errors for when in ("before", "after")]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for car in cars:
+        values = [getattr(car, name) for name in plain]
+        values += [getattr(side, name) for name in errors for side in (car.before, car.after)]
+        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+    atomic_files.write_text(path, text.getvalue())
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, GroupSummary):
+        return asdict(value)
+    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _heading(comparison: Comparison) -> str:
+    overall = comparison.overall
+    cars = (
+        f"{overall.num_cars} physical cars"
+        if comparison.tracks_known
+        else "physical cars not known, each label counts as a car of its own"
+    )
+    lines = [
+        f"{overall.num_detections} detections of {comparison.num_labels_counted} counted labels in "
+        f"{comparison.num_frames} frames; {cars}"
+    ]
+    if comparison.num_filtered_out:
+        lines.append(f"{comparison.num_filtered_out} more detections have no mask and are left out")
+    if overall.num_detections:
+        lines.append(
+            "in brackets: 95 % intervals, bootstrap over cars" if overall.num_cars > 1 else "one car: no intervals"
+        )
+    return "\n".join(lines)
+
+
+def _overall_table(group: GroupSummary) -> str:
+    if group.worse_share is None:
+        return "nothing to compare: no counted label has a detection"
+    rows = [["", "before", "after", "change"]]
+    for metric in METRICS:
+        summary = group.metrics[metric.key]
+        estimates = (summary.before, summary.after, summary.change)
+        rows.append([metric.label, *(_with_interval(metric.unit, e, sign=e is summary.change) for e in estimates)])
+    rows.append([f"BEV IoU worse by {WORSE_BY_BEV_IOU}", "", _with_interval("%", group.worse_share), ""])
+    return _align(rows)
+
+
+def _group_table(groups: Sequence[GroupSummary]) -> str:
+    if not groups:
+        return ""
+    metrics = [metric for metric in METRICS if metric.key in _GROUP_METRICS]
+    rows = [["group", "n", "cars", *(metric.label for metric in metrics), "worse"]]
+    for group in groups:
+        figures = [_before_after(metric, group) for metric in metrics]
+        worse = "" if group.worse_share is None else _number("%", group.worse_share.value)
+        rows.append([group.name, str(group.num_detections), str(group.num_cars), *figures, worse])
+    return _align(rows)
+
+
+def _before_after(metric: Metric, group: GroupSummary) -> str:
+    summary = group.metrics[metric.key]
+    before, after = (_number(metric.unit, e.value) for e in (summary.before, summary.after))
+    return f"{before.split(' ')[0]} -> {after}"
+
+
+def _with_interval(unit: str, estimate: Estimate, sign: bool = False) -> str:
+    value = _number(unit, estimate.value, sign)
+    if estimate.low is None or estimate.high is None:
+        return value
+    low, high = (_number(unit, bound, sign).split(" ")[0] for bound in (estimate.low, estimate.high))
+    return f"{value} [{low}, {high}]"
+
+
+def _number(unit: str, value: float, sign: bool = False) -> str:
+    if unit == "%":
+        return f"{100 * value:{'+' if sign else ''}.1f} %"
+    digits = 2 if unit == "deg" else 3
+    return f"{value:{'+' if sign else ''}.{digits}f}" + (f" {unit}" if unit else "")
+
+
+def _align(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines)

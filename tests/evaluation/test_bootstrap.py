@@ -1,0 +1,67 @@
+"""Bootstrap over cars: against closed forms and a plain loop."""
+
+import numpy as np
+import pytest
+
+from directshape_torch.errors import InputError
+from directshape_torch.evaluation.bootstrap import CarBootstrap, Estimate, weighted_mean, weighted_median
+
+
+def test_interval_of_a_mean_is_that_of_the_normal_law():
+    values = np.random.default_rng(3).normal(size=400)
+    estimate = CarBootstrap(np.arange(400), num_draws=4000).estimate(values, weighted_mean)
+    half_width = 1.96 * values.std() / np.sqrt(400)
+    assert estimate.value == pytest.approx(values.mean(), abs=1e-12)
+    assert estimate.low == pytest.approx(values.mean() - half_width, abs=0.1 * half_width)
+    assert estimate.high == pytest.approx(values.mean() + half_width, abs=0.1 * half_width)
+
+
+def test_frames_of_one_car_are_no_further_evidence():
+    values = np.random.default_rng(4).normal(size=20)
+    once = CarBootstrap(np.arange(20)).estimate(values, weighted_mean)
+    often = CarBootstrap(np.repeat(np.arange(20), 50)).estimate(np.repeat(values, 50), weighted_mean)
+    assert often.value == pytest.approx(once.value)
+    assert (often.low, often.high) == pytest.approx((once.low, once.high))
+
+
+def test_base_weights_make_every_car_count_the_same():
+    cars = np.array([0, 0, 0, 1])
+    values = np.array([1.0, 1.0, 1.0, 0.0])
+    assert CarBootstrap(cars).estimate(values, weighted_mean).value == pytest.approx(0.75)
+    assert CarBootstrap(cars, np.array([1, 1, 1, 3]) / 3).estimate(values, weighted_mean).value == pytest.approx(0.5)
+
+
+def test_weighted_median_equals_numpy_on_repeated_values():
+    generator = np.random.default_rng(5)
+    for _ in range(50):
+        values = generator.normal(size=generator.integers(1, 9))
+        weights = generator.integers(0, 4, size=len(values))
+        weights[0] += 1
+        expected = np.median(np.repeat(values, weights))
+        assert weighted_median(values, weights[None].astype(float))[0] == pytest.approx(expected)
+    assert weighted_median(np.array([1.0, 2.0, 6.0]), np.full((1, 3), 1 / 3))[0] == 2.0
+
+
+def test_one_car_has_no_interval():
+    assert CarBootstrap(np.zeros(3, dtype=np.int64)).estimate(np.arange(3.0), weighted_mean) == Estimate(
+        1.0, None, None
+    )
+
+
+def test_seed_decides_the_interval_and_chunks_do_not(monkeypatch: pytest.MonkeyPatch):
+    values = np.random.default_rng(6).normal(size=30)
+    whole = CarBootstrap(np.arange(30), seed=1).estimate(values, weighted_median)
+    assert whole == CarBootstrap(np.arange(30), seed=1).estimate(values, weighted_median)
+    means = [CarBootstrap(np.arange(30), seed=seed).estimate(values, weighted_mean) for seed in (1, 1, 2)]
+    assert means[0] == means[1] != means[2]
+    monkeypatch.setattr("directshape_torch.evaluation.bootstrap._CHUNK_ELEMENTS", 100)
+    assert whole == CarBootstrap(np.arange(30), seed=1).estimate(values, weighted_median)
+
+
+def test_wrong_input_is_named():
+    with pytest.raises(InputError, match="car_index: expected shape"):
+        CarBootstrap(np.zeros(0, dtype=np.int64))
+    with pytest.raises(InputError, match="base_weights: expected shape"):
+        CarBootstrap(np.arange(3), np.ones(2))
+    with pytest.raises(InputError, match="num_draws, confidence"):
+        CarBootstrap(np.arange(3), confidence=1.0)

@@ -1,0 +1,71 @@
+"""Errors of boxes against hand-derived numbers."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from directshape_torch.errors import InputError
+from directshape_torch.evaluation.pose_error import box_centres, boxes_of, pose_errors
+from directshape_torch.io.kitti_labels import parse_object
+from directshape_torch.io.text_files import Line
+
+TRUE = torch.tensor([[1.0, 1.6, 20.0, 1.5, 1.7, 4.0, 0.2]], dtype=torch.float64)
+
+
+def test_centre_is_that_of_the_box_not_of_its_bottom():
+    # 0.2 m taller on the same ground: its centre is 0.1 m higher. With 0.3 m in x and 0.4 m in z: BEV 0.5 m.
+    found = TRUE + torch.tensor([0.3, 0.0, 0.4, 0.2, 0.0, 0.0, 0.0], dtype=torch.float64)
+    errors = pose_errors(found, TRUE)
+    assert errors.centre_bev_m.item() == pytest.approx(0.5, abs=1e-12)
+    assert errors.centre_m.item() == pytest.approx(math.sqrt(0.25 + 0.01), abs=1e-12)
+    assert box_centres(TRUE)[0].tolist() == pytest.approx([1.0, 0.85, 20.0])
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "full", "axis"),
+    [(0, 0, 0), (5, 5, 5), (-5, 5, 5), (90, 90, 90), (100, 100, 80), (175, 175, 5), (180, 180, 0), (350, 10, 10)],
+)
+def test_yaw_errors_modulo_360_and_180(turn_deg: float, full: float, axis: float):
+    found = TRUE.clone()
+    found[:, 6] += math.radians(turn_deg)
+    errors = pose_errors(found, TRUE)
+    assert errors.yaw_deg.item() == pytest.approx(full, abs=1e-9)
+    assert errors.yaw_axis_deg.item() == pytest.approx(axis, abs=1e-9)
+
+
+@given(a=st.floats(-10, 10), b=st.floats(-10, 10))
+def test_yaw_errors_are_symmetric_and_bounded(a: float, b: float):
+    first, second = TRUE.clone(), TRUE.clone()
+    first[:, 6], second[:, 6] = a, b
+    there, back = pose_errors(first, second), pose_errors(second, first)
+    assert there.yaw_deg.item() == pytest.approx(back.yaw_deg.item(), abs=1e-6)
+    assert 0 <= there.yaw_axis_deg.item() <= 90 + 1e-9
+    assert there.yaw_axis_deg.item() <= there.yaw_deg.item() <= 180 + 1e-9
+
+
+def test_overlaps_of_a_half_length_shift():
+    level = TRUE * torch.tensor([1, 1, 1, 1, 1, 1, 0])
+    found = level.clone()
+    found[:, 0] += 2.0
+    errors = pose_errors(found, level)
+    assert errors.bev_iou.item() == pytest.approx(1 / 3, abs=1e-12)
+    assert errors.iou_3d.item() == pytest.approx(1 / 3, abs=1e-12)
+
+
+def test_boxes_of_reads_columns_in_order():
+    line = Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.7 20 0.4", "")
+    assert boxes_of([parse_object("labels", line)]).tolist() == [[1, 1.7, 20, 1.5, 1.6, 3.9, 0.4]]
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_shapes(count: int):
+    errors = pose_errors(TRUE.expand(count, -1), TRUE.expand(count, -1))
+    assert errors.centre_m.shape == errors.iou_3d.shape == (count,)
+
+
+def test_wrong_shape_is_named():
+    with pytest.raises(InputError, match=r"true_boxes: expected shape \(1, 7\)"):
+        pose_errors(TRUE, torch.zeros(2, 7))
