@@ -1,0 +1,58 @@
+"""From noisy linear radiance to the bytes of a camera: denoising, exposure, tone curve, gain and sensor noise."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from demo_scene.camera import Array
+from demo_scene.rendering import PathTraced
+from demo_scene.surfaces import Picture
+
+_NOISE_GREY_LEVELS = 1.2
+
+
+def denoise(view: PathTraced) -> Array:
+    """Radiance (H, W, 3) without path-tracing noise: Open Image Denoise if installed, else a joint bilateral filter."""
+    try:
+        import pyoidn
+    except ImportError:
+        return bilateral_denoise(view)
+    radiance, albedo, normals = (
+        np.ascontiguousarray(a, dtype=np.float32) for a in (view.radiance, view.albedo, np.clip(view.normals, -1, 1))
+    )
+    return np.asarray(pyoidn.denoise(radiance, albedo, normals, hdr=True), dtype=np.float64)
+
+
+def bilateral_denoise(view: PathTraced) -> Array:
+    """Smooths the illumination, radiance over albedo, within surfaces of like normal and colour."""
+    albedo = np.maximum(view.albedo, 0.02)
+    light = np.log1p(np.where(view.albedo.sum(axis=-1, keepdims=True) > 0, view.radiance / albedo, view.radiance))
+    guide = np.concatenate([view.normals, view.albedo], axis=-1)
+    total, weights = np.zeros_like(light), np.zeros(light.shape[:2])
+    radius = 3
+    for dv in range(-radius, radius + 1):
+        for du in range(-radius, radius + 1):
+            moved_light, moved_guide = (np.roll(a, (dv, du), axis=(0, 1)) for a in (light, guide))
+            unlike = ((moved_guide - guide) ** 2).sum(axis=-1) / 0.02 + ((moved_light - light) ** 2).sum(axis=-1) / 0.5
+            weight = np.exp(-unlike - (du * du + dv * dv) / 8.0)
+            total += weight[..., None] * moved_light
+            weights += weight
+    smooth = np.expm1(total / weights[..., None])
+    return np.asarray(np.where(view.albedo.sum(axis=-1, keepdims=True) > 0, smooth * albedo, smooth))
+
+
+def exposure_for(radiance: Array) -> float:
+    """Factor that brings the street, the lower half of the picture, to a middle grey."""
+    luminance = radiance[len(radiance) // 2 :] @ np.array([0.299, 0.587, 0.114])
+    return 0.22 / max(float(np.median(luminance)), 1e-6)
+
+
+def develop(rng: np.random.Generator, radiance: Array, exposure: float, gain: float) -> Picture:
+    """The camera's picture (H, W, 3), RGB bytes: a filmic shoulder, sRGB, a little blur, shot and read noise."""
+    linear = np.maximum(exposure * gain * radiance, 0.0)
+    shoulder = linear * (1.0 + linear / 9.0) / (1.0 + linear / 1.6)
+    linear = np.minimum(1.28 * shoulder, 1.0)
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    srgb = cv2.GaussianBlur(srgb, (0, 0), 0.45)
+    noise = rng.standard_normal(srgb.shape) * _NOISE_GREY_LEVELS * (0.6 + 0.8 * np.sqrt(np.clip(srgb, 0, 1)))
+    return np.clip(np.rint(255.0 * srgb + noise), 0, 255).astype(np.uint8)
