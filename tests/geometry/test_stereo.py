@@ -1,0 +1,100 @@
+"""Crossing to the right image: warp, its derivative by the depth, rays of the right camera, the rig's bias."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.derivatives import central_differences
+
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.pinhole import project, rays_from_pixels
+from directshape_torch.geometry.stereo import right_rays, warp_to_right
+
+K_LEFT = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+K_RIGHT = torch.tensor([[710.0, 0.3, 590.0], [0.0, 705.0, 176.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+GENERAL = se3.exp(torch.tensor([-0.54, -0.01, 0.02, 0.01, -0.02, 0.005], dtype=torch.float64))
+UV = torch.tensor([[100.0, 50.0], [620.3, 187.9], [1200.0, 300.0]], dtype=torch.float64)
+DEPTH = torch.tensor([4.0, 20.0, 80.0], dtype=torch.float64)
+
+
+def test_warp_equals_the_long_way_for_a_general_right_camera() -> None:
+    ray = rays_from_pixels(UV, K_LEFT)
+    warped = warp_to_right(ray, DEPTH, K_RIGHT, GENERAL)
+    torch.testing.assert_close(warped.uv_right, project(se3.transform(GENERAL, DEPTH[:, None] * ray), K_RIGHT))
+    assert warped.in_front.all()
+
+
+def test_disparity_is_focal_times_baseline_over_depth() -> None:
+    pure = torch.eye(4, dtype=torch.float64)
+    pure[0, 3] = -0.54
+    warped = warp_to_right(rays_from_pixels(UV, K_LEFT), DEPTH, K_LEFT, pure)
+    # Disparity u_left - u_right = f b / z, positive: 700 * 0.54 / 20 = 18.9 px at 20 m.
+    torch.testing.assert_close(UV[:, 0] - warped.uv_right[:, 0], 700 * 0.54 / DEPTH)
+    assert abs(float(UV[1, 0] - warped.uv_right[1, 0]) - 18.9) < 1e-9
+    torch.testing.assert_close(warped.uv_right[:, 1], UV[:, 1])
+
+
+@pytest.mark.parametrize("bias", [None, torch.tensor([0.3, -1.2, 0.7], dtype=torch.float64)])
+def test_depth_derivative_against_differences_and_autograd(bias: torch.Tensor | None) -> None:
+    ray = rays_from_pixels(UV, K_LEFT)
+    analytic = warp_to_right(ray, DEPTH, K_RIGHT, GENERAL, bias).J_pixel_depth
+
+    def pixels(depth: torch.Tensor) -> torch.Tensor:
+        return warp_to_right(ray, depth, K_RIGHT, GENERAL, bias).uv_right
+
+    row = torch.arange(3)
+    numeric = central_differences(pixels, DEPTH, 1e-5)[row, :, row]
+    torch.testing.assert_close(analytic, numeric, rtol=1e-7, atol=1e-8)
+    by_autograd = torch.autograd.functional.jacobian(pixels, DEPTH)
+    assert isinstance(by_autograd, torch.Tensor)
+    torch.testing.assert_close(analytic, by_autograd[row, :, row])
+
+
+def test_bias_is_measured_minus_true_disparity() -> None:
+    """A rig whose disparities come out 0.8 px too large shows points 0.8 px further left in the right image."""
+    ray = rays_from_pixels(UV, K_LEFT)
+    bias = torch.full((3,), 0.8, dtype=torch.float64)
+    plain, biased = (warp_to_right(ray, DEPTH, K_RIGHT, GENERAL, b) for b in (None, bias))
+    torch.testing.assert_close(biased.uv_right[:, 0], plain.uv_right[:, 0] - 0.8)
+    assert (biased.uv_right[:, 1] == plain.uv_right[:, 1]).all()
+    assert (biased.J_pixel_depth == plain.J_pixel_depth).all()
+
+
+@pytest.mark.parametrize("bias", [None, torch.tensor([0.3, -1.2, 0.7], dtype=torch.float64)])
+def test_right_rays_undo_the_warp(bias: torch.Tensor | None) -> None:
+    ray = rays_from_pixels(UV, K_LEFT)
+    point_cam = DEPTH[:, None] * ray
+    uv_right = warp_to_right(ray, DEPTH, K_RIGHT, GENERAL, bias).uv_right
+    back = right_rays(uv_right, K_RIGHT, GENERAL, bias)
+    depth_right = se3.transform(GENERAL, point_cam)[:, 2]
+    torch.testing.assert_close(back.origin_cam + depth_right[:, None] * back.direction_cam, point_cam)
+
+
+def test_right_rays_start_at_the_right_camera() -> None:
+    rays = right_rays(UV, K_RIGHT, GENERAL)
+    centre_right = se3.transform(GENERAL, rays.origin_cam)
+    torch.testing.assert_close(centre_right, torch.zeros_like(centre_right), atol=1e-14, rtol=0)
+    direction_right = rays.direction_cam @ GENERAL[:3, :3].T
+    torch.testing.assert_close(direction_right[:, 2], torch.ones(3, dtype=torch.float64))
+
+
+def test_a_point_behind_the_right_camera_is_finite_and_flagged() -> None:
+    behind = torch.eye(4, dtype=torch.float64)
+    behind[2, 3] = -30.0
+    warped = warp_to_right(rays_from_pixels(UV, K_LEFT), DEPTH, K_RIGHT, behind)
+    assert warped.in_front.tolist() == [False, False, True]
+    assert warped.uv_right.isfinite().all()
+    assert warped.J_pixel_depth.isfinite().all()
+
+
+def test_neighbourhoods_share_one_depth() -> None:
+    rays = rays_from_pixels(UV[:, None] + torch.tensor([[0.0, 0.0], [2.0, 0.0]]), K_LEFT)
+    both = warp_to_right(rays, DEPTH[:, None], K_RIGHT, GENERAL)
+    alone = warp_to_right(rays[:, 1], DEPTH, K_RIGHT, GENERAL)
+    torch.testing.assert_close(both.uv_right[:, 1], alone.uv_right)
+
+
+def test_no_pixels() -> None:
+    empty = torch.zeros(0, 3, dtype=torch.float64)
+    assert warp_to_right(empty, empty[:, 0], K_RIGHT, GENERAL).uv_right.shape == (0, 2)
+    assert right_rays(empty[:, :2], K_RIGHT, GENERAL).direction_cam.shape == (0, 3)

@@ -1,0 +1,1 @@
+"""What several test files share: small shapes, scenes and derivatives that are easy to trust."""

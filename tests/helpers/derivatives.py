@@ -1,0 +1,57 @@
+"""Derivatives by the tangent of the state, by central differences and by autograd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.geometry import se3
+
+
+def moved(state: CarState, delta: Tensor) -> CarState:
+    """The state at `delta` (B, 6 + K) of its own tangent, by the definition of CONVENTIONS.md; differentiable."""
+    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, state.code + delta[:, 6:])
+
+
+def tangent_of(state: CarState) -> Tensor:
+    """Zero tangent vectors (B, 6 + K)."""
+    return state.code.new_zeros(len(state.code), 6 + state.code.shape[1])
+
+
+def central_differences(function: Callable[[Tensor], Tensor], at: Tensor, step: float = 1e-6) -> Tensor:
+    """`d function / d at`, shape (*function, *at), of any function of one tensor."""
+    columns = []
+    for i in range(at.numel()):
+        offset = torch.zeros_like(at).reshape(-1)
+        offset[i] = step
+        offset = offset.view_as(at)
+        columns.append((function(at + offset) - function(at - offset)) / (2 * step))
+    value = function(at)
+    if not columns:
+        return value.new_zeros(*value.shape, *at.shape)
+    return torch.stack(columns, dim=-1).reshape(*value.shape, *at.shape)
+
+
+def jacobian_by_state(function: Callable[[CarState], Tensor], state: CarState) -> Tensor:
+    """Autograd `d function / d delta` at zero, (R, B, 6 + K), for a function of the state with values (R,)."""
+    jacobian = torch.autograd.functional.jacobian(lambda delta: function(moved(state, delta)), tangent_of(state))
+    assert isinstance(jacobian, Tensor)
+    return jacobian
+
+
+def differences_by_state(function: Callable[[CarState], Tensor], state: CarState, step: float = 1e-6) -> Tensor:
+    """Central differences `d function / d delta` at zero, (R, B, 6 + K)."""
+    return central_differences(lambda delta: function(moved(state, delta)), tangent_of(state), step)
+
+
+def of_own_object(jacobian: Tensor, object_index: Tensor) -> Tensor:
+    """Rows (R, D) of each residual by its own object, from (R, B, D)."""
+    return jacobian[torch.arange(len(object_index)), object_index]
+
+
+def relative_error(a: Tensor, b: Tensor) -> float:
+    """Largest difference, relative to the largest magnitude."""
+    return float((a - b).abs().max() / b.abs().max().clamp_min(1e-300))
