@@ -1,0 +1,1 @@
+"""Refining whole data sets into a folder of files, with resumption."""

@@ -1,0 +1,43 @@
+"""Hashes of what a run is made of, by content, so that they do not depend on a file's name or compression."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+_FIELD_TENSORS = ("coefficients", "hull_uv", "K_left", "K_right", "T_right_cam")
+
+
+def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
+    """The sha256 (hexadecimal) of named tensors: name, shape and values as float64, little-endian, in order of name.
+
+    Example:
+        >>> hash_tensors({"a": torch.zeros(2)}) == hash_tensors({"a": torch.zeros(2, dtype=torch.float64)})
+        True
+    """
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        values = tensors[name].detach().to("cpu", torch.float64).contiguous().numpy()
+        digest.update(json.dumps([name, list(values.shape)]).encode())
+        digest.update(values.astype("<f8", copy=False).tobytes())
+    return digest.hexdigest()
+
+
+def hash_prior(prior: PCAShapePrior) -> str:
+    """The sha256 of a shape prior: of its buffers and bounds."""
+    return hash_tensors({"bounds_obj": prior.bounds_obj, **dict(prior.named_buffers())})
+
+
+def hash_field(field: DisparityField | None) -> str | None:
+    """The sha256 of a residual disparity field, or None without one."""
+    if field is None:
+        return None
+    size = torch.tensor(field.size_wh)
+    return hash_tensors({"size_wh": size, **{name: getattr(field, name) for name in _FIELD_TENSORS}})

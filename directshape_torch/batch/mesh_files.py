@@ -1,0 +1,60 @@
+"""Surfaces of refined cars as mesh files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from directshape_torch.batch.options import MeshFormat
+from directshape_torch.io.atomic_files import write_bytes
+from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.result import RefinementResult
+
+if TYPE_CHECKING:
+    import trimesh
+
+# glTF demands y up and the viewer in front of +z; the camera has y down and looks along +z.
+T_GLTF_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def mesh_path(out_dir: Path, frame_id: str, line_number: int, mesh_format: MeshFormat) -> Path:
+    """The mesh file of one car; lines are counted from 1."""
+    return out_dir / "meshes" / f"{frame_id}_{line_number}.{mesh_format}"
+
+
+def write_car_meshes(
+    out_dir: Path, loaded: LoadedFrame, result: RefinementResult, first_row: int, mesh_format: MeshFormat
+) -> None:
+    """Write the surface of each refined car of a frame.
+
+    PLY files are in the left camera frame, metres. GLB files hold the same vertices below a node that turns them into
+    glTF's axes (y up).
+    """
+    refined = result.refined.tolist()
+    for car, row in enumerate(loaded.row_of_detection):
+        if refined[first_row + car]:
+            line_number = loaded.input_objects[row].line_number
+            mesh = result.mesh(first_row + car)
+            path = mesh_path(out_dir, loaded.frame_id, line_number, mesh_format)
+            write_bytes(path, mesh_bytes(mesh, mesh_format))
+
+
+def mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
+    """A mesh in the left camera frame as the content of a file."""
+    if mesh_format == "ply":
+        content: bytes = mesh.export(file_type="ply")
+        return content
+    return scene_bytes({"car": mesh})
+
+
+def scene_bytes(meshes_cam: dict[str, trimesh.Trimesh]) -> bytes:
+    """Named meshes in the left camera frame as one binary glTF scene, y up."""
+    import trimesh
+
+    scene = trimesh.Scene()
+    for name, mesh in meshes_cam.items():
+        scene.add_geometry(mesh, node_name=name, geom_name=name, transform=T_GLTF_CAM)
+    content: bytes = scene.export(file_type="glb")
+    return content

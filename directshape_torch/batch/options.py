@@ -1,0 +1,67 @@
+"""What a run over a data set is asked for besides the refinement itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, get_args
+
+from directshape_torch.errors import InputError
+
+MeshFormat = Literal["ply", "glb"]
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """Outputs and size of the steps of `refine_dataset`.
+
+    Attributes:
+        meshes: write the surface of each refined car as "ply" or "glb"; None writes none.
+        overlays: write a picture of each frame, before and after.
+        batch_frames: frames refined together in one call.
+
+    Raises:
+        InputError: an unknown mesh format, or a batch without frames.
+
+    Example:
+        >>> RefineOptions(meshes="ply", overlays=True).outputs
+        ('data', 'shapes', 'meshes_ply', 'overlays')
+    """
+
+    meshes: MeshFormat | None = None
+    overlays: bool = False
+    batch_frames: int = 1
+
+    def __post_init__(self) -> None:
+        if self.meshes is not None and self.meshes not in get_args(MeshFormat):
+            raise InputError("meshes", f"one of {', '.join(get_args(MeshFormat))}, or None", repr(self.meshes))
+        if self.batch_frames < 1:
+            raise InputError("batch_frames", "at least 1", str(self.batch_frames))
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the kinds of files that each frame gets."""
+        meshes = () if self.meshes is None else (f"meshes_{self.meshes}",)
+        return ("data", "shapes", *meshes, *(("overlays",) if self.overlays else ()))
+
+
+class RunObserver(Protocol):
+    """Is told how a run comes along; a progress bar, for example."""
+
+    def started(self, frame_ids: Sequence[str]) -> None:
+        """The frames that are about to be refined; finished ones of an earlier run are not among them."""
+        ...
+
+    def finished(self, frame_id: str, failure: str | None) -> None:
+        """A frame is done, or failed for the given reason."""
+        ...
+
+
+class SilentObserver:
+    """Says nothing."""
+
+    def started(self, frame_ids: Sequence[str]) -> None:
+        """Nothing."""
+
+    def finished(self, frame_id: str, failure: str | None) -> None:
+        """Nothing."""

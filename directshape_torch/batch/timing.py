@@ -1,0 +1,117 @@
+"""How long the refinement of each call took, and how much memory the process has used."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from directshape_torch.io.atomic_files import write_json
+
+TIMINGS_SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class CallTiming:
+    """One call of the refiner: its frames, its cars and the seconds it took, reading and writing not included."""
+
+    frame_ids: tuple[str, ...]
+    num_cars: int
+    refine_s: float
+
+
+@dataclass
+class RunTimings:
+    """All calls of a run, in order.
+
+    Attributes:
+        device: where the refiner ran.
+        calls: one entry a call.
+    """
+
+    device: torch.device
+    calls: list[CallTiming] = field(default_factory=list)
+
+    @contextmanager
+    def measure(self, frame_ids: Sequence[str], num_cars: int) -> Iterator[None]:
+        """Time the body as one call; waits for the device before and after."""
+        _wait_for(self.device)
+        start = time.perf_counter()
+        yield
+        _wait_for(self.device)
+        self.calls.append(CallTiming(tuple(frame_ids), num_cars, time.perf_counter() - start))
+
+    @property
+    def num_frames(self) -> int:
+        return sum(len(call.frame_ids) for call in self.calls)
+
+    @property
+    def num_cars(self) -> int:
+        return sum(call.num_cars for call in self.calls)
+
+    @property
+    def refine_s(self) -> float:
+        return sum(call.refine_s for call in self.calls)
+
+    @property
+    def ms_per_car(self) -> float | None:
+        """Mean over the cars of all calls, or None where there was none."""
+        return 1000 * self.refine_s / self.num_cars if self.num_cars else None
+
+    @property
+    def ms_per_frame(self) -> float | None:
+        """Mean over the frames of all calls, or None where there was none."""
+        return 1000 * self.refine_s / self.num_frames if self.num_frames else None
+
+
+def write_timings(path: Path, timings: RunTimings) -> None:
+    """Write `timings.json` (schema 1): a file of its own, so that every other file is the same in every run."""
+    content = {
+        "schema_version": TIMINGS_SCHEMA_VERSION,
+        "device": device_name(timings.device),
+        "threads": torch.get_num_threads(),
+        "peak_memory_mb": peak_memory_mb(),
+        "peak_device_memory_mb": peak_device_memory_mb(timings.device),
+        "ms_per_car": _rounded(timings.ms_per_car),
+        "ms_per_frame": _rounded(timings.ms_per_frame),
+        "calls": [
+            {"frames": list(call.frame_ids), "cars": call.num_cars, "refine_ms": _rounded(1000 * call.refine_s)}
+            for call in timings.calls
+        ],
+    }
+    write_json(path, content)
+
+
+def device_name(device: torch.device) -> str:
+    """ "cpu", or the name of the graphics card."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+
+
+def peak_memory_mb() -> float | None:
+    """The largest resident memory of the process so far, MB, or None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # only Unix has it
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # Linux counts in KiB, macOS in bytes.
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+
+
+def peak_device_memory_mb(device: torch.device) -> float | None:
+    """The largest memory of tensors on a graphics card so far, MB, or None on the CPU."""
+    return round(torch.cuda.max_memory_allocated(device) / 2**20, 1) if device.type == "cuda" else None
+
+
+def _wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _rounded(number: float | None) -> float | None:
+    return None if number is None else round(number, 3)

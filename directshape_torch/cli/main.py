@@ -1,0 +1,66 @@
+"""The program `directshape`: finds the command, runs it, turns errors into one line and an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from directshape_torch.errors import DirectShapeError
+
+EXIT_WRONG_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+# Each module has `add_parser(subparsers)` and `run(args) -> int`, and imports what is heavy inside `run`.
+COMMANDS = ("refine", "compare", "build_prior", "calibrate_stereo")
+
+_DESCRIPTION = "Refine pose and shape of cars in stereo frames by differentiable rendering of signed distance fields."
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the program.
+
+    Args:
+        arguments: words of the command line; default those of the process.
+
+    Returns:
+        The exit code (docs/file_formats.md): 0 all fine, 1 finished with failures, 2 wrong usage or input.
+    """
+    args = make_parser().parse_args(arguments)
+    try:
+        code: int = args.run(args)
+    except DirectShapeError as error:
+        print(f"directshape: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return EXIT_WRONG_INPUT
+    except KeyboardInterrupt:
+        print("directshape: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    return code
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of the program with all of its commands."""
+    parser = argparse.ArgumentParser(prog="directshape", description=_DESCRIPTION)
+    parser.add_argument("--version", action=_Version, help="print the version and stop")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for name in COMMANDS:
+        importlib.import_module(f"directshape_torch.cli.{name}").add_parser(subparsers)
+    return parser
+
+
+class _Version(argparse.Action):
+    """Looks the version up only when it is asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from directshape_torch.batch.refine_dataset import package_version
+
+        print(package_version())
+        parser.exit()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

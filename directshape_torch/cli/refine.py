@@ -1,0 +1,154 @@
+"""`directshape refine`: all frames of a data set in KITTI's layout."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from directshape_torch.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+    from directshape_torch.io.instance_masks import MaskSource
+    from directshape_torch.io.kitti_dataset import KittiStereoDataset
+    from directshape_torch.refiner import DirectShapeRefiner
+
+_DESCRIPTION = """
+Refine the rough 3D boxes of a detector: poses, boxes and shapes of all cars of all frames. A second run with the same
+settings continues where the first stopped. Exit code: 0 all frames done, 1 some frames failed, 2 wrong usage or input.
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its options."""
+    parser = subparsers.add_parser("refine", help="refine the cars of a data set", description=_DESCRIPTION)
+    _add_inputs(parser.add_argument_group("input"))
+    _add_outputs(parser.add_argument_group("output"))
+    _add_settings(parser.add_argument_group("settings"))
+    parser.set_defaults(run=run)
+
+
+def _add_inputs(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/image_2 ..")
+    group.add_argument("--detections", type=Path, required=True, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data")
+    group.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
+    group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
+    group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
+    group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
+    group.add_argument("--frames", nargs="+", metavar="ID", help="only these frames")
+    group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
+    group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
+    group.add_argument(
+        "--ground",
+        choices=("auto", "file", "stereo", "camera_height"),
+        default="auto",
+        help="where ground planes come from (default: file, else stereo, else camera height)",
+    )
+    group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
+
+
+def _add_outputs(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
+    group.add_argument("--meshes", choices=("ply", "glb"), help="write the surface of each refined car")
+    group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
+
+
+def _add_settings(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--config", type=Path, metavar="FILE", help="settings of the refinement (YAML)")
+    group.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting, e.g. photometric.weight=2"
+    )
+    group.add_argument("--prior", type=Path, metavar="FILE", help="shape prior (npz); default: the bundled one")
+    group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
+    group.add_argument("--batch-frames", type=int, default=1, metavar="N", help="frames in one call (default: 1)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Refine, write, report; returns the exit code.
+
+    Raises:
+        DirectShapeError: wrong input, or an output folder of another run; for the main program to show.
+    """
+    from directshape_torch.batch.options import RefineOptions
+    from directshape_torch.batch.refine_dataset import refine_dataset
+    from directshape_torch.batch.run_summary import format_summary
+    from directshape_torch.cli.progress import ProgressBar
+
+    options = RefineOptions(args.meshes, args.overlays, args.batch_frames)
+    refiner = make_refiner(args.config, args.set, args.prior, args.device)
+    with ProgressBar() as progress:
+        summary = refine_dataset(_make_dataset(args), refiner, args.out, options, progress)
+    for warning in summary.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    print(format_summary(summary))
+    print(f"results  {args.out}")
+    return summary.exit_code
+
+
+def make_refiner(config: Path | None, overrides: list[str], prior: Path | None, device: str) -> DirectShapeRefiner:
+    """The refiner that the options describe.
+
+    Raises:
+        ConfigError: unknown settings.
+        DataFormatError: a prior that cannot be used.
+        InputError: no such device.
+    """
+    from directshape_torch.config import load_config
+    from directshape_torch.refiner import DirectShapeRefiner
+    from directshape_torch.shape.pca_prior import PCAShapePrior
+
+    settings = load_config(config, overrides)
+    shapes = PCAShapePrior.load_bundled() if prior is None else PCAShapePrior.load(prior)
+    return DirectShapeRefiner(shapes, settings).to(find_device(device))
+
+
+def find_device(name: str) -> torch.device:
+    """The device of that name; "auto" is a graphics card where there is one.
+
+    Raises:
+        InputError: PyTorch does not know or does not have it.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError("--device", "a device of this machine", f"{name!r} ({reason})", "try cpu") from error
+    return device
+
+
+def _make_dataset(args: argparse.Namespace) -> KittiStereoDataset:
+    from directshape_torch.geometry.disparity_field import DisparityField
+    from directshape_torch.io.kitti_dataset import KittiStereoDataset
+
+    return KittiStereoDataset(
+        args.data,
+        args.detections,
+        _mask_source(args),
+        split=args.split,
+        frames=args.frames,
+        classes=args.classes,
+        ground=args.ground,
+        camera_height_m=args.camera_height,
+        disparity_field=None if args.stereo_bias is None else DisparityField.load(args.stereo_bias),
+    )
+
+
+def _mask_source(args: argparse.Namespace) -> MaskSource:
+    from directshape_torch.io.instance_masks import CocoFileMasks, mask_source
+
+    files = (args.masks_left, args.masks_right)
+    if (args.masks is None) == (files == (None, None)):
+        raise InputError(
+            "--masks",
+            "either a folder (--masks DIR) or COCO files (--masks-left FILE, --masks-right FILE)",
+            "neither" if args.masks is None else "both",
+        )
+    return CocoFileMasks(*files) if args.masks is None else mask_source(args.masks)
