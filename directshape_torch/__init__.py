@@ -11,6 +11,7 @@ from directshape_torch.errors import (
     ResumeError,
 )
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.quality import FitQuality
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
@@ -25,6 +26,7 @@ __all__ = [
     "DirectShapeError",
     "DirectShapeRefiner",
     "DisparityField",
+    "FitQuality",
     "FrameBatch",
     "GroundPlane",
     "InputError",

@@ -18,6 +18,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
 from directshape_torch.observation.packing import Observation, pack_pixels
+from directshape_torch.quality import FitQuality, fit_quality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -144,6 +145,7 @@ class DirectShapeRefiner(nn.Module):
             problem.term_costs(minimum.state),
             covariance,
             covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
+            fit_quality(problem, minimum.state),
         )
 
 
@@ -160,6 +162,7 @@ class _Outcome:
     cost_after: Tensor
     covariance: Tensor
     covariance_xyz_yaw: Tensor
+    quality: FitQuality
 
 
 def _no_outcome(state: CarState, unknowns: int) -> _Outcome:
@@ -168,9 +171,9 @@ def _no_outcome(state: CarState, unknowns: int) -> _Outcome:
     none = nothing.long()[:, 0:0].reshape(0)
     square = nothing.reshape(0, unknowns, unknowns)
     poses = nothing.reshape(0, 4, 4)
-    return _Outcome(
-        CarState(state.T_obj_cam[:0], state.code[:0]), none, none, nothing, (), nothing, nothing, square, poses
-    )
+    quality = FitQuality.nothing(nothing, 0)
+    empty = CarState(state.T_obj_cam[:0], state.code[:0])
+    return _Outcome(empty, none, none, nothing, (), nothing, nothing, square, poses, quality)
 
 
 def _is_refined(status: Tensor) -> Tensor:
@@ -242,6 +245,8 @@ def _assemble(
         covariance=spread(outcome.covariance),
         covariance_xyz_yaw=spread(outcome.covariance_xyz_yaw),
         cost_history=spread(outcome.cost_history),
+        quality=outcome.quality.spread(rows, count),
+        ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
         prior=prior,
     )

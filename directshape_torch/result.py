@@ -10,6 +10,7 @@ from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.quality import FitQuality
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
 from directshape_torch.status import Status
@@ -51,6 +52,8 @@ class RefinementResult:
             NaN for cars that were not refined.
         covariance_xyz_yaw: (B, 4, 4) of the object origin (x, y, z) in the reference frame and the heading.
         cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across stages.
+        quality: agreement of each refined car with masks and images.
+        ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
         prior: the shapes.
     """
@@ -65,6 +68,8 @@ class RefinementResult:
     covariance: Tensor
     covariance_xyz_yaw: Tensor
     cost_history: Tensor
+    quality: FitQuality
+    ground_source: tuple[str, ...]
     t_cam_ref: Tensor
     prior: PCAShapePrior
 

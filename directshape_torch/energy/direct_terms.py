@@ -88,5 +88,6 @@ def _photometric_term(
         pixels=observation.left,
         pyramid=tuple(pyramid),
         hidden_right=hidden,
-        crop_index=torch.arange(len(detections), device=cars.frame_index.device),
+        mask_left=detections.mask_left,
+        mask_row=torch.arange(len(detections), device=cars.frame_index.device),
     )

@@ -59,6 +59,7 @@ class _Fixed(NamedTuple):
     intensity_left: Tensor  # (Q, N) brought to the brightness of the right image
     rays_left: Tensor  # (Q, N, 3)
     gradient_weight: Tensor  # (Q,)
+    neighbour_weight: Tensor  # (Q, N) zero for neighbours that the mask says are not on the car
     images: GreyPair
     segments: Segments
 
@@ -79,7 +80,8 @@ class PhotometricTerm:
     pixels: PixelSamples  # of the left image
     pyramid: tuple[GreyPair, ...]
     hidden_right: OcclusionCrops | None
-    crop_index: Tensor  # (B,) row of each car in `hidden_right`
+    mask_left: Tensor  # (B of the call, H, W)
+    mask_row: Tensor  # (B,) row of each car in `mask_left` and `hidden_right`
     fixed: _Fixed | None = None
 
     @property
@@ -106,8 +108,7 @@ class PhotometricTerm:
     def pixel_cost(self, projected: ProjectedState) -> Tensor:
         """Weighted Huber norm (Q,), summed over the neighbourhood, of each pixel of the set; differentiable."""
         usable, residual = self._usable_and_residual(projected, attached=True)
-        rho = self._norm(residual.residual).rho
-        return torch.where(usable, rho.sum(dim=1), self._lost_cost()) * self._require().gradient_weight
+        return self._weighted_cost(self._norm(residual.residual).rho, usable)
 
     def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
         fixed = self._require()
@@ -121,10 +122,10 @@ class PhotometricTerm:
         weight = torch.where(usable, fixed.gradient_weight, torch.zeros_like(fixed.gradient_weight))
         # All neighbours share one depth, so their rows are multiples of one: sum the multiples first.
         J = residual.J_residual_depth
-        first = weight * (norm.gradient_weight * J).sum(dim=1)
-        second = weight * (norm.hessian_weight * J * J).sum(dim=1)
+        first = weight * (fixed.neighbour_weight * norm.gradient_weight * J).sum(dim=1)
+        second = weight * (fixed.neighbour_weight * norm.hessian_weight * J * J).sum(dim=1)
         gradient, hessian = fixed.segments.accumulate(depth.J_depth_state, first, second)
-        rho = torch.where(usable, norm.rho.sum(dim=1), self._lost_cost()) * fixed.gradient_weight
+        rho = self._weighted_cost(norm.rho, usable)
         c = self._weight()
         # The neighbourhoods of neighbouring samples overlap: a pixel counts once, with its neighbourhood's mean.
         per_pixel = fixed.segments.counts.to(torch.float64) / self.config.huber_grey_levels**2 / self.config.weight
@@ -132,10 +133,22 @@ class PhotometricTerm:
         cost = fixed.segments.sum(rho) * c
         return TermLinearisation(cost, c[:, None] * gradient, c[:, None, None] * hessian, fisher)
 
+    def agreement(self, projected: ProjectedState) -> tuple[Tensor, Tensor]:
+        """Mean absolute residual (B,) in grey levels of the usable pixels, and their share (B,) of the pixel set."""
+        fixed = self._require()
+        usable, residual = self._usable_and_residual(projected)
+        weight = fixed.neighbour_weight * usable[:, None]
+        total = fixed.segments.sum(weight.sum(dim=1))
+        error = fixed.segments.sum((weight * residual.residual.abs()).sum(dim=1))
+        nothing = torch.full_like(total, torch.nan)
+        count = fixed.segments.counts.to(torch.float64)
+        share = fixed.segments.sum(usable.to(weight.dtype)) / count.clamp_min(1)
+        return torch.where(total > 0, error / total.clamp_min(1), nothing), torch.where(count > 0, share, nothing)
+
     def of_objects(self, keep: Tensor) -> PhotometricTerm:
         pixels = self.pixels.of_objects(keep)
         reduced = replace(
-            self, cars=self.cars.of_objects(keep), pixels=pixels, crop_index=self.crop_index[keep], fixed=None
+            self, cars=self.cars.of_objects(keep), pixels=pixels, mask_row=self.mask_row[keep], fixed=None
         )
         if self.fixed is None:
             return reduced
@@ -150,6 +163,7 @@ class PhotometricTerm:
             intensity_left=self.fixed.intensity_left[chosen],
             rays_left=self.fixed.rays_left[chosen],
             gradient_weight=self.fixed.gradient_weight[chosen],
+            neighbour_weight=self.fixed.neighbour_weight[chosen],
             segments=Segments.from_sorted_index(object_index, int(keep.sum())),
         )
         return replace(reduced, fixed=fixed)
@@ -160,8 +174,14 @@ class PhotometricTerm:
         return self.fixed
 
     def _weight(self) -> Tensor:
-        counts = self._require().segments.counts.clamp_min(1).to(torch.float64)
-        return self.config.weight / (counts * len(DSO_PATTERN))
+        fixed = self._require()
+        return self.config.weight / fixed.segments.sum(fixed.neighbour_weight.sum(dim=1)).clamp_min(1)
+
+    def _weighted_cost(self, rho: Tensor, usable: Tensor) -> Tensor:
+        """Cost (Q,) of each pixel of the set from the norms (Q, N) of its neighbourhood."""
+        fixed = self._require()
+        rho = torch.where(usable[:, None], rho, self._lost_cost())
+        return (rho * fixed.neighbour_weight).sum(dim=1) * fixed.gradient_weight
 
     def _norm(self, residual: Tensor) -> robust.RobustValue:
         if self.config.truncated:
@@ -171,7 +191,7 @@ class PhotometricTerm:
     def _lost_cost(self) -> Tensor:
         """What a pixel of the set pays that cannot be compared any more: the Huber norm truncated there."""
         lost = torch.tensor(self.config.lost_grey_levels, dtype=self.pixels.uv.dtype, device=self.pixels.uv.device)
-        return robust.huber(lost, self.config.huber_grey_levels).rho * len(DSO_PATTERN)
+        return robust.huber(lost, self.config.huber_grey_levels).rho
 
     def _fix(self, pixel_index: Tensor, images: GreyPair) -> _Fixed:
         """The pixels of a set with the left image's side of their residuals."""
@@ -185,12 +205,25 @@ class PhotometricTerm:
         c2 = self.config.gradient_constant_grey_levels**2
         weight = c2 / (c2 + chosen.gradient_magnitude**2)
         segments = Segments.from_sorted_index(chosen.object_index, len(self.cars.frame_index))
-        return _Fixed(pixel_index, chosen.object_index, intensity, rays, weight, images, segments)
+        neighbours = self._neighbour_weight(chosen.object_index, uv_full)
+        return _Fixed(pixel_index, chosen.object_index, intensity, rays, weight, neighbours, images, segments)
+
+    def _neighbour_weight(self, object_index: Tensor, uv: Tensor) -> Tensor:
+        """One (Q, N) for neighbours on the car, zero for those that the mask gives to something else.
+
+        All neighbours are warped with the centre's depth: background beside the contour would pull the depth of a
+        small car away from its surface. The paper's pixel set keeps them.
+        """
+        if self.config.pixel_set == "hit":
+            return torch.ones_like(uv[..., 0])
+        last = torch.tensor(self.mask_left.shape[:0:-1], device=uv.device) - 1
+        u, v = uv.round().long().clamp_min(0).minimum(last).unbind(-1)
+        return (self.mask_left[self.mask_row[object_index][:, None], v, u] > 0.5).to(uv.dtype)
 
     def _gain(self, fixed: _Fixed, intensity_right: Tensor) -> Tensor:
         """Brightness (B,) of the right image relative to the left one, over each car's pixel set."""
-        left = fixed.segments.sum(fixed.intensity_left.mean(dim=1))
-        right = fixed.segments.sum(intensity_right.mean(dim=1))
+        left = fixed.segments.sum((fixed.neighbour_weight * fixed.intensity_left).sum(dim=1))
+        right = fixed.segments.sum((fixed.neighbour_weight * intensity_right).sum(dim=1))
         gain = torch.where(left > 0, right / torch.where(left > 0, left, torch.ones_like(left)), torch.ones_like(left))
         return gain.clamp(*_GAIN_BOUNDS).to(fixed.intensity_left.dtype)
 
@@ -222,7 +255,7 @@ class PhotometricTerm:
         usable = on_surface & residual.inside
         if self.hidden_right is None:
             return usable
-        crop = self.crop_index[self._require().object_index]
+        crop = self.mask_row[self._require().object_index]
         return usable & ~self.hidden_right.at(crop, residual.uv_right.detach())
 
     def _usable_and_residual(

@@ -1,0 +1,68 @@
+"""How well a car fits what the images show: figures that say when not to trust a result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.energy.projected_state import ProjectedView
+from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.shape.shape_prior import BoundShape
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """Agreement of B refined cars with the images; NaN where there is nothing to compare.
+
+    Attributes:
+        mask_iou_left, mask_iou_right: (B,) overlap of the projected shape with the instance mask over the sampled,
+            unoccluded pixels. Good fits stand above 0.9; below 0.8 mask or fit is wrong.
+        photometric_error_grey: (B,) mean absolute difference between the images over the pixels that count, in grey
+            levels of 0..255, after matching the brightness.
+        matched_share: (B,) share of the photometric pixel set that could be compared at the end.
+    """
+
+    mask_iou_left: Tensor
+    mask_iou_right: Tensor
+    photometric_error_grey: Tensor
+    matched_share: Tensor
+
+    @classmethod
+    def nothing(cls, like: Tensor, count: int) -> FitQuality:
+        """No figures for `count` cars."""
+        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
+        return cls(nan, nan, nan, nan)
+
+    def spread(self, rows: Tensor, count: int) -> FitQuality:
+        """The figures of some cars placed among `count` cars."""
+        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=rows.device)
+        return FitQuality(*(nan.index_copy(0, rows, getattr(self, f.name)) for f in fields(self)))
+
+
+@torch.no_grad()
+def fit_quality(problem: CarProblem, state: CarState) -> FitQuality:
+    """Figures of B cars at a state of a problem whose last stage has begun."""
+    projected = problem.project(state)
+    count = len(state.code)
+    left = _mask_iou(projected.shape, projected.left, problem.left, count)
+    right = _mask_iou(projected.shape, projected.right, problem.right, count)
+    nan = torch.full_like(left, torch.nan)
+    for term in problem.terms:
+        if isinstance(term, PhotometricTerm):
+            error, share = term.agreement(projected)
+            return FitQuality(left, right, error, share)
+    return FitQuality(left, right, nan, nan)
+
+
+def _mask_iou(shape: BoundShape, view: ProjectedView, pixels: PixelSamples, count: int) -> Tensor:
+    closest = shape.value(view.rays.at(view.closest_depth), view.rays.object_index)
+    covered = (closest < 0) & view.march.crosses_bounds
+    masked = pixels.foreground > 0.5
+    both = torch.bincount(pixels.object_index[covered & masked], minlength=count).to(torch.float64)
+    either = torch.bincount(pixels.object_index[covered | masked], minlength=count).to(torch.float64)
+    return torch.where(either > 0, both / either.clamp_min(1), torch.full_like(both, torch.nan))
