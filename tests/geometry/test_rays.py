@@ -40,7 +40,7 @@ def test_directions_with_zero_components() -> None:
     origins = torch.tensor([[-5.0, 0.0, 0.0], [-5.0, 0.3, 0.0], [0.0, -9.0, 0.9], [0.0, 0.0, 5.0]], dtype=torch.float64)
     directions = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [0, 1.0, -0.0], [0, 0, -0.5]], dtype=torch.float64)
     interval = ray_box_interval(origins, directions, BOUNDS)
-    # By hand: x from -5 to -2 and 2.1; y = 0.3 is above 0.2, a miss; on the face z = 0.9; z from 5 to 0.9 at half speed.
+    # By hand: x from -5 to -2 and 2.1; y = 0.3 is above 0.2, a miss; on the face z = 0.9; z from 5 at half speed.
     assert interval.hit.tolist() == [True, False, True, True]
     torch.testing.assert_close(interval.near[[0, 2, 3]], torch.tensor([3.0, 7.5, 8.2], dtype=torch.float64))
     torch.testing.assert_close(interval.far[[0, 2, 3]], torch.tensor([7.1, 9.2, 11.8], dtype=torch.float64))

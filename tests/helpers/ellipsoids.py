@@ -26,7 +26,7 @@ class Ellipsoid:
     def sphere(cls, radius: float, dtype: torch.dtype = torch.float64) -> Ellipsoid:
         return cls(torch.full((3,), radius, dtype=dtype), torch.zeros(3, dtype=dtype), radius)
 
-    def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:  # noqa: ARG002
+    def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         return self.scale * (((points_obj - self.centre) / self.half_axes).norm(dim=-1) - 1)
 
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
