@@ -1,0 +1,252 @@
+"""Comparison of result folders: a small data set whose every figure is derived by hand."""
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from directshape_torch.cli import compare
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, read_tracks, write_tracks
+from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
+from directshape_torch.evaluation.comparison_report import format_comparison
+from directshape_torch.io.result_files import ShapeArrays, write_shapes
+
+BOXES_2D = {
+    "near": "100 100 200 180",
+    "middle": "300 100 360 140",
+    "far": "500 100 530 126",
+    "small": "700 100 720 120",
+}
+
+
+def _line(
+    which: str, x: float, z: float, kind: str = "Car", yaw: float = 0.0, occluded: int = 0, score: str = ""
+) -> str:
+    return f"{kind} 0 {occluded} 0 {BOXES_2D[which]} 1.5 2 4 {x} 1.6 {z} {yaw} {score}".strip()
+
+
+def _write(folder: Path, **frames: list[str]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for frame, lines in frames.items():
+        (folder / f"{frame[1:]}.txt").write_text("".join(f"{line}\n" for line in lines))
+    return folder
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """Boxes are 4 x 2 m along x: a shift by s in x leaves the overlap (4 - s) / (4 + s).
+
+    Before: shifts 2, 1, 0.4. After: 0, 1, 1. The small label and the occluded one do not count.
+    """
+    labels = _write(
+        tmp_path / "labels",
+        f000001=[_line("near", 0, 8), _line("middle", 5, 25), _line("small", 9, 60)],
+        f000002=[
+            _line("far", 2, 40),
+            _line("near", 9, 9, occluded=2),
+            "DontCare -1 -1 -10 0 0 9 9 -1 -1 -1 -1000 -1000 -1000 -10",
+        ],
+    )
+    before = _write(
+        tmp_path / "before" / "data",
+        f000001=[
+            _line("middle", 6, 25, score="0.8"),
+            _line("near", 2, 8, score="0.9"),
+            _line("small", 9, 60, score="0.1"),
+        ],
+        f000002=[_line("near", 9, 9, score="0.5"), _line("far", 2.4, 40, score="0.7")],
+    )
+    after = _write(
+        tmp_path / "after",
+        f000001=[
+            _line("middle", 6, 25, score="0.8"),
+            _line("near", 0, 8, score="0.9"),
+            _line("small", 9, 60, score="0.1"),
+        ],
+        f000002=[_line("near", 9, 9, score="0.5"), _line("far", 3, 40, score="0.7")],
+    )
+    return labels, before.parent, after
+
+
+def test_every_figure(folders: tuple[Path, Path, Path]):
+    comparison = compare_results(*folders)
+    assert comparison.num_frames == 2
+    assert comparison.num_labels_counted == 3
+    assert [(c.frame_id, c.detection_line, c.label_line) for c in comparison.cars] == [
+        ("000001", 1, 2),
+        ("000001", 2, 1),
+        ("000002", 2, 1),
+    ]
+    overall = comparison.overall
+    assert (overall.num_detections, overall.num_cars) == (3, 3)
+    metrics = overall.metrics
+    before = (3 / 5, 2 / 6, 3.6 / 4.4)
+    after = (3 / 5, 1.0, 3 / 5)
+    assert metrics["bev_iou_mean"].before.value == pytest.approx(np.mean(before))
+    assert metrics["bev_iou_mean"].after.value == pytest.approx(np.mean(after))
+    assert metrics["bev_iou_mean"].change.value == pytest.approx(np.mean(after) - np.mean(before))
+    # All boxes stand on the same ground and are of one height.
+    assert metrics["iou_3d_mean"].before.value == pytest.approx(np.mean(before))
+    assert metrics["bev_iou_good_share"].before.value == pytest.approx(1 / 3)
+    assert metrics["centre_m_median"].before.value == pytest.approx(1.0)
+    assert metrics["centre_m_median"].after.value == pytest.approx(1.0)
+    assert metrics["yaw_deg_median"].after.value == pytest.approx(0.0)
+    assert overall.worse_share is not None
+    assert overall.worse_share.value == pytest.approx(1 / 3)
+    assert overall.worse_share.low == 0
+
+
+def test_depth_bins_partition_the_cars(folders: tuple[Path, Path, Path]):
+    groups = {group.name: group.num_detections for group in compare_results(*folders).by_depth}
+    assert groups == {"0-10 m": 1, "10-20 m": 0, "20-30 m": 1, "30-45 m": 1, "over 45 m": 0}
+
+
+def test_tracks_join_cars_and_drives(folders: tuple[Path, Path, Path], tmp_path: Path):
+    car, other = CarIdentity("0005/1", "0005"), CarIdentity("0007/3", "0007")
+    tracks = CarTracks({("000001", 1): car, ("000002", 1): car, ("000001", 2): other})
+    write_tracks(tmp_path / "tracks.json", tracks)
+    comparison = compare_results(*folders, tracks=tmp_path / "tracks.json")
+    assert comparison.tracks_known
+    assert comparison.overall.num_cars == 2
+    assert {g.name: g.num_detections for g in comparison.by_car} == {"0005/1": 2, "0007/3": 1}
+    assert {g.name: g.num_cars for g in comparison.by_drive} == {"0005": 1, "0007": 1}
+    # One vote a car: the mean of (2/6 + 3.6/4.4) / 2 and 3/5.
+    expected = np.mean([np.mean([2 / 6, 3.6 / 4.4]), 3 / 5])
+    assert comparison.per_car.metrics["bev_iou_mean"].before.value == pytest.approx(expected)
+    assert comparison.by_car[0].metrics["bev_iou_mean"].before.low is None
+
+
+def test_without_tracks_it_says_so(folders: tuple[Path, Path, Path]):
+    comparison = compare_results(*folders)
+    assert comparison.by_car == comparison.by_drive == ()
+    assert "physical cars not known" in format_comparison(comparison)
+
+
+def _shapes(frame_id: str, lines: list[int], statuses: list[str]) -> ShapeArrays:
+    count = len(lines)
+    eye = np.tile(np.eye(4), (count, 1, 1))
+    values = {
+        "T_cam_obj": eye,
+        "T_ref_obj": eye,
+        "covariances_ref": eye,
+        "covariances": np.tile(np.eye(7), (count, 1, 1)),
+    }
+    values |= {
+        "boxes_hwl": np.ones((count, 3)),
+        "boxes_location_ref": np.ones((count, 3)),
+        "codes": np.zeros((count, 1)),
+    }
+    values |= {
+        "boxes_rotation_y": np.zeros(count),
+        "costs_before": np.zeros((count, 0)),
+        "costs_after": np.zeros((count, 0)),
+    }
+    return ShapeArrays(
+        frame_id=frame_id,
+        prior_sha256="",
+        ground_source="file",
+        input_lines=np.array(lines, dtype=np.int64),
+        statuses=tuple(statuses),
+        messages=("",) * count,
+        term_names=(),
+        iterations=np.zeros(count, dtype=np.int64),
+        **values,
+    )
+
+
+def test_cars_without_a_mask_are_left_out(folders: tuple[Path, Path, Path], tmp_path: Path):
+    write_shapes(tmp_path / "shapes" / "000001.npz", _shapes("000001", [1, 2, 3], ["converged", "no_mask", "no_mask"]))
+    write_shapes(tmp_path / "shapes" / "000002.npz", _shapes("000002", [2], ["rejected_worse"]))
+    comparison = compare_results(*folders, keep_line=lines_with_left_mask(tmp_path / "shapes"))
+    assert [(c.frame_id, c.detection_line) for c in comparison.cars] == [("000001", 1), ("000002", 2)]
+    assert comparison.num_filtered_out == 1
+    assert "1 more detections have no mask" in format_comparison(comparison)
+
+
+def test_frames_and_split_choose(folders: tuple[Path, Path, Path], tmp_path: Path):
+    (tmp_path / "split.txt").write_text("000002\n")
+    assert compare_results(*folders, split=tmp_path / "split.txt").overall.num_detections == 1
+    assert compare_results(*folders, frames=[1]).overall.num_detections == 2
+    with pytest.raises(InputError, match="frames: expected frames or split, got both"):
+        compare_results(*folders, split=tmp_path / "split.txt", frames=[1])
+
+
+def test_files_that_do_not_belong_together_are_named(folders: tuple[Path, Path, Path]):
+    path = folders[2] / "000002.txt"
+    whole = path.read_text()
+    path.write_text(whole.splitlines()[0] + "\n")
+    with pytest.raises(DataFormatError, match=r"after/000002.txt: has 1 lines, .*before/data/000002.txt has 2"):
+        compare_results(*folders)
+    path.write_text(whole.replace("Car", "Van", 1))
+    with pytest.raises(DataFormatError, match=r"after/000002.txt, line 1: does not belong to line 1"):
+        compare_results(*folders)
+    path.unlink()
+    with pytest.raises(DataFormatError, match=r"after/000002\.txt"):
+        compare_results(*folders)
+
+
+def test_empty_files_and_no_files(tmp_path: Path):
+    parts = [_write(tmp_path / name, f000001=[]) for name in ("labels", "before", "after")]
+    comparison = compare_results(*parts)
+    assert comparison.cars == ()
+    assert comparison.overall.worse_share is None
+    assert "nothing to compare" in format_comparison(comparison)
+    (tmp_path / "none").mkdir()
+    with pytest.raises(InputError, match="frames: expected at least one frame"):
+        compare_results(parts[0], tmp_path / "none", parts[2])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not valid JSON"),
+        ("[]", "is no tracks file of schema 1"),
+        ('{"schema_version": 2, "labels": {}}', "schema_version is 2"),
+        ('{"schema_version": 1, "labels": {"000001": {"0": {"car": "a"}}}}', "'0' is no label line number"),
+        ('{"schema_version": 1, "labels": {"000001": {"1": {"car": 3}}}}', "frame 000001, line 1: expected"),
+        ('{"schema_version": 1, "labels": {"000001": []}}', "frame 000001 holds no object"),
+    ],
+)
+def test_damaged_tracks_are_named(tmp_path: Path, content: str, message: str):
+    path = tmp_path / "tracks.json"
+    path.write_text(content)
+    with pytest.raises(DataFormatError, match=message):
+        read_tracks(path)
+
+
+def test_command_prints_and_writes(
+    folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    import argparse
+
+    parser = argparse.ArgumentParser()
+    compare.add_parser(parser.add_subparsers())
+    names = ("--labels", "--before", "--after")
+    options = [text for pair in zip(names, map(str, folders), strict=True) for text in pair]
+    outputs = ["--json", str(tmp_path / "c.json"), "--csv", str(tmp_path / "c.csv"), "--draws", "50"]
+    args = parser.parse_args(["compare", *options, *outputs])
+    assert args.run(args) == 0
+    printed = capsys.readouterr().out
+    assert "3 detections of 3 counted labels in 2 frames" in printed
+    assert "BEV IoU, mean" in printed
+    content = json.loads((tmp_path / "c.json").read_text())
+    assert content["schema_version"] == 1
+    assert content["overall"]["metrics"]["bev_iou_mean"]["after"]["value"] == pytest.approx((0.6 + 1 + 0.6) / 3)
+    with (tmp_path / "c.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["bev_iou_after"]) for row in rows] == pytest.approx([0.6, 1.0, 0.6], abs=1e-5)
+    assert [row["depth_m"] for row in rows] == ["25", "8", "40"]
+
+
+@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: rendered frames needed")
+@pytest.mark.parametrize(("detector", "bev_iou"), [("stereo", 0.722), ("mono", 0.487), ("gt", 1.0)])
+def test_simulated_detectors(detector: str, bev_iou: float):
+    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "rendered"
+    folder = root / "detections" / detector
+    overall = compare_results(root / "training" / "label_2", folder, folder).overall
+    assert overall.metrics["bev_iou_mean"].after.value == pytest.approx(bev_iou, abs=2e-3)
+    assert overall.num_detections == (102 if detector == "gt" else 97)
