@@ -1,0 +1,168 @@
+"""The field: its basis, its tame continuation, its file, and its refusal of other rigs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry.disparity_field import DisparityField, nearest_in_convex_polygon, polynomial_basis
+
+SIZE = (1242, 375)
+
+
+def rig() -> tuple[Tensor, Tensor, Tensor]:
+    K = torch.tensor([[721.5, 0.0, 609.6], [0.0, 721.5, 172.9], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    T_right_cam = torch.eye(4, dtype=torch.float64)
+    T_right_cam[:3, 3] = torch.tensor([-0.5327, 0.0027, 0.0])
+    return K, K.clone(), T_right_cam
+
+
+def smooth_field(hull: list[list[float]] | None = None) -> DisparityField:
+    coefficients = torch.tensor([-0.3, 0.1, 0.2, -0.6, 0.05, 0.1, -0.2, 0.3, 0.1, -0.4], dtype=torch.float64)
+    hull_uv = torch.tensor(hull or [[0, 0], [1241, 0], [1241, 374], [0, 374]], dtype=torch.float64)
+    return DisparityField(coefficients, hull_uv, SIZE, *rig(), provenance={"source": "lidar", "num_points": 7})
+
+
+def test_basis_at_a_hand_computed_pixel() -> None:
+    # In an image of 5 x 3 pixels, (3, 0) is normalised to (0.5, -1).
+    basis = polynomial_basis(torch.tensor([3.0, 0.0], dtype=torch.float64), (5, 3))
+    assert basis.tolist() == [1, 0.5, -1, 0.25, -0.5, 1, 0.125, -0.25, 0.5, 0.0625]
+
+
+@pytest.mark.parametrize("shape", [(0,), (1,), (7,), (2, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bias_keeps_leading_shape_and_dtype(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    bias = smooth_field().bias(torch.full((*shape, 2), 33.0, dtype=dtype))
+    assert bias.shape == shape
+    assert bias.dtype == dtype
+
+
+def test_float32_is_close_to_float64() -> None:
+    uv = torch.rand(200, 2, dtype=torch.float64) * torch.tensor([1241.0, 374.0])
+    field = smooth_field()
+    torch.testing.assert_close(
+        field.to(dtype=torch.float32).bias(uv.float()).double(), field.bias(uv), atol=1e-5, rtol=0
+    )
+
+
+def test_inside_the_hull_it_is_the_polynomial() -> None:
+    field = smooth_field()
+    uv = torch.tensor([[0.0, 0.0], [620.5, 187.0], [1000.0, 300.0]], dtype=torch.float64)
+    torch.testing.assert_close(field.bias(uv), polynomial_basis(uv, SIZE) @ field.coefficients)
+    assert float(field.bias(uv[1])) == pytest.approx(-0.3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(u=st.floats(-3000, 4000), v=st.floats(-3000, 4000))
+def test_outside_it_stays_within_the_values_of_the_hull(u: float, v: float) -> None:
+    field = smooth_field([[300.0, 100.0], [900.0, 100.0], [900.0, 300.0], [300.0, 300.0]])
+    at = torch.tensor([u, v], dtype=torch.float64)
+    # For an upright rectangle the nearest point is the clamped one.
+    nearest = torch.stack([at[0].clamp(300, 900), at[1].clamp(100, 300)])
+    torch.testing.assert_close(field.bias(at), polynomial_basis(nearest, SIZE) @ field.coefficients)
+
+
+@settings(max_examples=30, deadline=None)
+@given(angle=st.floats(0, 6.28), clockwise=st.booleans())
+def test_nearest_point_of_a_polygon_agrees_with_dense_sampling_of_its_border(angle: float, clockwise: bool) -> None:
+    polygon = torch.tensor([[0, 0], [10, 1], [12, 6], [4, 9]], dtype=torch.float64)
+    polygon = polygon.flip(0) if clockwise else polygon
+    point = torch.tensor([6.0, 4.0]) + 15 * torch.tensor([angle, angle - torch.pi / 2], dtype=torch.float64).cos()
+    t = torch.linspace(0, 1, 2001, dtype=torch.float64)[:, None, None]
+    border = (polygon + t * (polygon.roll(-1, 0) - polygon)).reshape(-1, 2)
+    expected = border[(border - point).norm(dim=-1).argmin()]
+    torch.testing.assert_close(nearest_in_convex_polygon(point, polygon), expected, atol=0.01, rtol=0)
+
+
+def test_constant_is_constant_everywhere() -> None:
+    field = DisparityField.constant(-0.4, SIZE, *rig())
+    uv = torch.tensor([[-500.0, 9999.0], [3.0, 4.0]], dtype=torch.float64)
+    torch.testing.assert_close(field.bias(uv), torch.full((2,), -0.4, dtype=torch.float64))
+
+
+def test_same_rig_passes_even_in_float32() -> None:
+    smooth_field().check_rig(SIZE, *(t.float() for t in rig()))
+
+
+@pytest.mark.parametrize(
+    ("index", "entry", "change", "text"),
+    [
+        (0, (0, 0), 2.7, "K_left"),
+        (1, (0, 2), -0.2, "K_right"),
+        (2, (0, 3), 0.005, "T_right_cam"),
+        (2, (0, 1), 5e-4, "turned"),
+    ],
+)
+def test_another_rig_is_refused(index: int, entry: tuple[int, int], change: float, text: str) -> None:
+    matrices = [t.clone() for t in rig()]
+    matrices[index][entry] += change
+    with pytest.raises(InputError, match=text):
+        smooth_field().check_rig(SIZE, *matrices)
+
+
+def test_a_calibration_with_nan_is_refused() -> None:
+    K_left, K_right, T_right_cam = rig()
+    with pytest.raises(InputError, match="K_left"):
+        smooth_field().check_rig(SIZE, K_left * torch.nan, K_right, T_right_cam)
+
+
+def test_another_image_size_is_refused() -> None:
+    with pytest.raises(InputError, match=r"1242 x 375.*1224 x 370.*calibrate-stereo"):
+        smooth_field().check_rig((1224, 370), *rig())
+
+
+def test_save_and_load_give_the_same_field(tmp_path: Path) -> None:
+    path = tmp_path / "bias.json"
+    smooth_field().save(path)
+    loaded = DisparityField.load(path)
+    uv = torch.rand(50, 2, dtype=torch.float64) * 1000
+    assert torch.equal(loaded.bias(uv), smooth_field().bias(uv))
+    assert loaded.provenance == {"source": "lidar", "num_points": 7}
+    loaded.check_rig(SIZE, *rig())
+    assert [p.name for p in tmp_path.iterdir()] == ["bias.json"]
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"schema": "another"}, "no disparity field"),
+        ({"schema_version": 99}, "schema version 99"),
+        ({"coefficients": [1.0, 2.0]}, "'coefficients' must be finite numbers of shape \\(10\\)"),
+        ({"coefficients": ["a"] * 10}, "'coefficients' must be numbers"),
+        ({"hull_uv": [[0.0, 0.0], [1.0, 1.0]]}, "'hull_uv'"),
+        ({"K_left": None}, "'K_left'"),
+        ({"size_wh": [1242]}, "'size_wh'"),
+        ({"provenance": 3}, "'provenance'"),
+    ],
+)
+def test_a_bad_file_names_what_is_wrong(tmp_path: Path, change: dict[str, object], text: str) -> None:
+    path = tmp_path / "bias.json"
+    smooth_field().save(path)
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(DataFormatError, match=text):
+        DisparityField.load(path)
+
+
+def test_a_missing_or_cut_file_is_a_format_error(tmp_path: Path) -> None:
+    with pytest.raises(DataFormatError, match="cannot be read"):
+        DisparityField.load(tmp_path / "none.json")
+    (tmp_path / "cut.json").write_text('{"schema": ')
+    with pytest.raises(DataFormatError, match="is no JSON"):
+        DisparityField.load(tmp_path / "cut.json")
+
+
+def test_wrong_tensors_are_refused() -> None:
+    K_left, K_right, T_right_cam = rig()
+    with pytest.raises(InputError, match="coefficients"):
+        DisparityField(torch.zeros(9), torch.zeros(4, 2), SIZE, K_left, K_right, T_right_cam)
+    with pytest.raises(InputError, match="hull_uv"):
+        DisparityField(torch.zeros(10), torch.zeros(2, 2), SIZE, K_left, K_right, T_right_cam)
+    with pytest.raises(InputError, match="finite"):
+        DisparityField(torch.full((10,), torch.nan), torch.zeros(3, 2), SIZE, K_left, K_right, T_right_cam)
