@@ -282,9 +282,11 @@ def sample_pixels(
     if settings.mode == "dense":
         return PixelSelection(object_index, uv, above)
 
-    cell, centre_distance, num_cells = _small_cells(regions, object_index, u, v, settings)
+    side = _small_cell_side(regions, settings)
+    cell, num_cells = _small_cells(regions, side, object_index, u, v)
     if settings.mode == "uniform":
-        chosen = _strongest_of_each_cell(-centre_distance, torch.ones_like(above), cell, num_cells)
+        closeness = _closeness_to_cell_centre(regions, side, object_index, uv)
+        chosen = _strongest_of_each_cell(closeness, torch.ones_like(above), cell, num_cells)
     else:
         chosen = _strongest_of_each_cell(strength, above, cell, num_cells)
     if settings.mode == "round_one":
@@ -293,7 +295,7 @@ def sample_pixels(
 
 
 def _strongest_of_each_cell(
-    strength: Tensor,  # (A,) float32
+    strength: Tensor,  # (A,) float32, not negative
     preferred: Tensor,  # (A,) bool
     cell: Tensor,  # (A,)
     num_cells: int,
@@ -303,38 +305,56 @@ def _strongest_of_each_cell(
     if not count:
         return cell
     # One maximum over a packed key decides all three: bit 62 preferred, bits 31..61 the strength, below them the
-    # reversed index. The bits of floats of one sign are ordered as the floats are (reversed for negative ones).
+    # reversed index. The bits of floats that are not negative are ordered as the floats are.
     bits = strength.contiguous().view(torch.int32).long()
-    bits = torch.where(bits < 0, -(bits & _LOW_31_BITS) + _LOW_31_BITS, bits)
     key = (preferred.long() << 62) | (bits << 31) | (_LOW_31_BITS - torch.arange(count, device=strength.device))
     best = key.new_full((num_cells,), -1).scatter_reduce_(0, cell, key, "amax")
     return _LOW_31_BITS - (best[best >= 0] & _LOW_31_BITS)
 
 
+def _small_cell_side(
+    regions: Tensor,  # (B, 4)
+    settings: SamplingSettings,
+) -> Tensor:
+    """Side of the cells of each region, (B,) float64, pixels; at least one pixel."""
+    areas = ((regions[:, 3] - regions[:, 1]) * (regions[:, 2] - regions[:, 0])).double()
+    wanted = (settings.density * areas).clamp(settings.min_pixels, settings.max_pixels)
+    return (areas / wanted).sqrt().clamp(min=1.0)
+
+
 def _small_cells(
     regions: Tensor,  # (B, 4)
+    side: Tensor,  # (B,)
     object_index: Tensor,  # (A,)
     u: Tensor,  # (A,)
     v: Tensor,  # (A,)
-    settings: SamplingSettings,
-) -> tuple[Tensor, Tensor, int]:
-    """Cell (A,) of each pixel, its squared distance (A,) to the cell's centre in cells, and the number of cells."""
-    heights, widths = (regions[:, 3] - regions[:, 1]).double(), (regions[:, 2] - regions[:, 0]).double()
-    wanted = (settings.density * heights * widths).clamp(settings.min_pixels, settings.max_pixels)
-    side = (heights * widths / wanted).sqrt().clamp(min=1.0)
+) -> tuple[Tensor, int]:
+    """Cell (A,) of each pixel, numbered through all regions, and the number of cells."""
+    heights, widths = regions[:, 3] - regions[:, 1], regions[:, 2] - regions[:, 0]
     columns = (widths / side).ceil().long()
     num_cells = columns * (heights / side).ceil().long()
     start = num_cells.cumsum(0) - num_cells
+    # The cell of a row or a column is found once a region, not once a pixel.
+    longest = torch.arange(int(torch.cat([heights, widths]).max()) if len(regions) else 0, device=regions.device)
+    along = (longest / side[:, None]).floor().long()
+    row_start = start[:, None] + along * columns[:, None]
+    pixel = object_index * len(longest)
+    row = row_start.reshape(-1)[pixel + v - regions[:, 1][object_index]]
+    column = along.reshape(-1)[pixel + u - regions[:, 0][object_index]]
+    return row + column, int(num_cells.sum())
 
-    sides = side[object_index]
-    along_u = (u - regions[:, 0][object_index]) / sides
-    along_v = (v - regions[:, 1][object_index]) / sides
-    column, row = along_u.floor(), along_v.floor()
-    # Positions are those of pixel centres, half a pixel into the pixel.
-    half_pixel = 0.5 / sides
-    distance = (along_u + half_pixel - column - 0.5).square() + (along_v + half_pixel - row - 0.5).square()
-    cell = start[object_index] + row.long() * columns[object_index] + column.long()
-    return cell, distance.float(), int(num_cells.sum())
+
+def _closeness_to_cell_centre(
+    regions: Tensor,  # (B, 4)
+    side: Tensor,  # (B,)
+    object_index: Tensor,  # (A,)
+    uv: Tensor,  # (A, 2)
+) -> Tensor:
+    """One minus the squared distance (A,) of each pixel's centre to its cell's centre, in cells, float32."""
+    along = (uv - regions[object_index, :2]) / side[object_index, None]
+    # The centre of a pixel lies half a pixel into it.
+    offset = along - along.floor() + 0.5 / side[object_index, None] - 0.5
+    return (1 - offset.square().sum(dim=1)).clamp(min=0).float()
 
 
 def _above_threshold(
