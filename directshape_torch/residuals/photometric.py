@@ -28,9 +28,9 @@ class SurfaceDepth(NamedTuple):
 
 
 def surface_slope(gradient: Tensor, direction_obj: Tensor, min_cosine: float) -> tuple[Tensor, Tensor]:
-    """`slope = grad . ray_obj` (P,) and where it is grazing: `|slope| < min_cosine |grad| |ray|`."""
+    """`slope = grad . ray_obj` (P,) and where it is grazing: `|slope| <= min_cosine |grad| |ray|`."""
     slope = (gradient * direction_obj).sum(-1)
-    grazing = slope.abs() < min_cosine * gradient.norm(dim=-1) * direction_obj.norm(dim=-1)
+    grazing = slope.abs() <= min_cosine * gradient.norm(dim=-1) * direction_obj.norm(dim=-1)
     return slope, grazing
 
 

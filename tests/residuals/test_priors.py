@@ -1,0 +1,168 @@
+"""Priors: Jacobians three ways, numbers by hand, and the trap of the paper's rotation prior."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from helpers.derivatives import differences_by_state, jacobian_by_state
+from helpers.twists import twists
+from torch import Tensor
+
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.residuals.priors import (
+    PriorResidual,
+    dimensions_prior,
+    height_prior,
+    shape_prior,
+    tilt_prior_cosine,
+    tilt_prior_normal,
+)
+
+NUM_CODES = 3
+NORMAL = torch.nn.functional.normalize(torch.tensor([0.02, -1.0, -0.03], dtype=torch.float64), dim=0)
+OFFSET = torch.tensor(1.62, dtype=torch.float64)
+MEAN_HWL = torch.tensor([1.5, 1.6, 3.9], dtype=torch.float64)
+BASIS_HWL = torch.tensor([[0.1, 0.0, 0.02], [0.03, 0.1, 0.0], [0.3, -0.1, 0.2]], dtype=torch.float64)
+SIGMA_HWL = torch.tensor([0.1, 0.1, 0.4], dtype=torch.float64)
+
+
+def _shape(state: CarState) -> PriorResidual:
+    return shape_prior(state.code)
+
+
+def _height(state: CarState) -> PriorResidual:
+    count = len(state.code)
+    return height_prior(state.T_obj_cam, NORMAL.expand(count, 3), OFFSET.expand(count), NUM_CODES)
+
+
+def _tilt(state: CarState) -> PriorResidual:
+    return tilt_prior_normal(state.T_obj_cam, NORMAL.expand(len(state.code), 3), NUM_CODES)
+
+
+def _cosine(state: CarState) -> PriorResidual:
+    return tilt_prior_cosine(state.T_obj_cam, NORMAL.expand(len(state.code), 3), NUM_CODES)
+
+
+def _dimensions(state: CarState) -> PriorResidual:
+    detector = torch.tensor([1.4, 1.7, 4.3], dtype=torch.float64).expand(len(state.code), 3)
+    return dimensions_prior(state.code, detector, MEAN_HWL, BASIS_HWL, SIGMA_HWL)
+
+
+PRIORS: dict[str, Callable[[CarState], PriorResidual]] = {
+    "shape": _shape, "height": _height, "tilt": _tilt, "cosine": _cosine, "dimensions": _dimensions,
+}  # fmt: skip
+
+
+def states(regime: str) -> CarState:
+    T_cam_obj = se3.exp(0.5 * twists("normal", 4))
+    depth = {"typical": 15.0, "near": 3.0, "far": 80.0, "three_sigma": 15.0}[regime]
+    T_cam_obj[:, :3, 3] = torch.tensor([2.0, 1.6, depth], dtype=torch.float64)
+    code = 3.0 * torch.ones(4, NUM_CODES, dtype=torch.float64) if regime == "three_sigma" else torch.zeros(4, NUM_CODES)
+    return CarState(se3.inverse(T_cam_obj), code.double())
+
+
+@pytest.mark.parametrize("regime", ["typical", "near", "far", "three_sigma"])
+@pytest.mark.parametrize("name", PRIORS)
+def test_jacobian_three_ways(name: str, regime: str) -> None:
+    prior, state = PRIORS[name], states(regime)
+    analytic = prior(state).J_residual_state
+    rows = analytic.shape[1]
+
+    def residual(at: CarState) -> Tensor:
+        return prior(at).residual.reshape(-1)
+
+    own = torch.arange(4)
+    by_autograd = jacobian_by_state(residual, state).view(4, rows, 4, -1)[own, :, own]
+    by_differences = differences_by_state(residual, state).view(4, rows, 4, -1)[own, :, own]
+    torch.testing.assert_close(analytic, by_autograd, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(analytic, by_differences, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_shapes(name: str, count: int) -> None:
+    state = CarState(torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, NUM_CODES).double())
+    result = PRIORS[name](state)
+    assert len(result.residual) == count
+    assert result.J_residual_state.shape == (*result.residual.shape, 6 + NUM_CODES)
+
+
+def _standing(height_m: float, roll_rad: float = 0.0) -> CarState:
+    """A car whose origin is `height_m` above a level ground 1.65 m below the camera, rolled about its own x axis."""
+    T = pose_from_kitti(torch.tensor([3.0, 1.65 - height_m, 20.0]).double(), torch.tensor(0.6).double())
+    T = T @ se3.exp(torch.tensor([0, 0, 0, roll_rad, 0, 0], dtype=torch.float64))
+    return CarState(se3.inverse(T)[None], torch.zeros(1, NUM_CODES).double())
+
+
+LEVEL = torch.tensor([[0.0, -1.0, 0.0]], dtype=torch.float64)
+
+
+def test_height_by_hand() -> None:
+    """A car 0.3 m above the ground: r is the y coordinate of the origin minus that of the ground, -0.3."""
+    T = _standing(0.3).T_obj_cam
+    result = height_prior(T, LEVEL, torch.tensor([1.65]).double(), NUM_CODES)
+    torch.testing.assert_close(result.residual, torch.tensor([[-0.3]], dtype=torch.float64))
+    # The camera moving down by v_y of the object frame moves the object up: J_v = -[0, 1, 0] R_cam_obj = [0, -1, 0].
+    torch.testing.assert_close(result.J_residual_state[0, 0, :3], torch.tensor([0.0, -1.0, 0.0]).double())
+    assert (result.J_residual_state[0, 0, 3:] == 0).all()
+
+
+def test_height_is_measured_at_the_object_origin() -> None:
+    """Not at the box centre: a car standing on the ground has no residual, whatever its heading."""
+    T = _standing(0.0).T_obj_cam
+    assert height_prior(T, LEVEL, torch.tensor([1.65]).double(), 0).residual.abs().max() < 1e-14
+
+
+def test_tilt_by_hand() -> None:
+    """Rolled by 0.1 about x: the normal (0, -1, 0) becomes (0, -cos, sin) in the object frame."""
+    T = _standing(0.0, roll_rad=0.1).T_obj_cam
+    residual = tilt_prior_normal(T, LEVEL, 0).residual[0]
+    torch.testing.assert_close(residual, torch.tensor([0.0, math.sin(0.1)], dtype=torch.float64))
+    cosine = tilt_prior_cosine(T, LEVEL, 0).residual[0, 0]
+    torch.testing.assert_close(cosine, torch.tensor(1 - math.cos(0.1), dtype=torch.float64))
+
+
+def test_the_papers_rotation_prior_vanishes_at_its_optimum_and_ours_does_not() -> None:
+    T = _standing(0.0).T_obj_cam
+    assert (tilt_prior_cosine(T, LEVEL, 0).J_residual_state == 0).all()
+    J = tilt_prior_normal(T, LEVEL, 0).J_residual_state
+    # By hand with n_obj = (0, -1, 0): [[0, 0, 1], [-1, 0, 0]].
+    expected = torch.tensor([[[0, 0, 1.0], [-1.0, 0, 0]]], dtype=torch.float64)
+    torch.testing.assert_close(J[..., 3:], expected)
+
+
+def test_neither_tilt_prior_minds_position_or_heading() -> None:
+    for form in (tilt_prior_normal, tilt_prior_cosine):
+        J = form(_standing(0.2, 0.05).T_obj_cam, LEVEL, NUM_CODES).J_residual_state
+        assert (J[..., :3] == 0).all()
+        assert (J[..., 6:] == 0).all()
+        turned = se3.exp(torch.tensor([0, 0, 0, 0, 0.8, 0], dtype=torch.float64)) @ _standing(0.0).T_obj_cam
+        assert form(turned, LEVEL, 0).residual.abs().max() < 1e-14
+
+
+def test_dimensions_by_hand() -> None:
+    code = torch.tensor([[1.0, 0.0, -1.0]], dtype=torch.float64)
+    # Height 1.5 + 0.1 - 0.02 = 1.58 against 1.4 at 0.1 m: 1.8 standard deviations.
+    residual = dimensions_prior(code, torch.tensor([[1.4, 1.6, 4.0]]).double(), MEAN_HWL, BASIS_HWL, SIGMA_HWL).residual
+    torch.testing.assert_close(residual[0, 0], torch.tensor(1.8, dtype=torch.float64))
+
+
+def test_moving_the_whole_scene_changes_no_prior() -> None:
+    """Camera moved rigidly, ground and car with it: heights and tilts against the ground stay.
+
+    The height is measured along the camera's y axis, so only motions that keep that axis are free: a turn about it.
+    """
+    state = states("typical")
+    motion = se3.exp(torch.tensor([1.0, -0.4, 3.0, 0.0, 0.7, 0.0], dtype=torch.float64))
+    normal = (motion[:3, :3] @ NORMAL).expand(4, 3)
+    offset = (OFFSET - (motion[:3, :3] @ NORMAL) @ motion[:3, 3]).expand(4)
+    T_obj_cam = state.T_obj_cam @ se3.inverse(motion)
+    before = _height(state).residual
+    torch.testing.assert_close(height_prior(T_obj_cam, normal, offset, NUM_CODES).residual, before)
+    torch.testing.assert_close(tilt_prior_normal(T_obj_cam, normal, NUM_CODES).residual, _tilt(state).residual)
+    torch.testing.assert_close(tilt_prior_cosine(T_obj_cam, normal, NUM_CODES).residual, _cosine(state).residual)
