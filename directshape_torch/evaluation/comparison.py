@@ -41,7 +41,7 @@ class Comparison:
         overall: figures over detections.
         per_car: the same with one vote for each physical car.
         by_depth: figures for each bin of `DEPTH_BINS_M`.
-        by_car: figures for each physical car, only where tracks are known.
+        by_car: figures for each physical car that the tracks name.
         by_drive: figures for each drive, only where drives are known.
         num_frames: frames compared.
         num_labels_counted: labels that count, found by a detection or not.
@@ -102,7 +102,7 @@ def compare_results(
         num_counted += count
     kept = [p for p in pairs if keep_line is None or keep_line(p.frame_id, p.before.line_number)]
     cars = _compared_cars(kept, CarTracks({}) if known is None else known)
-    return _group(cars, len(frame_ids), num_counted, len(pairs) - len(kept), known is not None, bootstrap)
+    return _group(cars, len(frame_ids), num_counted, len(pairs) - len(kept), known, bootstrap)
 
 
 def lines_with_left_mask(shapes_dir: Path | str) -> LineFilter:
@@ -210,11 +210,12 @@ def _group(
     num_frames: int,
     num_counted: int,
     num_filtered_out: int,
-    tracks_known: bool,
+    tracks: CarTracks | None,
     bootstrap: BootstrapSettings | None,
 ) -> Comparison:
     settings = BootstrapSettings() if bootstrap is None else bootstrap
-    names = sorted({car.car for car in cars}) if tracks_known else []
+    tracked = set() if tracks is None else {identity.car for identity in tracks.identities.values()}
+    names = sorted(tracked & {car.car for car in cars})
     drives = sorted({car.drive for car in cars if car.drive is not None})
     return Comparison(
         cars=cars,
@@ -229,7 +230,7 @@ def _group(
         num_frames=num_frames,
         num_labels_counted=num_counted,
         num_filtered_out=num_filtered_out,
-        tracks_known=tracks_known,
+        tracks_known=tracks is not None,
     )
 
 
