@@ -18,7 +18,7 @@ from directshape_torch.stereo_matching.subpixel import refine_disparity
 
 # A match farther from the truth is a wrong match or a hidden point, not a bias.
 _LARGEST_DIFFERENCE_PX = 4.0
-_POINTS_PER_FRAME = 12_000
+_POINTS_PER_FRAME = 30_000
 _GRID = (16, 8)
 
 
@@ -75,7 +75,7 @@ def observe_disparity(
     Args:
         image_left, image_right: rectified pair.
         camera: calibration of the frame.
-        known: at most 12 000 of them are used, evenly over the image.
+        known: at most 30 000 of them are used, evenly over the image.
         subpixel: False keeps the semi-global disparity, which leans towards whole pixels.
 
     Returns:

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from directshape_torch.calibration.kitti_observations import RigFrame, TruthSource
 
 _DESCRIPTION = """Fit the residual disparity field of a stereo rig, measured minus true disparity as a smooth function
-of the left pixel, and write it to a JSON file for 'directshape refine --stereo-bias'. True disparities come from maps (training/disp_noc_0 or disp_occ_0), LiDAR scans (training/velodyne), or, much weaker, 3D box labels
+of the left pixel, and write it to a JSON file for 'directshape refine --stereo-bias'. True disparities come from
+disparity maps (training/disp_noc_0 or disp_occ_0), LiDAR scans (training/velodyne), or, much weaker, 3D box labels
 (training/label_2)."""
 
 
