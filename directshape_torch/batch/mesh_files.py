@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,18 +44,21 @@ def write_car_meshes(
 
 def mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
     """A mesh in the left camera frame as the content of a file."""
-    if mesh_format == "ply":
-        content: bytes = mesh.export(file_type="ply")
-        return content
-    return scene_bytes({"car": mesh})
+    if mesh_format == "glb":
+        return scene_bytes({"car": mesh})
+    from trimesh.exchange.ply import export_ply
+
+    content: bytes = export_ply(mesh)
+    return content
 
 
 def scene_bytes(meshes_cam: dict[str, trimesh.Trimesh]) -> bytes:
     """Named meshes in the left camera frame as one binary glTF scene, y up."""
     import trimesh
+    from trimesh.exchange.gltf import export_glb
 
     scene = trimesh.Scene()
     for name, mesh in meshes_cam.items():
         scene.add_geometry(mesh, node_name=name, geom_name=name, transform=T_GLTF_CAM)
-    content: bytes = scene.export(file_type="glb")
-    return content
+    export: Callable[..., bytes] = export_glb
+    return export(scene, include_normals=True)

@@ -103,7 +103,7 @@ class _Run:
             return
         prior = self.refiner.prior.mean
         frames, detections = collate([ready.loaded for ready in batch])
-        frames, detections = (scene.to(prior.device, prior.dtype) for scene in (frames, detections))
+        frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
         with self.timings.measure(frames.frame_ids, len(detections)):
             result = self.refiner(frames, detections)
         first_row = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Self
+from typing import NoReturn, Self
 
 from tqdm import tqdm
 
@@ -13,7 +13,7 @@ class ProgressBar:
     """Counts frames and tells of those that fail, while `refine_dataset` runs."""
 
     def __init__(self) -> None:
-        self._bar: tqdm[str] | None = None
+        self._bar: tqdm[NoReturn] | None = None
         self._num_failed = 0
 
     def __enter__(self) -> Self:

@@ -1,0 +1,57 @@
+"""`directshape demo`: refine the bundled stereo frame, print what changed, write pictures and a 3D scene."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
+
+_DESCRIPTION = """
+Refine the bundled stereo frame, a path-traced street with cars of our own, from noisy detections; print the errors
+before and after, and write the results, a picture and a 3D scene (scene.glb) for any glTF viewer.
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its options."""
+    parser = subparsers.add_parser("demo", help="refine the bundled stereo frame", description=_DESCRIPTION)
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("directshape_demo"),
+        metavar="DIR",
+        help="folder for the results (default: %(default)s)",
+    )
+    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Refine by the same way as `directshape refine`, then report; returns the exit code.
+
+    Raises:
+        DirectShapeError: an output folder of another run, or no such device; for the main program to show.
+    """
+    from directshape_torch.batch.options import RefineOptions
+    from directshape_torch.batch.refine_dataset import refine_dataset
+    from directshape_torch.batch.run_summary import format_summary
+    from directshape_torch.cli.demo_report import error_table, write_scene
+    from directshape_torch.cli.progress import ProgressBar
+    from directshape_torch.cli.refine import make_refiner
+    from directshape_torch.io.kitti_dataset import KittiStereoDataset
+
+    dataset = KittiStereoDataset(
+        DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training/masks"
+    )
+    refiner = make_refiner(None, [], None, args.device)
+    with ProgressBar() as progress:
+        summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress)
+    for frame_id in dataset.frame_ids:
+        loaded = dataset.load(frame_id)
+        write_scene(args.out / "scene.glb", loaded, args.out, refiner.prior)
+        print(error_table(loaded, args.out))
+    print(format_summary(summary))
+    print(f"picture  {args.out / 'overlays' / f'{dataset.frame_ids[0]}.png'}")
+    print(f"scene    {args.out / 'scene.glb'}")
+    return summary.exit_code

@@ -1,0 +1,99 @@
+"""Each car of a frame enlarged, its contour before above its contour after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from directshape_torch.visualize.drawing import (
+    NEAR_PLANE_M,
+    ORANGE,
+    Array,
+    Colour,
+    Picture,
+    Surface,
+    View,
+    draw_contour,
+    draw_text,
+)
+
+_TILE_HEIGHT_PX = 150
+_TILE_WIDTHS_PX = (140, 320)
+_CAPTION_PX = 18
+_GAP_PX = 6
+_GROUND = 24
+
+
+@dataclass(frozen=True)
+class CarTile:
+    """One car in two states, the colour of the second, and what is said about it."""
+
+    before: Surface
+    after: Surface
+    colour_after: Colour
+    caption: str
+
+
+def tile_strip(
+    image: Picture,
+    K: Array,  # (3, 3)
+    tiles: Sequence[CarTile],
+    width_px: int,
+) -> Picture:
+    """All cars that are seen in the image, from left to right in as many rows as needed; (h, width_px, 3)."""
+    pictures = [picture for picture in (_tile(image, K, tile) for tile in tiles) if picture is not None]
+    rows: list[list[Picture]] = [[]]
+    for picture in pictures:
+        used = sum(p.shape[1] + _GAP_PX for p in rows[-1])
+        if rows[-1] and used + picture.shape[1] > width_px:
+            rows.append([])
+        rows[-1].append(picture)
+    strips = [_row(row, width_px) for row in rows if row]
+    return np.concatenate(strips) if strips else np.zeros((0, width_px, 3), np.uint8)
+
+
+def _row(pictures: Sequence[Picture], width_px: int) -> Picture:
+    row = np.full((pictures[0].shape[0] + _GAP_PX, width_px, 3), _GROUND, np.uint8)
+    u = 0
+    for picture in pictures:
+        shown = picture[:, : width_px - u]
+        row[_GAP_PX:, u : u + shown.shape[1]] = shown
+        u += picture.shape[1] + _GAP_PX
+    return row
+
+
+def _tile(image: Picture, K: Array, tile: CarTile) -> Picture | None:
+    """Caption, before, after; None for a car that the image does not show."""
+    window = _window(image, K, (tile.before, tile.after))
+    if window is None:
+        return None
+    scale = _TILE_HEIGHT_PX / (window[3] - window[1])
+    states: list[tuple[Surface, Colour]] = [(tile.before, ORANGE), (tile.after, tile.colour_after)]
+    views = []
+    for surface, colour in states:
+        view = View.of_window(image, K, window, scale)
+        draw_contour(view, surface, colour, 1)
+        views.append(view.picture)
+    caption = np.full((_CAPTION_PX, views[0].shape[1], 3), _GROUND, np.uint8)
+    draw_text(caption, tile.caption, (3, 13), size=0.38)
+    return np.concatenate([caption, *views])
+
+
+def _window(image: Picture, K: Array, surfaces: Sequence[Surface]) -> tuple[int, int, int, int] | None:
+    """The part of the image around both states, of a shape that makes a handy tile."""
+    points = np.concatenate([surface.vertices_cam for surface in surfaces])
+    points = points[points[:, 2] > NEAR_PLANE_M]
+    if not len(points):
+        return None
+    height, width = image.shape[:2]
+    pixels = np.clip(View(image, K).project(points), 0, [width - 1, height - 1])
+    (u0, v0), (u1, v1) = pixels.min(axis=0), pixels.max(axis=0)
+    if u1 - u0 < 1 or v1 - v0 < 1:
+        return None
+    tall = 1.3 * max(v1 - v0, 6.0)
+    wide = float(np.clip(1.15 * (u1 - u0), *(tall * w / _TILE_HEIGHT_PX for w in _TILE_WIDTHS_PX)))
+    tall = max(tall, 1.15 * (u1 - u0) * _TILE_HEIGHT_PX / _TILE_WIDTHS_PX[1])
+    u, v = (u0 + u1) / 2, (v0 + v1) / 2
+    return round(u - wide / 2), round(v - tall / 2), round(u + wide / 2), round(v + tall / 2)

@@ -1,0 +1,177 @@
+"""Lines, text and projected things on pictures: (h, w, 3) RGB uint8, drawn in place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from directshape_torch.geometry.box3d import BOX_EDGES
+
+Picture = npt.NDArray[np.uint8]
+Array = npt.NDArray[np.floating[Any]]
+Colour = tuple[int, int, int]
+
+ORANGE, BLUE, GREEN, GREY = (255, 140, 0), (30, 144, 255), (60, 220, 80), (170, 170, 170)
+WHITE, BLACK = (255, 255, 255), (0, 0, 0)
+
+NEAR_PLANE_M = 0.3
+# OpenCV takes sub-pixel positions as integers with this many binary digits after the point.
+_SHIFT = 4
+# Beyond this OpenCV's fixed-point coordinates would overflow.
+_FARTHEST_PX = 1e5
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture with the intrinsics that its pixels have: an image, or an enlarged part of one.
+
+    Attributes:
+        picture: (h, w, 3), drawn in place.
+        K: (3, 3), pixels of the picture.
+    """
+
+    picture: Picture
+    K: Array
+
+    @classmethod
+    def of_window(
+        cls,
+        image: Picture,
+        K: Array,  # (3, 3) of the image
+        window: tuple[int, int, int, int],
+        scale: float,
+    ) -> View:
+        """The window (u_min, v_min, u_max, v_max), half open, of an image, enlarged; beyond the image it is black.
+
+        Example:
+            >>> view = View.of_window(np.zeros((4, 6, 3), np.uint8), np.eye(3), (1, 1, 5, 3), 2.0)
+            >>> view.picture.shape, view.K[0].tolist()
+            ((4, 8, 3), [2.0, 0.0, -1.5])
+        """
+        u0, v0, u1, v1 = window
+        part = np.zeros((v1 - v0, u1 - u0, 3), np.uint8)
+        height, width = image.shape[:2]
+        a, b, c, d = max(u0, 0), max(v0, 0), min(u1, width), min(v1, height)
+        if c > a and d > b:
+            part[b - v0 : d - v0, a - u0 : c - u0] = image[b:d, a:c]
+        size = (max(1, round(scale * (u1 - u0))), max(1, round(scale * (v1 - v0))))
+        picture = cv2.resize(part, size, interpolation=cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA)
+        s_u, s_v = size[0] / (u1 - u0), size[1] / (v1 - v0)
+        # Pixel centres are whole numbers: the edge of a picture lies at -0.5.
+        to_view = np.array([[s_u, 0, s_u * (0.5 - u0) - 0.5], [0, s_v, s_v * (0.5 - v0) - 0.5], [0, 0, 1]])
+        return cls(np.ascontiguousarray(picture, dtype=np.uint8), to_view @ K)
+
+    def project(self, points_cam: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3) in front of the camera."""
+        pixels = points_cam @ self.K.T
+        projected: Array = np.clip(pixels[:, :2] / pixels[:, 2:], -_FARTHEST_PX, _FARTHEST_PX)
+        return projected
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Triangles of a shape in the left camera frame: vertices (V, 3), metres, and faces (F, 3)."""
+
+    vertices_cam: Array
+    faces: npt.NDArray[np.integer[Any]]
+
+
+def draw_contour(view: View, surface: Surface, colour: Colour, thickness: int = 2) -> None:
+    """The outline of the projected shape (what its silhouette term sees); the picture's border is no part of it."""
+    padding = 2 + thickness
+    mask = silhouette_mask(view, surface, padding)
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(view.picture, contours, -1, colour, thickness, cv2.LINE_AA, offset=(-padding, -padding))
+
+
+def silhouette_mask(view: View, surface: Surface, padding: int = 0) -> Picture:
+    """Where a triangle of the shape is seen, 255, else 0; triangles that reach behind the camera are left out.
+
+    Returns:
+        (h + 2 padding, w + 2 padding): the picture with that many pixels around it.
+    """
+    height, width = view.picture.shape[:2]
+    mask = np.zeros((height + 2 * padding, width + 2 * padding), np.uint8)
+    in_front = surface.vertices_cam[:, 2] > NEAR_PLANE_M
+    pixels = np.zeros((len(surface.vertices_cam), 2), np.int32)
+    pixels[in_front] = _fixed_point(view.project(surface.vertices_cam[in_front]) + padding)
+    # One by one: a common fill would leave what two triangles cover empty.
+    for triangle in pixels[surface.faces[in_front[surface.faces].all(axis=1)]]:
+        cv2.fillConvexPoly(mask, triangle, 255, cv2.LINE_8, _SHIFT)
+    return mask
+
+
+def draw_box(
+    view: View,
+    corners_cam: Array,  # (8, 3) in the order of `box_corners`
+    colour: Colour,
+    thickness: int = 1,
+) -> None:
+    """The 12 edges of a 3D box, and a line on the ground from its centre to its front."""
+    for first, second in BOX_EDGES:
+        draw_segment(view, corners_cam[first], corners_cam[second], colour, thickness)
+    draw_segment(view, corners_cam[:4].mean(axis=0), corners_cam[:2].mean(axis=0), colour, thickness)
+
+
+def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour, thickness: int = 1) -> None:
+    """A straight line in space, cut at the near plane."""
+    ends = clip_at_near_plane(first_cam, second_cam)
+    if ends is not None:
+        first, second = _fixed_point(view.project(ends))
+        cv2.line(view.picture, first.tolist(), second.tolist(), colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def clip_at_near_plane(first_cam: Array, second_cam: Array) -> Array | None:
+    """The part (2, 3) of a segment that lies in front of the camera, or None.
+
+    Example:
+        >>> clip_at_near_plane(np.array([0.0, 0.0, -0.7]), np.array([2.0, 0.0, 1.3])).tolist()
+        [[1.0, 0.0, 0.3], [2.0, 0.0, 1.3]]
+    """
+    ends = np.stack([first_cam, second_cam])
+    behind = ends[:, 2] < NEAR_PLANE_M
+    if behind.all():
+        return None
+    if behind.any():
+        share = (NEAR_PLANE_M - ends[0, 2]) / (ends[1, 2] - ends[0, 2])
+        ends[int(behind.argmax())] = ends[0] + share * (ends[1] - ends[0])
+    return ends
+
+
+def draw_polygon(picture: Picture, points_px: Array, colour: Colour, thickness: int = 1) -> None:
+    """A closed line through points (N, 2) in pixels."""
+    cv2.polylines(picture, [_fixed_point(points_px)], True, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def draw_text(
+    picture: Picture, text: str, position: tuple[float, float], colour: Colour = WHITE, size: float = 0.45
+) -> None:
+    """Text with a dark rim, legible on any ground; `position` is its lower left corner."""
+    u, v = round(position[0]), round(position[1])
+    # The rim is the same text moved about: in OpenCV 5 bolder letters are also wider.
+    rim = [(du, dv, BLACK) for du in (-1, 0, 1) for dv in (-1, 0, 1) if du or dv]
+    for du, dv, ink in (*rim, (0, 0, colour)):
+        cv2.putText(picture, text, (u + du, v + dv), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
+
+
+def draw_legend(
+    picture: Picture, entries: Sequence[tuple[str, Colour]], position: tuple[int, int], size: float = 0.45
+) -> None:
+    """Coloured strokes with their meaning, one a line, from the upper left corner on."""
+    u, v = position
+    for row, (text, colour) in enumerate(entries):
+        middle = v + 9 + 18 * row
+        for ink, thickness in ((BLACK, 5), (colour, 3)):
+            cv2.line(picture, (u, middle), (u + 22, middle), ink, thickness, cv2.LINE_AA)
+        draw_text(picture, text, (u + 30, middle + 5), WHITE, size)
+
+
+def _fixed_point(pixels: Array) -> npt.NDArray[np.int32]:
+    limited = np.clip(pixels, -_FARTHEST_PX, _FARTHEST_PX)
+    fixed: npt.NDArray[np.int32] = np.round(limited * 2**_SHIFT).astype(np.int32)
+    return fixed

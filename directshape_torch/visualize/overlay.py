@@ -1,0 +1,200 @@
+"""A frame before and after its refinement: contours and boxes in the image, enlarged cars, and the view from above."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.result import RefinementResult
+from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.visualize.birds_eye import Footprint, birds_eye_picture
+from directshape_torch.visualize.car_tiles import CarTile, tile_strip
+from directshape_torch.visualize.drawing import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    Array,
+    Colour,
+    Picture,
+    Surface,
+    View,
+    draw_box,
+    draw_contour,
+    draw_legend,
+    draw_text,
+)
+
+_LEAST_WIDTH_PX = 1000
+_BIRDS_EYE_WIDTH_PX = 560
+# A thick contour would hide smaller cars.
+_TALL_PX = 60
+
+
+@dataclass(frozen=True)
+class DrawnCar:
+    """A car in one state, in the left camera frame.
+
+    Attributes:
+        corners_cam: (8, 3) of its box, in the order of `box_corners`, metres.
+        surface: its shape.
+        label: the number of its line.
+        note: what is said about it.
+        is_refined: whether the state comes from a refinement.
+    """
+
+    corners_cam: Array
+    surface: Surface
+    label: str
+    note: str = ""
+    is_refined: bool = True
+
+
+def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult, first_row: int = 0) -> Picture:
+    """The picture of a frame that was refined alone or in a batch.
+
+    Args:
+        loaded: the frame.
+        result: of a call with its detections.
+        first_row: where they begin in `result`.
+
+    Returns:
+        (h, w, 3) RGB uint8.
+    """
+    frame = loaded.frame
+    image = (255 * frame.images_left[0].nan_to_num().clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0)
+    return overlay_picture(
+        np.ascontiguousarray(image.cpu().numpy()),
+        frame.camera.K_left[0].double().cpu().numpy(),
+        before=_initial_cars(loaded, result),
+        after=_refined_cars(loaded, result, first_row),
+        truth_corners_cam=_true_corners(loaded),
+        title=f"frame {loaded.frame_id}",
+    )
+
+
+def overlay_picture(
+    image: Picture,
+    K: Array,
+    before: Sequence[DrawnCar],
+    after: Sequence[DrawnCar],
+    truth_corners_cam: Sequence[Array] = (),
+    title: str = "",
+) -> Picture:
+    """Two rows with the image, before and after; below them each car enlarged; beside them the view from above.
+
+    Args:
+        image: (H, W, 3) left image.
+        K: (3, 3) its intrinsics.
+        before, after: the same cars in both states.
+        truth_corners_cam: (8, 3) corners of each true box.
+        title: of the picture.
+
+    Returns:
+        (h, w, 3) RGB uint8.
+    """
+    rows = [
+        _image_row(image, K, before, ORANGE, f"{title}  before"),
+        _image_row(image, K, after, BLUE, f"{title}  after"),
+    ]
+    tiles = [
+        CarTile(b.surface, a.surface, BLUE if a.is_refined else GREY, f"{a.label}:  {a.note}")
+        for b, a in zip(before, after, strict=True)
+    ]
+    left = np.concatenate([*rows, tile_strip(image, K, tiles, rows[0].shape[1])])
+    footprints = _footprints(before, after, truth_corners_cam)
+    right = birds_eye_picture(footprints, (left.shape[0], _BIRDS_EYE_WIDTH_PX))
+    legend: list[tuple[str, Colour]] = [("before", ORANGE), ("after", BLUE)]
+    legend += [("ground truth", GREEN)] if truth_corners_cam else []
+    legend += [("not refined", GREY)] if any(not car.is_refined for car in after) else []
+    draw_legend(right, legend, (12, 10))
+    return np.concatenate([left, right], axis=1)
+
+
+def _image_row(image: Picture, K: Array, cars: Sequence[DrawnCar], colour: Colour, title: str) -> Picture:
+    height, width = image.shape[:2]
+    view = View.of_window(image, K, (0, 0, width, height), max(1.0, _LEAST_WIDTH_PX / width))
+    # Far cars first, so that near ones are drawn over them.
+    for car in sorted(cars, key=lambda car: -float(car.corners_cam[:, 2].mean())):
+        ink = colour if car.is_refined else GREY
+        draw_box(view, car.corners_cam, ink)
+        draw_contour(view, car.surface, ink, 2 if _height_px(view, car) > _TALL_PX else 1)
+        _draw_label(view, car, ink)
+    draw_text(view.picture, title, (8, 20), size=0.55)
+    return view.picture
+
+
+def _height_px(view: View, car: DrawnCar) -> float:
+    depth = max(float(car.corners_cam[:, 2].mean()), 1.0)
+    return float(view.K[1, 1]) * float(np.ptp(car.corners_cam[:, 1])) / depth
+
+
+def _draw_label(view: View, car: DrawnCar, colour: Colour) -> None:
+    roof = car.corners_cam[4:].mean(axis=0, keepdims=True)
+    if roof[0, 2] > 1:
+        u, v = view.project(roof)[0]
+        draw_text(view.picture, car.label, (u - 4, max(v - 8, 12)), colour, 0.5)
+
+
+def _footprints(
+    before: Sequence[DrawnCar], after: Sequence[DrawnCar], truth_corners_cam: Sequence[Array]
+) -> list[Footprint]:
+    return [
+        *(Footprint(corners, GREEN, 1) for corners in truth_corners_cam),
+        *(Footprint(car.corners_cam, ORANGE, 1) for car in before),
+        *(Footprint(car.corners_cam, BLUE if car.is_refined else GREY, 1, car.label) for car in after),
+    ]
+
+
+def _initial_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCar]:
+    """The mean shape at the pose of the detection, with the detection's box."""
+    detections, prior = loaded.detections, result.prior
+    T_cam_obj = detections.T_cam_obj.double()
+    corners = box_corners(T_cam_obj, detections.dimensions_hwl.double()).numpy()
+    mean = sdf_to_mesh(prior.mean, prior.origin, prior.spacing_m)
+    cars = []
+    for car, line in enumerate(loaded.row_of_detection):
+        T = T_cam_obj[car].numpy()
+        surface = Surface(mean.vertices @ T[:3, :3].T + T[:3, 3], mean.faces)
+        cars.append(DrawnCar(corners[car], surface, str(loaded.input_objects[line].line_number)))
+    return cars
+
+
+def _refined_cars(loaded: LoadedFrame, result: RefinementResult, first_row: int) -> list[DrawnCar]:
+    """The refined shape with the box of the result file; the initial state where there is none."""
+    boxes = result.boxes()
+    statuses, refined = result.status, result.refined.tolist()
+    t_cam_ref = loaded.frame.camera.t_cam_ref[0].double()
+    location_cam = boxes.location_ref.detach().double().cpu() + t_cam_ref
+    T_cam_box = pose_from_kitti(location_cam, boxes.rotation_y.detach().double().cpu())
+    corners = box_corners(T_cam_box, boxes.dimensions_hwl.detach().double().cpu()).numpy()
+    cars = []
+    for car, initial in enumerate(_initial_cars(loaded, result)):
+        row = first_row + car
+        depth = float(result.T_cam_obj[row, 2, 3])
+        note = f"{depth:.1f} m  {statuses[row].name}"
+        if refined[row]:
+            mesh = result.mesh(row)
+            cars.append(DrawnCar(corners[row], Surface(mesh.vertices, mesh.faces), initial.label, note))
+        else:
+            cars.append(replace(initial, note=note, is_refined=False))
+    return cars
+
+
+def _true_corners(loaded: LoadedFrame) -> list[Array]:
+    """Corners of the labelled boxes of the classes that were refined."""
+    classes = {loaded.input_objects[row].type for row in loaded.row_of_detection}
+    labels = [label for label in loaded.labels or () if label.type in classes and label.has_box_3d]
+    return list(_corners_cam(labels, loaded.frame.camera.t_cam_ref[0]).numpy())
+
+
+def _corners_cam(objects: Sequence[KittiObject], t_cam_ref: Tensor) -> Tensor:
+    dimensions = torch.tensor([o.hwl for o in objects], dtype=torch.float64).reshape(-1, 3)
+    return box_corners(poses_cam(objects, t_cam_ref.double()), dimensions)
