@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -16,7 +17,7 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
 
 CAMERA_HEIGHT_M = 1.65
-BACKDROP_M = 60.0
+BACKDROP_M = 150.0
 
 
 @dataclass(frozen=True)
@@ -185,3 +186,12 @@ def joined_detections(parts: list[Detections], size_hw: tuple[int, int]) -> Dete
     )  # fmt: skip
     frame_index = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])
     return Detections(frame_index=frame_index, **{name: column(name) for name in names})
+
+
+@lru_cache(maxsize=4)
+def cached_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, Street]:
+    """The two-car street, rendered once a test session; nobody changes its tensors."""
+    from helpers.ellipsoids import ellipsoid_prior
+
+    prior = ellipsoid_prior(dtype)
+    return prior, two_car_street(prior)

@@ -1,0 +1,63 @@
+"""Refinement problems over the synthetic street, for the settings that change the mathematics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig, StageConfig
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+DEFAULT = RefinerConfig(
+    stages=(StageConfig(2.0, 1, 6), StageConfig(0.5, 0, 8)),
+)
+DEFAULT = replace(
+    DEFAULT,
+    # With 32 samples a ray that crosses opposite faces of the small grid never has one exactly on a plane of nodes.
+    silhouette=replace(DEFAULT.silhouette, samples_per_ray=32),
+    priors=replace(DEFAULT.priors, dimensions_weight=1.0),
+)
+PAPER = replace(
+    DEFAULT,
+    silhouette=replace(DEFAULT.silhouette, form="product"),
+    photometric=replace(DEFAULT.photometric, pixel_set="hit", gain=False, truncated=False),
+    priors=replace(DEFAULT.priors, tilt_form="cosine", tilt_weight=1e7, dimensions_weight=0.0),
+    sampling=replace(DEFAULT.sampling, occlusion_order="box_bottom"),
+)
+TRUNCATED = replace(DEFAULT, photometric=replace(DEFAULT.photometric, truncated=True, lost_grey_levels=20.0))
+CONFIGS = {"default": DEFAULT, "paper": PAPER, "truncated": TRUNCATED}
+
+
+def begun_problem(
+    prior: PCAShapePrior,
+    frames: FrameBatch,
+    detections: Detections,
+    config: RefinerConfig = DEFAULT,
+    stage: int = 1,
+) -> tuple[CarProblem, CarState]:
+    """A problem whose given stage has begun at the input state, and that state."""
+    problem, state = DirectShapeRefiner(prior, config).problem(frames, detections)
+    problem.begin_stage(problem.stages()[stage], state)
+    return problem, state
+
+
+def frozen_like(problem: CarProblem, state: CarState, at: ProjectedState) -> ProjectedState:
+    """The projection of another state whose intervals and sample depths stay those of `at`."""
+    projected = problem.project(state)
+    for view, fixed in ((projected.left, at.left), (projected.right, at.right)):
+        view.__dict__["march"], view.__dict__["closest_depth"] = fixed.march, fixed.closest_depth
+    return projected
+
+
+def with_code(state: CarState, code: Any) -> CarState:
+    """The state with another code for all cars."""
+    values: Tensor = torch.as_tensor(code, dtype=state.code.dtype)
+    return CarState(state.T_obj_cam, values.expand_as(state.code).contiguous())
