@@ -42,11 +42,13 @@ class DisparityObservations:
     Attributes:
         uv_left: (P, 2) pixels, float64.
         bias_px: (P,) measured minus true disparity.
+        vertical_px: (P,) measured minus predicted row in the right image; zero where it was not measured.
         depth_m: (P,) true depth.
     """
 
     uv_left: Tensor
     bias_px: Tensor
+    vertical_px: Tensor
     depth_m: Tensor
 
     def __len__(self) -> int:
@@ -59,6 +61,7 @@ def concatenate(parts: Sequence[DisparityObservations]) -> DisparityObservations
     return DisparityObservations(
         torch.cat([empty.reshape(0, 2), *(part.uv_left for part in parts)]),
         torch.cat([empty, *(part.bias_px for part in parts)]),
+        torch.cat([empty, *(part.vertical_px for part in parts)]),
         torch.cat([empty, *(part.depth_m for part in parts)]),
     )
 
@@ -92,12 +95,13 @@ def observe_disparity(
     usable = torch.nonzero((measured - displacement[:, 0]).abs() < _LARGEST_DIFFERENCE_PX)[:, 0]
     chosen = usable[_evenly(known.uv_left[usable], (width, height), _POINTS_PER_FRAME)]
     uv, true, measured = known.uv_left[chosen], displacement[chosen], measured[chosen]
-    keep = torch.ones(len(uv), dtype=torch.bool)
+    keep, row_shift = torch.ones(len(uv), dtype=torch.bool), true[:, 1]
     if subpixel:
         left, right = (_grey(image) for image in (image_left, image_right))
-        measured, keep = refine_disparity(left, right, uv, measured, true[:, 1])
+        measured, row_shift, keep = refine_disparity(left, right, uv, measured, true[:, 1])
         keep = keep & ((measured - true[:, 0]).abs() < _LARGEST_DIFFERENCE_PX)
-    return DisparityObservations(uv[keep], (measured - true[:, 0])[keep], known.depth_m[chosen][keep])
+    bias, vertical = measured - true[:, 0], true[:, 1] - row_shift
+    return DisparityObservations(uv[keep], bias[keep], vertical[keep], known.depth_m[chosen][keep])
 
 
 def cell_index(

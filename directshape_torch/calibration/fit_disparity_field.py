@@ -86,13 +86,15 @@ def fit_disparity_field(
             "give more frames, or check that calibration and ground truth belong to the images",
         )
     basis = polynomial_basis(observations.uv_left, size_wh)
-    coefficients = _robust_ridge(basis, observations.bias_px, _balance(observations.uv_left, size_wh))
+    balance = _balance(observations.uv_left, size_wh)
+    coefficients = _robust_ridge(basis, observations.bias_px, balance)
     before, after = observations.bias_px, observations.bias_px - basis @ coefficients
     statistics = FitStatistics(
         len(observations), *_median_and_mad(before), *_median_and_mad(after), _uncovered(observations.uv_left, size_wh)
     )
     field = DisparityField(
         coefficients=coefficients,
+        vertical_coefficients=_robust_ridge(basis, observations.vertical_px, balance),
         hull_uv=_hull(observations.uv_left),
         size_wh=size_wh,
         K_left=camera.K_left[0].double().cpu(),

@@ -248,6 +248,7 @@ class PhotometricTerm:
             cars.K_right[fixed.object_index],
             cars.T_right_cam[fixed.object_index],
             self.pixels.bias_px[fixed.pixel_index],
+            self.pixels.vertical_px[fixed.pixel_index],
             DSO_PATTERN.index((0, 0)),
         )
 

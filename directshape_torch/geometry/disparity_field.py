@@ -1,8 +1,9 @@
-"""Residual disparity of a stereo rig: measured minus true disparity, a smooth function of the left pixel.
+"""Residual disparity of a stereo rig: measured minus true disparity, and row offset, smooth over the left image.
 
 Rectification leaves a residue of some tenths of a pixel (KITTI: -0.3 in the image centre, -1.2 at its left edge).
 At 30 m half a pixel is 1.2 m of depth, so it decides whether far cars come out right. Known in visual odometry: Kreso
-and Segvic, "Improving the Egomotion Estimation by Correcting the Calibration Bias", VISAPP 2015.
+and Segvic, "Improving the Egomotion Estimation by Correcting the Calibration Bias", VISAPP 2015. The rows are off too
+(KITTI: -0.2 to +0.3 px across the image), and on slanted texture a row offset that is ignored looks like disparity.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ class DisparityField:
     """`bias(u, v)` = measured minus true disparity in pixels, a polynomial over the left image of one rig.
 
     Attributes:
-        coefficients: (10,), pixels, of `polynomial_basis`.
+        coefficients: (10,), pixels, of `polynomial_basis`: the residual disparity.
+        vertical_coefficients: (10,), pixels: measured minus predicted row in the right image.
         hull_uv: (M, 2) convex polygon around the data of the fit, pixels; beyond it the value at its nearest point is
             used, because polynomials run away.
         size_wh: width and height of the rig's images.
@@ -98,9 +100,17 @@ class DisparityField:
     K_right: Tensor
     T_right_cam: Tensor
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
+    vertical_coefficients: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS))
 
     def __post_init__(self) -> None:
-        shapes = {"coefficients": (NUM_COEFFICIENTS,), "K_left": (3, 3), "K_right": (3, 3), "T_right_cam": (4, 4)}
+        polynomial = (NUM_COEFFICIENTS,)
+        shapes = {
+            "coefficients": polynomial,
+            "vertical_coefficients": polynomial,
+            "K_left": (3, 3),
+            "K_right": (3, 3),
+            "T_right_cam": (4, 4),
+        }
         for name, wanted in shapes.items():
             if tuple(getattr(self, name).shape) != wanted:
                 raise InputError(name, f"shape {wanted}", f"{tuple(getattr(self, name).shape)}")
@@ -134,7 +144,7 @@ class DisparityField:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> DisparityField:
         """A copy on another device and of another floating-point type."""
-        names = ("coefficients", "hull_uv", "K_left", "K_right", "T_right_cam")
+        names = ("coefficients", "vertical_coefficients", "hull_uv", "K_left", "K_right", "T_right_cam")
         return replace(self, **{name: getattr(self, name).to(device=device, dtype=dtype) for name in names})
 
     def bias(
@@ -148,8 +158,24 @@ class DisparityField:
             >>> DisparityField.constant(0.25, (640, 480), K, K, T).bias(torch.zeros(2, 3, 2)).shape
             torch.Size([2, 3])
         """
+        return self._evaluate(uv_left, self.coefficients)
+
+    def vertical(
+        self,
+        uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
+    ) -> Tensor:  # (*,)
+        """Measured minus predicted row in the right image, pixels; beyond the hull that of its nearest point.
+
+        Example:
+            >>> K, T = torch.eye(3), torch.eye(4)
+            >>> DisparityField.constant(0.25, (640, 480), K, K, T).vertical(torch.zeros(1, 2))
+            tensor([0.])
+        """
+        return self._evaluate(uv_left, self.vertical_coefficients)
+
+    def _evaluate(self, uv_left: Tensor, coefficients: Tensor) -> Tensor:
         inside = nearest_in_convex_polygon(uv_left, self.hull_uv.to(uv_left))
-        return polynomial_basis(inside, self.size_wh) @ self.coefficients.to(uv_left)
+        return polynomial_basis(inside, self.size_wh) @ coefficients.to(uv_left)
 
     def check_rig(
         self,
@@ -228,6 +254,7 @@ class DisparityField:
 _CURE = "write it again with 'directshape calibrate-stereo'"
 _TENSOR_SHAPES: dict[str, tuple[int | None, ...]] = {
     "coefficients": (NUM_COEFFICIENTS,),
+    "vertical_coefficients": (NUM_COEFFICIENTS,),
     "hull_uv": (None, 2),
     "K_left": (3, 3),
     "K_right": (3, 3),

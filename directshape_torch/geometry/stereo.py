@@ -1,7 +1,7 @@
 """From the left image to the right one: warp with its depth derivative, and rays of the right camera.
 
 Everything that crosses to the right image passes here, so the residual disparity field of a rig is applied here and
-nowhere else (`bias` = measured minus true disparity, so an image point lies at `u_right = pinhole - bias`).
+nowhere else: an image point lies at `u_right = pinhole - bias`, `v_right = pinhole + vertical`.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ def warp_to_right(
     K_right: Tensor,  # (*, 3, 3)
     T_right_cam: Tensor,  # (*, 4, 4)
     bias_px: Tensor | None = None,  # (*,) residual disparity at the left pixel
+    vertical_px: Tensor | None = None,  # (*,) residual row offset at the left pixel
 ) -> RightPixels:
     """Warp left pixels into the right image (paper, supplement, `warp(p, d)` and its derivative by d).
 
@@ -46,9 +47,17 @@ def warp_to_right(
     z = torch.where(in_front, homogeneous[..., 2], torch.ones_like(depth))[..., None]
     uv = homogeneous[..., :2] / z
     J_pixel_depth = (J_homogeneous_depth[..., :2] - uv * J_homogeneous_depth[..., 2:]) / z
-    if bias_px is not None:
-        uv = torch.stack([uv[..., 0] - bias_px, uv[..., 1]], dim=-1)
-    return RightPixels(uv, J_pixel_depth, in_front)
+    return RightPixels(_shifted(uv, bias_px, vertical_px, 1.0), J_pixel_depth, in_front)
+
+
+def _shifted(uv: Tensor, bias_px: Tensor | None, vertical_px: Tensor | None, sign: float) -> Tensor:
+    """Pinhole pixels to measured ones (sign 1), or back (sign -1)."""
+    if bias_px is None and vertical_px is None:
+        return uv
+    u, v = uv.unbind(-1)
+    u = u if bias_px is None else u - sign * bias_px
+    v = v if vertical_px is None else v + sign * vertical_px
+    return torch.stack([u, v], dim=-1)
 
 
 class RightRays(NamedTuple):
@@ -63,6 +72,7 @@ def right_rays(
     K_right: Tensor,  # (*, 3, 3)
     T_right_cam: Tensor,  # (*, 4, 4)
     bias_px: Tensor | None = None,  # (*,) residual disparity at the corresponding left pixel
+    vertical_px: Tensor | None = None,  # (*,) residual row offset there
 ) -> RightRays:
     """Rays of right-image pixels, in the left camera frame; the inverse of the crossing done by `warp_to_right`.
 
@@ -73,8 +83,7 @@ def right_rays(
         >>> right_rays(torch.tensor([565.0, 180.0]), K, T_right_cam).origin_cam
         tensor([0.5000, 0.0000, 0.0000])
     """
-    if bias_px is not None:
-        uv_right = torch.stack([uv_right[..., 0] + bias_px, uv_right[..., 1]], dim=-1)
+    uv_right = _shifted(uv_right, bias_px, vertical_px, -1.0)
     R_cam_right = T_right_cam[..., :3, :3].transpose(-1, -2)
     ray_right = rays_from_pixels(uv_right, K_right)
     direction = (R_cam_right @ ray_right[..., None])[..., 0]

@@ -127,8 +127,8 @@ def project_boxes(
     K_left, K_right, T_right_cam = (x[0].double() for x in (camera.K_left, camera.K_right, camera.T_right_cam))
     uv_left = project(points_cam, K_left)
     field = camera.disparity_field
-    bias = None if field is None else field.bias(uv_left.to(camera.K_left.dtype)).double()
-    right = warp_to_right(rays_from_pixels(uv_left, K_left), points_cam[..., 2], K_right, T_right_cam, bias)
+    offset = () if field is None else (field.bias(uv_left), field.vertical(uv_left))
+    right = warp_to_right(rays_from_pixels(uv_left, K_left), points_cam[..., 2], K_right, T_right_cam, *offset)
     return (
         _enclosing_box(uv_left, in_front, size_hw),
         _enclosing_box(right.uv_right, in_front & right.in_front, size_hw),

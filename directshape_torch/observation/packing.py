@@ -13,8 +13,7 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.se3 import transform
-from directshape_torch.geometry.stereo import right_rays
+from directshape_torch.geometry.stereo import right_rays, warp_to_right
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
 from directshape_torch.observation.occlusion import Side, hidden_pixels
 from directshape_torch.observation.pixel_sampling import (
@@ -40,6 +39,7 @@ class PixelSamples:
         foreground: (P,) probability in [0, 1] of the mask at the pixel.
         gradient_magnitude: (P,) grey levels per pixel.
         bias_px: (P,) residual disparity at the (corresponding) left pixel, zero without a field.
+        vertical_px: (P,) residual row offset there, zero without a field.
     """
 
     object_index: Tensor
@@ -49,6 +49,7 @@ class PixelSamples:
     foreground: Tensor
     gradient_magnitude: Tensor
     bias_px: Tensor
+    vertical_px: Tensor
 
     def __len__(self) -> int:
         return len(self.object_index)
@@ -93,12 +94,13 @@ def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConf
     return Observation(left, right, *regions)
 
 
-def bias_at(frames: FrameBatch, uv_left: Tensor) -> Tensor:
-    """Residual disparity (P,) at left pixels; zero without a field."""
+def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tensor]:
+    """Residual disparity and row offset (P,) at left pixels (P, 2); zero without a field."""
     field = frames.camera.disparity_field
     if field is None:
-        return torch.zeros_like(uv_left[:, 0])
-    return field.bias(uv_left)
+        zero = torch.zeros_like(uv_left[..., 0])
+        return zero, zero
+    return field.bias(uv_left), field.vertical(uv_left)
 
 
 def projected_box_right(frames: FrameBatch, detections: Detections) -> Tensor:
@@ -106,13 +108,18 @@ def projected_box_right(frames: FrameBatch, detections: Detections) -> Tensor:
     camera = frames.camera
     f = detections.frame_index
     corners_cam = box_corners(detections.T_cam_obj, detections.dimensions_hwl)
-    corners = transform(camera.T_right_cam[f][:, None], corners_cam)
-    uv = project(corners, camera.K_right[f][:, None])
-    if camera.disparity_field is not None:
-        uv_left = project(corners_cam, camera.K_left[f][:, None])
-        uv = torch.stack([uv[..., 0] - camera.disparity_field.bias(uv_left), uv[..., 1]], dim=-1)
+    K_left = camera.K_left[f][:, None]
+    uv_left = project(corners_cam, K_left)
+    right = warp_to_right(
+        rays_from_pixels(uv_left, K_left),
+        corners_cam[..., 2],
+        camera.K_right[f][:, None],
+        camera.T_right_cam[f][:, None],
+        *residual_offsets(frames, uv_left),
+    )
+    uv = right.uv_right
     box = torch.cat([uv.amin(dim=1), uv.amax(dim=1)], dim=1)
-    in_front = (corners[..., 2] > 0.1).all(dim=1)
+    in_front = ((corners_cam[..., 2] > 0.1) & right.in_front).all(dim=1)
     return torch.where(in_front[:, None], box, torch.full_like(box, torch.nan))
 
 
@@ -165,27 +172,28 @@ def _pack_side(
         ray_cam=rays[1],
         foreground=mask[object_index, uv[:, 1], uv[:, 0]].to(dtype),
         gradient_magnitude=magnitude[frame, uv[:, 1], uv[:, 0]],
-        bias_px=rays[2],
+        bias_px=rays[2][0],
+        vertical_px=rays[2][1],
     )
 
 
 def _rays_left(
     frames: FrameBatch, detections: Detections, object_index: Tensor, uv: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
     K = frames.camera.K_left[detections.frame_index[object_index]]
     ray = rays_from_pixels(uv, K)
-    return torch.zeros_like(ray), ray, bias_at(frames, uv)
+    return torch.zeros_like(ray), ray, residual_offsets(frames, uv)
 
 
 def _rays_right(
     frames: FrameBatch, detections: Detections, object_index: Tensor, uv: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
     """The corresponding left pixel is the one at the car's INPUT depth: frozen per car, so moving does not pay."""
     camera = frames.camera
     frame = detections.frame_index[object_index]
     z_input = detections.T_cam_obj[object_index, 2, 3]
     shift = camera.K_left[frame, 0, 0] * camera.baseline[frame] / z_input
     uv_left = torch.stack([uv[:, 0] + shift, uv[:, 1]], dim=-1)
-    bias = bias_at(frames, uv_left)
-    rays = right_rays(uv, camera.K_right[frame], camera.T_right_cam[frame], bias)
-    return rays.origin_cam, rays.direction_cam, bias
+    offsets = residual_offsets(frames, uv_left)
+    rays = right_rays(uv, camera.K_right[frame], camera.T_right_cam[frame], *offsets)
+    return rays.origin_cam, rays.direction_cam, offsets

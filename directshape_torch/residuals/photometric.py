@@ -73,14 +73,15 @@ def photometric_residual(
     K_right: Tensor,  # (P, 3, 3)
     T_right_cam: Tensor,  # (P, 4, 4)
     bias_px: Tensor | None,  # (P,)
+    vertical_px: Tensor | None,  # (P,)
     centre: int,  # which neighbourhood pixel is the pixel itself
 ) -> PhotometricResidual:
     """`r = I_r(warp(p~, d_p)) - I_l(p~)` for the neighbourhood, all warped with the centre's depth (paper, r_photo).
 
     Chain: `J_residual_depth = grad I_r . J_pixel_depth`, with the exact derivative of the bilinear lookup.
     """
-    bias = None if bias_px is None else bias_px[:, None]
-    warped = warp_to_right(rays_left, depth[:, None], K_right[:, None], T_right_cam[:, None], bias)
+    offsets = (x if x is None else x[:, None] for x in (bias_px, vertical_px))
+    warped = warp_to_right(rays_left, depth[:, None], K_right[:, None], T_right_cam[:, None], *offsets)
     uv_level = (warped.uv_right + 0.5) * level_scale - 0.5
     intensity, gradient, in_image = bilinear_with_gradient(image_right, frame_index[:, None], uv_level, sizes)
     J_residual_depth = (gradient * warped.J_pixel_depth).sum(-1) * level_scale

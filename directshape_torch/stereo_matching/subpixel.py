@@ -1,7 +1,8 @@
-"""Photometric refinement of disparities: one-dimensional Gauss-Newton on small patches (Lucas and Kanade, 1981).
+"""Photometric refinement of disparities: Gauss-Newton on small patches (Lucas and Kanade, 1981).
 
 Semi-global matching leans towards whole pixels by up to 0.2 px. A rig's bias is of that size, and what uses the bias
-afterwards is a direct photometric method, so it is measured photometrically here.
+afterwards is a direct photometric method, so it is measured photometrically here. The row is free too: with rows off by
+a few tenths of a pixel (KITTI), slanted texture would turn the row offset into disparity.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ _LARGEST_CHANGE_PX = 1.0
 _CONVERGED_PX = 0.02
 # Standard deviation of the disparity for residuals of one grey level; a weaker patch says little.
 _LARGEST_SIGMA_PX = 0.03
+_LARGEST_ROW_SIGMA_PX = 0.1
 
 
 class RefinedDisparity(NamedTuple):
     """Disparities after photometric refinement."""
 
     disparity: Tensor  # (P,) pixels
+    row_shift: Tensor  # (P,) v_left - v_right, pixels
     reliable: Tensor  # (P,) bool: converged near the start, textured, patch inside both images
 
 
@@ -35,7 +38,7 @@ def refine_disparity(
     grey_right: Tensor,  # (H, W)
     uv_left: Tensor,  # (P, 2) pixels
     disparity: Tensor,  # (P,) start, pixels
-    row_shift: Tensor,  # (P,) v_left - v_right, pixels
+    row_shift: Tensor,  # (P,) start of v_left - v_right, pixels
 ) -> RefinedDisparity:
     """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset.
 
@@ -55,34 +58,35 @@ def refine_disparity(
     frame = torch.zeros(len(uv), 1, dtype=torch.long, device=uv.device)
     observed, _, inside_left = bilinear_with_gradient(grey_left[None], frame, uv)
     centred = observed - observed.mean(dim=1, keepdim=True)
-    current, weight = disparity, torch.ones_like(observed)
+    start = torch.stack([disparity, row_shift], dim=-1)
+    current, weight = start, torch.ones_like(observed)
     for _ in range(_NUM_ITERATIONS):
-        displacement = torch.stack([current, row_shift], dim=-1)[:, None]
-        predicted, gradient, inside_right = bilinear_with_gradient(grey_right[None], frame, uv - displacement)
-        step, variance, residual = _solve(predicted - observed, -gradient[..., 0], centred, weight)
+        predicted, gradient, inside_right = bilinear_with_gradient(grey_right[None], frame, uv - current[:, None])
+        step, variance, residual = _solve(predicted - observed, -gradient, centred, weight)
         weight = _HUBER_GREY / residual.abs().clamp_min(_HUBER_GREY)
         step = step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX)
         current = current + step
     reliable = (
-        (step.abs() < _CONVERGED_PX)
-        & ((current - disparity).abs() < _LARGEST_CHANGE_PX)
-        & (variance < _LARGEST_SIGMA_PX**2)
+        (step.abs() < _CONVERGED_PX).all(dim=1)
+        & ((current - start).abs() < _LARGEST_CHANGE_PX).all(dim=1)
+        & (variance[:, 0] < _LARGEST_SIGMA_PX**2)
+        & (variance[:, 1] < _LARGEST_ROW_SIGMA_PX**2)
         & (inside_left & inside_right).all(dim=1)
     )
-    return RefinedDisparity(current, reliable)
+    return RefinedDisparity(current[:, 0], current[:, 1], reliable)
 
 
 def _solve(
     residual: Tensor,  # (P, N)
-    J_residual_disparity: Tensor,  # (P, N)
+    J_residual_displacement: Tensor,  # (P, N, 2)
     centred: Tensor,  # (P, N)
     weight: Tensor,  # (P, N)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Weighted least squares for disparity, offset and gain: step (P,), its unit variance (P,), residual after it."""
-    J = torch.stack([J_residual_disparity, torch.ones_like(centred), centred], dim=-1)
+    """Least squares for displacement, offset and gain: step (P, 2), its unit variance (P, 2), residual after it."""
+    J = torch.cat([J_residual_displacement, torch.ones_like(centred)[..., None], centred[..., None]], dim=-1)
     weighted = J * weight[..., None]
     # The floor keeps patches without texture solvable; they are rejected by their variance.
-    H = weighted.mT @ J + 1e-3 * torch.eye(3, dtype=J.dtype, device=J.device)
+    H = weighted.mT @ J + 1e-3 * torch.eye(4, dtype=J.dtype, device=J.device)
     inverse = torch.linalg.inv(H)
     step = -(inverse @ (weighted.mT @ residual[..., None]))
-    return step[:, 0, 0], inverse[:, 0, 0], residual + (J @ step)[..., 0]
+    return step[:, :2, 0], inverse.diagonal(dim1=1, dim2=2)[:, :2], residual + (J @ step)[..., 0]
