@@ -1,0 +1,167 @@
+"""The fit finds a known field under noise and wrong matches, from points and from whole frames by the command."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch.calibration.disparity_observations import DisparityObservations, concatenate
+from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
+from directshape_torch.calibration.observations_labels import known_depth_from_labels
+from directshape_torch.cli import calibrate_stereo
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
+from directshape_torch.io.atomic_files import write_png
+from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.scene import StereoCamera
+
+SIZE = (400, 160)
+FOCAL_PX, BASELINE_M = 300.0, 0.5
+TRUE = torch.tensor([-0.3, 0.1, 0.2, -0.5, 0.05, 0.1, -0.2, 0.1, 0.1, -0.3], dtype=torch.float64)
+
+
+def camera() -> StereoCamera:
+    P = torch.tensor([[FOCAL_PX, 0, 200, 0], [0, FOCAL_PX, 80, 0], [0, 0, 1, 0]], dtype=torch.float64)
+    P_right = P.clone()
+    P_right[0, 3] = -FOCAL_PX * BASELINE_M
+    return StereoCamera.from_projections(P[None], P_right[None])
+
+
+def observations(count: int, outliers: float, lower_half: bool = False) -> DisparityObservations:
+    generator = torch.Generator().manual_seed(1)
+    uv = torch.rand(count, 2, generator=generator).double() * torch.tensor([399.0, 159.0])
+    if lower_half:
+        uv[:, 1] = 80 + uv[:, 1] / 2
+    bias = polynomial_basis(uv, SIZE) @ TRUE + 0.1 * torch.randn(count, generator=generator).double()
+    wrong = torch.rand(count, generator=generator) < outliers
+    return DisparityObservations(uv, torch.where(wrong, bias + 3.0, bias), torch.full_like(bias, 20.0))
+
+
+def image_grid() -> Tensor:
+    u, v = torch.meshgrid(torch.linspace(0, 399, 21), torch.linspace(0, 159, 11), indexing="xy")
+    return torch.stack([u, v], dim=-1).double()
+
+
+def test_fit_recovers_the_field_under_a_fifth_of_wrong_matches_on_one_side() -> None:
+    fit = fit_disparity_field(observations(4000, outliers=0.2), SIZE, camera(), "lidar", ("000107",))
+    error = fit.field.bias(image_grid()) - polynomial_basis(image_grid(), SIZE) @ TRUE
+    assert float(error.abs().mean()) < 0.03
+    assert fit.statistics.mad_after_px < fit.statistics.mad_before_px
+    assert fit.statistics.uncovered_cells == ()
+    assert fit.field.provenance["frames"] == "000107"
+
+
+def test_outside_of_the_data_the_fit_is_tame_and_named() -> None:
+    fit = fit_disparity_field(observations(2000, 0.0, lower_half=True), SIZE, camera(), "lidar")
+    assert {row for row, _ in fit.statistics.uncovered_cells} == {0, 1}
+    assert fit.statistics.uncovered_share == 0.5
+    inside = fit.field.bias(image_grid()[6:])
+    everywhere = fit.field.bias(image_grid())
+    assert float(everywhere.min()) > float(inside.min()) - 0.1
+    assert float(everywhere.max()) < float(inside.max()) + 0.1
+    text = calibrate_stereo.report(fit.statistics, "lidar", 1)
+    assert "50 % of the image" in text
+    assert "row 1 of 4 (top): columns 1 2 3 4 5 6 7 8 of 8" in text
+
+
+def test_too_few_observations_are_refused() -> None:
+    with pytest.raises(InputError, match="at least 50"):
+        fit_disparity_field(concatenate([]), SIZE, camera(), "labels")
+
+
+def write_frame(root: Path, frame_id: str, bias_px: float, focal_px: float = FOCAL_PX) -> None:
+    """A frame of a smooth texture on an upright wall, measured disparity = true + bias."""
+    training = root / "training"
+    u, v = np.meshgrid(np.arange(float(SIZE[0])), np.arange(float(SIZE[1])))
+    true = 12.0
+
+    def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 128 + 40 * np.sin(x / 2.9 + y / 7) + 35 * np.sin(x / 5.3 - y / 4.1) + 30 * np.cos(x / 11.7 + y / 3.3)
+
+    for folder, shift in (("image_2", 0.0), ("image_3", true + bias_px)):
+        grey = texture(u + shift, v).clip(0, 255).astype(np.uint8)
+        write_png(training / folder / f"{frame_id}.png", np.repeat(grey[..., None], 3, axis=2))
+    stored = np.full((SIZE[1], SIZE[0]), 256 * true, np.uint16)
+    write_png(training / "disp_occ_0" / f"{frame_id}.png", stored)
+    lines = [
+        f"{name}: {focal_px} 0 200 {shift} 0 {focal_px} 80 0 0 0 1 0"
+        for name, shift in (("P2", 0.0), ("P3", -focal_px * BASELINE_M))
+    ]
+    (training / "calib").mkdir(exist_ok=True)
+    (training / "calib" / f"{frame_id}.txt").write_text("\n".join(lines) + "\n")
+
+
+def calibrate(root: Path, *more: str) -> int:
+    parser = argparse.ArgumentParser()
+    calibrate_stereo.add_parser(parser.add_subparsers())
+    args = parser.parse_args(
+        ["calibrate-stereo", "--data", str(root), "--from", "disparity", "--out", str(root / "bias.json"), *more]
+    )
+    return int(args.run(args))
+
+
+def test_command_finds_a_constant_bias_in_images(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_frame(tmp_path, "000001", bias_px=-0.6)
+    assert calibrate(tmp_path) == 0
+    field = DisparityField.load(tmp_path / "bias.json")
+    bias = field.bias(torch.tensor([[100.0, 40.0], [200.0, 80.0], [350.0, 120.0]], dtype=torch.float64))
+    torch.testing.assert_close(bias, torch.full((3,), -0.6, dtype=torch.float64), atol=0.05, rtol=0)
+    assert (tmp_path / "bias.png").is_file()
+    assert "before" in capsys.readouterr().out
+
+
+def test_command_reports_a_damaged_frame_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for frame_id in ("000001", "000002"):
+        write_frame(tmp_path, frame_id, bias_px=-0.6)
+    broken = tmp_path / "training" / "image_3" / "000002.png"
+    broken.write_bytes(broken.read_bytes()[:1000])
+    assert calibrate(tmp_path) == 0
+    assert "000002 left out" in capsys.readouterr().err
+    assert DisparityField.load(tmp_path / "bias.json").provenance["frames"] == "000001"
+
+
+def test_command_refuses_two_rigs_and_unknown_frames_and_empty_folders(tmp_path: Path) -> None:
+    with pytest.raises(DataFormatError, match="training"):
+        calibrate(tmp_path)
+    write_frame(tmp_path, "000001", bias_px=0.0)
+    write_frame(tmp_path, "000002", bias_px=0.0, focal_px=310.0)
+    with pytest.raises(InputError, match="000002 of another"):
+        calibrate(tmp_path)
+    with pytest.raises(InputError, match="000009"):
+        calibrate(tmp_path, "--frames", "000009")
+
+
+def test_labels_give_the_near_sides_of_visible_cars(tmp_path: Path) -> None:
+    # Seen from behind at 20 m: half of 4 m nearer, 10 cm within the box.
+    lines = [
+        "Car 0.00 0 0.0 180 70 220 100 1.5 1.6 4.0 0.0 1.5 20.0 -1.5707963",
+        "Car 0.00 1 0.0 180 70 220 100 1.5 1.6 4.0 4.0 1.5 20.0 -1.5707963",
+        "Car 0.00 0 0.0 180 70 220 100 1.5 1.6 4.0 0.0 1.5 9.0 -1.5707963",
+    ]
+    path = tmp_path / "labels.txt"
+    path.write_text("\n".join(lines) + "\n")
+    known = known_depth_from_labels(read_objects(path), SIZE, camera())
+    assert len(known.depth_m) > 50
+    torch.testing.assert_close(known.depth_m, torch.full_like(known.depth_m, 18.1), atol=1e-6, rtol=0)
+    assert len(known_depth_from_labels([], SIZE, camera()).depth_m) == 0
+
+
+@pytest.mark.skipif(
+    "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
+)
+def test_real_frame_has_the_known_field() -> None:
+    from directshape_torch.calibration.kitti_observations import observe_frame, truth_files
+
+    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
+    frame = observe_frame(root, "007322", truth_files(root, "disparity")["007322"], "disparity")
+    field = fit_disparity_field(frame.observations, frame.size_wh, frame.camera, "disparity").field
+    left, middle, right = field.bias(torch.tensor([[60.0, 180.0], [620.0, 180.0], [1180.0, 150.0]]).double()).tolist()
+    assert -1.6 < left < -0.6
+    assert -0.5 < middle < 0.0
+    assert -2.0 < right < -0.9

@@ -1,0 +1,47 @@
+"""LiDAR points in the camera frame, and the ones that it cannot see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from directshape_torch.calibration.observations_lidar import known_depth_from_lidar
+from directshape_torch.errors import DataFormatError
+from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
+
+SIZE = (400, 160)
+# x forward, y left, z up becomes x right, y down, z forward.
+VELO_TO_CAM = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
+
+
+def calibration() -> KittiCalibration:
+    P2 = np.array([[300.0, 0, 200, 0], [0, 300, 80, 0], [0, 0, 1, 0]])
+    P3 = P2.copy()
+    P3[0, 3] = -150.0
+    return KittiCalibration(Path("calib.txt"), P2, P3, np.eye(3), VELO_TO_CAM)
+
+
+def test_a_point_right_behind_a_nearer_one_and_those_outside_are_left_out(tmp_path: Path) -> None:
+    scan = np.array([[10, 0, 0, 0], [40, 0.2, 0, 0], [20, 5, 1, 0], [-10, 0, 0, 0], [10, 50, 0, 0]], dtype="<f4")
+    scan.tofile(tmp_path / "scan.bin")
+    rig = calibration()
+    known = known_depth_from_lidar(tmp_path / "scan.bin", rig, SIZE, to_stereo_camera([rig], dtype=torch.float64))
+    # (20, 5, 1): 300 * -5 / 20 + 200 = 125 and 300 * -1 / 20 + 80 = 65; the second point is 1.5 px beside the first.
+    expected = torch.tensor([[200.0, 80.0], [125.0, 65.0]], dtype=torch.float64)
+    torch.testing.assert_close(known.uv_left, expected)
+    torch.testing.assert_close(known.depth_m, torch.tensor([10.0, 20.0], dtype=torch.float64))
+
+
+def test_a_cut_scan_and_a_calibration_without_lidar_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "scan.bin"
+    path.write_bytes(b"\0" * 17)
+    rig = calibration()
+    camera = to_stereo_camera([rig], dtype=torch.float64)
+    with pytest.raises(DataFormatError, match="16 bytes a point"):
+        known_depth_from_lidar(path, rig, SIZE, camera)
+    with pytest.raises(DataFormatError, match="Tr_velo_to_cam"):
+        known_depth_from_lidar(path, replace(rig, Tr_velo_to_cam=None), SIZE, camera)
