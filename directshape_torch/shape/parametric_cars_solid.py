@@ -15,8 +15,9 @@ Array = NDArray[np.float64]
 
 _TABLE_SPACING_M = 0.02
 _TABLE_MARGIN_M = 0.6
-_ARCH_GAP_M = 0.045
-_ARCH_DEPTH_M = 0.28
+_ARCH_GAP_M = 0.04
+# A groove around the tyre, no cavity behind the wheel: meshes of real cars have liners there.
+_ARCH_DEPTH_M = 0.08
 
 
 @dataclass(frozen=True)
@@ -35,38 +36,43 @@ def side_outline(car: CarParameters) -> Array:
     """Outline of the side view without wheels, a closed polygon with rounded corners, (N, 2) of (x forward, height)."""
     bonnet_middle_u = 0.45 * (car.nose_setback + 0.12) + 0.55 * car.cowl_u
     bonnet_middle_height = 0.45 * car.nose_height + 0.55 * car.cowl_height + car.bonnet_bulge
-    corners_u_height = np.array(
+    front_face = car.nose_height - car.bumper_clearance_front
+    rear_face = car.tail_height - car.bumper_clearance_rear
+    rear_axle_u = car.front_axle_u + car.wheelbase
+    # Distance behind the front end, height above the ground, and how far from the corner its rounding begins.
+    corners = np.array(
         [
-            (0.10, car.bumper_clearance_front),
-            (0.0, 0.5 * (car.bumper_clearance_front + car.nose_height) - 0.08),
-            (0.0, 0.5 * (car.bumper_clearance_front + car.nose_height) + 0.06),
-            (car.nose_setback, car.nose_height),
-            (car.nose_setback + 0.15, car.nose_height + 0.05),
-            (bonnet_middle_u, bonnet_middle_height),
-            (car.cowl_u, car.cowl_height),
-            (car.roof_front_u, car.height - car.roof_front_drop),
-            (car.roof_peak_u, car.height + 0.01),
-            (car.roof_rear_u, car.height - car.roof_rear_drop),
-            (car.rear_glass_base_u, car.rear_glass_base_height),
-            (car.length - car.tail_setback, car.tail_height),
-            (car.length, 0.5 * (car.bumper_clearance_rear + car.tail_height) + 0.05),
-            (car.length, car.bumper_clearance_rear + 0.12),
-            (car.length - 0.10, car.bumper_clearance_rear),
-            (car.front_axle_u + car.wheelbase + 0.1, car.ground_clearance),
-            (car.front_axle_u, car.ground_clearance),
+            (0.06, car.bumper_clearance_front, 0.12),
+            (0.0, car.bumper_clearance_front + 0.18 * front_face, 0.12),
+            (0.0, car.bumper_clearance_front + 0.55 * front_face, 0.15),
+            (car.nose_setback, car.nose_height, 0.20),
+            (car.nose_setback + 0.18, car.nose_height + 0.05, 0.25),
+            (bonnet_middle_u, bonnet_middle_height, 0.50),
+            (car.cowl_u, car.cowl_height, 0.25),
+            (car.roof_front_u, car.height - car.roof_front_drop, 0.40),
+            (car.roof_peak_u, car.height + 0.005, 0.60),
+            (car.roof_rear_u, car.height - car.roof_rear_drop, 0.20),
+            (car.rear_glass_base_u, car.rear_glass_base_height, 0.20),
+            (car.length - car.tail_setback, car.tail_height, 0.12),
+            (car.length, car.bumper_clearance_rear + 0.50 * rear_face, 0.15),
+            (car.length, car.bumper_clearance_rear + 0.15 * rear_face, 0.12),
+            (car.length - 0.06, car.bumper_clearance_rear, 0.12),
+            (rear_axle_u - 0.1, car.ground_clearance, 0.30),
+            (car.front_axle_u, car.ground_clearance, 0.30),
         ]
     )
-    x_height = np.stack([0.5 * car.length - corners_u_height[:, 0], corners_u_height[:, 1]], axis=1)
-    return _round_corners(x_height, reach_m=0.35)
+    x_height = np.stack([0.5 * car.length - corners[:, 0], corners[:, 1]], axis=1)
+    return _round_corners(x_height, corners[:, 2])
 
 
-def _round_corners(polygon: Array, reach_m: float) -> Array:
+def _round_corners(polygon: Array, reach_m: Array) -> Array:
     """Replaces each corner of a closed polygon by a parabola that begins at most `reach_m` before and after it."""
     t = np.linspace(0.0, 1.0, 6)[:, None]
     arcs = []
-    for before, corner, after in zip(np.roll(polygon, 1, axis=0), polygon, np.roll(polygon, -1, axis=0), strict=True):
+    neighbours = zip(np.roll(polygon, 1, axis=0), polygon, np.roll(polygon, -1, axis=0), reach_m, strict=True)
+    for before, corner, after, reach in neighbours:
         start, end = (
-            corner + (other - corner) * min(0.45, reach_m / max(float(np.linalg.norm(other - corner)), 1e-9))
+            corner + (other - corner) * min(0.45, reach / max(float(np.linalg.norm(other - corner)), 1e-9))
             for other in (before, after)
         )
         arcs.append((1 - t) ** 2 * start + 2 * t * (1 - t) * corner + t**2 * end)
@@ -102,10 +108,10 @@ def half_width(car: CarParameters, x: Array, height: Array) -> Array:
     towards_rear = np.clip(-x / (0.5 * car.length), 0.0, 1.2)
     plan = 1.0 - car.taper_front * towards_front**3 - car.taper_rear * towards_rear**3
     above_belt = np.maximum(height - car.belt_height, 0.0)
-    lean = car.tumblehome * above_belt + 0.25 * above_belt**2
+    lean = car.tumblehome * above_belt + 0.15 * above_belt**2
     shoulder = 0.55 * car.belt_height
     tuck_low = car.sill_tuck * (np.maximum(shoulder - height, 0.0) / shoulder) ** 2
-    tuck_high = 0.03 * (np.clip(height - shoulder, 0.0, car.belt_height - shoulder) / (car.belt_height - shoulder)) ** 2
+    tuck_high = 0.05 * (np.clip(height - shoulder, 0.0, car.belt_height - shoulder) / (car.belt_height - shoulder)) ** 2
     return 0.5 * car.width * plan - lean - tuck_low - tuck_high
 
 
@@ -144,9 +150,9 @@ def rounded_intersection(a: Array, b: Array, radius: float) -> Array:
 
 
 def _arches_and_wheels(car: CarParameters, x: Array, height: Array, side: Array) -> tuple[Array, Array]:
-    outer = 0.5 * car.width - 0.03
+    outer = 0.5 * car.width - 0.015
     from_axle = np.min([np.hypot(x - at, height - car.wheel_radius) for at in axle_x(car)], axis=0)
-    arches = np.maximum(from_axle - car.wheel_radius - _ARCH_GAP_M, 0.5 * car.width - _ARCH_DEPTH_M - side)
+    arches = np.maximum(from_axle - car.wheel_radius - _ARCH_GAP_M, outer - _ARCH_DEPTH_M - side)
     middle = outer - 0.5 * car.wheel_width
     wheels = rounded_intersection(from_axle - car.wheel_radius, np.abs(side - middle) - 0.5 * car.wheel_width, 0.03)
     return arches, wheels

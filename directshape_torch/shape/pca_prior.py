@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
-from directshape_torch.scene import check_shape
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.zero_level import zero_level_extents
 
@@ -163,7 +163,8 @@ class PCAShapePrior(nn.Module):
         A = self.dimensions_basis_hwl
         noise = torch.diag(self.dimensions_residual_std_hwl**2 + std_m**2)
         gain = torch.linalg.solve(A @ A.T + noise, A)  # (3, K): the transposed Kalman gain of a N(0, 1) code
-        return (dimensions_hwl - self.dimensions_mean_hwl) @ gain
+        code: Tensor = (dimensions_hwl - self.dimensions_mean_hwl) @ gain
+        return code
 
     def with_num_codes(self, num_codes: int) -> PCAShapePrior:
         """The prior of the first components only.

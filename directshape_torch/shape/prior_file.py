@@ -73,7 +73,7 @@ def read_prior(path: Path) -> PCAShapePrior:
 
 def _read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             if not isinstance(file, np.lib.npyio.NpzFile):
                 raise DataFormatError(path, "not an npz archive")
             return {name: file[name] for name in file.files}

@@ -1,0 +1,201 @@
+"""`directshape build-prior`: a shape prior from a folder of car meshes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from directshape_torch.errors import DirectShapeError, InputError, MeshError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions
+    from directshape_torch.shape.pca_prior import PCAShapePrior
+
+REPORT_SCHEMA = "directshape_torch.prior_report/1"
+
+
+@dataclass(frozen=True)
+class PriorReport:
+    """What `build-prior` found, as written to the JSON file beside the prior.
+
+    Attributes:
+        leave_one_out_error_cm: mean |reconstructed - true| distance within 7 cm of the surface of cars left out.
+        explained_variance_ratio: of each component.
+        skipped: file and reason of each mesh that could not be used.
+    """
+
+    schema: str
+    num_meshes: int
+    num_codes: int
+    spacing_m: float
+    explained_variance_ratio: tuple[float, ...]
+    leave_one_out_error_cm: float
+    leave_one_out_num_cars: int
+    mean_height_width_length_m: tuple[float, ...]
+    std_height_width_length_m: tuple[float, ...]
+    meshes: tuple[str, ...]
+    skipped: dict[str, str]
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Register the command with the program's parser."""
+    parser = subparsers.add_parser(
+        "build-prior",
+        help="make a shape prior from a folder of car meshes",
+        description="Make meshes solid, sample their signed distance and keep the principal components. Writes the "
+        "prior, a report (.json) and a picture of the components (.png) beside it.",
+    )
+    parser.add_argument(
+        "--meshes", type=Path, required=True, help="folder of obj, ply, glb or off files, searched deep"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="npz file to write")
+    parser.add_argument("--pattern", default="**/*", help="which files below the folder (default: %(default)s)")
+    parser.add_argument("--num-codes", type=int, default=8, help="components to keep (default: %(default)s)")
+    parser.add_argument("--spacing", type=float, default=0.1, metavar="M", help="grid spacing (default: %(default)s)")
+    parser.add_argument(
+        "--forward-axis", default="+x", help="the files' axis to the front, as --forward-axis=-x (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--up-axis", default="+z", help="the files' axis upwards, as --up-axis=-y (default: %(default)s)"
+    )
+    parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the files (default: %(default)s)")
+    parser.add_argument("--length", type=float, metavar="M", help="scale every car to this length")
+    parser.add_argument("--closing", type=float, default=0.2, metavar="M", help="closes gaps up to twice this wide")
+    parser.add_argument("--no-symmetry", action="store_true", help="do not average left and right")
+    parser.add_argument("--licence", default="as the meshes", help="kept inside the prior (default: %(default)s)")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Build the prior; 0 when all meshes were used, 3 when some were skipped.
+
+    Raises:
+        InputError: no mesh files, too few usable ones, or an option out of range.
+    """
+    import torch
+
+    from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions
+    from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+
+    _check_options(args)
+    options = MeshOptions(
+        args.forward_axis,
+        args.up_axis,
+        args.scale,
+        args.length,
+        symmetrise=not args.no_symmetry,
+        closing_m=args.closing,
+    )
+    grid = GridSpec.for_cars(args.spacing)
+    grids, skipped = _read_meshes(find_meshes(args.meshes, args.pattern), args.meshes, grid, options)
+    if len(grids) <= args.num_codes:
+        reasons = "; ".join(skipped.values())
+        raise InputError(
+            "--meshes",
+            f"more than --num-codes = {args.num_codes} usable meshes",
+            f"{len(grids)} ({len(skipped)} skipped{': ' + reasons if reasons else ''})",
+            "add meshes or lower --num-codes",
+        )
+    samples = torch.stack(list(grids.values()))
+    provenance = PriorProvenance("directshape build-prior", args.licence, len(grids), ", ".join(grids))
+    prior = PCAShapePrior.fit(samples, torch.tensor(grid.origin), grid.spacing_m, args.num_codes, provenance)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    prior.save(args.out)
+    report = _make_report(prior, samples, tuple(grids), skipped)
+    _write_beside(args.out, prior, report)
+    print(_report_text(args.out, report))
+    return 3 if skipped else 0
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    if not 0.02 <= args.spacing <= 0.5:
+        raise InputError("--spacing", "0.02 to 0.5 m", f"{args.spacing}")
+    if args.num_codes < 1:
+        raise InputError("--num-codes", "at least 1", f"{args.num_codes}")
+
+
+def find_meshes(folder: Path, pattern: str) -> list[Path]:
+    """Mesh files below a folder, sorted.
+
+    Raises:
+        InputError: no such folder, or nothing that matches.
+    """
+    from directshape_torch.shape.mesh_to_sdf import MESH_SUFFIXES
+
+    if not folder.is_dir():
+        raise InputError("--meshes", "a folder", str(folder))
+    files = sorted(f for f in folder.glob(pattern) if f.suffix.lower() in MESH_SUFFIXES and f.is_file())
+    if not files:
+        raise InputError("--meshes", f"{', '.join(MESH_SUFFIXES)} files matching {pattern!r}", f"none in {folder}")
+    return files
+
+
+def _read_meshes(
+    files: list[Path], folder: Path, grid: GridSpec, options: MeshOptions
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Signed distance grids by file name, and why the others were skipped."""
+    import torch
+    from tqdm import tqdm
+
+    from directshape_torch.shape.mesh_to_sdf import load_mesh_obj, mesh_to_sdf
+
+    grids: dict[str, Tensor] = {}
+    skipped: dict[str, str] = {}
+    for file in tqdm(files, desc="meshes", unit="mesh"):
+        name = str(file.relative_to(folder))
+        try:
+            grids[name] = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file, options), grid, options, name))
+        except MeshError as problem:
+            skipped[name] = str(problem)
+    return grids, skipped
+
+
+def _make_report(prior: PCAShapePrior, samples: Tensor, names: tuple[str, ...], skipped: dict[str, str]) -> PriorReport:
+    from directshape_torch.shape.prior_quality import leave_one_out_errors_cm
+
+    errors = leave_one_out_errors_cm(samples, prior) if len(samples) >= 3 else samples.new_full((1,), float("nan"))
+    return PriorReport(
+        schema=REPORT_SCHEMA,
+        num_meshes=len(samples),
+        num_codes=prior.num_codes,
+        spacing_m=prior.spacing_m,
+        explained_variance_ratio=tuple(round(share, 5) for share in prior.explained_variance_ratio.tolist()),
+        leave_one_out_error_cm=round(float(errors.mean()), 3),
+        leave_one_out_num_cars=len(errors),
+        mean_height_width_length_m=tuple(round(d, 3) for d in prior.dimensions_mean_hwl.tolist()),
+        std_height_width_length_m=tuple(round(d, 3) for d in prior.dimensions_std_hwl.tolist()),
+        meshes=names,
+        skipped=skipped,
+    )
+
+
+def _write_beside(out: Path, prior: PCAShapePrior, report: PriorReport) -> None:
+    import cv2
+
+    from directshape_torch.visualize.prior_pictures import prior_picture
+
+    temporary = out.with_name(f".{out.stem}.{os.getpid()}.json")
+    temporary.write_text(json.dumps(asdict(report), indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, out.with_suffix(".json"))
+    picture = out.with_suffix(".png")
+    if not cv2.imwrite(str(picture), prior_picture(prior)):
+        raise DirectShapeError(f"{picture}: the picture could not be written")
+
+
+def _report_text(out: Path, report: PriorReport) -> str:
+    shares = " ".join(f"{100 * share:.1f}" for share in report.explained_variance_ratio)
+    sizes = zip(report.mean_height_width_length_m, report.std_height_width_length_m, strict=True)
+    lines = [
+        f"{out}: {report.num_codes} components of {report.num_meshes} meshes (report .json and picture .png beside it)",
+        f"explained variance, %: {shares} (sum {100 * sum(report.explained_variance_ratio):.1f})",
+        f"leave-one-out error within 7 cm of the surface: {report.leave_one_out_error_cm:.2f} cm "
+        f"(mean over {report.leave_one_out_num_cars} cars)",
+        "height, width, length, m: " + ", ".join(f"{mean:.2f} +- {std:.2f}" for mean, std in sizes),
+    ]
+    return "\n".join(lines + [f"skipped {name}: {reason}" for name, reason in report.skipped.items()])

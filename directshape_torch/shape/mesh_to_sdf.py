@@ -1,0 +1,246 @@
+"""Signed distance grids of triangle meshes as CAD files have them: open, with gaps, glass as loose sheets.
+
+The surface is voxelised finely, gaps are closed, what the outside cannot reach is solid, and the distance transform of
+that solid is sampled at the nodes of a coarser grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.errors import InputError, MeshError
+
+if TYPE_CHECKING:
+    import trimesh
+
+Array = NDArray[np.float64]
+Voxels = NDArray[np.bool_]
+
+MESH_SUFFIXES = (".obj", ".ply", ".glb", ".off")
+_AXES = {sign + axis: k for k, axis in enumerate("xyz") for sign in "+-"}
+# A solid car fills 60 to 85 percent of its convex hull; a shell that the flood entered fills a few percent.
+_LEAST_SHARE_OF_HULL = 0.4
+
+
+@dataclass(frozen=True)
+class GridSpec:
+    """Where the nodes of a signed distance grid lie, object frame, metres."""
+
+    origin: tuple[float, float, float]
+    spacing_m: float
+    shape: tuple[int, int, int]
+
+    def nodes(self) -> Array:
+        """Positions of all nodes, (nx, ny, nz, 3), metres."""
+        axes = [o + self.spacing_m * np.arange(n) for o, n in zip(self.origin, self.shape, strict=True)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+    @classmethod
+    def for_cars(cls, spacing_m: float = 0.1) -> GridSpec:
+        """Room for a car 5.2 m long, 2 m high and 2 m wide with 0.2 m or more around it, below the ground too.
+
+        Example:
+            >>> GridSpec.for_cars().shape
+            (59, 26, 27)
+        """
+        half_length, half_width = (int(np.ceil(size / spacing_m - 1e-9)) for size in (2.9, 1.3))
+        above, below = (int(np.ceil(size / spacing_m - 1e-9)) for size in (2.2, 0.3))
+        origin = (-half_length * spacing_m, -above * spacing_m, -half_width * spacing_m)
+        return cls(origin, spacing_m, (2 * half_length + 1, above + below + 1, 2 * half_width + 1))
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """How a mesh file is to be read and made solid.
+
+    Attributes:
+        forward_axis, up_axis: the file's axes that point to the car's front and up: "+x", "-x", "+y", ...
+        scale: metres per unit of the file.
+        length_m: scale the car to this length (after `scale`); None keeps it.
+        symmetrise: average the field with its left-right mirror image.
+        voxel_m: fine voxel size.
+        closing_m: gaps up to twice this wide are closed. Narrower closings are tried first.
+    """
+
+    forward_axis: str = "+x"
+    up_axis: str = "+z"
+    scale: float = 1.0
+    length_m: float | None = None
+    symmetrise: bool = True
+    voxel_m: float = 0.025
+    closing_m: float = 0.2
+
+    def __post_init__(self) -> None:
+        for name, axis in (("forward_axis", self.forward_axis), ("up_axis", self.up_axis)):
+            if axis not in _AXES:
+                raise InputError(name, f"one of {', '.join(_AXES)}", repr(axis))
+        if _AXES[self.forward_axis] == _AXES[self.up_axis]:
+            raise InputError("up_axis", "another axis than forward_axis", repr(self.up_axis))
+        lengths = [("scale", self.scale), ("voxel_m", self.voxel_m), ("closing_m", self.closing_m)]
+        for name, value in lengths + ([("length_m", self.length_m)] if self.length_m is not None else []):
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(name, "a positive number", f"{value}")
+
+
+def load_mesh_obj(path: Path | str, options: MeshOptions | None = None) -> trimesh.Trimesh:
+    """Read a mesh file and place it in the object frame: x forward, y down, centred in x and z, lowest point at y = 0.
+
+    Raises:
+        MeshError: the file cannot be read or holds no triangles.
+    """
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except Exception as problem:  # the loaders of the formats raise whatever their parsers raise
+        raise MeshError(f"{path}: cannot be read as a mesh ({type(problem).__name__}: {problem})") from problem
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+        raise MeshError(f"{path}: holds no triangles with finite vertices")
+    return place_mesh(mesh, options or MeshOptions())
+
+
+def place_mesh(mesh: trimesh.Trimesh, options: MeshOptions) -> trimesh.Trimesh:
+    """A copy of a mesh in the object frame, by the axes, scale and length of the options."""
+    import trimesh
+
+    forward, up = _unit(options.forward_axis), _unit(options.up_axis)
+    R_obj_file = np.stack([forward, -up, np.cross(forward, -up)])
+    vertices = options.scale * np.asarray(mesh.vertices, dtype=np.float64) @ R_obj_file.T
+    if options.length_m is not None:
+        vertices *= options.length_m / np.ptp(vertices[:, 0])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    vertices -= [0.5 * (low[0] + high[0]), high[1], 0.5 * (low[2] + high[2])]
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+
+def _unit(axis: str) -> Array:
+    return np.asarray(np.eye(3)[_AXES[axis]] * (1.0 if axis[0] == "+" else -1.0))
+
+
+def mesh_to_sdf(
+    mesh_obj: trimesh.Trimesh,
+    grid: GridSpec,
+    options: MeshOptions | None = None,
+    name: str = "mesh",
+) -> NDArray[np.float32]:
+    """Signed distance of a mesh at the nodes of a grid, metres, negative inside, not truncated.
+
+    Args:
+        mesh_obj: in the object frame, metres; need not be watertight.
+        grid: where to sample; the mesh should lie inside.
+        options: voxel size, closing and symmetry (axes and scale are `load_mesh_obj`'s business).
+        name: for messages.
+
+    Returns:
+        (nx, ny, nz), about half a fine voxel exact.
+
+    Raises:
+        MeshError: the mesh cannot be made solid, or does not fit into the grid.
+
+    Example:
+        >>> import trimesh
+        >>> box = trimesh.creation.box((4.0, 1.5, 1.6))
+        >>> sdf = mesh_to_sdf(box.apply_translation((0, -0.75, 0)), GridSpec.for_cars(0.2), MeshOptions(voxel_m=0.05))
+        >>> sdf.shape, bool(abs(sdf.min() + 0.75) < 0.06)
+        ((31, 14, 15), True)
+    """
+    from scipy.ndimage import map_coordinates
+
+    options = options or MeshOptions()
+    _check_fits(mesh_obj, grid, name)
+    surface, origin = _voxelise(mesh_obj, grid, options)
+    solid = _solid(surface, mesh_obj, options, name)
+    distance = _signed_distance(solid, options.voxel_m)
+    nodes = grid.nodes()
+
+    def sample(points: Array) -> Array:
+        index = (points - origin) / options.voxel_m
+        return np.asarray(map_coordinates(distance, index.reshape(-1, 3).T, order=1, mode="nearest")).reshape(
+            points.shape[:-1]
+        )
+
+    sdf = sample(nodes)
+    if options.symmetrise:
+        sdf = 0.5 * (sdf + sample(nodes * [1.0, 1.0, -1.0]))
+    return sdf.astype(np.float32)
+
+
+def _check_fits(mesh_obj: trimesh.Trimesh, grid: GridSpec, name: str) -> None:
+    low = np.array(grid.origin)
+    high = low + grid.spacing_m * (np.array(grid.shape) - 1)
+    if (mesh_obj.bounds[0] < low).any() or (mesh_obj.bounds[1] > high).any():
+        raise MeshError(
+            f"{name}: extents {np.round(mesh_obj.bounds, 2).tolist()} m leave the grid {low.round(2).tolist()} to "
+            f"{high.round(2).tolist()} m; check axes and scale, or normalise the length"
+        )
+
+
+def _voxelise(mesh_obj: trimesh.Trimesh, grid: GridSpec, options: MeshOptions) -> tuple[Voxels, Array]:
+    """Fine voxels that the surface passes through, with room for the closing, and the centre of the first."""
+    room = options.closing_m + 3 * options.voxel_m
+    half_cell = 0.5 * options.voxel_m
+    high = np.array(grid.origin) + grid.spacing_m * (np.array(grid.shape) - 1) + room
+    # Symmetric about the middle plane and covering the grid, so that both halves are sampled alike.
+    high[2] = max(high[2], -grid.origin[2] + room)
+    low = np.minimum(np.array(grid.origin) - room, [np.inf, np.inf, -high[2]])
+    shape = np.ceil((high - low) / options.voxel_m).astype(int) + 1
+    voxels = np.zeros(shape, dtype=bool)
+    for points in _surface_points(mesh_obj, half_cell):
+        index = np.floor((points - low) / options.voxel_m + 0.5).astype(int)
+        voxels[index[:, 0], index[:, 1], index[:, 2]] = True
+    return voxels, low
+
+
+def _surface_points(mesh_obj: trimesh.Trimesh, step_m: float) -> list[Array]:
+    """Points on all triangles, on barycentric lattices at most `step_m` apart."""
+    triangles = np.asarray(mesh_obj.triangles, dtype=np.float64)
+    longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+    divisions = np.maximum(np.ceil(longest / step_m).astype(int), 1)
+    parts = []
+    for count in np.unique(divisions):
+        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
+        keep = i + j <= count
+        weights = np.stack([i[keep], j[keep], count - i[keep] - j[keep]], axis=1) / count
+        parts.append(np.einsum("wk,tkc->twc", weights, triangles[divisions == count]).reshape(-1, 3))
+    return parts
+
+
+def _solid(surface: Voxels, mesh_obj: trimesh.Trimesh, options: MeshOptions, name: str) -> Voxels:
+    """What the outside cannot reach, with the narrowest closing that makes the mesh solid."""
+    hull_m3 = float(mesh_obj.convex_hull.volume)
+    share = 0.0
+    for closing_m in (0.25 * options.closing_m, 0.5 * options.closing_m, options.closing_m):
+        solid = _fill(surface, closing_m / options.voxel_m)
+        share = float(solid.sum()) * options.voxel_m**3 / max(hull_m3, 1e-9)
+        if share >= _LEAST_SHARE_OF_HULL:
+            return solid
+    raise MeshError(
+        f"{name}: cannot be made solid: only {100 * share:.0f} percent of its convex hull is enclosed, so "
+        f"it has a hole wider than {2 * options.closing_m:.2f} m; close the hole or raise the closing"
+    )
+
+
+def _fill(surface: Voxels, radius: float) -> Voxels:
+    """Closes gaps of the surface voxels up to twice the radius, floods from outside and returns the rest."""
+    from scipy.ndimage import distance_transform_edt, label
+
+    thick = distance_transform_edt(~surface) <= radius
+    regions, _ = label(~thick)
+    outside = regions == regions[0, 0, 0]
+    # The outside grows back by what the closing took from it.
+    reached = distance_transform_edt(~outside) <= radius
+    return np.asarray(surface | ~reached)
+
+
+def _signed_distance(solid: Voxels, voxel_m: float) -> Array:
+    """Distance to the solid's outermost voxel centres: the surface passes through those voxels, on average there."""
+    from scipy.ndimage import distance_transform_edt
+
+    outside = distance_transform_edt(~solid)
+    inside = np.maximum(distance_transform_edt(solid) - 1.0, 0.0)
+    return np.asarray(voxel_m * (outside - inside))

@@ -1,0 +1,73 @@
+import argparse
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from directshape_torch.cli import build_prior
+from directshape_torch.errors import InputError
+from directshape_torch.shape.parametric_cars import car_mesh, sample_car
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+def run(*arguments: str) -> int:
+    parser = argparse.ArgumentParser()
+    build_prior.add_parser(parser.add_subparsers())
+    args = parser.parse_args(["build-prior", *arguments])
+    code: int = args.run(args)
+    return code
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cars in the object frame: front +x, up -y."""
+    folder = tmp_path_factory.mktemp("meshes")
+    for seed, suffix in enumerate(("obj", "ply", "off")):
+        car_mesh(sample_car(seed), spacing_m=0.1).export(folder / f"car{seed}.{suffix}")
+    return folder
+
+
+OPTIONS = ("--up-axis=-y", "--num-codes", "1", "--spacing", "0.2")
+
+
+def test_writes_prior_report_and_picture(meshes, tmp_path, capsys):
+    out = tmp_path / "made" / "car.npz"
+    assert run("--meshes", str(meshes), "--out", str(out), *OPTIONS) == 0
+    prior = PCAShapePrior.load(out)
+    assert prior.num_codes == 1
+    assert prior.provenance.num_samples == 3
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert report["schema"] == build_prior.REPORT_SCHEMA
+    assert report["meshes"] == ["car0.obj", "car1.ply", "car2.off"]
+    assert 0 < report["leave_one_out_error_cm"] < 20
+    lengths = [sample_car(seed).length for seed in range(3)]
+    assert report["mean_height_width_length_m"][2] == pytest.approx(sum(lengths) / 3, abs=0.1)
+    picture = cv2.imread(str(out.with_suffix(".png")))
+    assert picture is not None
+    assert (picture < 200).any()
+    assert "leave-one-out error" in capsys.readouterr().out
+    assert sorted(f.name for f in out.parent.iterdir()) == ["car.json", "car.npz", "car.png"]
+
+
+def test_skips_a_mesh_that_is_no_solid_and_says_so(meshes, tmp_path, capsys):
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for file in meshes.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    (folder / "broken.obj").write_text("v 0 0 0\n")
+    assert run("--meshes", str(folder), "--out", str(tmp_path / "car.npz"), *OPTIONS) == 3
+    assert "skipped broken.obj" in capsys.readouterr().out
+
+
+def test_wrong_input(meshes, tmp_path):
+    out = str(tmp_path / "car.npz")
+    with pytest.raises(InputError, match="--meshes: expected a folder"):
+        run("--meshes", str(tmp_path / "none"), "--out", out)
+    with pytest.raises(InputError, match=r"none in"):
+        run("--meshes", str(meshes), "--out", out, "--pattern", "*.glb")
+    with pytest.raises(InputError, match="more than --num-codes = 9 usable meshes"):
+        run("--meshes", str(meshes), "--out", out, "--num-codes", "9", "--up-axis=-y", "--spacing", "0.2")
+    with pytest.raises(InputError, match="--spacing"):
+        run("--meshes", str(meshes), "--out", out, "--spacing", "3")
+    assert list(tmp_path.iterdir()) == []

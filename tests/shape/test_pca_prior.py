@@ -1,0 +1,226 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.zero_level import zero_level_extents
+
+MADE = PriorProvenance("a test", "Apache-2.0", 40)
+SPACING_M = 0.2
+SHAPE = (21, 13, 11)
+ORIGIN = torch.tensor([-2.0, -2.0, -1.0], dtype=torch.float64)
+
+
+def box_samples(count: int = 40, seed: int = 0) -> torch.Tensor:
+    """Boxes on the ground whose length and height vary; width fixed."""
+    generator = torch.Generator().manual_seed(seed)
+    axes = [ORIGIN[k] + SPACING_M * torch.arange(SHAPE[k], dtype=torch.float64) for k in range(3)]
+    nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    length = 2.6 + 0.3 * torch.randn(count, generator=generator, dtype=torch.float64)
+    height = 1.2 + 0.1 * torch.randn(count, generator=generator, dtype=torch.float64)
+    samples = []
+    for half_x, half_y in zip(0.5 * length, 0.5 * height, strict=True):
+        q = torch.stack(
+            [nodes[..., 0].abs() - half_x, (nodes[..., 1] + half_y).abs() - half_y, nodes[..., 2].abs() - 0.7]
+        )
+        samples.append(q.clamp_min(0).norm(dim=0) + q.amax(dim=0).clamp_max(0))
+    return torch.stack(samples)
+
+
+@pytest.fixture(scope="module")
+def samples() -> torch.Tensor:
+    return box_samples()
+
+
+@pytest.fixture(scope="module")
+def prior(samples) -> PCAShapePrior:
+    return PCAShapePrior.fit(samples, ORIGIN, SPACING_M, 4, MADE)
+
+
+def test_implements_the_protocol(prior):
+    assert isinstance(prior, ShapePrior)
+    assert prior.num_codes == 4
+    torch.testing.assert_close(prior.bounds_obj[1], torch.tensor([2.0, 0.4, 1.0], dtype=torch.float64))
+
+
+def test_unweighted_components_equal_those_of_a_singular_value_decomposition(samples):
+    prior = PCAShapePrior.fit(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
+    centred = (samples - samples.mean(0)).flatten(1)
+    _, singular, directions = torch.linalg.svd(centred, full_matrices=False)
+    sigma = singular[:3] / (len(samples) - 1) ** 0.5
+    expected = directions[:3] * sigma[:, None]
+    found = prior.basis.reshape(-1, 3).T
+    signs = (found * expected).sum(1).sign()
+    torch.testing.assert_close(found, expected * signs[:, None], atol=1e-9, rtol=0)
+    torch.testing.assert_close(prior.explained_variance_ratio, singular[:3] ** 2 / (singular**2).sum())
+
+
+def test_codes_of_the_training_samples_are_white(samples):
+    prior = PCAShapePrior.fit(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
+    basis = prior.basis.reshape(-1, 3)
+    codes = torch.linalg.lstsq(basis, (samples - prior.mean).flatten(1).T).solution.T
+    torch.testing.assert_close(
+        codes.T @ codes / (len(samples) - 1), torch.eye(3, dtype=torch.float64), atol=1e-8, rtol=0
+    )
+
+
+def test_reconstruction_improves_with_each_component_and_is_exact_with_all():
+    few = box_samples(6)
+    errors = []
+    for k in (1, 3, 5):
+        prior = PCAShapePrior.fit(few, ORIGIN, SPACING_M, k, MADE, surface_band_m=None)
+        basis = prior.basis.reshape(-1, k)
+        target = (few - prior.mean).flatten(1).T
+        errors.append(float((basis @ torch.linalg.lstsq(basis, target).solution - target).abs().max()))
+    assert errors[0] > errors[1] > errors[2]
+    assert errors[2] < 1e-9
+
+
+def test_positive_first_code_makes_the_car_larger(prior):
+    code = prior.initial_code(2)
+    code[:, 0] = torch.tensor([-1.0, 1.0])
+    small, large = zero_level_extents(prior.values(code), prior.origin, prior.spacing_m).diff(dim=1)[:, 0]
+    assert large[0] > small[0] + 0.3
+
+
+def test_linear_dimensions_follow_the_zero_level(prior):
+    code = torch.tensor([[0.0, 0, 0, 0], [0.7, -0.5, 0, 0], [-1.0, 0.4, 0, 0]], dtype=torch.float64)
+    extents = zero_level_extents(prior.values(code), prior.origin, prior.spacing_m)
+    measured = (extents[:, 1] - extents[:, 0])[:, [1, 2, 0]]
+    torch.testing.assert_close(prior.dimensions_hwl(code), measured, atol=0.06, rtol=0)
+    assert (prior.dimensions_residual_std_hwl < 0.06).all()
+
+
+def test_code_from_dimensions_is_the_minimum_of_its_cost(prior):
+    measured = prior.dimensions_mean_hwl + torch.tensor([[0.1, 0.0, -0.4], [-0.05, 0.02, 0.3]], dtype=torch.float64)
+    code = prior.code_from_dimensions(measured, std_m=0.1).requires_grad_()
+    variance = prior.dimensions_residual_std_hwl**2 + 0.1**2
+    cost = 0.5 * (code**2).sum() + 0.5 * ((prior.dimensions_hwl(code) - measured) ** 2 / variance).sum()
+    (gradient,) = torch.autograd.grad(cost, code)
+    assert gradient.abs().max() < 1e-9
+    assert prior.code_from_dimensions(measured[:0]).shape == (0, 4)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_values_are_linear_and_within_the_lipschitz_bound(prior, seed):
+    generator = torch.Generator().manual_seed(seed)
+    code = torch.randn(2, prior.num_codes, generator=generator, dtype=torch.float64)
+    code = code / code.norm(dim=1, keepdim=True) * CODE_NORM_IN_USE
+    values = prior.values(code)
+    torch.testing.assert_close(prior.values(code.mean(0, keepdim=True))[0], values.mean(0))
+    points = prior.bounds_obj[0] + torch.rand(300, 3, generator=generator, dtype=torch.float64) * (
+        prior.bounds_obj[1] - prior.bounds_obj[0]
+    )
+    index = torch.arange(300) % 2
+    assert prior.bind(code).value_and_derivatives(points, index).gradient.norm(dim=1).max() <= prior.lipschitz + 1e-9
+
+
+def test_bind_agrees_with_the_sum_over_components(prior):
+    code = torch.tensor([[0.5, -1.0, 0.2, 0.1]], dtype=torch.float64)
+    node = torch.tensor([4, 6, 3])
+    point = prior.origin + prior.spacing_m * node
+    expected = prior.mean[4, 6, 3] + (prior.basis[4, 6, 3] * code[0]).sum()
+    torch.testing.assert_close(prior.bind(code).value(point[None], torch.tensor([0]))[0], expected)
+    assert prior.values(prior.initial_code(0)).shape == (0, *SHAPE)
+
+
+def test_fewer_codes(prior):
+    short = prior.with_num_codes(2)
+    code = torch.tensor([[0.3, -0.8]], dtype=torch.float64)
+    padded = torch.cat([code, torch.zeros(1, 2, dtype=torch.float64)], dim=1)
+    torch.testing.assert_close(short.values(code), prior.values(padded))
+    torch.testing.assert_close(short.dimensions_hwl(code), prior.dimensions_hwl(padded))
+    assert (short.dimensions_residual_std_hwl >= prior.dimensions_residual_std_hwl).all()
+    for count in (0, 5):
+        with pytest.raises(InputError, match=r"num_codes: expected 1\.\.4"):
+            prior.with_num_codes(count)
+
+
+def test_state_dict_and_dtype(prior, samples):
+    other = PCAShapePrior.fit(samples * 1.1, ORIGIN, 0.3, 4, MADE)
+    other.load_state_dict(prior.state_dict())
+    assert other.spacing_m == prior.spacing_m
+    code = torch.ones(1, 4, dtype=torch.float64)
+    torch.testing.assert_close(other.values(code), prior.values(code))
+    single = prior.with_num_codes(4).to(torch.float32)
+    assert single.values(single.initial_code(1)).dtype == torch.float32
+    torch.testing.assert_close(single.values(code.float()).double(), prior.values(code), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("grid_dtype", "atol"), [("float32", 1e-6), ("float16", 1e-3)])
+def test_file_round_trip(prior, tmp_path, grid_dtype, atol):
+    path = tmp_path / "prior.npz"
+    prior.save(path, grid_dtype)
+    read = PCAShapePrior.load(path)
+    assert read.provenance == MADE
+    assert read.spacing_m == prior.spacing_m
+    code = torch.tensor([[0.5, -0.5, 0.5, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(read.values(code.float()).double(), prior.values(code), atol=3 * atol, rtol=0)
+    torch.testing.assert_close(read.dimensions_basis_hwl.double(), prior.dimensions_basis_hwl, atol=1e-6, rtol=0)
+    first = path.read_bytes()
+    prior.save(path, grid_dtype)
+    assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def rewrite(source, target, **changes) -> None:
+    with np.load(source) as file:
+        arrays = {name: file[name] for name in file.files}
+    arrays.update(changes)
+    np.savez(target, **{name: array for name, array in arrays.items() if array is not None})
+
+
+def test_bad_files_say_what_is_wrong(prior, tmp_path):
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    prior.save(good)
+    cases = {
+        "schema 'other' is not": {"schema": np.array("other")},
+        "lacks the arrays basis": {"basis": None},
+        "basis: expected shape": {"basis": np.zeros((2, 2, 2, 4), dtype=np.float32)},
+        "mean holds values that are no finite": {"mean": np.full(SHAPE, np.nan)},
+        "not a valid shape prior": {"provenance": np.array('{"other": 1}')},
+    }
+    for message, changes in cases.items():
+        rewrite(good, bad, **changes)
+        with pytest.raises(DataFormatError, match=message):
+            PCAShapePrior.load(bad)
+    bad.write_bytes(good.read_bytes()[:200])
+    with pytest.raises(DataFormatError, match=r"bad\.npz: cannot be read"):
+        PCAShapePrior.load(bad)
+    np.savez(bad, schema=np.array([{"pickled": 1}], dtype=object))
+    with pytest.raises(DataFormatError, match="without pickle"):
+        PCAShapePrior.load(bad)
+    with pytest.raises(DataFormatError, match="no such file"):
+        PCAShapePrior.load(tmp_path / "none.npz")
+
+
+def test_fit_refuses_samples_that_make_no_prior(samples):
+    with pytest.raises(InputError, match="more than num_codes = 4"):
+        PCAShapePrior.fit(samples[:4], ORIGIN, SPACING_M, 4, MADE)
+    with pytest.raises(InputError, match="finite distances"):
+        PCAShapePrior.fit(samples.where(samples > -0.3, torch.nan), ORIGIN, SPACING_M, 2, MADE)
+    with pytest.raises(InputError, match="without surface"):
+        PCAShapePrior.fit(samples.abs() + 0.1, ORIGIN, SPACING_M, 2, MADE)
+
+
+def test_wrong_code_shape(prior):
+    with pytest.raises(InputError, match="code: expected shape"):
+        prior.values(torch.zeros(1, 3, dtype=torch.float64))
+
+
+def test_bundled_prior_is_a_car():
+    prior = PCAShapePrior.load_bundled()
+    assert 5 <= prior.num_codes <= 10
+    assert prior.provenance.licence == "Apache-2.0"
+    # KITTI's labelled cars: 1.53 +- 0.14, 1.63 +- 0.10, 3.88 +- 0.43 m.
+    torch.testing.assert_close(prior.dimensions_mean_hwl, torch.tensor([1.53, 1.63, 3.88]), atol=0.06, rtol=0)
+    torch.testing.assert_close(prior.dimensions_std_hwl, torch.tensor([0.14, 0.10, 0.43]), atol=0.04, rtol=0)
+    extents = zero_level_extents(prior.values(prior.initial_code(1)), prior.origin, prior.spacing_m)[0]
+    torch.testing.assert_close(extents[1] - extents[0], prior.dimensions_mean_hwl[[2, 0, 1]], atol=0.12, rtol=0)
+    assert abs(extents[1, 1]) < 0.06  # the tyres stand on the ground
+    torch.testing.assert_close(prior.mean, prior.mean.flip(2), atol=1e-3, rtol=0)
