@@ -67,6 +67,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--scale", type=float, default=1.0, help="metres per unit of the files (default: %(default)s)")
     parser.add_argument("--length", type=float, metavar="M", help="scale every car to this length")
     parser.add_argument("--closing", type=float, default=0.2, metavar="M", help="closes gaps up to twice this wide")
+    parser.add_argument("--voxel", type=float, default=0.025, metavar="M", help="fine voxels (default: %(default)s)")
     parser.add_argument("--no-symmetry", action="store_true", help="do not average left and right")
     parser.add_argument("--licence", default="as the meshes", help="kept inside the prior (default: %(default)s)")
     parser.set_defaults(run=run)
@@ -90,18 +91,14 @@ def run(args: argparse.Namespace) -> int:
         args.scale,
         args.length,
         symmetrise=not args.no_symmetry,
+        voxel_m=args.voxel,
         closing_m=args.closing,
     )
     grid = GridSpec.for_cars(args.spacing)
-    grids, skipped = _read_meshes(find_meshes(args.meshes, args.pattern), args.meshes, grid, options)
-    if len(grids) <= args.num_codes:
-        reasons = "; ".join(skipped.values())
-        raise InputError(
-            "--meshes",
-            f"more than --num-codes = {args.num_codes} usable meshes",
-            f"{len(grids)} ({len(skipped)} skipped{': ' + reasons if reasons else ''})",
-            "add meshes or lower --num-codes",
-        )
+    files = find_meshes(args.meshes, args.pattern)
+    _check_enough(len(files), {}, args.num_codes)
+    grids, skipped = _read_meshes(files, args.meshes, grid, options)
+    _check_enough(len(grids), skipped, args.num_codes)
     samples = torch.stack(list(grids.values()))
     provenance = PriorProvenance("directshape build-prior", args.licence, len(grids), ", ".join(grids))
     prior = PCAShapePrior.fit(samples, torch.tensor(grid.origin), grid.spacing_m, args.num_codes, provenance)
@@ -118,6 +115,13 @@ def _check_options(args: argparse.Namespace) -> None:
         raise InputError("--spacing", "0.02 to 0.5 m", f"{args.spacing}")
     if args.num_codes < 1:
         raise InputError("--num-codes", "at least 1", f"{args.num_codes}")
+
+
+def _check_enough(num_usable: int, skipped: dict[str, str], num_codes: int) -> None:
+    if num_usable <= num_codes:
+        reasons = f" ({len(skipped)} skipped: {'; '.join(skipped.values())})" if skipped else ""
+        expected = f"more than --num-codes = {num_codes} usable meshes"
+        raise InputError("--meshes", expected, f"{num_usable}{reasons}", "add meshes or lower --num-codes")
 
 
 def find_meshes(folder: Path, pattern: str) -> list[Path]:

@@ -28,7 +28,7 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-OPTIONS = ("--up-axis=-y", "--num-codes", "1", "--spacing", "0.2")
+OPTIONS = ("--up-axis=-y", "--num-codes", "1", "--spacing", "0.2", "--voxel", "0.08")
 
 
 def test_writes_prior_report_and_picture(meshes, tmp_path, capsys):
