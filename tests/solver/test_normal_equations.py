@@ -1,0 +1,88 @@
+"""Sums over objects: against a naive loop, empty objects, isolation, the same bits every time."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.solver.normal_equations import Segments
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.integers(0, 300), max_size=6))
+def test_against_a_loop(counts: list[int]) -> None:
+    index = torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts, dtype=torch.long))
+    segments = Segments.from_sorted_index(index, len(counts))
+    J = torch.randn(len(index), 4, dtype=torch.float64)
+    first, second = torch.randn(2, len(index), dtype=torch.float64)
+    gradient, hessian = segments.accumulate(J, first, second)
+    assert segments.counts.tolist() == counts
+    assert gradient.shape == (len(counts), 4)
+    for i in range(len(counts)):
+        own = index == i
+        torch.testing.assert_close(segments.sum(first)[i], first[own].sum(), rtol=1e-11, atol=1e-11)
+        torch.testing.assert_close(gradient[i], (first[own, None] * J[own]).sum(0), rtol=1e-11, atol=1e-11)
+        expected = (J[own] * second[own, None]).T @ J[own]
+        torch.testing.assert_close(hessian[i], expected, rtol=1e-11, atol=1e-11)
+
+
+def test_objects_without_rows_sum_to_zero() -> None:
+    segments = Segments.from_sorted_index(torch.tensor([1, 1, 3]), 5)
+    assert segments.sum(torch.tensor([1.0, 2.0, 4.0])).tolist() == [0.0, 3.0, 0.0, 4.0, 0.0]
+
+
+@pytest.mark.parametrize("num_objects", [0, 3])
+def test_no_rows(num_objects: int) -> None:
+    segments = Segments.from_sorted_index(torch.zeros(0, dtype=torch.long), num_objects)
+    gradient, hessian = segments.accumulate(torch.zeros(0, 4), torch.zeros(0), torch.zeros(0))
+    assert segments.sum(torch.zeros(0)).tolist() == [0.0] * num_objects
+    assert (gradient.shape, hessian.shape) == ((num_objects, 4), (num_objects, 4, 4))
+
+
+def test_nan_and_infinity_stay_in_their_object() -> None:
+    index = torch.repeat_interleave(torch.arange(3), torch.tensor([70, 130, 64]))
+    segments = Segments.from_sorted_index(index, 3)
+    values, J = torch.ones(264), torch.ones(264, 2)
+    values[100], J[150] = torch.nan, torch.inf
+    gradient, hessian = segments.accumulate(J, values, values)
+    for result in (segments.sum(values), gradient.sum(1), hessian.sum((1, 2))):
+        assert result.isfinite().tolist() == [True, False, True]
+    assert segments.sum(values)[[0, 2]].tolist() == [70.0, 64.0]
+
+
+def test_float32_rows_are_summed_in_float64() -> None:
+    rows = torch.full((200_000,), 0.1)
+    total = Segments.from_sorted_index(torch.zeros(200_000, dtype=torch.long), 1).sum(rows)
+    assert total.dtype == torch.float64
+    assert abs(float(total) - 200_000 * float(rows[0])) < 1e-6
+
+
+def test_an_objects_sums_do_not_depend_on_its_neighbours() -> None:
+    generator = torch.Generator().manual_seed(1)
+    J = torch.randn(500, 9, generator=generator)
+    weights = torch.rand(500, generator=generator)
+    alone = Segments.from_sorted_index(torch.zeros(500, dtype=torch.long), 1)
+    crowd = torch.cat([torch.zeros(37), torch.ones(500), torch.full((2000,), 2.0)]).long()
+    rows = torch.cat([torch.randn(37, 9), J, torch.randn(2000, 9)])
+    w = torch.cat([torch.ones(37), weights, torch.ones(2000)])
+    together = Segments.from_sorted_index(crowd, 3)
+    for a, b in zip(alone.accumulate(J, weights, weights), together.accumulate(rows, w, w), strict=True):
+        torch.testing.assert_close(b[1], a[0], rtol=1e-13, atol=1e-13)
+
+
+def test_sums_are_differentiable() -> None:
+    segments = Segments.from_sorted_index(torch.tensor([0, 0, 2]), 3)
+    values = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
+    (segments.sum(values) * torch.tensor([2.0, 5.0, 7.0])).sum().backward()
+    assert values.grad is not None
+    assert values.grad.tolist() == [2.0, 2.0, 7.0]
+
+
+def test_the_same_bits_twice() -> None:
+    index = torch.randint(0, 7, (5000,)).sort().values
+    J, w = torch.randn(5000, 11), torch.rand(5000)
+    results = [Segments.from_sorted_index(index, 7).accumulate(J, w, w) for _ in range(2)]
+    for a, b in zip(*results, strict=True):
+        assert (a == b).all()
