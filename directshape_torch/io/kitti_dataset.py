@@ -67,7 +67,8 @@ class KittiStereoDataset:
         split: file with one frame id a line; default every frame that has a detection file.
         frames: ids of the frames to use, of those.
         classes: object types to refine; other lines are copied.
-        ground: where ground planes come from: "auto" is file, else stereo, else camera height.
+        ground: where ground planes come from: "auto" is file, else stereo, else camera height; with a disparity
+            field stereo comes first, for plane files share the bias of the disparities they were made from.
         camera_height_m: height of the camera above a level ground, the last resort.
         disparity_field: residual disparity of the rig, or None.
         dtype: of the tensors.
@@ -190,19 +191,43 @@ class KittiStereoDataset:
     def _ground(
         self, frame_id: str, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
     ) -> GroundPlane:
-        """The plane of the first source that has one, of those that `self.ground` allows."""
-        path = self._plane_path(frame_id)
-        if self.ground == "file" or (self.ground == "auto" and path.is_file()):
-            plane_cam = plane_ref_to_cam(read_plane(path), camera.t_cam_ref[0].double().numpy())
-            return _ground_plane(torch.from_numpy(plane_cam), "file", self.dtype)
-        if self.ground in ("auto", "stereo"):
-            from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
+        """The plane of the first source that has one, of those that `self.ground` allows.
 
-            plane = estimate_ground_plane(left, right, camera)
-            if plane is not None:
-                normal, offset = (torch.as_tensor(part, dtype=torch.float64).reshape(-1) for part in plane)
-                return _ground_plane(torch.cat([normal, offset]), "stereo", self.dtype)
+        Plane files are commonly made from raw disparity and share its bias, so with a disparity field "auto" asks the
+        corrected stereo pair first.
+        """
+        orders: dict[GroundSource, tuple[GroundSource, ...]] = {
+            "auto": ("file", "stereo") if self.disparity_field is None else ("stereo", "file"),
+            "file": ("file",),
+            "stereo": ("stereo",),
+            "camera_height": (),
+        }
+        for source in orders[self.ground]:
+            plane_cam = (
+                self._plane_from_file(frame_id, camera)
+                if source == "file"
+                else self._plane_from_stereo(left, right, camera)
+            )
+            if plane_cam is not None:
+                return _ground_plane(plane_cam, source, self.dtype)
         return GroundPlane.from_camera_height(self.camera_height_m).to(dtype=self.dtype)
+
+    def _plane_from_file(self, frame_id: str, camera: StereoCamera) -> Tensor | None:
+        path = self._plane_path(frame_id)
+        if self.ground == "auto" and not path.is_file():
+            return None
+        return torch.from_numpy(plane_ref_to_cam(read_plane(path), camera.t_cam_ref[0].double().numpy()))
+
+    def _plane_from_stereo(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
+    ) -> Tensor | None:
+        from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
+
+        plane = estimate_ground_plane(left, right, camera)
+        if plane is None:
+            return None
+        normal, offset = (torch.as_tensor(part, dtype=torch.float64).reshape(-1) for part in plane)
+        return torch.cat([normal, offset])
 
 
 def _ground_plane(plane_cam: Tensor, source: str, dtype: torch.dtype) -> GroundPlane:
