@@ -93,6 +93,6 @@ class RunRecord:
             hashes = hash_files(dataset.input_files(frame_id))
         except DataFormatError as error:
             raise ResumeError(
-                f"cannot resume: frame {frame_id}: a file it was refined from is gone: {error}"
+                f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}"
             ) from error
         check_inputs(self.manifest, frame_id, hashes)
