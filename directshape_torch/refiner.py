@@ -100,10 +100,9 @@ class DirectShapeRefiner(nn.Module):
         upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
         in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
         has_mask = detections.has_mask_left | detections.has_mask_right
-        safe = _replace_poses(detections, in_front)
-        observation = pack_pixels(frames, safe, self.config.sampling)
+        observation = pack_pixels(frames, detections, self.config.sampling)
         left, right = (
-            torch.bincount(x.object_index, minlength=len(safe)) for x in (observation.left, observation.right)
+            torch.bincount(x.object_index, minlength=len(detections)) for x in (observation.left, observation.right)
         )
         too_few = left + right < self.config.sampling.min_usable_pixels
         for condition, status in (
@@ -183,13 +182,6 @@ def _is_refined(status: Tensor) -> Tensor:
 def _take(detections: Detections, rows: Tensor) -> Detections:
     changed = {f.name: getattr(detections, f.name)[rows] for f in fields(detections) if f.name != "occluders"}
     return replace(detections, **changed)
-
-
-def _replace_poses(detections: Detections, good: Tensor) -> Detections:
-    """Harmless poses for cars that will not be refined, so that their numbers can disturb nothing."""
-    harmless = torch.eye(4, dtype=detections.T_cam_obj.dtype, device=detections.T_cam_obj.device)
-    harmless[2, 3] = 10.0
-    return replace(detections, T_cam_obj=torch.where(good[:, None, None], detections.T_cam_obj, harmless))
 
 
 def _check_fit(frames: FrameBatch, detections: Detections, prior: PCAShapePrior) -> None:

@@ -61,6 +61,9 @@ class StereoCamera(_TensorRecord):
         check_shape("K_right", self.K_right, (num_frames, 3, 3))
         check_shape("T_right_cam", self.T_right_cam, (num_frames, 4, 4))
         check_shape("t_cam_ref", self.t_cam_ref, (num_frames, 3))
+        for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref"):
+            if not bool(getattr(self, name).isfinite().all()):
+                raise InputError(name, "finite numbers", "NaN or infinity", "check the calibration of every frame")
 
     @classmethod
     def from_projections(

@@ -1,0 +1,239 @@
+"""A car that cannot be refined says why, gets its input back to the bit, and touches no other car."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT, PAPER
+from helpers.synthetic_scene import (
+    Street,
+    cached_street,
+    disturbed,
+    joined_detections,
+    joined_frames,
+    select,
+    street,
+)
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.status import Status
+
+
+def refine(frames: FrameBatch, detections: Detections, config: RefinerConfig = DEFAULT) -> RefinementResult:
+    return DirectShapeRefiner(cached_street()[0], config)(frames, detections)
+
+
+def base() -> tuple[FrameBatch, Detections]:
+    scene = cached_street()[1]
+    return scene.frames, disturbed(scene.detections)
+
+
+@lru_cache(maxsize=1)
+def healthy() -> RefinementResult:
+    return refine(*base())
+
+
+def with_third(change: Callable[[Detections], Detections]) -> tuple[FrameBatch, Detections]:
+    """The two cars and a third row, made from the second by `change`, whose mask is empty unless `change` sets one."""
+    frames, detections = base()
+    third = select(detections, torch.tensor([1]))
+    third = change(replace(third, mask_left=0 * third.mask_left, mask_right=0 * third.mask_right))
+    rows = {
+        name: torch.cat([getattr(detections, name), getattr(third, name)])
+        for name in (
+            "frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score",
+            "mask_left", "mask_right", "has_mask_left", "has_mask_right",
+        )
+    }  # fmt: skip
+    return frames, replace(detections, **rows)
+
+
+def assert_others_unchanged(result: RefinementResult) -> None:
+    expected = healthy()
+    for name in ("T_cam_obj", "code", "status_code", "iterations", "cost_before", "cost_after"):
+        assert torch.equal(getattr(result, name)[:2], getattr(expected, name)), name
+    torch.testing.assert_close(result.covariance[:2], expected.covariance, rtol=1e-10, atol=1e-14)
+
+
+def _posed(T_cam_obj: Tensor) -> Callable[[Detections], Detections]:
+    return lambda d: replace(d, T_cam_obj=T_cam_obj.to(d.T_cam_obj)[None])
+
+
+def _pose(twist: list[float]) -> Tensor:
+    return se3.exp(torch.tensor(twist, dtype=torch.float64))
+
+
+def _five_pixels(d: Detections) -> Detections:
+    mask = torch.zeros_like(d.mask_left)
+    mask[0, 100, 10:15] = 1
+    box = torch.tensor([[10.0, 100.0, 14.0, 100.0]], dtype=d.box_2d.dtype)
+    far = _pose([-30.0, 30.0, 100.0, 0, 0, 0])[None]
+    return replace(d, mask_left=mask, mask_right=mask, box_2d=box, T_cam_obj=far)
+
+
+def _no_mask(d: Detections) -> Detections:
+    absent = torch.zeros_like(d.has_mask_left)
+    return replace(d, has_mask_left=absent, has_mask_right=absent)
+
+
+def _outside(d: Detections) -> Detections:
+    box = torch.tensor([[-90.0, 40.0, -20.0, 80.0]], dtype=d.box_2d.dtype)
+    return replace(_no_mask(d), box_2d=box, T_cam_obj=_pose([-40.0, 1.6, 10.0, 0, 0, 0])[None])
+
+
+CASES: dict[str, tuple[Callable[[Detections], Detections], set[Status]]] = {
+    "behind the camera": (_posed(_pose([0.0, 1.6, -10.0, 0, 0, 0])), {Status.behind_camera}),
+    "at the camera": (_posed(_pose([0.0, 1.6, 0.2, 0, 0, 0])), {Status.behind_camera}),
+    "upside down": (_posed(_pose([0.0, 1.6, 20.0, 3.14159, 0, 0])), {Status.behind_camera}),
+    "nan pose": (_posed(torch.full((4, 4), torch.nan)), {Status.non_finite}),
+    "infinite pose": (_posed(torch.full((4, 4), torch.inf)), {Status.non_finite}),
+    "no mask": (_no_mask, {Status.no_mask}),
+    "outside the image": (_outside, {Status.no_mask, Status.too_few_pixels}),
+    "five pixels": (_five_pixels, set(Status)),
+    "empty mask": (lambda d: d, set(Status)),
+    "nan box": (lambda d: replace(_no_mask(d), box_2d=d.box_2d * torch.nan), {Status.no_mask}),
+    "nan mask": (lambda d: replace(d, mask_left=d.mask_left * torch.nan), {Status.non_finite}),
+    "nan dimensions": (lambda d: replace(d, dimensions_hwl=d.dimensions_hwl * torch.nan), {Status.non_finite}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_bad_car_beside_good_ones(case: str) -> None:
+    change, allowed = CASES[case]
+    frames, detections = with_third(change)
+    result = refine(frames, detections)
+    assert result.status[2] in allowed
+    assert_others_unchanged(result)
+    if not result.status[2].is_refined:
+        torch.testing.assert_close(result.T_cam_obj[2], detections.T_cam_obj[2], rtol=0, atol=0, equal_nan=True)
+        assert (result.code[2] == 0).all()
+    assert len(result.status[2].value) > 20
+
+
+def test_a_car_without_a_pose_hides_no_other_by_its_depth() -> None:
+    """Its depth is unknown, so its mask hides only cars whose boxes end higher up in the image: none here."""
+
+    def phantom(d: Detections) -> Detections:
+        mask = cached_street()[1].detections.mask_left[1:2]
+        box = d.box_2d - torch.tensor([0.0, 20.0, 0.0, 20.0], dtype=d.box_2d.dtype)
+        return replace(d, mask_left=mask, box_2d=box, T_cam_obj=d.T_cam_obj * torch.nan)
+
+    result = refine(*with_third(phantom))
+    assert result.status[2] is Status.non_finite
+    assert_others_unchanged(result)
+
+
+def test_a_tiny_car_is_left_alone_when_too_few_pixels_remain() -> None:
+    config = replace(DEFAULT, sampling=replace(DEFAULT.sampling, min_usable_pixels=100_000))
+    frames, detections = base()
+    result = refine(frames, detections, config)
+    assert result.status == [Status.too_few_pixels] * 2
+    assert torch.equal(result.T_cam_obj, detections.T_cam_obj)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_mask_in_one_image_only_is_enough(side: str) -> None:
+    frames, detections = base()
+    other = "right" if side == "left" else "left"
+    absent = replace(
+        detections,
+        **{
+            f"mask_{other}": torch.full_like(detections.mask_left, torch.nan),  # an absent mask is never read
+            f"has_mask_{other}": torch.zeros(2, dtype=torch.bool),
+        },
+    )
+    result = refine(frames, absent)
+    assert all(status.is_refined for status in result.status)
+    assert result.T_cam_obj.isfinite().all()
+    assert (result.cost_after.sum(1) < result.cost_before.sum(1)).all()
+
+
+@pytest.mark.parametrize("config", [DEFAULT, PAPER])
+@pytest.mark.parametrize("side", ["images_left", "images_right"])
+def test_a_nan_image_fails_its_own_frame_only(side: str, config: RefinerConfig) -> None:
+    first = cached_street()[1]
+    second = street(ellipsoid_prior(), [(0.5, 1.65, 9.0)], [0.8])
+    detections = joined_detections([disturbed(first.detections), disturbed(second.detections)], (120, 160))
+    frames = joined_frames([first.frames, second.frames])
+    expected = refine(frames, detections, config)
+    image = getattr(frames, side).clone()
+    image[1] = torch.nan
+    result = refine(replace(frames, **{side: image}), detections, config)
+    assert result.status[2] is Status.non_finite
+    assert torch.equal(result.T_cam_obj[2], detections.T_cam_obj[2])
+    assert result.status[:2] == expected.status[:2]
+    torch.testing.assert_close(result.T_cam_obj[:2], expected.T_cam_obj[:2], rtol=0, atol=1e-11)
+    torch.testing.assert_close(result.code[:2], expected.code[:2], rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("what", ["K_left", "K_right", "T_right_cam", "t_cam_ref"])
+def test_a_nan_calibration_is_named(what: str) -> None:
+    camera = cached_street()[1].frames.camera
+    broken = getattr(camera, what).clone()
+    broken[0, 0] = torch.nan
+    with pytest.raises(InputError, match=f"{what}: expected finite numbers"):
+        replace(camera, **{what: broken})
+
+
+def test_a_nan_ground_plane_fails_its_own_frame_only() -> None:
+    first = cached_street()[1]
+    frames = joined_frames([first.frames, first.frames])
+    offset = frames.ground.offset.clone()
+    offset[1] = torch.nan
+    result = refine(
+        replace(frames, ground=replace(frames.ground, offset=offset)),
+        joined_detections([disturbed(first.detections)] * 2, (120, 160)),
+    )
+    assert result.status[2:] == [Status.non_finite] * 2
+    torch.testing.assert_close(result.T_cam_obj[:2], healthy().T_cam_obj, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("frames_too", [False, True])
+def test_no_cars(frames_too: bool) -> None:
+    frames, detections = base()
+    if frames_too:
+        frames = replace(
+            frames,
+            images_left=frames.images_left[:0],
+            images_right=frames.images_right[:0],
+            sizes=frames.sizes[:0],
+            camera=type(frames.camera)(
+                *(getattr(frames.camera, n)[:0] for n in ("K_left", "K_right", "T_right_cam", "t_cam_ref"))
+            ),
+            ground=type(frames.ground)(frames.ground.normal[:0], frames.ground.offset[:0], ()),
+            frame_ids=(),
+        )
+    result = refine(frames, select(detections, torch.zeros(0, dtype=torch.long)))
+    assert len(result) == 0
+    assert result.status == []
+    assert result.boxes().dimensions_hwl.shape == (0, 3)
+    assert result.covariance.shape == (0, 9, 9)
+
+
+def test_only_bad_cars() -> None:
+    frames, detections = base()
+    result = refine(frames, replace(detections, has_mask_left=detections.has_mask_left & False,
+                                    has_mask_right=detections.has_mask_right & False))  # fmt: skip
+    assert result.status == [Status.no_mask] * 2
+    assert result.covariance.isnan().all()
+    assert not result.refined.any()
+
+
+def test_a_failed_car_has_its_costs_or_none_but_never_a_refined_state() -> None:
+    scene: Street = cached_street()[1]
+    frames = replace(scene.frames, images_right=scene.frames.images_right * torch.nan)
+    result = refine(frames, scene.detections)
+    assert result.status == [Status.non_finite] * 2
+    assert torch.equal(result.T_cam_obj, scene.detections.T_cam_obj)
+    assert (result.code == 0).all()
