@@ -33,12 +33,14 @@ class Footprint:
         colour: of its outline.
         thickness: of its outline, pixels.
         label: text beside it, or "".
+        is_framed: whether the picture is made large enough to show it.
     """
 
     corners_cam: Array
     colour: Colour
     thickness: int = 1
     label: str = ""
+    is_framed: bool = True
 
 
 @dataclass(frozen=True)
@@ -77,8 +79,9 @@ def birds_eye_picture(footprints: Sequence[Footprint], size_hw: tuple[int, int])
 
 
 def _fit(footprints: Sequence[Footprint], size_hw: tuple[int, int]) -> _Map:
-    """The map that shows the camera and all boxes."""
-    xz = np.concatenate([np.zeros((1, 2)), *(f.corners_cam[:, [0, 2]] for f in footprints)])
+    """The map that shows the camera and all boxes that are to be seen."""
+    framed = [f.corners_cam[:, [0, 2]] for f in footprints if f.is_framed]
+    xz = np.concatenate([np.zeros((1, 2)), *framed])
     low, high = xz.min(axis=0) - _MARGIN_M, xz.max(axis=0) + _MARGIN_M
     depth, breadth = max(high[1] - low[1], _LEAST_DEPTH_M), high[0] - low[0]
     scale = min(size_hw[0] / depth, size_hw[1] / breadth)

@@ -147,9 +147,9 @@ def _footprints(
     before: Sequence[DrawnCar], after: Sequence[DrawnCar], truth_corners_cam: Sequence[Array]
 ) -> list[Footprint]:
     return [
-        *(Footprint(corners, GREEN, 1) for corners in truth_corners_cam),
-        *(Footprint(car.corners_cam, ORANGE, 1) for car in before),
-        *(Footprint(car.corners_cam, BLUE if car.is_refined else GREY, 1, car.label) for car in after),
+        *(Footprint(corners, GREEN, 2, is_framed=False) for corners in truth_corners_cam),
+        *(Footprint(car.corners_cam, ORANGE) for car in before),
+        *(Footprint(car.corners_cam, BLUE if car.is_refined else GREY, 2, car.label) for car in after),
     ]
 
 

@@ -1,0 +1,72 @@
+"""The program's commands, its one-line errors and its exit codes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from directshape_torch.cli import main as program
+from directshape_torch.errors import DataFormatError
+
+
+def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        program.main(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for command in ("refine", "demo", "compare", "build-prior", "calibrate-stereo"):
+        assert f"\n    {command}" in text
+
+
+@pytest.mark.parametrize("arguments", [[], ["refin"], ["refine"], ["compare", "--labels", "x"]])
+def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        program.main(arguments)
+    assert stop.value.code == 2
+    assert "usage: directshape" in capsys.readouterr().err
+
+
+def test_an_error_is_one_line_and_exit_code_2(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: object) -> int:
+        raise DataFormatError("calib/000001.txt", "expected 12 numbers,\n got 11", line_number=3)
+
+    monkeypatch.setattr("directshape_torch.cli.demo.run", fail)
+    assert program.main(["demo"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == "directshape: error: calib/000001.txt, line 3: expected 12 numbers, got 11\n"
+
+
+def test_an_interrupted_run_is_exit_code_130(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("directshape_torch.cli.demo.run", interrupt)
+    assert program.main(["demo"]) == 130
+    assert capsys.readouterr().err == "directshape: interrupted\n"
+
+
+def test_commands_do_not_load_what_help_does_not_need() -> None:
+    """Whatever the package itself imports, the command modules add nothing heavy to it."""
+    script = (
+        "import sys; import directshape_torch; before = set(sys.modules); "
+        "from directshape_torch.cli.main import make_parser; make_parser(); "
+        "print(*sorted({m.split('.')[0] for m in set(sys.modules) - before}))"
+    )
+    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert not {"cv2", "trimesh", "skimage", "scipy", "tqdm", "matplotlib", "pycocotools", "torch"} & set(
+        output.split()
+    )
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        program.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out.strip()
