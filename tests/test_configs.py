@@ -1,0 +1,67 @@
+"""The configuration files say what the code does."""
+
+from __future__ import annotations
+
+import runpy
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from directshape_torch.config import RefinerConfig, config_to_mapping, load_config
+
+ROOT = Path(__file__).parent.parent
+CONFIGS = ROOT / "configs"
+
+
+def keys(mapping: Any, prefix: str = "") -> set[str]:
+    if not isinstance(mapping, dict):
+        return {prefix}
+    return {key for name, value in mapping.items() for key in keys(value, f"{prefix}.{name}")}
+
+
+def test_default_is_what_the_code_uses() -> None:
+    assert load_config(CONFIGS / "default.yaml") == RefinerConfig()
+
+
+def test_default_is_what_its_script_writes() -> None:
+    text = runpy.run_path(str(ROOT / "scripts" / "write_default_config.py"))["default_yaml"]()
+    assert (CONFIGS / "default.yaml").read_text(encoding="utf-8") == text, "run scripts/write_default_config.py"
+
+
+@pytest.mark.parametrize("name", ["default", "paper"])
+def test_no_key_is_left_to_the_defaults(name: str) -> None:
+    written = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
+    assert keys(written) == keys(config_to_mapping(RefinerConfig()))
+
+
+def test_paper_has_the_weights_and_forms_of_the_paper() -> None:
+    config = load_config(CONFIGS / "paper.yaml")
+    # Paper, section on the energy: lambda_silh = 12, lambda_1 = 10, lambda_2 = 10, lambda_3 = 1e7.
+    assert config.silhouette.weight == 12
+    assert (config.priors.shape_weight, config.priors.height_weight, config.priors.tilt_weight) == (10, 10, 1e7)
+    assert (config.silhouette.form, config.priors.tilt_form) == ("product", "cosine")
+    assert (config.photometric.pixel_set, config.sampling.occlusion_order) == ("hit", "box_bottom")
+    assert config.solver.initial_damping == 0
+    assert config.solver.accept_every_step
+    # What the paper does not have.
+    assert not config.photometric.gain
+    assert not config.photometric.truncated
+    assert config.priors.dimensions_weight == 0
+    assert config.search.disparity_offsets_px == config.search.yaw_offsets_deg == ()
+
+
+def test_paper_anneals_the_contour_by_a_factor_of_07() -> None:
+    widths = [stage.contour_width_px for stage in load_config(CONFIGS / "paper.yaml").stages]
+    assert widths[0] == 4 * widths[-1] == 1.0
+    for softer, sharper in pairwise(widths[:-1]):
+        assert sharper == pytest.approx(0.7 * softer, abs=1e-3)
+
+
+def test_fast_has_less_to_do() -> None:
+    fast, default = load_config(CONFIGS / "fast.yaml"), RefinerConfig()
+    steps = [sum(stage.max_iterations for stage in config.stages) for config in (fast, default)]
+    assert steps[0] < steps[1]
+    assert fast.sampling.max_pixels < default.sampling.max_pixels

@@ -1,0 +1,106 @@
+"""Projection of views, contours and boxes against hand-derived pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from directshape_torch.visualize.drawing import (
+    Surface,
+    View,
+    clip_at_near_plane,
+    draw_box,
+    draw_contour,
+    draw_segment,
+    silhouette_mask,
+)
+
+K = np.array([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
+SQUARE = np.array([[-1.0, -1.0, 10.0], [1.0, -1.0, 10.0], [1.0, 1.0, 10.0], [-1.0, 1.0, 10.0]])
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
+BLUE = (0, 0, 255)
+
+
+def black(width: int = 101, height: int = 81) -> View:
+    return View(np.zeros((height, width, 3), np.uint8), K)
+
+
+def test_silhouette_of_a_square() -> None:
+    # 1 m at 10 m with f = 100 px: 10 px around the principal point (50, 40).
+    mask = silhouette_mask(black(), Surface(SQUARE, FACES))
+    rows, columns = np.nonzero(mask)
+    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (40, 60, 30, 50)
+    assert mask[30:51, 40:61].all()
+
+
+def test_overlapping_triangles_leave_no_hole() -> None:
+    twice = Surface(np.concatenate([SQUARE, SQUARE + np.array([0, 0, 1])]), np.concatenate([FACES, FACES + 4]))
+    mask = silhouette_mask(black(), twice)
+    assert mask[30:51, 40:61].all()
+
+
+def test_triangles_behind_the_camera_are_left_out() -> None:
+    behind = Surface(SQUARE - np.array([0, 0, 20]), FACES)
+    assert not silhouette_mask(black(), behind).any()
+    half = SQUARE.copy()
+    half[3, 2] = -5
+    # Only the triangle 0, 1, 2 is in front.
+    mask = silhouette_mask(black(), Surface(half, FACES))
+    assert mask[32, 58] == 255
+    assert mask[48, 42] == 0
+
+
+def test_contour_has_no_line_along_the_border_of_the_picture() -> None:
+    view = black()
+    # The left half of the square lies outside the picture.
+    draw_contour(view, Surface(SQUARE - np.array([5, 0, 0]), FACES), BLUE, 1)
+    drawn = view.picture.any(axis=2)
+    assert drawn[30, :11].any()
+    assert drawn[30:51, 10].all()
+    assert not drawn[35:46, 0].any()
+
+
+def test_enlarged_window_projects_to_the_same_things() -> None:
+    image = np.zeros((81, 101, 3), np.uint8)
+    image[35, 55] = 255
+    view = View.of_window(image, K, (50, 30, 60, 40), 4.0)
+    assert view.picture.shape == (40, 40, 3)
+    # The point that is seen at pixel (55, 35): offset (5, -5) px at 10 m.
+    point = np.array([[0.5, -0.5, 10.0]])
+    u, v = view.project(point)[0]
+    # Pixel 55 is the sixth of the window: its centre lies at 4 * 5.5 - 0.5.
+    assert (u, v) == pytest.approx((21.5, 21.5))
+    bright_rows, bright_columns = np.nonzero(view.picture[..., 0] > 100)
+    assert bright_columns.mean() == pytest.approx(u, abs=0.1)
+    assert bright_rows.mean() == pytest.approx(v, abs=0.1)
+
+
+def test_window_beyond_the_image_is_black() -> None:
+    view = View.of_window(np.full((10, 10, 3), 200, np.uint8), K, (-5, -5, 15, 15), 1.0)
+    assert view.picture.shape == (20, 20, 3)
+    assert (view.picture[5:15, 5:15] == 200).all()
+    assert view.picture.sum() == 200 * 100 * 3
+
+
+def test_segments_are_cut_at_the_near_plane() -> None:
+    assert clip_at_near_plane(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 0.0])) is None
+    ends = clip_at_near_plane(np.array([0.0, 1.0, 5.3]), np.array([0.0, 1.0, -4.7]))
+    assert ends is not None
+    np.testing.assert_allclose(ends, [[0.0, 1.0, 5.3], [0.0, 1.0, 0.3]])
+    view = black()
+    draw_segment(view, np.array([0.0, 0.0, 5.0]), np.array([1.0, 0.0, -5.0]), BLUE)
+    # From the principal point to the right along its row, never wrapping to the left.
+    assert view.picture[40, 51:].any(axis=1).all()
+    assert not view.picture[:, :48].any()
+
+
+def test_box_is_drawn_around_its_corners() -> None:
+    view = black()
+    corners = np.array([[x, y, z] for y in (1.0, -1.0) for x, z in ((-1, 9), (1, 9), (1, 11), (-1, 11))], dtype=float)
+    draw_box(view, corners, BLUE)
+    rows, columns = np.nonzero(view.picture.any(axis=2))
+    # The near face at 9 m: 100 / 9 = 11.1 px about the principal point; smooth lines are up to 3 px wide.
+    assert abs(columns.min() - 38.9) <= 2
+    assert abs(columns.max() - 61.1) <= 2
+    assert abs(rows.min() - 28.9) <= 2
+    assert abs(rows.max() - 51.1) <= 2

@@ -1,0 +1,98 @@
+"""The picture of a frame: drawn where the cars are, whatever their state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.visualize.birds_eye import Footprint, birds_eye_picture
+from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, Surface
+from directshape_torch.visualize.ground_grid import ground_grid
+from directshape_torch.visualize.overlay import DrawnCar, overlay_picture
+
+K = np.array([[700.0, 0.0, 500.0], [0.0, 700.0, 150.0], [0.0, 0.0, 1.0]])
+# Two triangles a face would do as well for pictures: the outline is that of the convex hull.
+FACES = np.array([[i, j, k] for i in range(8) for j in range(i + 1, 8) for k in range(j + 1, 8)])
+
+
+def corners(x: float, z: float) -> Array:
+    pose = pose_from_kitti(torch.tensor([x, 1.6, z]), torch.tensor(0.3))
+    found: Array = box_corners(pose, torch.tensor([1.5, 1.7, 4.0])).double().numpy()
+    return found
+
+
+def car(x: float, z: float, label: str = "1", *, is_refined: bool = True) -> DrawnCar:
+    points = corners(x, z)
+    return DrawnCar(points, Surface(points, FACES), label, "12.0 m  converged", is_refined)
+
+
+def has_colour(picture: Picture, colour: tuple[int, int, int]) -> bool:
+    return bool((np.abs(picture.astype(int) - colour).max(axis=-1) < 30).any())
+
+
+def image(height: int = 300, width: int = 1000) -> Picture:
+    return np.full((height, width, 3), 90, np.uint8)
+
+
+def test_rows_show_before_and_after() -> None:
+    picture = overlay_picture(image(), K, [car(0, 12)], [car(0.5, 13)], [corners(0.4, 13)])
+    before, after, birds_eye = picture[30:300, :1000], picture[330:600, :1000], picture[:, 1000:]
+    assert has_colour(before, ORANGE)
+    assert not has_colour(before, BLUE)
+    assert has_colour(after, BLUE)
+    assert not has_colour(after, ORANGE)
+    # Below the legend.
+    for colour in (ORANGE, BLUE, GREEN):
+        assert has_colour(birds_eye[100:], colour)
+
+
+def test_cars_that_were_not_refined_are_grey() -> None:
+    picture = overlay_picture(image(), K, [car(0, 12)], [car(0, 12, is_refined=False)])
+    assert has_colour(picture[330:600, :1000], GREY)
+    assert not has_colour(picture[330:600, :1000], BLUE)
+
+
+@pytest.mark.parametrize("z", [-8.0, 0.5, 400.0])
+def test_cars_in_odd_places_do_not_break_the_picture(z: float) -> None:
+    picture = overlay_picture(image(), K, [car(0, z), car(0, 12, "2")], [car(0, z), car(0, 12, "2")])
+    assert has_colour(picture[30:300, :1000], ORANGE)
+
+
+def test_no_cars_and_small_images() -> None:
+    picture = overlay_picture(image(60, 80), K, [], [])
+    # The image is enlarged so that text can be read beside it.
+    assert picture.shape == (2 * 750, 1000 + 560, 3)
+
+
+def test_many_cars_wrap_into_rows_of_the_width_of_the_image() -> None:
+    cars = [car(0.5 * k - 4, 15 + k, str(k)) for k in range(14)]
+    picture = overlay_picture(image(), K, cars, cars)
+    assert picture.shape[1] == 1560
+    assert picture.shape[0] > 600 + 2 * 300
+
+
+def test_birds_eye_is_true_to_scale() -> None:
+    square = np.array([[x, 0, z] for x, z in ((-2, 10), (2, 10), (2, 14), (-2, 14))], dtype=float)
+    picture = birds_eye_picture([Footprint(square, BLUE)], (800, 800))
+    rows, columns = np.nonzero(np.abs(picture.astype(int) - BLUE).max(axis=-1) < 30)
+    # From 3 m behind the camera to 3 m beyond the box: 20 m in 800 px.
+    assert columns.max() - columns.min() == pytest.approx(4 * 40, abs=2)
+    assert rows.max() - rows.min() == pytest.approx(4 * 40, abs=2)
+    assert rows.max() == pytest.approx(799 - 13 * 40, abs=2)
+
+
+def test_birds_eye_leaves_far_truth_out_of_the_scale() -> None:
+    near, far = corners(0, 15), corners(0, 150)
+    with_far = birds_eye_picture([Footprint(near, BLUE), Footprint(far, GREEN, is_framed=False)], (400, 400))
+    np.testing.assert_array_equal(with_far, birds_eye_picture([Footprint(near, BLUE)], (400, 400)))
+
+
+def test_ground_grid_lies_on_the_plane_and_is_seen_from_both_sides() -> None:
+    normal = torch.tensor([0.02, -0.999, 0.03], dtype=torch.float64)
+    normal = normal / normal.norm()
+    grid = ground_grid(normal, 1.7)
+    np.testing.assert_allclose(grid.vertices @ normal.numpy() + 1.7, 0, atol=1e-12)
+    up = grid.face_normals[:, 1] < 0
+    assert up.sum() == (~up).sum() > 0
