@@ -18,6 +18,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
 from directshape_torch.observation.packing import Observation, pack_pixels
+from directshape_torch.observation.pixel_sampling import MASK_THRESHOLD
 from directshape_torch.quality import FitQuality, fit_quality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -82,6 +83,7 @@ class DirectShapeRefiner(nn.Module):
     def problem(self, frames: FrameBatch, detections: Detections) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
         _check_fit(frames, detections, self.prior)
+        detections = _without_empty_masks(detections, _mask_areas(detections))
         observation = pack_pixels(frames, detections, self.config.sampling)
         terms = self._terms(frames, detections, observation)
         state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
@@ -99,12 +101,15 @@ class DirectShapeRefiner(nn.Module):
         finite = T.isfinite().all(-1).all(-1)
         upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
         in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
+        areas = _mask_areas(detections)
+        detections = _without_empty_masks(detections, areas)
         has_mask = detections.has_mask_left | detections.has_mask_right
         observation = pack_pixels(frames, detections, self.config.sampling)
         left, right = (
             torch.bincount(x.object_index, minlength=len(detections)) for x in (observation.left, observation.right)
         )
-        too_few = left + right < self.config.sampling.min_usable_pixels
+        # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
+        too_few = torch.minimum(left + right, areas.sum(dim=1)) < self.config.sampling.min_usable_pixels
         for condition, status in (
             (too_few, Status.too_few_pixels),
             (~has_mask, Status.no_mask),
@@ -182,6 +187,19 @@ def _is_refined(status: Tensor) -> Tensor:
 def _take(detections: Detections, rows: Tensor) -> Detections:
     changed = {f.name: getattr(detections, f.name)[rows] for f in fields(detections) if f.name != "occluders"}
     return replace(detections, **changed)
+
+
+def _mask_areas(detections: Detections) -> Tensor:
+    """Foreground pixels (B, 2) of the left and right masks, zero where absent; NaN counts, to be noticed later."""
+    masks = (detections.mask_left, detections.mask_right)
+    areas = torch.stack([(~(mask <= MASK_THRESHOLD)).flatten(1).sum(dim=1) for mask in masks], dim=1)
+    return areas * torch.stack([detections.has_mask_left, detections.has_mask_right], dim=1)
+
+
+def _without_empty_masks(detections: Detections, areas: Tensor) -> Detections:
+    """A mask without any foreground counts as none: it would only say that there is no car."""
+    left, right = (areas > 0).unbind(dim=1)
+    return replace(detections, has_mask_left=left, has_mask_right=right)
 
 
 def _check_fit(frames: FrameBatch, detections: Detections, prior: PCAShapePrior) -> None:

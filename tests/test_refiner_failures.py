@@ -82,6 +82,13 @@ def _five_pixels(d: Detections) -> Detections:
     return replace(d, mask_left=mask, mask_right=mask, box_2d=box, T_cam_obj=far)
 
 
+def _masked(d: Detections) -> Detections:
+    """A mask at the lower edge of the left image, away from the other cars."""
+    mask = torch.zeros_like(d.mask_left)
+    mask[0, 105:118, 40:80] = 1
+    return replace(d, mask_left=mask)
+
+
 def _no_mask(d: Detections) -> Detections:
     absent = torch.zeros_like(d.has_mask_left)
     return replace(d, has_mask_left=absent, has_mask_right=absent)
@@ -99,12 +106,12 @@ CASES: dict[str, tuple[Callable[[Detections], Detections], set[Status]]] = {
     "nan pose": (_posed(torch.full((4, 4), torch.nan)), {Status.non_finite}),
     "infinite pose": (_posed(torch.full((4, 4), torch.inf)), {Status.non_finite}),
     "no mask": (_no_mask, {Status.no_mask}),
-    "outside the image": (_outside, {Status.no_mask, Status.too_few_pixels}),
-    "five pixels": (_five_pixels, set(Status)),
-    "empty mask": (lambda d: d, set(Status)),
+    "outside the image": (_outside, {Status.no_mask}),
+    "five pixels": (_five_pixels, {Status.too_few_pixels}),
+    "all-zero mask": (lambda d: d, {Status.no_mask}),
     "nan box": (lambda d: replace(_no_mask(d), box_2d=d.box_2d * torch.nan), {Status.no_mask}),
     "nan mask": (lambda d: replace(d, mask_left=d.mask_left * torch.nan), {Status.non_finite}),
-    "nan dimensions": (lambda d: replace(d, dimensions_hwl=d.dimensions_hwl * torch.nan), {Status.non_finite}),
+    "nan dimensions": (lambda d: replace(_masked(d), dimensions_hwl=d.dimensions_hwl * torch.nan), {Status.non_finite}),
 }
 
 
