@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
 from demo_scene.camera import Array, transform
 from demo_scene.layout import PlacedCar
 from demo_scene.surfaces import Indices, Material, Surface
-
 from directshape_torch.shape import parametric_cars as cars
 
 # One more part than `parametric_cars` knows: the gaps around doors, bonnet and tailgate.
@@ -114,7 +114,7 @@ def part_labels(car: PlacedCar, points_obj: Array) -> Indices:
 def _materials(car: PlacedCar) -> dict[int, Material]:
     dark = Material((0.012, 0.012, 0.012), roughness=0.6)
     return {
-        cars.PAINT: Material(car.paint_rgb, roughness=0.32, metallic=car.metallic, specular=0.5, clearcoat=1.0),
+        cars.PAINT: Material(car.paint_rgb, roughness=0.20, metallic=car.metallic, specular=0.9, clearcoat=1.0),
         cars.GLASS: Material((0.012, 0.015, 0.016), roughness=0.03, specular=0.7),
         cars.TYRE: Material((0.016, 0.016, 0.016), roughness=0.85),
         cars.RIM: Material((0.50, 0.50, 0.51), roughness=0.25, metallic=0.9),

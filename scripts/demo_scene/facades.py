@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
 from demo_scene.camera import Array
 from demo_scene.noise import fractal_noise, to_picture
 from demo_scene.surfaces import Material
@@ -63,7 +64,7 @@ def facade(rng: np.random.Generator, width_m: float, height_m: float) -> Materia
 def _plaster_wall(rng: np.random.Generator, rows: int, columns: int) -> Array:
     base = np.array(_PLASTERS[int(rng.integers(len(_PLASTERS)))])
     grain = 0.02 * fractal_noise(rng, rows, columns, 120.0, 4.0) + 0.022 * rng.standard_normal((rows, columns))
-    return np.asarray(base * (1.0 + grain[..., None]))
+    return np.asarray(0.88 * base * (1.0 + grain[..., None]))
 
 
 def _brick_wall(rng: np.random.Generator, rows: int, columns: int) -> Array:

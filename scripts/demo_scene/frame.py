@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
 from demo_scene import sensor
 from demo_scene.camera import Array
-from demo_scene.car_surfaces import CarModel, car_model, car_surfaces
+from demo_scene.car_surfaces import car_model, car_surfaces
 from demo_scene.frame_files import Frame
 from demo_scene.labels import StereoNoise, noisy_detection, true_label
 from demo_scene.layout import SceneLayout
@@ -45,7 +46,8 @@ def render_frame(layout: SceneLayout, settings: RenderSettings) -> Frame:
     left, right = (
         sensor.develop(rngs["sensor"], picture, exposure, gain) for picture, gain in zip(radiance, gains, strict=True)
     )
-    truth_left, truth_right = (renderer.pixel_truth(view) for view in views)
+    truth = Renderer(surfaces, None, settings.variant)
+    truth_left, truth_right = (truth.pixel_truth(view) for view in views)
     shares = _visible_shares(layout, car_parts, truth_left, settings.variant)
     labels = tuple(
         true_label(layout.camera, car, model.vertices, share)
@@ -76,6 +78,3 @@ def _visible_shares(layout: SceneLayout, car_parts: list[list[Surface]], truth: 
         alone = Renderer(parts, None, variant).pixel_truth(layout.camera.T_cam_road)
         shares.append((truth.instance == k).sum() / max((alone.instance == k).sum(), 1))
     return np.array(shares)
-
-
-__all__ = ["CarModel", "RenderSettings", "render_frame", "scene_light"]

@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+
 from demo_scene.camera import CameraPose, projection
 from demo_scene.labels import CarLabel, label_line, result_line
 from demo_scene.layout import SceneLayout
@@ -46,7 +47,7 @@ def write_frame(root: Path, name: str, frame: Frame) -> None:
 
 
 def calibration_text() -> str:
-    """KITTI's object calibration file, without the laser scanner's and IMU's rows meaning anything: identities."""
+    """KITTI's object calibration file; there is no laser scanner or IMU, so their rows are a mere change of axes."""
     lines = [f"{name}: " + _numbers(projection(name).ravel()) for name in ("P0", "P1", "P2", "P3")]
     lines.append("R0_rect: " + _numbers(np.eye(3).ravel()))
     axes = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0]])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+
 from demo_scene.camera import Array
 from demo_scene.layout import CENTRE_LINE_M, LEFT_KERB_M, LEFT_LANE_M, RIGHT_KERB_M, RIGHT_LANE_M
 from demo_scene.noise import fractal_noise, smooth_noise, to_picture

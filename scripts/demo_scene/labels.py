@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+
 from demo_scene.camera import (
     IMAGE_HEIGHT_PX,
     IMAGE_WIDTH_PX,

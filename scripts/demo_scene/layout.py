@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from demo_scene.camera import Array, CameraPose, project, transform
 
+from demo_scene.camera import Array, CameraPose, project, transform
 from directshape_torch.shape.parametric_cars import CarParameters, sample_car
 
 # Lateral measures of the street, metres in the road frame; traffic keeps to the right.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from demo_scene.camera import Array
 from demo_scene.surfaces import Material, Surface, tube
 

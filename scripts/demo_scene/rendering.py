@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
 from demo_scene.camera import IMAGE_HEIGHT_PX, IMAGE_WIDTH_PX, Array, K
 from demo_scene.surfaces import Indices, Material, Picture, Surface
 
 _MAX_RADIANCE = 12.0
+_MAX_INSTANCES = 64
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Renderer:
 
     Args:
         surfaces: everything that is seen.
-        light: sky and sun, or None where only `pixel_truth` is wanted.
+        light: sky and sun for `path_trace`; None for `pixel_truth`, where materials do not matter.
         variant: Mitsuba's variant.
     """
 
@@ -61,13 +63,12 @@ class Renderer:
 
         mitsuba.set_variant(variant)
         self._mi: Any = mitsuba
-        self._instance_of_shape = np.array([surface.instance for surface in surfaces])
+        self._shows_instances = light is None
         description: dict[str, Any] = {"type": "scene"}
         if light is not None:
             description |= self._lights(light)
         for k, surface in enumerate(surfaces):
             description[f"surface_{k:04d}"] = self._mesh(f"surface_{k:04d}", surface)
-        # Merged shapes would lose their index, which tells the cars apart.
         self._scene = mitsuba.load_dict(description, optimize=False)
 
     def path_trace(self, T_view_road: Array, paths_per_pixel: int, seed: int, scale: float = 1.0) -> PathTraced:
@@ -84,15 +85,14 @@ class Renderer:
 
     def pixel_truth(self, T_view_road: Array) -> PixelTruth:
         """Instance and depth where the rays through the pixel centres arrive."""
-        integrator = {"type": "aov", "aovs": "shape:shape_index,position:position"}
+        integrator = {"type": "aov", "aovs": "instance:albedo,position:position"}
         # One stratified sample without jitter lies in the middle of its pixel.
         sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
         channels = self._render(T_view_road, integrator, sampler, 0, 1.0)
-        index, points_road = np.rint(channels[..., -4]).astype(int), channels[..., -3:].astype(np.float64)
+        instance = np.rint(channels[..., -6] * _MAX_INSTANCES).astype(np.int64) - 1
+        points_road = channels[..., -3:]
         depth = points_road @ T_view_road[2, :3] + T_view_road[2, 3]
         hit = np.abs(points_road).sum(axis=-1) > 0.0
-        index = np.where(hit, index, 0)
-        instance = np.where(hit, self._instance_of_shape[np.clip(index, 0, len(self._instance_of_shape) - 1)], -1)
         return PixelTruth(instance, np.where(hit, depth, 0.0))
 
     def _render(
@@ -113,9 +113,10 @@ class Renderer:
             "near_clip": 0.05,
             "far_clip": 1000.0,
             "to_world": self._mi.ScalarTransform4f(to_world),
-            # The film's continuous coordinates put the centre of the first pixel at 0.5, ours at 0.
-            "principal_point_offset_x": float((K[0, 2] + 0.5 - 0.5 * IMAGE_WIDTH_PX) / IMAGE_WIDTH_PX),
-            "principal_point_offset_y": float((K[1, 2] + 0.5 - 0.5 * IMAGE_HEIGHT_PX) / IMAGE_HEIGHT_PX),
+            # The film's continuous coordinates put the centre of the first pixel at 0.5, ours at 0;
+            # its axes point left and up.
+            "principal_point_offset_x": float((0.5 * IMAGE_WIDTH_PX - K[0, 2] - 0.5) / IMAGE_WIDTH_PX),
+            "principal_point_offset_y": float((0.5 * IMAGE_HEIGHT_PX - K[1, 2] - 0.5) / IMAGE_HEIGHT_PX),
             "film": {
                 "type": "hdrfilm",
                 "width": width,
@@ -140,7 +141,7 @@ class Renderer:
 
     def _mesh(self, name: str, surface: Surface) -> Any:
         properties = self._mi.Properties()
-        properties["material"] = self._mi.load_dict(self._bsdf(surface.material))
+        properties["material"] = self._mi.load_dict(self._bsdf(surface))
         mesh = self._mi.Mesh(
             name,
             len(surface.vertices),
@@ -164,7 +165,15 @@ class Renderer:
         parameters.update()
         return mesh
 
-    def _bsdf(self, material: Material) -> dict[str, Any]:
+    def _bsdf(self, surface: Surface) -> dict[str, Any]:
+        if self._shows_instances:
+            # The car's number as a grey: shape indices count all scenes of the process, albedo is the surface's own.
+            grey = (surface.instance + 1) / _MAX_INSTANCES
+            reflectance = {"type": "rgb", "value": [grey, grey, grey]}
+            return {"type": "twosided", "material": {"type": "diffuse", "reflectance": reflectance}}
+        return {"type": "twosided", "material": self._principled(surface.material)}
+
+    def _principled(self, material: Material) -> dict[str, Any]:
         base = material.base_color
         if base is None:
             color: Any = {"type": "mesh_attribute", "name": "vertex_color"}
@@ -173,7 +182,7 @@ class Renderer:
         else:
             color = self._bitmap(base, raw=False)
         roughness = material.roughness
-        principled = {
+        return {
             "type": "principled",
             "base_color": color,
             "roughness": roughness if isinstance(roughness, float) else self._bitmap(roughness, raw=True),
@@ -182,7 +191,6 @@ class Renderer:
             "clearcoat": material.clearcoat,
             "clearcoat_gloss": 0.97,
         }
-        return {"type": "twosided", "material": principled}
 
     def _bitmap(self, picture: Picture, raw: bool) -> dict[str, Any]:
         bitmap = self._mi.Bitmap(np.ascontiguousarray(picture if picture.ndim == 3 else picture[..., None]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+
 from demo_scene.camera import Array
 from demo_scene.rendering import PathTraced
 from demo_scene.surfaces import Picture
@@ -44,7 +45,7 @@ def bilateral_denoise(view: PathTraced) -> Array:
 def exposure_for(radiance: Array) -> float:
     """Factor that brings the street, the lower half of the picture, to a middle grey."""
     luminance = radiance[len(radiance) // 2 :] @ np.array([0.299, 0.587, 0.114])
-    return 0.22 / max(float(np.median(luminance)), 1e-6)
+    return 0.19 / max(float(np.median(luminance)), 1e-6)
 
 
 def develop(rng: np.random.Generator, radiance: Array, exposure: float, gain: float) -> Picture:

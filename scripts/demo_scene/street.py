@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from demo_scene import ground_textures
 from demo_scene.camera import Array
 from demo_scene.facades import facade
@@ -91,9 +92,11 @@ def _house(rng: np.random.Generator, side: int, x: float, z: float, width: float
     end_far = quad(np.array([x, y, z + width]), np.array([side * depth, 0.0, 0.0]), up, gable)
     low_x, high_x = sorted((x - side * eaves, far_x))
     gutter = box((low_x, -height - 0.25, z - 0.1), (high_x, -height, z + width + 0.1), _ROOF)
-    ridge = np.array([side * 0.5 * depth, -rng.uniform(2.0, 3.5), 0.0])
-    roof = quad(np.array([x - side * eaves, -height - 0.25, z]), np.array([0.0, 0.0, width]), ridge, _ROOF)
-    return [front, end_near, end_far, gutter, roof]
+    ridge_x, ridge_y = x + side * 0.5 * depth, -height - rng.uniform(1.8, 3.0)
+    gable_end = ((x - side * eaves, -height), (ridge_x, ridge_y), (far_x, -height))
+    attic = np.array([[a, b, c] for c in (z, z + width) for a, b in gable_end])
+    prism = np.array([[0, 1, 2], [3, 5, 4], [0, 3, 4], [0, 4, 1], [1, 4, 5], [1, 5, 2]])
+    return [front, end_near, end_far, gutter, Surface(attic, prism, _ROOF)]
 
 
 def _furniture(rng: np.random.Generator, side: int) -> list[Surface]:

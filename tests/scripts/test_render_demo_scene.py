@@ -1,0 +1,225 @@
+"""The generator of demo frames: conventions, layout, labels and files; the renderer only where it is installed."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from directshape_torch.scene import StereoCamera
+
+_SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+if str(_SCRIPTS) not in sys.path:
+    sys.path.insert(0, str(_SCRIPTS))
+
+from demo_scene import camera, car_surfaces, frame_files, labels, layout, sensor, surfaces  # noqa: E402
+
+# pycocotools' decode predates numpy 2's protocol.
+pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
+ASSET = Path(__file__).resolve().parents[2] / "directshape_torch" / "assets" / "demo"
+
+
+@pytest.fixture(scope="module")
+def scene() -> layout.SceneLayout:
+    return layout.sample_layout(1, 6)
+
+
+def test_camera_agrees_with_the_library() -> None:
+    P2, P3 = (torch.from_numpy(camera.projection(name))[None] for name in ("P2", "P3"))
+    rig = StereoCamera.from_projections(P2, P3)
+    np.testing.assert_allclose(rig.T_right_cam[0, :3, 3].numpy(), camera.T_RIGHT_CAM, atol=1e-12)
+    np.testing.assert_allclose(rig.t_cam_ref[0].numpy(), camera.T_CAM_REF, atol=1e-12)
+    # (-339.5242 - 44.85728) / 721.5377 = -0.5327 m, and 2.7 mm vertically.
+    np.testing.assert_allclose(camera.T_RIGHT_CAM[:2], [-0.53272, 0.00275], atol=2e-5)
+
+
+def test_ground_plane_holds_the_road() -> None:
+    pose = camera.CameraPose(1.65, 0.02, -0.01)
+    road = np.array([[0.0, 0.0, 10.0], [3.0, 0.0, 20.0], [-4.0, 0.0, 5.0]])
+    points_ref = camera.transform(pose.T_cam_road, road) - camera.T_CAM_REF
+    plane = pose.ground_plane_ref
+    np.testing.assert_allclose(points_ref @ plane[:3] + plane[3], 0.0, atol=1e-12)
+    assert plane[1] < 0
+    # The nose is down: the point straight ahead at the camera's height appears above the principal point.
+    ahead = camera.project(camera.transform(pose.T_cam_road, np.array([[0.0, -1.65, 100.0]])))
+    assert ahead[0, 1] < camera.K[1, 2]
+
+
+def test_layout_is_a_function_of_its_seed(scene: layout.SceneLayout) -> None:
+    again = layout.sample_layout(1, 6)
+    assert frame_files.scene_description(again) == frame_files.scene_description(scene)
+    assert frame_files.scene_description(layout.sample_layout(2, 6)) != frame_files.scene_description(scene)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cars_stand_apart_in_range_and_one_is_partly_hidden(seed: int) -> None:
+    drawn = layout.sample_layout(seed)
+    assert 4 <= len(drawn.cars) <= 6
+    depths = np.array([car.T_road_obj[2, 3] for car in drawn.cars])
+    assert depths.min() > 7.5
+    assert depths.max() < 36.0
+    centres = np.array([car.T_road_obj[[0, 2], 3] for car in drawn.cars])
+    gaps = np.abs(centres[:, None] - centres[None])
+    apart = (gaps[..., 0] > 2.0) | (gaps[..., 1] > 5.0) | np.eye(len(centres), dtype=bool)
+    assert apart.all()
+    shares = layout.visible_column_shares(drawn.camera, drawn.cars)
+    assert shares.min() > 0.45
+    assert shares.min() < 0.85
+
+
+def test_label_of_a_known_box(scene: layout.SceneLayout) -> None:
+    level = camera.CameraPose(1.65, 0.0, 0.0)
+    car = layout.PlacedCar(scene.cars[0].parameters, layout.pose_on_road(2.0, 10.0, -0.5 * np.pi), (0.5, 0.5, 0.5), 0.0)
+    # 4 x 1.8 x 1.5 m, its middle 0.1 m ahead of the object's origin: at z = 10.1 in the road frame.
+    corners = layout.box_corners_obj(4.0, 1.8, 1.5) + np.array([0.1, 0.0, 0.0])
+    label = labels.true_label(level, car, corners, visible_share=0.7)
+    assert label.dimensions_hwl == pytest.approx((1.5, 1.8, 4.0))
+    np.testing.assert_allclose(np.array(label.location_ref) + camera.T_CAM_REF, [2.0, 1.65, 10.1], atol=1e-12)
+    assert label.rotation_y == pytest.approx(-0.5 * np.pi)
+    assert label.alpha == pytest.approx(-0.5 * np.pi - np.arctan2(2.0, 10.1), abs=0.02)
+    assert (label.occluded, label.truncated) == (1, 0.0)
+    # The nearest face is at z = 8.1: it bounds the box at the right and below.
+    assert label.box_2d[2] == pytest.approx(609.5593 + 721.5377 * 2.9 / 8.1)
+    assert label.box_2d[3] == pytest.approx(172.854 + 721.5377 * 1.65 / 8.1)
+
+
+def test_truncation_is_the_share_of_the_box_outside(scene: layout.SceneLayout) -> None:
+    level = camera.CameraPose(1.65, 0.0, 0.0)
+    # A flat target at z = 10 from u = -c to c' : half of its width lies left of the picture.
+    middle = -camera.K[0, 2] * 10.0 / camera.K[0, 0]
+    car = layout.PlacedCar(scene.cars[0].parameters, layout.pose_on_road(middle, 10.0, -0.5 * np.pi), (0, 0, 0), 0.0)
+    label = labels.true_label(level, car, layout.box_corners_obj(1e-9, 2.0, 1.0), visible_share=1.0)
+    assert label.truncated == pytest.approx(0.5, abs=1e-6)
+    assert label.box_2d[0] == 0.0
+
+
+def test_detection_noise_has_the_stated_size() -> None:
+    truth = labels.CarLabel(0.0, 0, (500, 170, 600, 230), (1.5, 1.6, 3.9), (0.0, 1.5, 20.0), 0.3)
+    rng = np.random.default_rng(0)
+    draws = [labels.noisy_detection(rng, truth, labels.StereoNoise()) for _ in range(4000)]
+    location = np.array([d.location_ref for d in draws])
+    np.testing.assert_allclose(location.mean(axis=0), [0.0, 1.5, 20.0], atol=0.03)
+    np.testing.assert_allclose(location[:, 0].std(), 0.12, rtol=0.05)
+    np.testing.assert_allclose(location[:, 2].std(), 0.5, rtol=0.05)
+    yaw = np.array([d.rotation_y for d in draws])
+    np.testing.assert_allclose(np.degrees(yaw.std()), 5.0, rtol=0.05)
+    sizes = np.array([d.dimensions_hwl for d in draws])
+    np.testing.assert_allclose(sizes.mean(axis=0), [1.53, 1.63, 3.88], rtol=0.01)
+
+
+def test_lines_have_kittis_columns() -> None:
+    label = labels.CarLabel(0.1, 1, (1.0, 2.0, 3.0, 4.0), (1.5, 1.6, 3.9), (-1.0, 1.6, 10.0), 1.57)
+    assert labels.label_line(label) == "Car 0.10 1 1.67 1.00 2.00 3.00 4.00 1.50 1.60 3.90 -1.00 1.60 10.00 1.57"
+    assert labels.result_line(label, 0.9).split()[1:3] == ["-1", "-1"]
+    assert len(labels.result_line(label, 0.9).split()) == 16
+
+
+def test_car_parts_cover_the_whole_mesh(scene: layout.SceneLayout) -> None:
+    car = scene.cars[0]
+    model = car_surfaces.car_model(car, spacing_m=0.08)
+    parts = car_surfaces.car_surfaces(car, model, 3)
+    assert {part.instance for part in parts} == {3}
+    assert len(parts) >= 6
+    area = sum(_area(part.vertices, part.faces) for part in parts)
+    assert area == pytest.approx(_area(model.vertices, model.faces), rel=1e-9)
+
+
+def _area(vertices: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+
+
+def test_masks_round_trip() -> None:
+    from pycocotools import mask as coco
+
+    instance = np.full((6, 9), -1)
+    instance[1:4, 2:5] = 0
+    instance[2:6, 6:8] = 2
+    entries = frame_files.mask_entries(instance, "left")
+    assert [entry["instance_id"] for entry in entries] == [1001, 1003]
+    assert entries[0]["bbox"] == [2.0, 1.0, 3.0, 3.0]
+    decoded = coco.decode(json.loads(json.dumps(entries[1]["segmentation"])))
+    np.testing.assert_array_equal(decoded.astype(bool), instance == 2)
+
+
+def test_developing_is_seeded_and_monotonic() -> None:
+    ramp = np.repeat(np.linspace(0.0, 2.0, 64)[None, :, None], 40, axis=0).repeat(3, axis=2)
+    first, second = (sensor.develop(np.random.default_rng(5), ramp, 1.0, 1.0) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    columns = first.mean(axis=(0, 2))
+    assert (np.diff(columns) > -1.0).all()
+    # The lens blur lets a little of the next column in.
+    assert columns[0] < 12
+    assert columns[-1] > 240
+
+
+def test_bundled_frame_is_complete_and_small() -> None:
+    files = [path for path in ASSET.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 4e6
+    lines = (ASSET / "training/label_2/000000.txt").read_text().splitlines()
+    detections = (ASSET / "detections/noisy_stereo/data/000000.txt").read_text().splitlines()
+    masks = json.loads((ASSET / "training/masks/000000.json").read_text())
+    assert len(lines) == len(detections) == 6
+    for side in ("left", "right"):
+        assert sorted(m["instance_id"] for m in masks if m["image"] == side) == list(range(1001, 1007))
+    assert any(line.split()[2] == "1" for line in lines)
+
+
+def test_bundled_labels_are_those_of_the_seed(scene: layout.SceneLayout) -> None:
+    lines = (ASSET / "training/label_2/000000.txt").read_text().splitlines()
+    for car, line in zip(scene.cars, lines, strict=True):
+        T_cam_obj = scene.camera.T_cam_road @ car.T_road_obj
+        location = np.array([float(x) for x in line.split()[11:14]])
+        # The label's place is the middle of the mesh, the layout's the object's origin: they differ by centimetres.
+        np.testing.assert_allclose(location + camera.T_CAM_REF, T_cam_obj[:3, 3], atol=0.08)
+
+
+def test_bundled_masks_lie_in_the_projected_boxes() -> None:
+    from pycocotools import mask as coco
+
+    lines = (ASSET / "training/label_2/000000.txt").read_text().splitlines()
+    for entry in json.loads((ASSET / "training/masks/000000.json").read_text()):
+        if entry["image"] == "right":
+            continue
+        box = [float(x) for x in lines[entry["instance_id"] - 1001].split()[4:8]]
+        v, u = np.nonzero(coco.decode(entry["segmentation"]))
+        # The 2D box is the exact outline, so integer pixel centres inside the car cannot lie outside it.
+        assert u.min() >= box[0] - 0.02
+        assert v.min() >= box[1] - 0.02
+        assert u.max() <= box[2] + 0.02
+        assert v.max() <= box[3] + 0.02
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mitsuba") is None, reason="needs the extra `render` (mitsuba)")
+def test_renderer_puts_pixel_centres_at_integers() -> None:
+    from demo_scene.rendering import Renderer
+
+    pose = camera.CameraPose(1.65, 0.01, 0.02)
+    grey = surfaces.Material((0.5, 0.5, 0.5))
+    road = surfaces.quad(np.array([-200.0, 0.0, 1.0]), np.array([400.0, 0, 0]), np.array([0, 0, 400.0]), grey)
+    block = surfaces.box((-1.0, -1.5, 12.0), (1.0, 0.0, 14.0), grey)
+    block = surfaces.Surface(block.vertices, block.faces, grey, instance=4)
+    renderer = Renderer([road, block], None)
+    u, v = np.meshgrid(np.arange(camera.IMAGE_WIDTH_PX), np.arange(camera.IMAGE_HEIGHT_PX))
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
+    for T_view_road in (pose.T_cam_road, pose.T_right_road):
+        truth = renderer.pixel_truth(T_view_road)
+        # Ground seen through pixel (u, v): depth = height / (ray . down), exactly.
+        down = T_view_road[:3, 1]
+        height_m = -down @ (-T_view_road[:3, 3])
+        ground = (truth.instance == -1) & (truth.depth_m > 0) & (truth.depth_m < 60)
+        expected = height_m / (rays @ down)
+        disparity_error_px = camera.K[0, 0] * 0.5327 * (1 / truth.depth_m[ground] - 1 / expected[ground])
+        assert ground.sum() > 100_000
+        assert np.abs(disparity_error_px).max() < 0.02
+        # The front face's outline, projected, bounds the mask to within one pixel centre.
+        pixels = camera.project(camera.transform(T_view_road, block.vertices))
+        v_mask, u_mask = np.nonzero(truth.instance == 4)
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        assert [u_mask.min(), v_mask.min()] == list(np.ceil(low))
+        assert [u_mask.max(), v_mask.max()] == list(np.floor(high))
