@@ -60,10 +60,13 @@ def with_third(change: Callable[[Detections], Detections]) -> tuple[FrameBatch, 
 
 
 def assert_others_unchanged(result: RefinementResult) -> None:
+    """To the bit if the bad car never reached the solver; else to rounding, for it leaves the batch at another time."""
     expected = healthy()
+    tolerance = 0.0 if result.cost_before[2].isnan().all() else 1e-11
     for name in ("T_cam_obj", "code", "status_code", "iterations", "cost_before", "cost_after"):
-        assert torch.equal(getattr(result, name)[:2], getattr(expected, name)), name
-    torch.testing.assert_close(result.covariance[:2], expected.covariance, rtol=1e-10, atol=1e-14)
+        mine, theirs = getattr(result, name)[:2], getattr(expected, name)
+        torch.testing.assert_close(mine, theirs, rtol=tolerance, atol=tolerance, msg=name)
+    torch.testing.assert_close(result.covariance[:2], expected.covariance, rtol=1e-8, atol=1e-14)
 
 
 def _posed(T_cam_obj: Tensor) -> Callable[[Detections], Detections]:

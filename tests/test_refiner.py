@@ -1,0 +1,199 @@
+"""The refiner as a module: batching, order, determinism, dtypes, padding, stored state, borders."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT, PAPER
+from helpers.synthetic_scene import (
+    Street,
+    cached_street,
+    disturbed,
+    joined_detections,
+    joined_frames,
+    select,
+    street,
+)
+
+from directshape_torch.config import RefinerConfig, SearchConfig
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import rotation_y_from_pose
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+
+SEARCH = replace(DEFAULT, search=SearchConfig(disparity_offsets_px=(-1.0, 1.0), yaw_offsets_deg=(-10.0, 10.0)))
+
+
+def refiner(config: RefinerConfig = DEFAULT) -> DirectShapeRefiner:
+    return DirectShapeRefiner(cached_street()[0], config)
+
+
+@lru_cache(maxsize=1)
+def small_street() -> Street:
+    """One car in an image of another size."""
+    return street(ellipsoid_prior(), [(0.5, 1.65, 9.0)], [0.8], size_wh=(131, 97), focal_px=130.0)
+
+
+@lru_cache(maxsize=1)
+def two_frames() -> tuple[FrameBatch, Detections, list[tuple[FrameBatch, Detections]]]:
+    """A batch of two frames of different size, and the same frames one by one."""
+    parts = [(s.frames, disturbed(s.detections, seed=i)) for i, s in enumerate((cached_street()[1], small_street()))]
+    frames = joined_frames([p[0] for p in parts])
+    return frames, joined_detections([p[1] for p in parts], tuple(frames.images_left.shape[2:])), parts
+
+
+def assert_same(a: RefinementResult, b: RefinementResult, tolerance: float = 1e-9) -> None:
+    assert a.status == b.status
+    assert torch.equal(a.iterations, b.iterations)
+    for name in ("T_cam_obj", "code", "cost_before", "cost_after", "t_cam_ref"):
+        torch.testing.assert_close(getattr(a, name), getattr(b, name), rtol=tolerance, atol=tolerance, msg=name)
+    torch.testing.assert_close(a.covariance, b.covariance, rtol=1e-6, atol=1e-12)
+
+
+def rows(result: RefinementResult, index: list[int]) -> RefinementResult:
+    names = (
+        "T_cam_obj", "code", "status_code", "iterations", "cost_before", "cost_after",
+        "covariance", "covariance_xyz_yaw", "cost_history", "t_cam_ref",
+    )  # fmt: skip
+    return replace(result, **{name: getattr(result, name)[index] for name in names})
+
+
+@pytest.mark.parametrize("config", [DEFAULT, PAPER, SEARCH], ids=["default", "paper", "search"])
+def test_a_batch_of_frames_equals_a_loop_over_them(config: RefinerConfig) -> None:
+    """Frames of different sizes: padding with arbitrary values must change nothing either."""
+    frames, detections, parts = two_frames()
+    batch = refiner(config)(frames, detections)
+    first, second = (refiner(config)(*part) for part in parts)
+    assert_same(rows(batch, [0, 1]), first)
+    assert_same(rows(batch, [2]), second)
+
+
+def test_a_batch_of_cars_equals_a_loop_over_them() -> None:
+    """Without occlusion, which is the only thing that one car knows of another."""
+    config = replace(DEFAULT, sampling=replace(DEFAULT.sampling, occlusion=False))
+    scene = cached_street()[1]
+    detections = disturbed(scene.detections)
+    batch = refiner(config)(scene.frames, detections)
+    for i in range(2):
+        alone = refiner(config)(scene.frames, select(detections, torch.tensor([i])))
+        assert_same(rows(batch, [i]), alone)
+
+
+@pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0], [1, 2, 0]])
+def test_permuting_cars_permutes_results(order: list[int]) -> None:
+    frames, detections, _ = two_frames()
+    expected = refiner()(frames, detections)
+    permuted = refiner()(frames, select(detections, torch.tensor(order)))
+    assert_same(permuted, rows(expected, order))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_same_bits_twice(dtype: torch.dtype) -> None:
+    frames, detections, _ = two_frames()
+    module = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).to(dtype)
+    a, b = (module(frames.to(dtype=dtype), detections.to(dtype=dtype)) for _ in range(2))
+    for name in ("T_cam_obj", "code", "cost_before", "cost_after", "covariance", "iterations", "status_code"):
+        assert torch.equal(getattr(a, name), getattr(b, name)), name
+    assert a.T_cam_obj.dtype == a.code.dtype == dtype
+
+
+def test_refinement_brings_cars_nearer_to_the_truth() -> None:
+    scene = cached_street()[1]
+    before, after = torch.zeros(2), torch.zeros(2)
+    for seed in range(3):
+        detections = disturbed(scene.detections, seed=seed)
+        result = refiner()(scene.frames, detections)
+        assert all(status.is_refined for status in result.status)
+        assert (result.cost_after.sum(1) <= result.cost_before.sum(1)).all()
+        for total, T in ((before, detections.T_cam_obj), (after, result.T_cam_obj)):
+            total += (T - scene.detections.T_cam_obj)[:, :3, 3].norm(dim=1) / 3
+    assert after.mean() < 0.7 * before.mean()
+
+
+def test_float32_ends_where_float64_does() -> None:
+    scene = cached_street()[1]
+    detections = disturbed(scene.detections)
+    double = refiner()(scene.frames, detections)
+    low = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).to(torch.float32)
+    single = low(scene.frames.to(dtype=torch.float32), detections.to(dtype=torch.float32))
+    assert (single.T_cam_obj.double() - double.T_cam_obj).abs().max() < 0.05
+
+
+def test_prior_lives_in_the_state_dict() -> None:
+    source, target = DirectShapeRefiner(ellipsoid_prior(), DEFAULT), DirectShapeRefiner(ellipsoid_prior(), DEFAULT)
+    target.prior.mean.add_(0.3)
+    frames, detections, _ = two_frames()
+    target.load_state_dict(source.state_dict())
+    assert {"prior.mean", "prior.basis", "prior.origin"} <= set(source.state_dict())
+    assert torch.equal(source(frames, detections).T_cam_obj, target(frames, detections).T_cam_obj)
+    assert not list(source.parameters())
+
+
+def test_inputs_are_not_written_to() -> None:
+    frames, detections, _ = two_frames()
+    copies = [t.clone() for t in (frames.images_left, detections.T_cam_obj, detections.mask_left)]
+    refiner()(frames, detections)
+    for t, copy in zip((frames.images_left, detections.T_cam_obj, detections.mask_left), copies, strict=True):
+        assert torch.equal(t, copy)
+
+
+def test_a_rotated_right_camera_is_taken_into_account() -> None:
+    T_right_cam = se3.exp(torch.tensor([-0.53, -0.003, 0.004, 0.004, -0.015, 0.01], dtype=torch.float64))
+    scene = street(ellipsoid_prior(), [(0.2, 1.65, 9.0)], [2.0], T_right_cam=T_right_cam)
+    detections = disturbed(scene.detections)
+    right = refiner()(scene.frames, detections)
+    unrotated = scene.frames.camera.T_right_cam.clone()
+    unrotated[0, :3, :3] = torch.eye(3, dtype=torch.float64)
+    wrong = refiner()(replace(scene.frames, camera=replace(scene.frames.camera, T_right_cam=unrotated)), detections)
+    assert right.cost_after[0, :3].sum() < 0.6 * wrong.cost_after[0, :3].sum()
+
+
+def test_statuses_costs_and_names_fit_together() -> None:
+    frames, detections, _ = two_frames()
+    result = refiner()(frames, detections)
+    assert len(result) == 3
+    assert result.cost_before.shape == result.cost_after.shape == (3, len(result.term_names))
+    assert result.term_names[:3] == ("silhouette_left", "silhouette_right", "photometric")
+    assert result.covariance.shape == (3, 9, 9)
+    assert result.covariance_xyz_yaw.shape == (3, 4, 4)
+    assert (torch.linalg.eigvalsh(result.covariance) > 0).all()
+    assert result.refined.all()
+    for car in range(3):
+        seen = result.cost_history[car][result.cost_history[car].isfinite()]
+        assert len(seen) >= int(result.iterations[car])
+
+
+def test_boxes_are_measured_on_the_refined_shape_in_the_reference_frame() -> None:
+    scene = cached_street()[1]
+    result = refiner()(scene.frames, scene.detections)
+    boxes = result.boxes()
+    # The ellipsoid's bottom is its origin's height; its extents follow the code by 0.24 m a standard deviation.
+    expected = cached_street()[0].dimensions_hwl(result.code)
+    torch.testing.assert_close(boxes.dimensions_hwl, expected, atol=0.03, rtol=0)
+    torch.testing.assert_close(boxes.rotation_y, rotation_y_from_pose(result.T_cam_obj))
+    moved = result.T_cam_obj[:, :3, 3] - scene.frames.camera.t_cam_ref
+    torch.testing.assert_close(boxes.location_ref[:, [0, 2]], moved[:, [0, 2]], atol=0.03, rtol=0)
+
+
+def test_wrong_inputs_are_named() -> None:
+    scene = cached_street()[1]
+    module = refiner()
+    with pytest.raises(InputError, match=r"frames: expected dtype torch\.float64"):
+        module(scene.frames.to(dtype=torch.float32), scene.detections)
+    with pytest.raises(InputError, match=r"detections.frame_index: expected 0..0, got 0..3"):
+        module(scene.frames, replace(scene.detections, frame_index=torch.tensor([0, 3])))
+    small = {name: getattr(scene.detections, name)[:, :50] for name in ("mask_left", "mask_right")}
+    with pytest.raises(InputError, match="masks of the \\(padded\\) image size"):
+        module(scene.frames, replace(scene.detections, **small))
+
+
+def test_no_gradient_graph_is_built() -> None:
+    scene = cached_street()[1]
+    pose = scene.detections.T_cam_obj.clone().requires_grad_()
+    assert not refiner()(scene.frames, replace(scene.detections, T_cam_obj=pose)).T_cam_obj.requires_grad
