@@ -19,8 +19,9 @@ from directshape_torch.visualize.drawing import (
     draw_text,
 )
 
-_TILE_HEIGHT_PX = 150
-_TILE_WIDTHS_PX = (140, 320)
+_TILE_HEIGHTS_PX = (150, 135, 120)
+# Width of a tile as a share of its height.
+_LEAST_ASPECT, _LARGEST_ASPECT = 0.95, 2.2
 _CAPTION_PX = 18
 _GAP_PX = 6
 _GROUND = 24
@@ -42,16 +43,33 @@ def tile_strip(
     tiles: Sequence[CarTile],
     width_px: int,
 ) -> Picture:
-    """All cars that are seen in the image, from left to right in as many rows as needed; (h, width_px, 3)."""
-    pictures = [picture for picture in (_tile(image, K, tile) for tile in tiles) if picture is not None]
-    rows: list[list[Picture]] = [[]]
-    for picture in pictures:
-        used = sum(p.shape[1] + _GAP_PX for p in rows[-1])
-        if rows[-1] and used + picture.shape[1] > width_px:
-            rows.append([])
-        rows[-1].append(picture)
-    strips = [_row(row, width_px) for row in rows if row]
+    """All cars that are seen in the image, side by side; (h, width_px, 3).
+
+    Tiles are made a little smaller where that saves a second row, else they wrap into as many rows as needed.
+    """
+    for height_px in _TILE_HEIGHTS_PX:
+        rows = _wrapped([_tile(image, K, tile, height_px) for tile in tiles], width_px)
+        if len(rows) <= 1:
+            break
+    else:
+        rows = _wrapped([_tile(image, K, tile, _TILE_HEIGHTS_PX[0]) for tile in tiles], width_px)
+    strips = [_row(row, width_px) for row in rows]
     return np.concatenate(strips) if strips else np.zeros((0, width_px, 3), np.uint8)
+
+
+def _wrapped(pictures: Sequence[Picture | None], width_px: int) -> list[list[Picture]]:
+    """Rows of pictures that fit the width; a row holds at least one."""
+    rows: list[list[Picture]] = []
+    used = width_px
+    for picture in pictures:
+        if picture is None:
+            continue
+        if not rows or used + picture.shape[1] > width_px:
+            rows.append([])
+            used = 0
+        rows[-1].append(picture)
+        used += picture.shape[1] + _GAP_PX
+    return rows
 
 
 def _row(pictures: Sequence[Picture], width_px: int) -> Picture:
@@ -64,12 +82,12 @@ def _row(pictures: Sequence[Picture], width_px: int) -> Picture:
     return row
 
 
-def _tile(image: Picture, K: Array, tile: CarTile) -> Picture | None:
+def _tile(image: Picture, K: Array, tile: CarTile, height_px: int) -> Picture | None:
     """Caption, before, after; None for a car that the image does not show."""
     window = _window(image, K, (tile.before, tile.after))
     if window is None:
         return None
-    scale = _TILE_HEIGHT_PX / (window[3] - window[1])
+    scale = height_px / (window[3] - window[1])
     states: list[tuple[Surface, Colour]] = [(tile.before, ORANGE), (tile.after, tile.colour_after)]
     views = []
     for surface, colour in states:
@@ -92,8 +110,7 @@ def _window(image: Picture, K: Array, surfaces: Sequence[Surface]) -> tuple[int,
     (u0, v0), (u1, v1) = pixels.min(axis=0), pixels.max(axis=0)
     if u1 - u0 < 1 or v1 - v0 < 1:
         return None
-    tall = 1.3 * max(v1 - v0, 6.0)
-    wide = float(np.clip(1.15 * (u1 - u0), *(tall * w / _TILE_HEIGHT_PX for w in _TILE_WIDTHS_PX)))
-    tall = max(tall, 1.15 * (u1 - u0) * _TILE_HEIGHT_PX / _TILE_WIDTHS_PX[1])
+    tall = max(1.3 * max(v1 - v0, 6.0), 1.15 * (u1 - u0) / _LARGEST_ASPECT)
+    wide = max(1.15 * (u1 - u0), _LEAST_ASPECT * tall)
     u, v = (u0 + u1) / 2, (v0 + v1) / 2
     return round(u - wide / 2), round(v - tall / 2), round(u + wide / 2), round(v + tall / 2)

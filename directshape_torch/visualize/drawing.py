@@ -164,6 +164,7 @@ def draw_legend(
 ) -> None:
     """Coloured strokes with their meaning, one a line, from the upper left corner on."""
     u, v = position
+    picture[v - 6 : v + 18 * len(entries) + 6, u - 6 : u + 140] //= 3
     for row, (text, colour) in enumerate(entries):
         middle = v + 9 + 18 * row
         for ink, thickness in ((BLACK, 5), (colour, 3)):

@@ -101,8 +101,8 @@ def overlay_picture(
         (h, w, 3) RGB uint8.
     """
     rows = [
-        _image_row(image, K, before, ORANGE, f"{title}  before"),
-        _image_row(image, K, after, BLUE, f"{title}  after"),
+        _image_row(image, K, before, ORANGE, f"{title}  before: the detection's box, mean shape"),
+        _image_row(image, K, after, BLUE, f"{title}  after: refined box and shape"),
     ]
     tiles = [
         CarTile(b.surface, a.surface, BLUE if a.is_refined else GREY, f"{a.label}:  {a.note}")

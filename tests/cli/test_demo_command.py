@@ -23,6 +23,8 @@ def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(rows) == len(cars)
     overlap = re.search(r"mean .* (\d\.\d\d) -> +(\d\.\d\d)", out)
     assert overlap is not None
+    before, after = map(float, overlap.groups())
+    assert after > before + 0.1
     assert (tmp_path / "overlays" / "000000.png").stat().st_size > 100_000
     statuses = read_shapes(tmp_path / "shapes" / "000000.npz").statuses
     num_refined = sum(Status[name].is_refined for name in statuses)
