@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from directshape_torch.config_ranges import check_ranges
 from directshape_torch.errors import ConfigError
 
 
@@ -184,6 +185,9 @@ class RefinerConfig:
     priors: PriorConfig = field(default_factory=PriorConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 _ConfigT = TypeVar("_ConfigT")

@@ -1,0 +1,92 @@
+"""Which values of the settings make sense; anything else is an error that names the key."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from directshape_torch.errors import ConfigError
+
+_TINY = 1e-300
+_POSITIVE = (_TINY, math.inf)
+_NOT_NEGATIVE = (0.0, math.inf)
+
+# Lowest and highest allowed value of each number; in a tuple of numbers, of each entry.
+_RANGES: dict[str, tuple[float, float]] = {
+    "contour_width_px": _POSITIVE,
+    "image_level": (0, 8),
+    "max_iterations": _NOT_NEGATIVE,
+    "solver.initial_damping": _NOT_NEGATIVE,
+    "solver.damping_decrease": (_TINY, 1),
+    "solver.damping_increase": (1, math.inf),
+    "solver.min_damping": _NOT_NEGATIVE,
+    "solver.max_damping": _POSITIVE,
+    "solver.cost_tolerance": _NOT_NEGATIVE,
+    "solver.step_tolerance": _NOT_NEGATIVE,
+    "solver.block_iterations": (1, math.inf),
+    "solver.max_step_translation_m": _POSITIVE,
+    "solver.max_step_rotation_rad": _POSITIVE,
+    "solver.max_step_code": _POSITIVE,
+    "solver.max_code": _POSITIVE,
+    "silhouette.weight": _NOT_NEGATIVE,
+    "silhouette.samples_per_ray": (1, 4096),
+    "silhouette.probability_floor": (1e-6, 0.49),
+    "silhouette.residual_floor": _POSITIVE,
+    "silhouette.min_zeta_per_m": _POSITIVE,
+    "silhouette.max_zeta_per_m": _POSITIVE,
+    "silhouette.saturation": _POSITIVE,
+    "photometric.weight": _NOT_NEGATIVE,
+    "photometric.huber_grey_levels": _POSITIVE,
+    "photometric.gradient_constant_grey_levels": _POSITIVE,
+    "photometric.lost_grey_levels": _POSITIVE,
+    "photometric.min_ray_cosine": (0, 0.999),
+    "priors.shape_weight": _NOT_NEGATIVE,
+    "priors.height_weight": _NOT_NEGATIVE,
+    "priors.tilt_weight": _NOT_NEGATIVE,
+    "priors.dimensions_weight": _NOT_NEGATIVE,
+    "priors.dimensions_sigma_m": _POSITIVE,
+    "sampling.density": (_TINY, 1),
+    "sampling.min_pixels": (1, math.inf),
+    "sampling.max_pixels": (1, math.inf),
+    "sampling.region_margin_px": _NOT_NEGATIVE,
+    "sampling.region_margin_share": _NOT_NEGATIVE,
+    "sampling.min_usable_pixels": _NOT_NEGATIVE,
+    "search.disparity_offsets_px": (-100, 100),
+    "search.yaw_offsets_deg": (-360, 360),
+}
+
+
+def check_ranges(config: Any) -> None:
+    """Raise `ConfigError` naming the first setting of a `RefinerConfig` that is out of range.
+
+    Example:
+        >>> from directshape_torch.config import RefinerConfig
+        >>> check_ranges(RefinerConfig())
+    """
+    if not config.stages:
+        raise ConfigError("stages: expected at least one stage, got none")
+    for i, stage in enumerate(config.stages):
+        for key in ("contour_width_px", "image_level", "max_iterations"):
+            _check(f"stages[{i}].{key}", getattr(stage, key), *_RANGES[key])
+    for path, (low, high) in _RANGES.items():
+        group, _, key = path.partition(".")
+        if key:
+            _check(path, getattr(getattr(config, group), key), low, high)
+    for path, low_value, high_value in (
+        ("silhouette.max_zeta_per_m", config.silhouette.min_zeta_per_m, config.silhouette.max_zeta_per_m),
+        ("sampling.max_pixels", config.sampling.min_pixels, config.sampling.max_pixels),
+        ("solver.max_damping", config.solver.min_damping, config.solver.max_damping),
+    ):
+        if low_value > high_value:
+            raise ConfigError(f"{path}: expected at least {path.replace('max', 'min')} = {low_value}, got {high_value}")
+
+
+def _check(path: str, value: Any, low: float, high: float) -> None:
+    for number in value if isinstance(value, tuple) else (value,):
+        if not low <= number <= high or math.isinf(number):
+            raise ConfigError(f"{path}: expected {_words(low, high)}, got {value}")
+
+
+def _words(low: float, high: float) -> str:
+    lowest = "a number above 0" if low == _TINY else f"a number of at least {low:g}"
+    return lowest if high == math.inf else f"{lowest} and at most {high:g}"

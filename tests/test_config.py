@@ -1,0 +1,138 @@
+"""Settings: unknown keys name the nearest one, wrong kinds and values out of range name the key."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from directshape_torch.config import (
+    PhotometricConfig,
+    PriorConfig,
+    RefinerConfig,
+    SamplingConfig,
+    SearchConfig,
+    SilhouetteConfig,
+    SolverConfig,
+    config_from_mapping,
+    config_to_mapping,
+    load_config,
+)
+from directshape_torch.config_ranges import _RANGES
+from directshape_torch.errors import ConfigError, DirectShapeError
+
+
+@pytest.mark.parametrize(
+    ("mapping", "nearest"),
+    [
+        ({"silhouete": {}}, "silhouette"),
+        ({"silhouette": {"wieght": 3}}, "silhouette.weight"),
+        ({"solver": {"max_step_translation": 1}}, "solver.max_step_translation_m"),
+        ({"stages": [{"contour_px": 1.0}]}, "stages[0].contour_width_px"),
+    ],
+)
+def test_an_unknown_key_names_the_nearest(mapping: dict[str, Any], nearest: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        config_from_mapping(RefinerConfig, mapping)
+    assert "unknown key" in str(error.value)
+    assert str(error.value).endswith(f"the nearest known one is {nearest}")
+
+
+@pytest.mark.parametrize(
+    ("mapping", "text"),
+    [
+        ({"silhouette": 3}, "silhouette.: expected keys and values, got 3"),
+        ({"silhouette": {"weight": "heavy"}}, "silhouette.weight: expected a number, got 'heavy'"),
+        ({"silhouette": {"weight": True}}, "silhouette.weight: expected float, got True"),
+        ({"silhouette": {"samples_per_ray": 3.5}}, "silhouette.samples_per_ray: expected int, got 3.5"),
+        ({"silhouette": {"form": "sum"}}, "silhouette.form: expected one of closest_approach, product, got 'sum'"),
+        ({"photometric": {"gain": 1}}, "photometric.gain: expected bool, got 1"),
+        ({"stages": {"a": 1}}, "stages: expected a list, got {'a': 1}"),
+        ({"priors": {"dimensions_sigma_m": [0.1, 0.2]}}, "priors.dimensions_sigma_m: expected 3 entries"),
+        ({"search": {"yaw_offsets_deg": ["x"]}}, "search.yaw_offsets_deg[0]: expected a number"),
+        ({"silhouette": {"weight": None}}, "silhouette.weight: expected float, got None"),
+    ],
+)
+def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        config_from_mapping(RefinerConfig, mapping)
+    assert text in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [
+        ("stages=[]", "stages: expected at least one stage"),
+        ("stages=[{contour_width_px: 0}]", "stages[0].contour_width_px: expected a number above 0, got 0.0"),
+        ("silhouette.samples_per_ray=0", "silhouette.samples_per_ray: expected a number of at least 1"),
+        ("silhouette.probability_floor=0.5", "silhouette.probability_floor: expected"),
+        ("silhouette.weight=-1", "silhouette.weight: expected a number of at least 0, got -1.0"),
+        ("photometric.huber_grey_levels=.nan", "photometric.huber_grey_levels: expected a number above 0, got nan"),
+        ("solver.max_code=.inf", "solver.max_code: expected a number above 0, got inf"),
+        ("priors.dimensions_sigma_m=[0.1, 0, 0.1]", "priors.dimensions_sigma_m: expected a number above 0"),
+        ("sampling.max_pixels=50", "sampling.max_pixels: expected at least sampling.min_pixels = 100, got 50"),
+        ("sampling.density=1.5", "sampling.density: expected a number above 0 and at most 1, got 1.5"),
+    ],
+)
+def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        load_config(None, [override])
+    assert text in str(error.value)
+
+
+def test_every_number_has_a_range() -> None:
+    groups = {
+        "solver": SolverConfig, "silhouette": SilhouetteConfig, "photometric": PhotometricConfig,
+        "priors": PriorConfig, "sampling": SamplingConfig, "search": SearchConfig,
+    }  # fmt: skip
+    for group, kind in groups.items():
+        for field in dataclasses.fields(kind):
+            default = getattr(kind(), field.name)
+            if isinstance(default, (int, float, tuple)) and not isinstance(default, bool):
+                assert f"{group}.{field.name}" in _RANGES
+
+
+def test_round_trip() -> None:
+    config = load_config(None, ["silhouette.form=product", "search.yaw_offsets_deg=[-8, 8]", "solver.max_code=2"])
+    assert config.search.yaw_offsets_deg == (-8.0, 8.0)
+    assert config.solver.max_code == 2.0
+    assert config_from_mapping(RefinerConfig, config_to_mapping(config)) == config
+
+
+def test_numbers_that_yaml_reads_as_text() -> None:
+    assert load_config(None, ["priors.tilt_weight=1e7"]).priors.tilt_weight == 1e7
+
+
+def test_files_and_overrides(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("silhouette: {weight: 5}\nphotometric: {gain: false}\n", encoding="utf-8")
+    config = load_config(path, ["silhouette.weight=6"])
+    assert config.silhouette.weight == 6
+    assert not config.photometric.gain
+    path.write_text("", encoding="utf-8")
+    assert load_config(path) == RefinerConfig()
+
+
+@pytest.mark.parametrize(
+    ("content", "overrides", "text"),
+    [
+        ("- 1\n", [], "expected keys and values"),
+        ("a: [1\n", [], "cannot be read as a YAML configuration"),
+        ("solver: 3\n", ["solver.max_code=2"], "solver holds no keys of its own"),
+        ("", ["solver.max_code"], "expected key=value"),
+        ("", ["solver.max_code=[1"], "the value is not YAML"),
+    ],
+)
+def test_unreadable_files_and_overrides(tmp_path: Path, content: str, overrides: list[str], text: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(ConfigError) as error:
+        load_config(path, overrides)
+    assert text in str(error.value)
+
+
+def test_a_missing_file_is_an_error_of_this_package(tmp_path: Path) -> None:
+    with pytest.raises(DirectShapeError, match=r"none\.yaml: cannot be read"):
+        load_config(tmp_path / "none.yaml")
