@@ -58,14 +58,21 @@ def test_bias_is_measured_minus_true_disparity() -> None:
     torch.testing.assert_close(biased.uv_right[:, 0], plain.uv_right[:, 0] - 0.8)
     assert (biased.uv_right[:, 1] == plain.uv_right[:, 1]).all()
     assert (biased.J_pixel_depth == plain.J_pixel_depth).all()
+    lower = warp_to_right(ray, DEPTH, K_RIGHT, GENERAL, vertical_px=bias)
+    torch.testing.assert_close(lower.uv_right[:, 1], plain.uv_right[:, 1] + 0.8)
+    assert (lower.uv_right[:, 0] == plain.uv_right[:, 0]).all()
 
 
-@pytest.mark.parametrize("bias", [None, torch.tensor([0.3, -1.2, 0.7], dtype=torch.float64)])
-def test_right_rays_undo_the_warp(bias: torch.Tensor | None) -> None:
+BIAS = torch.tensor([0.3, -1.2, 0.7], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("vertical", [None, -0.5 * BIAS])
+@pytest.mark.parametrize("bias", [None, BIAS])
+def test_right_rays_undo_the_warp(bias: torch.Tensor | None, vertical: torch.Tensor | None) -> None:
     ray = rays_from_pixels(UV, K_LEFT)
     point_cam = DEPTH[:, None] * ray
-    uv_right = warp_to_right(ray, DEPTH, K_RIGHT, GENERAL, bias).uv_right
-    back = right_rays(uv_right, K_RIGHT, GENERAL, bias)
+    uv_right = warp_to_right(ray, DEPTH, K_RIGHT, GENERAL, bias, vertical).uv_right
+    back = right_rays(uv_right, K_RIGHT, GENERAL, bias, vertical)
     depth_right = se3.transform(GENERAL, point_cam)[:, 2]
     torch.testing.assert_close(back.origin_cam + depth_right[:, None] * back.direction_cam, point_cam)
 

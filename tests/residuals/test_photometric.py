@@ -118,7 +118,7 @@ K_SMALL = torch.tensor([[80.0, 0, 44.0], [0, 80.0, 30.0], [0, 0, 1]], dtype=torc
 T_RIGHT_CAM = se3.exp(torch.tensor([-0.5, -0.003, 0.004, 0.002, -0.004, 0.001], dtype=torch.float64))
 
 
-def _residual(depth: Tensor, uv: Tensor, image: Tensor, scale: float = 1.0, bias: Tensor | None = None):  # type: ignore[no-untyped-def]
+def _residual(depth: Tensor, uv: Tensor, image: Tensor, scale: float = 1.0, bias: Tensor | None = None, vertical: Tensor | None = None):  # type: ignore[no-untyped-def]
     pattern = torch.tensor(DSO_PATTERN, dtype=torch.float64)
     rays = rays_from_pixels(uv[:, None] + pattern / scale, K_SMALL)
     count = len(uv)
@@ -133,6 +133,7 @@ def _residual(depth: Tensor, uv: Tensor, image: Tensor, scale: float = 1.0, bias
         K_SMALL.expand(count, 3, 3),
         T_RIGHT_CAM.expand(count, 4, 4),
         bias,
+        vertical,
         DSO_PATTERN.index((0, 0)),
     )
 
@@ -187,6 +188,9 @@ def test_bias_moves_the_lookup_to_the_left() -> None:
     uv, depth = torch.tensor([[50.0, 30.0]]).double(), torch.tensor([8.0]).double()
     biased = _residual(depth, uv, ramp, bias=torch.tensor([0.7]).double())
     torch.testing.assert_close(biased.residual, _residual(depth, uv, ramp).residual - 0.7)
+    rows = torch.arange(HEIGHT, dtype=torch.float64)[:, None].expand(1, HEIGHT, WIDTH).contiguous()
+    lower = _residual(depth, uv, rows, vertical=torch.tensor([0.4]).double())
+    torch.testing.assert_close(lower.residual, _residual(depth, uv, rows).residual + 0.4)
 
 
 def test_pixels_that_leave_the_right_image_say_so() -> None:
