@@ -12,8 +12,6 @@ from torch import Tensor
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
-_FIELD_TENSORS = ("coefficients", "hull_uv", "K_left", "K_right", "T_right_cam")
-
 
 def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
     """The sha256 (hexadecimal) of named tensors: name, shape and values as float64, little-endian, in order of name.
@@ -39,5 +37,5 @@ def hash_field(field: DisparityField | None) -> str | None:
     """The sha256 of a residual disparity field, or None without one."""
     if field is None:
         return None
-    size = torch.tensor(field.size_wh)
-    return hash_tensors({"size_wh": size, **{name: getattr(field, name) for name in _FIELD_TENSORS}})
+    tensors = {name: value for name, value in vars(field).items() if isinstance(value, Tensor)}
+    return hash_tensors({"size_wh": torch.tensor(field.size_wh), **tensors})

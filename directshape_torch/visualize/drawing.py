@@ -130,7 +130,7 @@ def clip_at_near_plane(first_cam: Array, second_cam: Array) -> Array | None:
     """The part (2, 3) of a segment that lies in front of the camera, or None.
 
     Example:
-        >>> clip_at_near_plane(np.array([0.0, 0.0, -0.7]), np.array([2.0, 0.0, 1.3])).tolist()
+        >>> clip_at_near_plane(np.array([0.0, 0.0, -0.7]), np.array([2.0, 0.0, 1.3])).round(6).tolist()
         [[1.0, 0.0, 0.3], [2.0, 0.0, 1.3]]
     """
     ends = np.stack([first_cam, second_cam])

@@ -1,0 +1,93 @@
+"""What a run says about itself: counts, warnings, exit code, times."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from directshape_torch.batch.run_summary import RunSummary, count_statuses, find_warnings, format_summary
+from directshape_torch.batch.timing import CallTiming, RunTimings, peak_memory_mb, write_timings
+
+
+def done(**statuses: int) -> dict[str, Any]:
+    cars = sum(statuses.values())
+    return {"state": "done", "lines": cars + 1, "cars": cars, "statuses": statuses, "ground_source": "file"}
+
+
+FAILED = {"state": "failed", "reason": "cut short"}
+
+
+def timings() -> RunTimings:
+    calls = [CallTiming(("000000",), 2, 0.3), CallTiming(("000001", "000002"), 4, 0.6)]
+    return RunTimings(torch.device("cpu"), calls)
+
+
+def test_statuses_are_counted_over_frames_in_a_fixed_order() -> None:
+    frames = {"a": done(no_mask=1, converged=2), "b": FAILED, "c": done(converged=1, max_iterations=4)}
+    assert list(count_statuses(frames).items()) == [("converged", 3), ("max_iterations", 4), ("no_mask", 1)]
+
+
+@pytest.mark.parametrize(
+    ("frames", "expected"),
+    [
+        ({"a": done(converged=3)}, []),
+        ({"a": FAILED}, []),
+        ({"a": done(no_mask=2), "b": done(no_mask=1)}, ["none of the 3 cars has a mask"]),
+        ({"a": done(behind_camera=2)}, ["all 2 initial boxes lie behind"]),
+        ({"a": done(converged=1, too_few_pixels=2)}, ["only 1 of 3 cars were refined"]),
+        ({"a": done()}, ["none of the 1 input lines is of class Car"]),
+        ({"a": done(converged=1) | {"ground_source": "camera_height"}}, ["the ground of 1 of 1 frames"]),
+    ],
+)
+def test_warnings(frames: dict[str, Any], expected: list[str]) -> None:
+    found = find_warnings(frames, ["Car"])
+    assert len(found) == len(expected)
+    for warning, start in zip(found, expected, strict=True):
+        assert warning.startswith(start)
+
+
+def test_report() -> None:
+    frames = {"000000": done(converged=2), "000001": done(converged=3, no_mask=1), "000002": FAILED}
+    summary = RunSummary(frames, ("000000",), {"000002": "cut short"}, (), timings())
+    assert summary.exit_code == 1
+    assert summary.num_cars == 6
+    lines = format_summary(summary).splitlines()
+    assert lines[0] == "frames   2 done, 1 of them in an earlier run, 1 failed"
+    assert lines[1] == "cars     6: converged 5, no_mask 1"
+    # 0.9 s over 6 cars and 3 frames.
+    assert lines[2] == "time     150 ms per car, 300 ms per frame (refinement only, cpu)"
+    assert lines[3].startswith("memory   ")
+
+
+def test_a_run_without_work_has_no_time() -> None:
+    nothing = RunTimings(torch.device("cpu"))
+    assert nothing.ms_per_car is None
+    assert nothing.ms_per_frame is None
+    assert "time" not in format_summary(RunSummary({}, (), {}, (), nothing))
+
+
+def test_timings_file(tmp_path: Path) -> None:
+    write_timings(tmp_path / "timings.json", timings())
+    content = json.loads((tmp_path / "timings.json").read_text())
+    assert content["schema_version"] == 1
+    assert content["ms_per_car"] == 150.0
+    assert content["calls"][1] == {"frames": ["000001", "000002"], "cars": 4, "refine_ms": 600.0}
+
+
+def test_measuring_adds_a_call_even_when_cars_are_none() -> None:
+    run = RunTimings(torch.device("cpu"))
+    with run.measure(("000007",), 0):
+        torch.ones(10).sum()
+    assert run.calls[0].frame_ids == ("000007",)
+    assert run.calls[0].refine_s > 0
+    assert run.ms_per_car is None
+
+
+def test_peak_memory_is_that_of_this_process() -> None:
+    peak = peak_memory_mb()
+    # A process that has loaded torch needs between 50 MB and what a machine has.
+    assert peak is None or 50 < peak < 1e6
