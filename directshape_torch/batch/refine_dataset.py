@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from directshape_torch.batch.content_hashes import hash_field, hash_prior
 from directshape_torch.batch.frame_outputs import failed_entry, frame_entry, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver
@@ -104,8 +106,12 @@ class _Run:
         prior = self.refiner.prior.mean
         frames, detections = collate([ready.loaded for ready in batch])
         frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
-        with self.timings.measure(frames.frame_ids, len(detections)):
-            result = self.refiner(frames, detections)
+        try:
+            with self.timings.measure(frames.frame_ids, len(detections)):
+                result = self.refiner(frames, detections)
+        except torch.OutOfMemoryError as error:
+            size = f"{len(batch)} frames with {len(detections)} cars"
+            raise DirectShapeError(f"the device has too little memory for {size}; lower batch_frames") from error
         first_row = 0
         for ready in batch:
             self._write(ready, result, first_row)

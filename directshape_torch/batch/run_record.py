@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from directshape_torch.batch.frame_outputs import overlay_path
 from directshape_torch.errors import DataFormatError, ResumeError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.refinement_files import result_path
+from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.run_manifest import (
     RunManifest,
     check_inputs,
@@ -48,11 +49,10 @@ class RunRecord:
         """
         finished = []
         for frame_id in dataset.frame_ids:
-            entry = self.manifest.frames.get(frame_id, {})
-            if not self.manifest.is_done(frame_id) or not result_path(self.out_dir, frame_id).is_file():
+            if not self.manifest.is_done(frame_id):
                 continue
             self._check_inputs(dataset, frame_id)
-            if set(outputs) <= set(entry["outputs"]):
+            if self._has_outputs(frame_id, outputs):
                 finished.append(frame_id)
         return finished
 
@@ -87,6 +87,14 @@ class RunRecord:
                     f"cannot resume: {folder} holds files, but {self.path} is missing, so what they were made of is "
                     "unknown; choose another output folder, or remove this one to start again"
                 )
+
+    def _has_outputs(self, frame_id: str, outputs: Sequence[str]) -> bool:
+        """Whether the outputs were written, and nobody has removed them since."""
+        paths = {"data": result_path, "shapes": shapes_path, "overlays": overlay_path}
+        written = self.manifest.frames[frame_id]["outputs"]
+        return set(outputs) <= set(written) and all(
+            path(self.out_dir, frame_id).is_file() for name, path in paths.items() if name in outputs
+        )
 
     def _check_inputs(self, dataset: KittiStereoDataset, frame_id: str) -> None:
         try:

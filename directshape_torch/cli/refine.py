@@ -38,7 +38,7 @@ def _add_inputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
     group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
     group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
-    group.add_argument("--frames", nargs="+", metavar="ID", help="only these frames")
+    group.add_argument("--frames", nargs="+", metavar="ID", type=_frame_id, help="only these frames, e.g. 107 7322")
     group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
     group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
     group.add_argument(
@@ -64,6 +64,11 @@ def _add_settings(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--prior", type=Path, metavar="FILE", help="shape prior (npz); default: the bundled one")
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
     group.add_argument("--batch-frames", type=int, default=1, metavar="N", help="frames in one call (default: 1)")
+
+
+def _frame_id(word: str) -> str:
+    """KITTI's names of frames have six digits; shorter numbers are filled up."""
+    return word.zfill(6) if word.isdigit() else word
 
 
 def run(args: argparse.Namespace) -> int:

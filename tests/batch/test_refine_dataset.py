@@ -17,7 +17,7 @@ from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.config import RefinerConfig, load_config
-from directshape_torch.errors import InputError, ResumeError
+from directshape_torch.errors import DirectShapeError, InputError, ResumeError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
@@ -166,6 +166,25 @@ def test_further_outputs_are_added_to_finished_frames(source: Path, tmp_path: Pa
     assert (tmp_path / "overlays" / "000000.png").is_file()
     assert files(tmp_path / "data") == results
     assert refine(source, tmp_path).resumed == FRAMES
+
+
+@pytest.mark.parametrize("name", ["data/000001.txt", "shapes/000001.npz", "overlays/000001.png"])
+def test_outputs_that_were_removed_are_made_again(source: Path, tmp_path: Path, name: str) -> None:
+    refine(source, tmp_path, overlays=True)
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).unlink()
+    assert refine(source, tmp_path, overlays=True).resumed == ("000000", "000002")
+    assert (tmp_path / name).read_bytes() == content
+
+
+def test_too_little_memory_says_what_to_do(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_memory(*_: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    too_big = refiner(source)
+    monkeypatch.setattr(too_big, "forward", no_memory)
+    with pytest.raises(DirectShapeError, match="2 frames with 4 cars; lower batch_frames"):
+        refine_dataset(dataset(source), too_big, tmp_path, RefineOptions(batch_frames=2))
 
 
 def test_another_setting_is_named_and_nothing_is_written(source: Path, tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_a_second_run_resumes_and_another_setting_is_named(
 
 
 def test_frames_and_split_choose(source: Path, tmp_path: Path) -> None:
-    assert main(command(source, tmp_path / "a", "--frames", "000001")) == 0
+    assert main(command(source, tmp_path / "a", "--frames", "1")) == 0
     assert [path.name for path in (tmp_path / "a" / "data").iterdir()] == ["000001.txt"]
     (tmp_path / "split.txt").write_text("000000\n")
     assert main(command(source, tmp_path / "b", "--split", str(tmp_path / "split.txt"))) == 0
