@@ -125,11 +125,11 @@ class PriorConfig:
         dimensions_sigma_m: standard deviation of the detector's height, width and length.
     """
 
-    shape_weight: float = 1.0
+    shape_weight: float = 0.15
     height_weight: float = 10.0
     tilt_weight: float = 100.0
     tilt_form: Literal["normal", "cosine"] = "normal"
-    dimensions_weight: float = 0.0
+    dimensions_weight: float = 0.5
     dimensions_sigma_m: tuple[float, float, float] = (0.1, 0.1, 0.4)
 
 

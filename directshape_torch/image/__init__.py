@@ -1,1 +1,1 @@
-"""TBD"""
+"""Image operations: grey levels, gradients, pyramid, bilinear lookup."""
