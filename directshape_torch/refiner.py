@@ -174,10 +174,10 @@ def _no_outcome(state: CarState, unknowns: int) -> _Outcome:
     nothing = state.code.new_zeros(0, 0, dtype=torch.float64)
     none = nothing.long()[:, 0:0].reshape(0)
     square = nothing.reshape(0, unknowns, unknowns)
-    poses = nothing.reshape(0, 4, 4)
+    xyz_yaw = nothing.reshape(0, 4, 4)
     quality = FitQuality.nothing(nothing, 0)
     empty = CarState(state.T_obj_cam[:0], state.code[:0])
-    return _Outcome(empty, none, none, nothing, (), nothing, nothing, square, poses, quality)
+    return _Outcome(empty, none, none, nothing, (), nothing, nothing, square, xyz_yaw, quality)
 
 
 def _is_refined(status: Tensor) -> Tensor:
