@@ -59,7 +59,12 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
 def _add_settings(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--config", type=Path, metavar="FILE", help="settings of the refinement (YAML)")
     group.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting, e.g. photometric.weight=2"
+        "--set",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="KEY=VALUE",
+        help="single settings, e.g. photometric.weight=2",
     )
     group.add_argument("--prior", type=Path, metavar="FILE", help="shape prior (npz); default: the bundled one")
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")

@@ -15,7 +15,8 @@ from directshape_torch.batch.timing import CallTiming, RunTimings, peak_memory_m
 
 def done(**statuses: int) -> dict[str, Any]:
     cars = sum(statuses.values())
-    return {"state": "done", "lines": cars + 1, "cars": cars, "statuses": statuses, "ground_source": "file"}
+    masks = {"masks_left": cars, "masks_right": cars}
+    return {"state": "done", "lines": cars + 1, "cars": cars, "statuses": statuses, "ground_source": "file", **masks}
 
 
 FAILED = {"state": "failed", "reason": "cut short"}
@@ -40,6 +41,8 @@ def test_statuses_are_counted_over_frames_in_a_fixed_order() -> None:
         ({"a": done(behind_camera=2)}, ["all 2 initial boxes lie behind"]),
         ({"a": done(converged=1, too_few_pixels=2)}, ["only 1 of 3 cars were refined"]),
         ({"a": done()}, ["none of the 1 input lines is of class Car"]),
+        ({"a": done(converged=1) | {"masks_right": 0}, "b": done(converged=1)}, []),
+        ({"a": done(converged=1) | {"masks_right": 0}}, ["no car has a mask in the right image"]),
         ({"a": done(converged=1) | {"ground_source": "camera_height"}}, ["the ground of 1 of 1 frames"]),
     ],
 )
