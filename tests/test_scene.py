@@ -1,0 +1,115 @@
+"""What a refinement is given: shapes are checked, wrong input is named with a cure; statuses and errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from helpers.synthetic_scene import cached_street
+
+from directshape_torch.checks import check_shape
+from directshape_torch.errors import (
+    ConfigError,
+    DataFormatError,
+    DirectShapeError,
+    InputError,
+    MeshError,
+    MissingDependencyError,
+    ResumeError,
+)
+from directshape_torch.scene import GroundPlane, Occluders, StereoCamera
+from directshape_torch.status import Status
+
+
+def test_a_flipped_baseline_is_refused() -> None:
+    K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+    left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
+    right = torch.cat([K, torch.tensor([[378.0], [0.0], [0.0]])], dim=1)[None]
+    with pytest.raises(InputError, match=r"P_right: expected a camera to the right .* got baseline -0\.5400 m; swap"):
+        StereoCamera.from_projections(left, right)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"sizes": torch.tensor([[121, 160]])}, "sizes: expected (height, width) within (1..120, 1..160)"),
+        ({"sizes": torch.tensor([[0, 160]])}, "sizes: expected"),
+        ({"frame_ids": ("a", "b")}, "frame_ids: expected 1 names, got 2"),
+        ({"images_right": torch.zeros(1, 3, 120, 161)}, "images_right: expected shape (1, 3, 120, 160)"),
+        ({"images_left": torch.zeros(120, 160, 3)}, "images_left: expected shape (F, 3, H, W), got (120, 160, 3)"),
+        ({"images_left": torch.zeros(1, 3, 120, 160, dtype=torch.uint8)}, "divide by 255"),
+        ({"ground": GroundPlane.from_camera_height(1.6, 2)}, "ground: expected 1 frames, got 2"),
+    ],
+)
+def test_wrong_frames_are_named(changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError) as error:
+        replace(cached_street()[1].frames, **changes)
+    assert text in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("T_cam_obj", torch.zeros(2, 3, 4)),
+        ("dimensions_hwl", torch.zeros(3, 3)),
+        ("box_2d", torch.zeros(2, 5)),
+        ("score", torch.zeros(2, 1)),
+        ("mask_right", torch.zeros(2, 50, 160)),
+        ("has_mask_left", torch.zeros(3, dtype=torch.bool)),
+    ],
+)
+def test_wrong_detections_are_named(name: str, wrong: torch.Tensor) -> None:
+    with pytest.raises(InputError, match=f"{name}: expected shape"):
+        replace(cached_street()[1].detections, **{name: wrong})
+
+
+def test_ground_planes_point_up_and_are_normalised() -> None:
+    up = torch.tensor([[0.0, -1.0, 0.0]])
+    with pytest.raises(InputError, match=r"normal: expected a normal pointing up"):
+        GroundPlane(-up, torch.ones(1), ("file",))
+    with pytest.raises(InputError, match=r"normal: expected unit length"):
+        GroundPlane(2 * up, torch.ones(1), ("file",))
+    with pytest.raises(InputError, match=r"source: expected 1 entries"):
+        GroundPlane(up, torch.ones(1), ())
+
+
+def test_moving_to_a_dtype_keeps_integers_and_masks() -> None:
+    scene = cached_street()[1]
+    frames, detections = scene.frames.to(dtype=torch.float32), scene.detections.to(dtype=torch.float32)
+    assert frames.images_left.dtype == frames.camera.K_left.dtype == frames.ground.normal.dtype == torch.float32
+    assert frames.sizes.dtype == detections.frame_index.dtype == torch.int64
+    assert detections.has_mask_left.dtype == torch.bool
+    assert frames.frame_ids == scene.frames.frame_ids
+
+
+def test_occluders_have_as_many_masks_as_depths() -> None:
+    with pytest.raises(InputError, match="depth_m"):
+        Occluders(torch.zeros(2).long(), torch.zeros(2, 4, 4), torch.zeros(2, 4, 4), torch.zeros(3), torch.zeros(2))
+
+
+def test_letters_stand_for_any_size() -> None:
+    check_shape("points", torch.zeros(0, 3), ("P", 3))
+    with pytest.raises(InputError, match=r"points: expected shape \(P, 3\), got \(3,\); stack them"):
+        check_shape("points", torch.zeros(3), ("P", 3), "stack them")
+
+
+def test_status_codes_are_stable_and_messages_advise() -> None:
+    names = [Status.from_code(code).name for code in range(8)]
+    assert names == [
+        "converged", "max_iterations", "no_mask", "too_few_pixels",
+        "behind_camera", "singular", "non_finite", "rejected_worse",
+    ]  # fmt: skip
+    assert [s.name for s in Status if s.is_refined] == ["converged", "max_iterations"]
+    assert all(Status.from_code(s.code) is s for s in Status)
+    assert len({s.value for s in Status}) == len(Status)
+
+
+def test_errors_share_a_base_and_say_where() -> None:
+    kinds = (InputError, DataFormatError, ConfigError, MeshError, ResumeError, MissingDependencyError)
+    assert all(issubclass(kind, DirectShapeError) for kind in kinds)
+    error = DataFormatError("a/000001.txt", "expected 15 columns", line_number=3, line="Car 0", cure="check it")
+    assert str(error) == "a/000001.txt, line 3: expected 15 columns: 'Car 0'; check it"
+    missing = MissingDependencyError("mitsuba", "render", "rendering")
+    assert "pip install 'directshape_torch[render]'" in str(missing)
