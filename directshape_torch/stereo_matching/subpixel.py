@@ -42,12 +42,10 @@ def refine_disparity(
 ) -> RefinedDisparity:
     """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset.
 
-    Measured on rendered frames of known depth: median error 0.00 px and at most 0.04 px of dependence on the fraction
-    of the disparity, against 0.07 px and 0.2 px of the semi-global matching it starts from.
-
     Example:
         >>> u = torch.arange(60, dtype=torch.float64)
-        >>> left, right = (100 + 50 * torch.sin((u + shift) / 3).repeat(20, 1) for shift in (0.0, 7.3))
+        >>> rows = 30 * torch.cos(u[:20, None] / 2)
+        >>> left, right = (100 + 50 * torch.sin((u + shift) / 3) + rows for shift in (0.0, 7.3))
         >>> refined = refine_disparity(left, right, torch.tensor([[30.0, 10.0]]).double(), u[7:8], u[:1])
         >>> round(float(refined.disparity), 1), bool(refined.reliable)
         (7.3, True)

@@ -24,6 +24,7 @@ from directshape_torch.scene import StereoCamera
 SIZE = (400, 160)
 FOCAL_PX, BASELINE_M = 300.0, 0.5
 TRUE = torch.tensor([-0.3, 0.1, 0.2, -0.5, 0.05, 0.1, -0.2, 0.1, 0.1, -0.3], dtype=torch.float64)
+TRUE_VERTICAL = torch.tensor([0.1, 0.2, 0, 0, 0, 0.05, 0, 0, 0, 0], dtype=torch.float64)
 
 
 def camera() -> StereoCamera:
@@ -40,7 +41,8 @@ def observations(count: int, outliers: float, lower_half: bool = False) -> Dispa
         uv[:, 1] = 80 + uv[:, 1] / 2
     bias = polynomial_basis(uv, SIZE) @ TRUE + 0.1 * torch.randn(count, generator=generator).double()
     wrong = torch.rand(count, generator=generator) < outliers
-    return DisparityObservations(uv, torch.where(wrong, bias + 3.0, bias), torch.full_like(bias, 20.0))
+    vertical = polynomial_basis(uv, SIZE) @ TRUE_VERTICAL + 0.1 * torch.randn(count, generator=generator).double()
+    return DisparityObservations(uv, torch.where(wrong, bias + 3.0, bias), vertical, torch.full_like(bias, 20.0))
 
 
 def image_grid() -> Tensor:
@@ -52,6 +54,8 @@ def test_fit_recovers_the_field_under_a_fifth_of_wrong_matches_on_one_side() -> 
     fit = fit_disparity_field(observations(4000, outliers=0.2), SIZE, camera(), "lidar", ("000107",))
     error = fit.field.bias(image_grid()) - polynomial_basis(image_grid(), SIZE) @ TRUE
     assert float(error.abs().mean()) < 0.03
+    rows = fit.field.vertical(image_grid()) - polynomial_basis(image_grid(), SIZE) @ TRUE_VERTICAL
+    assert float(rows.abs().mean()) < 0.03
     assert fit.statistics.mad_after_px < fit.statistics.mad_before_px
     assert fit.statistics.uncovered_cells == ()
     assert fit.field.provenance["frames"] == "000107"

@@ -57,6 +57,16 @@ def test_refinement_follows_the_row_shift() -> None:
     torch.testing.assert_close(refined.disparity, torch.full((2,), 6.0, dtype=torch.float64), atol=1e-3, rtol=0)
 
 
+def test_an_unknown_row_offset_is_found_and_does_not_leak_into_the_disparity() -> None:
+    u, v = np.meshgrid(np.arange(160.0), np.arange(60.0))
+    left, right = torch.from_numpy(waves(u, v)), torch.from_numpy(waves(u + 6, v - 0.3))
+    uv = torch.tensor([[70.0, 30.0], [90.0, 25.0]], dtype=torch.float64)
+    start = torch.full((2,), 6.2, dtype=torch.float64)
+    refined = refine_disparity(left, right, uv, start, torch.zeros(2, dtype=torch.float64))
+    torch.testing.assert_close(refined.row_shift, torch.full((2,), -0.3, dtype=torch.float64), atol=0.03, rtol=0)
+    torch.testing.assert_close(refined.disparity, torch.full((2,), 6.0, dtype=torch.float64), atol=0.03, rtol=0)
+
+
 def test_flat_patches_borders_and_nothing_are_not_reliable() -> None:
     flat = torch.full((40, 80), 100.0, dtype=torch.float64)
     uv, start = torch.tensor([[40.0, 20.0]], dtype=torch.float64), torch.tensor([5.0], dtype=torch.float64)
