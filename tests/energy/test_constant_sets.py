@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -143,9 +144,14 @@ def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
     torch.testing.assert_close(softer.zeta, term.zeta / 4)
 
 
-def test_a_ray_that_misses_the_bounds_counts_as_background() -> None:
-    problem, state = _problem(DEFAULT)
-    gone = problem.project(_translated(state, [80.0, 0.0, 0.0]))
+SOFT = replace(DEFAULT.silhouette, min_zeta_per_m=0.2, max_zeta_per_m=0.2)
+
+
+@pytest.mark.parametrize("form", ["closest_approach", "product"])
+def test_a_ray_that_misses_the_bounds_counts_as_background(form: Literal["closest_approach", "product"]) -> None:
+    """However soft the contour: so soft here that the distance alone would still give a gradient."""
+    problem, state = _problem(replace(DEFAULT, silhouette=replace(SOFT, form=form)))
+    gone = problem.project(_translated(state, [25.0, 0.0, 0.0]))
     for term in problem.terms:
         if isinstance(term, SilhouetteTerm):
             torch.testing.assert_close(term.pixel_residual(gone), -torch.log(1 - term.foreground))

@@ -76,6 +76,14 @@ def test_accepting_every_step_goes_uphill_but_returns_the_best_state() -> None:
     assert (one.state.x == -1.0).all()
 
 
+def test_the_best_state_on_the_way_is_returned() -> None:
+    """Gauss-Newton on atan(x) from 3 with steps of at most 4.5: -1.5 by hand, then 1.69, then -2.32: it diverges."""
+    problem = ResidualProblem(lambda x, _: torch.atan(x), torch.arange(1), 1, [Stage(1.0, 0, 3)], limit=4.5)
+    result = minimise(problem, start(1, 1, 3.0), replace(PURE, step_tolerance=0.0))
+    assert result.cost_history[0, 1] > result.cost_history[0, 0]
+    assert float(result.state.x) == -1.5
+
+
 def test_each_problem_is_solved_as_if_alone() -> None:
     together = minimise(rosenbrock(5), start(5, 2, -1.3), DAMPED)
     for i in range(5):
