@@ -18,9 +18,14 @@ _POINTS_TO_COVER_CELL = 5
 _BALANCE_GRID = (16, 8)
 # Points of one cell share their scene and its errors: they count as this many independent ones at most.
 _INDEPENDENT_PER_CELL = 10
-_NUM_ITERATIONS = 30
+_NUM_ITERATIONS = 60
 _TUKEY = 4.685
 _SMALLEST_SCALE_PX = 0.02
+# Aligned patches are good to a tenth of a pixel or two. Wrong ones, on depth edges, err towards the nearer side by a
+# pixel and more: their spread must not become the scale by which they are judged, so it shrinks to the patches' own.
+_FIRST_ITERATIONS = 15
+_SHRINK = 0.93
+_PATCH_SCALE_PX = 0.15
 _SMALLEST_NUMBER = 50
 # Standard deviation expected of a coefficient by its degree, pixels: what keeps the fit tame where data is thin.
 _COEFFICIENT_SIGMA_PX = (5.0, 2.0, 1.0, 0.5, 0.5)
@@ -116,13 +121,17 @@ def _robust_ridge(
     bias_px: Tensor,  # (P,)
     weight: Tensor,  # (P,)
 ) -> Tensor:  # (10,)
-    """Tukey's biweight from a start that is the median alone; its scale is the spread of the residuals."""
+    """Tukey's biweight from a start that is the median alone; its scale shrinks from the residuals' spread to the
+    accuracy of the patches, because the outliers are one-sided."""
     sigma = torch.tensor([_COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=basis.dtype)
     coefficients = torch.zeros_like(sigma)
     coefficients[0] = bias_px.median()
-    for _ in range(_NUM_ITERATIONS):
+    scale = torch.zeros_like(sigma[0])
+    for iteration in range(_NUM_ITERATIONS):
         residual = bias_px - basis @ coefficients
-        scale = (1.4826 * residual.abs().median()).clamp_min(_SMALLEST_SCALE_PX)
+        spread = (1.4826 * residual.abs().median()).clamp_min(_SMALLEST_SCALE_PX)
+        shrunk = torch.minimum(scale, (_SHRINK * scale).clamp_min(_PATCH_SCALE_PX))
+        scale = spread if iteration < _FIRST_ITERATIONS else shrunk
         robust = (1 - (residual / (_TUKEY * scale)) ** 2).clamp_min(0) ** 2
         weighted = basis * (weight * robust)[:, None]
         H = weighted.T @ basis + torch.diag(scale**2 / sigma**2)
