@@ -118,7 +118,14 @@ K_SMALL = torch.tensor([[80.0, 0, 44.0], [0, 80.0, 30.0], [0, 0, 1]], dtype=torc
 T_RIGHT_CAM = se3.exp(torch.tensor([-0.5, -0.003, 0.004, 0.002, -0.004, 0.001], dtype=torch.float64))
 
 
-def _residual(depth: Tensor, uv: Tensor, image: Tensor, scale: float = 1.0, bias: Tensor | None = None, vertical: Tensor | None = None):  # type: ignore[no-untyped-def]
+def _residual(
+    depth: Tensor,
+    uv: Tensor,
+    image: Tensor,
+    scale: float = 1.0,
+    bias: Tensor | None = None,
+    vertical: Tensor | None = None,
+):  # type: ignore[no-untyped-def]
     pattern = torch.tensor(DSO_PATTERN, dtype=torch.float64)
     rays = rays_from_pixels(uv[:, None] + pattern / scale, K_SMALL)
     count = len(uv)
