@@ -68,6 +68,7 @@ def _add_settings(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument("--prior", type=Path, metavar="FILE", help="shape prior (npz); default: the bundled one")
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
+    group.add_argument("--threads", type=int, metavar="N", help="of the CPU; 1 is by far the best on a busy machine")
     group.add_argument("--batch-frames", type=int, default=1, metavar="N", help="frames in one call (default: 1)")
 
 
@@ -87,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.progress import ProgressBar
 
+    _limit_threads(args.threads)
     options = RefineOptions(args.meshes, args.overlays, args.batch_frames)
     refiner = make_refiner(args.config, args.set, args.prior, args.device)
     with ProgressBar() as progress:
@@ -96,6 +98,17 @@ def run(args: argparse.Namespace) -> int:
     print(format_summary(summary))
     print(f"results  {args.out}")
     return summary.exit_code
+
+
+def _limit_threads(num_threads: int | None) -> None:
+    """PyTorch's threads wait for each other by spinning, so on a busy machine two are many times slower than one."""
+    import torch
+
+    if num_threads is None:
+        return
+    if num_threads < 1:
+        raise InputError("--threads", "at least 1", str(num_threads))
+    torch.set_num_threads(num_threads)
 
 
 def make_refiner(config: Path | None, overrides: list[str], prior: Path | None, device: str) -> DirectShapeRefiner:

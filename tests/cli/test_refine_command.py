@@ -142,6 +142,17 @@ def test_stereo_bias_is_used_and_hashed(source: Path, tmp_path: Path, capsys: py
     assert "sha256 of 'stereo_bias'" in capsys.readouterr().err
 
 
+def test_threads_are_those_asked_for(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = torch.get_num_threads()
+    try:
+        assert main(command(source, tmp_path, "--threads", "1")) == 0
+        assert json.loads((tmp_path / "timings.json").read_text())["threads"] == 1
+    finally:
+        torch.set_num_threads(before)
+    assert main(command(source, tmp_path, "--threads", "0")) == 2
+    assert "--threads: expected at least 1, got 0" in capsys.readouterr().err
+
+
 def test_unknown_device_is_refused() -> None:
     with pytest.raises(InputError, match="--device: expected a device of this machine, got 'gpu7'"):
         find_device("gpu7")
