@@ -161,7 +161,7 @@ class CocoFileMasks:
                     masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))
         return [mask for mask in masks if mask is not None]
 
-    def files(self, frame_id: str) -> tuple[Path, ...]: - the same two files serve all frames
+    def files(self, frame_id: str) -> tuple[Path, ...]:  # the same two files serve all frames
         return tuple(path for path in (self.left, self.right) if path is not None)
 
     def _entries(self, side: Side, path: Path) -> dict[int, list[tuple[int, Mapping[str, Any]]]]:
