@@ -72,7 +72,8 @@ class SilhouetteConfig:
         probability_floor: foreground probabilities are clamped to [floor, 1 - floor].
         residual_floor: smallest residual in the reweighting 1/r.
         min_zeta_per_m, max_zeta_per_m: bounds of zeta.
-        saturation: |zeta * sdf| beyond which the projection counts as certain and has no gradient.
+        saturation: |zeta * sdf| beyond which the projection counts as certain and has no gradient (closest approach
+            only).
     """
 
     weight: float = 12.0
@@ -97,7 +98,7 @@ class PhotometricConfig:
         truncated: residuals beyond lost_grey_levels (reflections, wrong matches) cost no more than a lost pixel.
         pixel_set: "hit" (the paper) or "hit_and_mask" (hit and p_fg > 0.5).
         min_ray_cosine: rays closer to the surface's tangent are grazing and lost.
-        gain: match brightness and contrast of the two images per car at the start of each stage.
+        gain: match the brightness of the two images, by one factor per car, at the start of each stage.
     """
 
     weight: float = 1.0

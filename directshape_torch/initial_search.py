@@ -8,23 +8,20 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SearchConfig
+from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
-from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.problem import where_rows
 
 
-def search_start(
-    problem: CarProblem, initial: CarState, frames: FrameBatch, detections: Detections, config: SearchConfig
-) -> CarState:
+def search_start(problem: CarProblem, initial: CarState, cars: CarBatch, config: SearchConfig) -> CarState:
     """The cheapest of the input state and its moved copies, for each car by itself, at the first stage's settings."""
     if not config.disparity_offsets_px and not config.yaw_offsets_deg:
         return initial
     problem.begin_stage(problem.stages()[0], initial)
     best, best_cost = initial, problem.cost(initial)
-    focal_baseline = frames.camera.K_left[:, 0, 0] * frames.camera.baseline
-    fb = focal_baseline[detections.frame_index]
+    fb = -cars.K_left[:, 0, 0] * cars.T_right_cam[:, 0, 3]
     for offset_px in config.disparity_offsets_px:
         best, best_cost = _keep_cheaper(problem, best, best_cost, move_by_disparity(initial, fb, offset_px))
     base = best

@@ -43,6 +43,11 @@ class FitQuality:
         nan = torch.full((count,), torch.nan, dtype=torch.float64, device=rows.device)
         return FitQuality(*(nan.index_copy(0, rows, getattr(self, f.name)) for f in fields(self)))
 
+    def where(self, condition: Tensor) -> FitQuality:
+        """The figures where the condition (B,) holds, NaN elsewhere."""
+        values = (getattr(self, f.name) for f in fields(self))
+        return FitQuality(*(torch.where(condition, x, torch.full_like(x, torch.nan)) for x in values))
+
 
 @torch.no_grad()
 def fit_quality(problem: CarProblem, state: CarState) -> FitQuality:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,6 @@ from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.direct_terms import direct_terms
-from directshape_torch.energy.term import Term
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
@@ -75,7 +74,7 @@ class DirectShapeRefiner(nn.Module):
         state, status = input_state, failure.clone()
         outcome = None
         if len(rows):
-            outcome = self._minimise(frames, _take(detections, rows), observation, usable)
+            outcome = self._minimise(frames, detections, observation, usable)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
         return _assemble(self.prior, frames, detections, state, status, rows, outcome)
@@ -85,7 +84,8 @@ class DirectShapeRefiner(nn.Module):
         _check_fit(frames, detections, self.prior)
         detections = _without_empty_masks(detections, _mask_areas(detections))
         observation = pack_pixels(frames, detections, self.config.sampling)
-        terms = self._terms(frames, detections, observation)
+        cars = CarBatch.from_scene(frames, detections)
+        terms = direct_terms(self.config, self.prior, frames, detections, cars, observation)
         state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
         return CarProblem(self.prior, terms, observation.left, observation.right, self.config), state
 
@@ -119,24 +119,17 @@ class DirectShapeRefiner(nn.Module):
             code = torch.where(condition, torch.full_like(code, status.code), code)
         return observation, code
 
-    def _terms(self, frames: FrameBatch, detections: Detections, observation: Observation) -> list[Term]:
-        cars = CarBatch.from_scene(frames, detections)
-        return direct_terms(self.config, self.prior, frames, detections, cars, observation)
-
     def _minimise(
         self, frames: FrameBatch, detections: Detections, observation: Observation | None, usable: Tensor
     ) -> _Outcome:
         assert observation is not None
-        reduced = Observation(
-            observation.left.of_objects(usable),
-            observation.right.of_objects(usable),
-            observation.region_left[usable],
-            observation.region_right[usable],
-        )
-        terms = self._terms(frames, detections, reduced)
-        problem = CarProblem(self.prior, terms, reduced.left, reduced.right, self.config)
-        initial = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
-        start = search_start(problem, initial, frames, detections, self.config.search)
+        seen = observation.of_objects(usable)
+        cars = CarBatch.from_scene(frames, detections).of_objects(usable)
+        terms = direct_terms(self.config, self.prior, frames, detections, cars, seen)
+        problem = CarProblem(self.prior, terms, seen.left, seen.right, self.config)
+        T_cam_obj = detections.T_cam_obj[usable]
+        initial = CarState(se3.inverse(T_cam_obj), self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj))
+        start = search_start(problem, initial, cars, self.config.search)
         minimum = minimise(problem, initial, self.config.solver, start)
         covariance = tangent_covariance(problem, minimum.state)
         return _Outcome(
@@ -144,7 +137,7 @@ class DirectShapeRefiner(nn.Module):
             minimum.status,
             minimum.iterations,
             minimum.cost_history,
-            tuple(term.name for term in terms),
+            tuple(term.name for term in problem.terms),
             problem.term_costs(initial),
             problem.term_costs(minimum.state),
             covariance,
@@ -182,11 +175,6 @@ def _no_outcome(state: CarState, unknowns: int) -> _Outcome:
 
 def _is_refined(status: Tensor) -> Tensor:
     return (status == Status.converged.code) | (status == Status.max_iterations.code)
-
-
-def _take(detections: Detections, rows: Tensor) -> Detections:
-    changed = {f.name: getattr(detections, f.name)[rows] for f in fields(detections) if f.name != "occluders"}
-    return replace(detections, **changed)
 
 
 def _mask_areas(detections: Detections) -> Tensor:
@@ -240,10 +228,13 @@ def _assemble(
         full = torch.full((count, *part.shape[1:]), torch.nan, dtype=torch.float64, device=status.device)
         return full.index_copy(0, rows, part.to(torch.float64))
 
+    def only_refined(values: Tensor) -> Tensor:
+        return torch.where(refined[:, None, None], values, torch.full_like(values, torch.nan))
+
     iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
-    refined = _is_refined(status)[:, None, None]
+    refined = _is_refined(status)
     # The input pose is returned to the bit for cars that were not refined, not inverted twice.
-    T_cam_obj = torch.where(refined, se3.inverse(state.T_obj_cam), detections.T_cam_obj)
+    T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), detections.T_cam_obj)
     return RefinementResult(
         T_cam_obj=T_cam_obj,
         code=state.code,
@@ -252,10 +243,11 @@ def _assemble(
         term_names=outcome.term_names,
         cost_before=spread(outcome.cost_before),
         cost_after=spread(outcome.cost_after),
-        covariance=spread(outcome.covariance),
-        covariance_xyz_yaw=spread(outcome.covariance_xyz_yaw),
+        covariance=only_refined(spread(outcome.covariance)),
+        covariance_xyz_yaw=only_refined(spread(outcome.covariance_xyz_yaw)),
         cost_history=spread(outcome.cost_history),
-        quality=outcome.quality.spread(rows, count),
+        quality=outcome.quality.spread(rows, count).where(refined),
+        input_dimensions_hwl=detections.dimensions_hwl,
         ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
         prior=prior,

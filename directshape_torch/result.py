@@ -51,8 +51,10 @@ class RefinementResult:
         covariance: (B, 6 + K, 6 + K) in the tangent `(v, omega, dcode)` of the object frame; uncalibrated (relative).
             NaN for cars that were not refined.
         covariance_xyz_yaw: (B, 4, 4) of the object origin (x, y, z) in the reference frame and the heading.
-        cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across stages.
+        cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across
+            stages, each of which begins when the slowest car of the batch has ended the one before.
         quality: agreement of each refined car with masks and images.
+        input_dimensions_hwl: (B, 3) of the detections, metres.
         ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
         prior: the shapes.
@@ -69,6 +71,7 @@ class RefinementResult:
     covariance_xyz_yaw: Tensor
     cost_history: Tensor
     quality: FitQuality
+    input_dimensions_hwl: Tensor
     ground_source: tuple[str, ...]
     t_cam_ref: Tensor
     prior: PCAShapePrior
@@ -97,6 +100,8 @@ class RefinementResult:
     def boxes(self) -> KittiBoxes:
         """KITTI boxes of the refined zero level, sub-voxel; the location is the level's own bottom centre.
 
+        Cars that were not refined have the detector's box.
+
         Location is `T_ref_obj` of (mid x, max y, mid z) of the level, not the object origin.
         """
         values = self.prior.values(self.code)
@@ -109,6 +114,10 @@ class RefinementResult:
         location = se3.transform(T_ref_obj, bottom_obj)
         rotation_y = rotation_y_from_pose(T_ref_obj)
         dimensions = torch.stack([height, width, length], dim=-1)
+        # A car that was not refined keeps the detector's box, not one of the mean shape.
+        refined = self.refined[:, None]
+        dimensions = torch.where(refined, dimensions, self.input_dimensions_hwl)
+        location = torch.where(refined, location, T_ref_obj[:, :3, 3])
         return KittiBoxes(dimensions, location, rotation_y, alpha_from_kitti(location, rotation_y))
 
     def mesh(self, index: int) -> trimesh.Trimesh:

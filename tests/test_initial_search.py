@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import cached_street, disturbed
+from helpers.synthetic_scene import Street, cached_street, disturbed
 
 from directshape_torch.config import SearchConfig
+from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
@@ -44,17 +45,21 @@ def test_the_cheapest_start_wins_and_never_loses_to_the_input() -> None:
     detections = disturbed(scene.detections, 0.3, 0.2)
     problem, initial = DirectShapeRefiner(prior, DEFAULT).problem(scene.frames, detections)
     wide = SearchConfig((-2.0, -1.0, 1.0, 2.0), (-10.0, 10.0))
-    start = search_start(problem, initial, scene.frames, detections, wide)
+    start = search_start(problem, initial, CarBatch.from_scene(scene.frames, detections), wide)
     problem.begin_stage(problem.stages()[0], initial)
     assert (problem.cost(start) <= problem.cost(initial)).all()
     moved = (start.T_obj_cam - initial.T_obj_cam).abs().amax((1, 2)) > 0
     assert moved.any()
 
 
+def _cars(scene: Street) -> CarBatch:
+    return CarBatch.from_scene(scene.frames, scene.detections)
+
+
 def test_no_offsets_are_no_search() -> None:
     prior, scene = cached_street()
     problem, initial = DirectShapeRefiner(prior, DEFAULT).problem(scene.frames, scene.detections)
-    start = search_start(problem, initial, scene.frames, scene.detections, SearchConfig((), ()))
+    start = search_start(problem, initial, _cars(scene), SearchConfig((), ()))
     assert torch.equal(start.T_obj_cam, initial.T_obj_cam)
 
 
@@ -62,5 +67,5 @@ def test_a_perfect_start_is_kept() -> None:
     scene = cached_street()[1]
     problem, initial = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).problem(scene.frames, scene.detections)
     exact = CarState(initial.T_obj_cam, scene.code)
-    start = search_start(problem, exact, scene.frames, scene.detections, SearchConfig((-3.0, 3.0), (-15.0, 15.0)))
+    start = search_start(problem, exact, _cars(scene), SearchConfig((-3.0, 3.0), (-15.0, 15.0)))
     torch.testing.assert_close(start.T_obj_cam, exact.T_obj_cam)

@@ -36,8 +36,8 @@ def refiner(config: RefinerConfig = DEFAULT) -> DirectShapeRefiner:
 
 @lru_cache(maxsize=1)
 def small_street() -> Street:
-    """One car in an image of another size."""
-    return street(ellipsoid_prior(), [(0.5, 1.65, 9.0)], [0.8], size_wh=(131, 97), focal_px=130.0)
+    """One car, cut off by the right border, in an image of another size."""
+    return street(ellipsoid_prior(), [(4.0, 1.65, 9.0)], [0.8], size_wh=(131, 97), focal_px=130.0)
 
 
 @lru_cache(maxsize=1)
@@ -59,7 +59,7 @@ def assert_same(a: RefinementResult, b: RefinementResult, tolerance: float = 1e-
 def rows(result: RefinementResult, index: list[int]) -> RefinementResult:
     names = (
         "T_cam_obj", "code", "status_code", "iterations", "cost_before", "cost_after",
-        "covariance", "covariance_xyz_yaw", "cost_history", "t_cam_ref",
+        "covariance", "covariance_xyz_yaw", "cost_history", "t_cam_ref", "input_dimensions_hwl",
     )  # fmt: skip
     return replace(result, **{name: getattr(result, name)[index] for name in names})
 
@@ -72,6 +72,12 @@ def test_a_batch_of_frames_equals_a_loop_over_them(config: RefinerConfig) -> Non
     first, second = (refiner(config)(*part) for part in parts)
     assert_same(rows(batch, [0, 1]), first)
     assert_same(rows(batch, [2]), second)
+
+
+def test_the_car_of_the_small_street_is_cut_off_by_the_border() -> None:
+    mask = small_street().detections.mask_left[0] > 0.5
+    assert mask[:, -1].any()
+    assert not mask[:, 0].any()
 
 
 def test_a_batch_of_cars_equals_a_loop_over_them() -> None:

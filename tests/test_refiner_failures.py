@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 
 import pytest
@@ -247,3 +247,46 @@ def test_a_failed_car_has_its_costs_or_none_but_never_a_refined_state() -> None:
     assert result.status == [Status.non_finite] * 2
     assert torch.equal(result.T_cam_obj, scene.detections.T_cam_obj)
     assert (result.code == 0).all()
+
+
+def test_a_car_that_is_not_refined_keeps_the_detectors_box_and_has_no_figures() -> None:
+    frames, detections = with_third(_no_mask)
+    detections = replace(detections, dimensions_hwl=torch.tensor([[2.2, 2.0, 5.2]]).double().repeat(3, 1))
+    result = refine(frames, detections)
+    assert result.status[2] is Status.no_mask
+    boxes = result.boxes()
+    assert torch.equal(boxes.dimensions_hwl[2], detections.dimensions_hwl[2])
+    torch.testing.assert_close(boxes.location_ref[2], result.T_ref_obj[2, :3, 3])
+    assert result.covariance[2].isnan().all()
+    assert result.covariance_xyz_yaw[2].isnan().all()
+    assert result.quality.mask_iou_left[2].isnan()
+    assert result.quality.mask_iou_left[:2].isfinite().all()
+
+
+def test_nearer_cars_hide_right_pixels_even_of_cars_without_a_right_mask_and_when_not_refined_themselves() -> None:
+    """What hides a car in the right image is known from all detections, wherever the warp may land."""
+    frames, detections = base()
+    everything = torch.ones_like(detections.mask_right[:1])
+    wall = replace(
+        select(detections, torch.tensor([0])),
+        T_cam_obj=_at_depth(detections.T_cam_obj[:1], 0.9),
+        mask_left=torch.zeros_like(everything),
+        mask_right=everything,
+    )
+    far = replace(select(detections, torch.tensor([1])), has_mask_right=torch.tensor([False]))
+    both = joined_cars([far, wall])
+    result = refine(frames, both)
+    assert result.status[1] is Status.behind_camera
+    # Every right pixel is behind the wall, so nothing can be compared photometrically.
+    assert not (result.quality.matched_share[0] > 0)
+
+
+def _at_depth(T_cam_obj: Tensor, depth_m: float) -> Tensor:
+    moved = T_cam_obj.clone()
+    moved[:, 2, 3] = depth_m
+    return moved
+
+
+def joined_cars(parts: list[Detections]) -> Detections:
+    names = [f.name for f in fields(Detections) if f.name != "occluders"]
+    return Detections(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
+import torch
 from torch import Tensor
 
 from directshape_torch.scene import Detections, FrameBatch
@@ -14,6 +15,7 @@ class CarBatch:
     """Per-car constants of B cars.
 
     Attributes:
+        detection_row: (B,) row of each car among the detections of the call.
         frame_index: (B,) frame of each car.
         focal_over_depth: (B,) focal length over INPUT depth, pixels per metre: zeta comes from the input depth for the
             whole call, for a zeta that follows the state would let a car lower its cost by moving.
@@ -25,6 +27,7 @@ class CarBatch:
         detector_hwl: (B, 3).
     """
 
+    detection_row: Tensor
     frame_index: Tensor
     focal_over_depth: Tensor
     K_left: Tensor
@@ -39,6 +42,7 @@ class CarBatch:
         f = detections.frame_index
         depth = detections.T_cam_obj[:, 2, 3]
         return cls(
+            detection_row=torch.arange(len(f), device=f.device),
             frame_index=f,
             focal_over_depth=frames.camera.K_left[f, 0, 0] / depth,
             K_left=frames.camera.K_left[f],

@@ -12,7 +12,6 @@ from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.silhouette_term import silhouette_term
 from directshape_torch.energy.term import Term
 from directshape_torch.image.gradients import grey_levels
-from directshape_torch.observation.occlusion import occlusion_crops
 from directshape_torch.observation.packing import Observation
 from directshape_torch.residuals.priors import (
     PriorResidual,
@@ -34,7 +33,16 @@ def direct_terms(
     cars: CarBatch,
     observation: Observation,
 ) -> list[Term]:
-    """Terms of weight zero are left out, so ablations cost nothing."""
+    """The terms of some cars of a call; those of weight zero are left out, so ablations cost nothing.
+
+    Args:
+        config: weights and forms.
+        prior: the shapes.
+        frames: F frames.
+        detections: all detections of the call, whose masks `cars.detection_row` points into.
+        cars: the B cars to refine.
+        observation: packed pixels of these cars.
+    """
     terms: list[Term] = []
     if config.silhouette.weight > 0:
         terms.append(silhouette_term("left", config.silhouette, cars, observation.left))
@@ -79,15 +87,11 @@ def _photometric_term(
     pyramid = [GreyPair(grey_levels(frames.images_left), grey_levels(frames.images_right), frames.sizes, 1.0)]
     for _ in range(max(stage.image_level for stage in config.stages)):
         pyramid.append(pyramid[-1].halved())
-    hidden = None
-    if config.sampling.occlusion:
-        hidden = occlusion_crops(detections, "right", observation.region_right, config.sampling.occlusion_order)
     return PhotometricTerm(
         config=config.photometric,
         cars=cars,
         pixels=observation.left,
         pyramid=tuple(pyramid),
-        hidden_right=hidden,
+        hidden_right=observation.hidden_right,
         mask_left=detections.mask_left,
-        mask_row=torch.arange(len(detections), device=cars.frame_index.device),
     )

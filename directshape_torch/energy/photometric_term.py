@@ -80,8 +80,7 @@ class PhotometricTerm:
     pixels: PixelSamples  # of the left image
     pyramid: tuple[GreyPair, ...]
     hidden_right: OcclusionCrops | None
-    mask_left: Tensor  # (B of the call, H, W)
-    mask_row: Tensor  # (B,) row of each car in `mask_left` and `hidden_right`
+    mask_left: Tensor  # (detections of the call, H, W)
     fixed: _Fixed | None = None
 
     @property
@@ -121,7 +120,8 @@ class PhotometricTerm:
         norm = self._norm(residual.residual)
         weight = torch.where(usable, fixed.gradient_weight, torch.zeros_like(fixed.gradient_weight))
         # All neighbours share one depth, so their rows are multiples of one: sum the multiples first.
-        J = residual.J_residual_depth
+        J = torch.where(usable[:, None], residual.J_residual_depth, torch.zeros_like(residual.J_residual_depth))
+        norm = robust.RobustValue(*(torch.where(usable[:, None], x, torch.zeros_like(x)) for x in norm))
         first = weight * (fixed.neighbour_weight * norm.gradient_weight * J).sum(dim=1)
         second = weight * (fixed.neighbour_weight * norm.hessian_weight * J * J).sum(dim=1)
         gradient, hessian = fixed.segments.accumulate(depth.J_depth_state, first, second)
@@ -147,9 +147,7 @@ class PhotometricTerm:
 
     def of_objects(self, keep: Tensor) -> PhotometricTerm:
         pixels = self.pixels.of_objects(keep)
-        reduced = replace(
-            self, cars=self.cars.of_objects(keep), pixels=pixels, mask_row=self.mask_row[keep], fixed=None
-        )
+        reduced = replace(self, cars=self.cars.of_objects(keep), pixels=pixels, fixed=None)
         if self.fixed is None:
             return reduced
         kept_pixel = keep[self.pixels.object_index]
@@ -216,9 +214,11 @@ class PhotometricTerm:
         """
         if self.config.pixel_set == "hit":
             return torch.ones_like(uv[..., 0])
-        last = torch.tensor(self.mask_left.shape[:0:-1], device=uv.device) - 1
-        u, v = uv.round().long().clamp_min(0).minimum(last).unbind(-1)
-        return (self.mask_left[self.mask_row[object_index][:, None], v, u] > 0.5).to(uv.dtype)
+        last_of_frame = self.pyramid[0].sizes[self.cars.frame_index[object_index]].flip(-1)[:, None] - 1
+        inside = ((uv >= -0.5) & (uv <= last_of_frame + 0.5)).all(dim=-1)
+        u, v = uv.round().long().clamp_min(0).minimum(last_of_frame).unbind(-1)
+        on_car = self.mask_left[self.cars.detection_row[object_index][:, None], v, u] > 0.5
+        return (inside & on_car).to(uv.dtype)
 
     def _gain(self, fixed: _Fixed, intensity_right: Tensor) -> Tensor:
         """Brightness (B,) of the right image relative to the left one, over each car's pixel set."""
@@ -256,7 +256,7 @@ class PhotometricTerm:
         usable = on_surface & residual.inside
         if self.hidden_right is None:
             return usable
-        crop = self.mask_row[self._require().object_index]
+        crop = self.cars.detection_row[self._require().object_index]
         return usable & ~self.hidden_right.at(crop, residual.uv_right.detach())
 
     def _usable_and_residual(

@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.geometry.box3d import box_corners
-from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.stereo import right_rays, warp_to_right
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.geometry.stereo import right_rays
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
-from directshape_torch.observation.occlusion import Side, hidden_pixels
+from directshape_torch.observation.occlusion import OcclusionCrops, Side, hidden_pixels, occlusion_crops
 from directshape_torch.observation.pixel_sampling import (
     PixelSelection,
     SamplingSettings,
@@ -25,6 +24,9 @@ from directshape_torch.observation.pixel_sampling import (
     sample_pixels,
 )
 from directshape_torch.scene import Detections, FrameBatch
+
+# Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
+_ROW_MARGIN_PX = 8
 
 
 @dataclass(frozen=True)
@@ -72,12 +74,24 @@ class Observation:
     Attributes:
         left, right: packed pixels of the two images.
         region_left, region_right: (B, 4) integer regions (u0, v0, u1, v1), half open, pixels.
+        hidden_right: where nearer instances cover the right image, by row of the detections; None: not asked for.
     """
 
     left: PixelSamples
     right: PixelSamples
     region_left: Tensor
     region_right: Tensor
+    hidden_right: OcclusionCrops | None
+
+    def of_objects(self, keep: Tensor) -> Observation:
+        """What the objects where `keep` (B,) holds see; `hidden_right` stays that of all detections."""
+        return replace(
+            self,
+            left=self.left.of_objects(keep),
+            right=self.right.of_objects(keep),
+            region_left=self.region_left[keep],
+            region_right=self.region_right[keep],
+        )
 
 
 def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConfig) -> Observation:
@@ -91,7 +105,22 @@ def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConf
     regions = _regions(frames, detections, config)
     left = _pack_side(frames, detections, "left", regions[0], config)
     right = _pack_side(frames, detections, "right", regions[1], config)
-    return Observation(left, right, *regions)
+    hidden = None
+    if config.occlusion:
+        strips = _strips_in_right_image(regions[0], frames.sizes[detections.frame_index])
+        hidden = occlusion_crops(detections, "right", strips, config.occlusion_order)
+    return Observation(left, right, *regions, hidden)
+
+
+def _strips_in_right_image(region_left: Tensor, sizes: Tensor) -> Tensor:
+    """Where pixels of the left regions can land in the right image at any depth: their rows, and a few more."""
+    u0, v0, u1, v1 = region_left.unbind(-1)
+    height, width = sizes.unbind(-1)
+    strips = torch.stack(
+        [torch.zeros_like(u0), (v0 - _ROW_MARGIN_PX).clamp_min(0), width, torch.minimum(v1 + _ROW_MARGIN_PX, height)],
+        dim=-1,
+    )
+    return strips * (u1 > u0)[:, None]
 
 
 def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tensor]:
@@ -101,26 +130,6 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
         zero = torch.zeros_like(uv_left[..., 0])
         return zero, zero
     return field.bias(uv_left), field.vertical(uv_left)
-
-
-def projected_box_right(frames: FrameBatch, detections: Detections) -> Tensor:
-    """Bounding boxes (B, 4) of the initial 3D boxes in the right image, NaN for those not wholly in front of it."""
-    camera = frames.camera
-    f = detections.frame_index
-    corners_cam = box_corners(detections.T_cam_obj, detections.dimensions_hwl)
-    K_left = camera.K_left[f][:, None]
-    uv_left = project(corners_cam, K_left)
-    right = warp_to_right(
-        rays_from_pixels(uv_left, K_left),
-        corners_cam[..., 2],
-        camera.K_right[f][:, None],
-        camera.T_right_cam[f][:, None],
-        *residual_offsets(frames, uv_left),
-    )
-    uv = right.uv_right
-    box = torch.cat([uv.amin(dim=1), uv.amax(dim=1)], dim=1)
-    in_front = ((corners_cam[..., 2] > 0.1) & right.in_front).all(dim=1)
-    return torch.where(in_front[:, None], box, torch.full_like(box, torch.nan))
 
 
 def select_pixels(
@@ -142,9 +151,10 @@ def _regions(frames: FrameBatch, d: Detections, config: SamplingConfig) -> tuple
     sizes = frames.sizes[d.frame_index]
     margins = {"margin_px": config.region_margin_px, "margin_share": config.region_margin_share}
     left = region_boxes(d.box_2d, d.mask_left, d.has_mask_left, sizes, join=True, **margins)
-    right = region_boxes(projected_box_right(frames, d), d.mask_right, d.has_mask_right, sizes, join=False, **margins)
-    # Without a mask a side says nothing about the car.
-    return left * d.has_mask_left[:, None], right * d.has_mask_right[:, None]
+    # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
+    nowhere = torch.full_like(d.box_2d, torch.nan)
+    right = region_boxes(nowhere, d.mask_right, d.has_mask_right, sizes, join=False, **margins)
+    return left * d.has_mask_left[:, None], right
 
 
 def _pack_side(
@@ -193,6 +203,7 @@ def _rays_right(
     frame = detections.frame_index[object_index]
     z_input = detections.T_cam_obj[object_index, 2, 3]
     shift = camera.K_left[frame, 0, 0] * camera.baseline[frame] / z_input
+    shift = shift + camera.K_left[frame, 0, 2] - camera.K_right[frame, 0, 2]
     uv_left = torch.stack([uv[:, 0] + shift, uv[:, 1]], dim=-1)
     offsets = residual_offsets(frames, uv_left)
     rays = right_rays(uv, camera.K_right[frame], camera.T_right_cam[frame], *offsets)
