@@ -121,7 +121,7 @@ class _Run:
         loaded = ready.loaded
         try:
             write_frame_outputs(self.out_dir, loaded, result, first_row, self.prior_sha256, self.options)
-        except DirectShapeError as error:
+        except (DirectShapeError, OSError) as error:
             self._fail(loaded.frame_id, error)
             return
         self.record.add(loaded.frame_id, ready.inputs, frame_entry(loaded, result, first_row, self.options))

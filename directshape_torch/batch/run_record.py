@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,9 @@ class RunRecord:
         self.manifest.inputs[frame_id] = inputs
         self.manifest.frames[frame_id] = entry
         if time.monotonic() - self._written_at > _SECONDS_BETWEEN_WRITES:
-            self.write()
+            # On a full disk the frames go on, each to its own error; the write at the end is the one that counts.
+            with suppress(OSError):
+                self.write()
 
     def write(self) -> None:
         """Write `summary.json`."""

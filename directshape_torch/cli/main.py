@@ -30,7 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = make_parser().parse_args(arguments)
     try:
         code: int = args.run(args)
-    except DirectShapeError as error:
+    except (DirectShapeError, OSError) as error:
+        # OSError: a full disk or a folder that may not be written, for which a traceback helps nobody.
         print(f"directshape: error: {' '.join(str(error).split())}", file=sys.stderr)
         return EXIT_WRONG_INPUT
     except KeyboardInterrupt:

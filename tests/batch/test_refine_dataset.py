@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from pathlib import Path
@@ -13,8 +14,10 @@ import pytest
 import torch
 from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN, write_data_set
 
-from directshape_torch.batch.options import RefineOptions
-from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.content_hashes import hash_prior
+from directshape_torch.batch.options import RefineOptions, SilentObserver
+from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
+from directshape_torch.batch.run_record import RunRecord
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.config import RefinerConfig, load_config
 from directshape_torch.errors import DirectShapeError, InputError, ResumeError
@@ -240,6 +243,40 @@ def test_a_truncated_image_is_reported_and_the_others_go_on(root: Path, tmp_path
     image.write_bytes(content)
     assert refine(root, tmp_path / "out").resumed == ("000000", "000002")
     assert files(tmp_path / "out") == files(tmp_path / "whole")
+
+
+def test_a_file_that_cannot_be_written_is_reported_and_the_others_go_on(source: Path, tmp_path: Path) -> None:
+    (tmp_path / "data" / "000001.txt").mkdir(parents=True)
+    (tmp_path / "summary.json").write_text(empty_summary(source, tmp_path / "elsewhere"))
+    summary = refine(source, tmp_path)
+    assert summary.exit_code == 1
+    assert list(summary.failed) == ["000001"]
+    assert "data/000001.txt" in summary.failed["000001"]
+    assert (tmp_path / "data" / "000002.txt").is_file()
+
+
+def empty_summary(source: Path, out: Path) -> str:
+    """What a run leaves that was stopped before its first frame."""
+    run = RunRecord(out, run_manifest(dataset(source), refiner(source), hash_prior(refiner(source).prior)))
+    return run.path.read_text()
+
+
+def test_a_full_disk_is_reported_for_every_frame(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    reasons = []
+
+    class Listener(SilentObserver):
+        def finished(self, frame_id: str, failure: str | None) -> None:
+            monkeypatch.setattr("directshape_torch.batch.run_record._SECONDS_BETWEEN_WRITES", -1.0)
+            monkeypatch.setattr("directshape_torch.io.atomic_files.write_json", full)
+            reasons.append(failure)
+
+    monkeypatch.setattr("directshape_torch.batch.refine_dataset.write_frame_outputs", full)
+    with pytest.raises(OSError, match="No space left"):
+        refine_dataset(dataset(source), refiner(source), tmp_path, observer=Listener())
+    assert reasons == ["[Errno 28] No space left on device"] * len(FRAMES)
 
 
 def test_a_line_of_14_columns_is_reported_with_its_text(root: Path, tmp_path: Path) -> None:
