@@ -17,6 +17,11 @@ from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 
+# Calibration files have six digits or more, and float32 seven.
+_ROTATION_TOLERANCE = 1e-3
+# Resampling by cubic kernels overshoots a little.
+_BRIGHTEST = 1.01
+
 
 class _TensorRecord:
     """Moves every tensor field of a frozen dataclass to a device, and floating ones to a dtype."""
@@ -47,6 +52,10 @@ class StereoCamera(_TensorRecord):
         t_cam_ref: `x_cam = x_ref + t_cam_ref`, (F, 3): `ref` is the frame of labels and result files (KITTI: rectified
             camera 0). Zero where there is no such frame.
         disparity_field: residual disparity of the rig (measured minus true), or None.
+
+    Raises:
+        InputError: wrong shapes, numbers that are not finite, a rotation that is none, or a right camera that is not
+            to the right of the left one.
     """
 
     K_left: Tensor
@@ -64,6 +73,14 @@ class StereoCamera(_TensorRecord):
         for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref"):
             if not bool(getattr(self, name).isfinite().all()):
                 raise InputError(name, "finite numbers", "NaN or infinity", "check the calibration of every frame")
+        _check_rotation("T_right_cam", self.T_right_cam)
+        if (self.baseline <= 0).any():
+            raise InputError(
+                "T_right_cam",
+                "a right camera to the right of the left one (positive baseline)",
+                f"baseline {self.baseline.min().item():.4f} m",
+                "swap the two cameras, or the sign of the baseline",
+            )
 
     @classmethod
     def from_projections(
@@ -92,15 +109,7 @@ class StereoCamera(_TensorRecord):
         t_right = torch.linalg.solve(K_right, P_right[..., 3:])[..., 0]
         T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
         T_right_cam[:, :3, 3] = t_right - t_left
-        camera = cls(K_left.clone(), K_right.clone(), T_right_cam, t_left, disparity_field)
-        if (camera.baseline <= 0).any():
-            raise InputError(
-                "P_right",
-                "a camera to the right of P_left (positive baseline)",
-                f"baseline {camera.baseline.min().item():.4f} m",
-                "swap the two projections, or the sign of the baseline",
-            )
-        return camera
+        return cls(K_left.clone(), K_right.clone(), T_right_cam, t_left, disparity_field)
 
     @property
     def num_frames(self) -> int:
@@ -177,6 +186,12 @@ class FrameBatch(_TensorRecord):
         check_shape("sizes", self.sizes, (num_frames, 2))
         if not self.images_left.is_floating_point() or not self.images_right.is_floating_point():
             raise InputError("images", "floating point in [0, 1]", str(self.images_left.dtype), "divide by 255")
+        for what in ("dtype", "device"):
+            left, right = getattr(self.images_left, what), getattr(self.images_right, what)
+            if left != right:
+                raise InputError("images_right", f"the {what} of images_left ({left})", str(right))
+        _check_at_most_one("images_left", self.images_left)
+        _check_at_most_one("images_right", self.images_right)
         if len(self.frame_ids) != num_frames:
             raise InputError("frame_ids", f"{num_frames} names", f"{len(self.frame_ids)}")
         for name, count in (("camera", self.camera.num_frames), ("ground", len(self.ground.normal))):
@@ -227,7 +242,7 @@ class Detections(_TensorRecord):
     Attributes:
         frame_index: (B,) integer, the frame of each object.
         T_cam_obj: (B, 4, 4) initial pose, object to left camera (KITTI's object frame: x forward, y down, origin on
-            the ground under the box centre).
+            the ground under the box centre). A row with NaN is a car that is not refined.
         dimensions_hwl: (B, 3) height, width, length of the initial box, metres.
         box_2d: (B, 4) left-image box (u_min, v_min, u_max, v_max), pixels.
         score: (B,) the detector's score, any scale.
@@ -251,6 +266,7 @@ class Detections(_TensorRecord):
         check_shape("frame_index", self.frame_index, ("B",))
         count = len(self.frame_index)
         check_shape("T_cam_obj", self.T_cam_obj, (count, 4, 4))
+        _check_rotation("T_cam_obj", self.T_cam_obj[self.T_cam_obj.isfinite().flatten(1).all(dim=1)])
         check_shape("dimensions_hwl", self.dimensions_hwl, (count, 3))
         check_shape("box_2d", self.box_2d, (count, 4))
         check_shape("score", self.score, (count,))
@@ -261,3 +277,27 @@ class Detections(_TensorRecord):
 
     def __len__(self) -> int:
         return len(self.frame_index)
+
+
+def _check_rotation(
+    name: str,
+    transform: Tensor,  # (N, 4, 4), finite
+) -> None:
+    rotation = transform.detach()[:, :3, :3].double()
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().amax(dim=(1, 2))
+    wrong = (error > _ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
+    if wrong.any():
+        row = int(wrong.int().argmax())
+        raise InputError(
+            name,
+            "rotations R with R R^T = I and determinant 1",
+            f"R = {rotation[row].tolist()} in row {row}",
+            "leave scale out of the transform, and build it from a rotation matrix",
+        )
+
+
+def _check_at_most_one(name: str, images: Tensor) -> None:
+    """Values that are not finite are left to the refinement, which fails the cars that need them."""
+    brightest = images.detach().nan_to_num(nan=0.0, posinf=0.0).flatten().amax() if images.numel() else 0.0
+    if brightest > _BRIGHTEST:
+        raise InputError(name, "values in [0, 1]", f"a value of {float(brightest):g}", "divide by 255")

@@ -27,8 +27,42 @@ def test_a_flipped_baseline_is_refused() -> None:
     K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
     left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
     right = torch.cat([K, torch.tensor([[378.0], [0.0], [0.0]])], dim=1)[None]
-    with pytest.raises(InputError, match=r"P_right: expected a camera to the right .* got baseline -0\.5400 m; swap"):
+    with pytest.raises(
+        InputError, match=r"T_right_cam: expected a right camera to the right .* got baseline -0\.5400 m; swap"
+    ):
         StereoCamera.from_projections(left, right)
+    T_right_cam = torch.eye(4)[None].clone()
+    T_right_cam[0, 0, 3] = 0.54
+    with pytest.raises(InputError, match=r"T_right_cam: .* got baseline -0\.5400 m; swap"):
+        StereoCamera(K[None], K[None], T_right_cam, torch.zeros(1, 3))
+
+
+@pytest.mark.parametrize("wrong", [2 * torch.eye(3), torch.diag(torch.tensor([1.0, 1.0, -1.0])), torch.zeros(3, 3)])
+def test_rotations_are_rotations(wrong: torch.Tensor) -> None:
+    scene = cached_street()[1]
+    T_right_cam, T_cam_obj = scene.frames.camera.T_right_cam.clone(), scene.detections.T_cam_obj.clone()
+    T_right_cam[0, :3, :3], T_cam_obj[1, :3, :3] = wrong, wrong
+    with pytest.raises(InputError, match=r"T_right_cam: expected rotations R .* in row 0; leave scale out"):
+        replace(scene.frames.camera, T_right_cam=T_right_cam)
+    with pytest.raises(InputError, match=r"T_cam_obj: expected rotations R .* in row 1; leave scale out"):
+        replace(scene.detections, T_cam_obj=T_cam_obj)
+
+
+def test_poses_may_be_rounded_or_unknown() -> None:
+    detections = cached_street()[1].detections
+    T_cam_obj = detections.T_cam_obj.float().double()
+    T_cam_obj[0] = torch.nan
+    assert len(replace(detections, T_cam_obj=T_cam_obj)) == 2
+
+
+def test_images_of_0_to_255_are_refused_and_nan_is_not() -> None:
+    frames = cached_street()[1].frames
+    for name in ("images_left", "images_right"):
+        with pytest.raises(InputError, match=rf"{name}: expected values in \[0, 1\], got .*; divide by 255"):
+            replace(frames, **{name: 255 * getattr(frames, name)})
+    spoiled = frames.images_left.clone()
+    spoiled[0, 0, 0, :2] = torch.tensor([torch.nan, torch.inf], dtype=spoiled.dtype)
+    assert len(replace(frames, images_left=1.005 * spoiled)) == 1
 
 
 @pytest.mark.parametrize(
@@ -40,6 +74,14 @@ def test_a_flipped_baseline_is_refused() -> None:
         ({"images_right": torch.zeros(1, 3, 120, 161)}, "images_right: expected shape (1, 3, 120, 160)"),
         ({"images_left": torch.zeros(120, 160, 3)}, "images_left: expected shape (F, 3, H, W), got (120, 160, 3)"),
         ({"images_left": torch.zeros(1, 3, 120, 160, dtype=torch.uint8)}, "divide by 255"),
+        (
+            {"images_right": torch.zeros(1, 3, 120, 160)},
+            "images_right: expected the dtype of images_left (torch.float64)",
+        ),
+        (
+            {"images_right": torch.zeros(1, 3, 120, 160, dtype=torch.float64, device="meta")},
+            "images_right: expected the device of images_left (cpu), got meta",
+        ),
         ({"ground": GroundPlane.from_camera_height(1.6, 2)}, "ground: expected 1 frames, got 2"),
     ],
 )

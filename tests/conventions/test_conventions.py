@@ -300,9 +300,9 @@ def test_23_residuals_are_predicted_minus_observed() -> None:
     T = se3.inverse(box3d.pose_from_kitti(vector(0, 1.9, 10), torch.tensor(0.0).double()))[None]
     assert height_prior(T, vector(0, -1, 0)[None], vector(1.65), 0).residual > 0
     prior, scene = cached_street()
-    brighter = replace(scene.frames, images_right=scene.frames.images_right + 0.1)
+    darker_left = replace(scene.frames, images_left=scene.frames.images_left - 0.1)
     config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, gain=False))
-    problem, state = begun_problem(prior, brighter, scene.detections, config)
+    problem, state = begun_problem(prior, darker_left, scene.detections, config)
     term = next(t for t in problem.terms if isinstance(t, PhotometricTerm))
     _, residual = term._usable_and_residual(problem.project(CarState(state.T_obj_cam, scene.code)))
     assert float(residual.residual.median()) == pytest.approx(25.5, abs=3)  # right minus left

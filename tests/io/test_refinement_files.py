@@ -51,6 +51,7 @@ def loaded_frame(objects: list[KittiObject], rows: tuple[int, ...], frame_id: st
     B = sum(row >= 0 for row in rows)
     eye = torch.eye(3, dtype=torch.float64)[None]
     T_right_cam = torch.eye(4, dtype=torch.float64)[None]
+    T_right_cam[0, 0, 3] = -0.54
     image = torch.zeros(1, 3, 4, 4)
     frame = FrameBatch(
         image,
