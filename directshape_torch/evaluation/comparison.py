@@ -106,19 +106,18 @@ def compare_results(
 
 
 def lines_with_left_mask(shapes_dir: Path | str) -> LineFilter:
-    """A filter for `compare_results`: detections that had an instance mask, by the shape files of the refinement.
+    """A filter for `compare_results`: detections that had a left mask, by the shape files of the refinement.
 
     Args:
-        shapes_dir: `OUT/shapes` with `NNNNNN.npz`. Lines with status `no_mask`, and lines that were only copied, are
-            left out.
+        shapes_dir: `OUT/shapes` with `NNNNNN.npz`. Lines without a left mask, and lines that were only copied,
+            are left out.
     """
     lines: dict[str, frozenset[int]] = {}
 
     def keep(frame_id: str, line: int) -> bool:
         if frame_id not in lines:
             shapes = read_shapes(Path(shapes_dir) / f"{frame_id}.npz")
-            pairs = zip(shapes.input_lines.tolist(), shapes.statuses, strict=True)
-            lines[frame_id] = frozenset(number for number, status in pairs if status != "no_mask")
+            lines[frame_id] = frozenset(shapes.input_lines[shapes.has_mask_left].tolist())
         return line in lines[frame_id]
 
     return keep

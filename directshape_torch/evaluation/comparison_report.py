@@ -74,7 +74,7 @@ def _heading(comparison: Comparison) -> str:
         f"{comparison.num_frames} frames; {cars}"
     ]
     if comparison.num_filtered_out:
-        lines.append(f"{comparison.num_filtered_out} more detections have no mask and are left out")
+        lines.append(f"{comparison.num_filtered_out} more detections have no left mask and are left out")
     if overall.num_detections:
         lines.append(
             "in brackets: 95 % intervals, bootstrap over cars" if overall.num_cars > 1 else "one car: no intervals"

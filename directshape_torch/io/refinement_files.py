@@ -96,6 +96,11 @@ def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: st
         costs_before=_numpy(result.cost_before[rows]),
         costs_after=_numpy(result.cost_after[rows]),
         iterations=_numpy(result.iterations[rows]).astype(np.int64),
+        has_mask_left=_numpy(loaded.detections.has_mask_left),
+        mask_iou_left=_numpy(result.quality.mask_iou_left[rows]),
+        mask_iou_right=_numpy(result.quality.mask_iou_right[rows]),
+        photometric_errors_grey=_numpy(result.quality.photometric_error_grey[rows]),
+        matched_shares=_numpy(result.quality.matched_share[rows]),
     )
 
 

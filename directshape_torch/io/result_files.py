@@ -100,6 +100,10 @@ class ShapeArrays:
         term_names: (T,) text.
         costs_before, costs_after: (B, T) cost of each term.
         iterations: (B,).
+        has_mask_left: (B,) bool, whether a mask of the left image was matched.
+        mask_iou_left, mask_iou_right: (B,) overlap of the projected shape with its masks; NaN where not refined.
+        photometric_errors_grey: (B,) mean absolute difference of the images, grey levels of 0..255.
+        matched_shares: (B,) share of the photometric pixels that could be compared.
     """
 
     frame_id: str
@@ -120,6 +124,11 @@ class ShapeArrays:
     costs_before: NDArray[np.floating[Any]]
     costs_after: NDArray[np.floating[Any]]
     iterations: NDArray[np.int64]
+    has_mask_left: NDArray[np.bool_]
+    mask_iou_left: NDArray[np.floating[Any]]
+    mask_iou_right: NDArray[np.floating[Any]]
+    photometric_errors_grey: NDArray[np.floating[Any]]
+    matched_shares: NDArray[np.floating[Any]]
 
     def __post_init__(self) -> None:
         B, T = len(self.input_lines), len(self.term_names)
@@ -139,6 +148,11 @@ class ShapeArrays:
             "costs_before": (B, T),
             "costs_after": (B, T),
             "iterations": (B,),
+            "has_mask_left": (B,),
+            "mask_iou_left": (B,),
+            "mask_iou_right": (B,),
+            "photometric_errors_grey": (B,),
+            "matched_shares": (B,),
         }
         for name, shape in expected.items():
             got = np.shape(getattr(self, name))

@@ -154,6 +154,11 @@ def _shapes(frame_id: str, lines: list[int], statuses: list[str]) -> ShapeArrays
         messages=("",) * count,
         term_names=(),
         iterations=np.zeros(count, dtype=np.int64),
+        has_mask_left=np.array([status != "no_mask" for status in statuses]),
+        mask_iou_left=np.full(count, 0.9),
+        mask_iou_right=np.full(count, 0.9),
+        photometric_errors_grey=np.full(count, 4.0),
+        matched_shares=np.ones(count),
         **values,
     )
 
@@ -164,7 +169,7 @@ def test_cars_without_a_mask_are_left_out(folders: tuple[Path, Path, Path], tmp_
     comparison = compare_results(*folders, keep_line=lines_with_left_mask(tmp_path / "shapes"))
     assert [(c.frame_id, c.detection_line) for c in comparison.cars] == [("000001", 1), ("000002", 2)]
     assert comparison.num_filtered_out == 1
-    assert "1 more detections have no mask" in format_comparison(comparison)
+    assert "1 more detections have no left mask" in format_comparison(comparison)
 
 
 def test_frames_and_split_choose(folders: tuple[Path, Path, Path], tmp_path: Path):

@@ -16,6 +16,7 @@ from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.quality import FitQuality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, StereoCamera
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
@@ -91,6 +92,9 @@ def result(statuses: list[Status]) -> RefinementResult:
         covariance=torch.eye(8).repeat(B, 1, 1),
         covariance_xyz_yaw=torch.eye(4).repeat(B, 1, 1),
         cost_history=torch.zeros(B, 3),
+        quality=FitQuality.nothing(T_cam_obj, B),
+        input_dimensions_hwl=torch.ones(B, 3, dtype=torch.float64),
+        ground_source=("file",) * B,
         t_cam_ref=T_CAM_REF.expand(B, 3),
         prior=box_prior(),
     )
@@ -125,7 +129,7 @@ def test_one_frame(tmp_path: Path, objects: list[KittiObject]) -> None:
     assert shapes.messages[1] == Status.no_mask.value
     np.testing.assert_allclose(shapes.T_ref_obj[2, :3, 3], [2.0, 1.6, 12.0])
     np.testing.assert_allclose(shapes.T_cam_obj[2, :3, 3], [2.06, 1.59, 12.003])
-    np.testing.assert_allclose(shapes.boxes_hwl, [[1.5, 1.6, 4.0]] * 3, atol=1e-6)
+    np.testing.assert_allclose(shapes.boxes_hwl, [[1.5, 1.6, 4.0], [1.0, 1.0, 1.0], [1.5, 1.6, 4.0]], atol=1e-6)
     assert shapes.codes.tolist() == [[0, 1], [2, 3], [4, 5]]
 
 

@@ -100,6 +100,11 @@ def shapes(num_cars: int) -> ShapeArrays:
         costs_before=random.random((B, T)),
         costs_after=random.random((B, T)),
         iterations=np.full(B, 7, dtype=np.int64),
+        has_mask_left=np.ones(B, dtype=bool),
+        mask_iou_left=np.full(B, 0.9),
+        mask_iou_right=np.full(B, 0.9),
+        photometric_errors_grey=np.full(B, 4.0),
+        matched_shares=np.ones(B),
     )
 
 

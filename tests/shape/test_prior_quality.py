@@ -52,4 +52,4 @@ def test_bundled_prior_takes_on_a_real_saloon():
     sdf = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file), GridSpec.for_cars()))
     prior = PCAShapePrior.load_bundled()
     assert fit_code(prior.with_num_codes(5), sdf).mean_error_cm < 3.0
-    assert fit_code(prior, sdf).mean_error_cm < 2.6
+    assert fit_code(prior, sdf).mean_error_cm < 2.8
