@@ -50,7 +50,7 @@ def write_frame_outputs(
 def frame_entry(
     loaded: LoadedFrame, result: RefinementResult, first_row: int, options: RefineOptions
 ) -> dict[str, Any]:
-    """The entry of a finished frame."""
+    """The entry of a finished frame; it lists the meshes, because which cars have one only the result knows."""
     num_cars = len(loaded.detections)
     statuses = Counter(status.name for status in result.status[first_row : first_row + num_cars])
     return {
@@ -62,7 +62,19 @@ def frame_entry(
         "ground_source": loaded.frame.ground.source[0],
         "statuses": dict(statuses),
         "outputs": sorted(options.outputs),
+        "mesh_files": _mesh_files(loaded, result, first_row, options),
     }
+
+
+def _mesh_files(loaded: LoadedFrame, result: RefinementResult, first_row: int, options: RefineOptions) -> list[str]:
+    """Paths in the output folder."""
+    if options.meshes is None:
+        return []
+    from directshape_torch.batch.mesh_files import car_mesh_paths
+
+    return sorted(
+        path.as_posix() for path in car_mesh_paths(Path(), loaded, result, first_row, options.meshes).values()
+    )
 
 
 def failed_entry(reason: str) -> dict[str, Any]:

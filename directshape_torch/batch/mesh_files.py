@@ -25,6 +25,18 @@ def mesh_path(out_dir: Path, frame_id: str, line_number: int, mesh_format: MeshF
     return out_dir / "meshes" / f"{frame_id}_{line_number}.{mesh_format}"
 
 
+def car_mesh_paths(
+    out_dir: Path, loaded: LoadedFrame, result: RefinementResult, first_row: int, mesh_format: MeshFormat
+) -> dict[int, Path]:
+    """The mesh file of each refined car of a frame, by the car's row in `result`."""
+    refined = result.refined.tolist()
+    return {
+        first_row + car: mesh_path(out_dir, loaded.frame_id, loaded.input_objects[row].line_number, mesh_format)
+        for car, row in enumerate(loaded.row_of_detection)
+        if refined[first_row + car]
+    }
+
+
 def write_car_meshes(
     out_dir: Path, loaded: LoadedFrame, result: RefinementResult, first_row: int, mesh_format: MeshFormat
 ) -> None:
@@ -33,13 +45,8 @@ def write_car_meshes(
     PLY files are in the left camera frame, metres. GLB files hold the same vertices below a node that turns them into
     glTF's axes (y up).
     """
-    refined = result.refined.tolist()
-    for car, row in enumerate(loaded.row_of_detection):
-        if refined[first_row + car]:
-            line_number = loaded.input_objects[row].line_number
-            mesh = result.mesh(first_row + car)
-            path = mesh_path(out_dir, loaded.frame_id, line_number, mesh_format)
-            write_bytes(path, mesh_bytes(mesh, mesh_format))
+    for car, path in car_mesh_paths(out_dir, loaded, result, first_row, mesh_format).items():
+        write_bytes(path, mesh_bytes(result.mesh(car), mesh_format))
 
 
 def mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:

@@ -61,7 +61,8 @@ class RunRecord:
         """Note how a frame ended; outputs of an earlier run that are still valid stay listed."""
         earlier = self.manifest.frames.get(frame_id, {})
         if entry["state"] == "done" and self.manifest.is_done(frame_id):
-            entry = {**entry, "outputs": sorted({*earlier["outputs"], *entry["outputs"]})}
+            lists = ("outputs", "mesh_files")
+            entry = {**entry, **{name: sorted({*earlier.get(name, ()), *entry[name]}) for name in lists}}
         self.manifest.inputs[frame_id] = inputs
         self.manifest.frames[frame_id] = entry
         if time.monotonic() - self._written_at > _SECONDS_BETWEEN_WRITES:
@@ -94,10 +95,10 @@ class RunRecord:
     def _has_outputs(self, frame_id: str, outputs: Sequence[str]) -> bool:
         """Whether the outputs were written, and nobody has removed them since."""
         paths = {"data": result_path, "shapes": shapes_path, "overlays": overlay_path}
-        written = self.manifest.frames[frame_id]["outputs"]
-        return set(outputs) <= set(written) and all(
-            path(self.out_dir, frame_id).is_file() for name, path in paths.items() if name in outputs
-        )
+        entry = self.manifest.frames[frame_id]
+        files = [path(self.out_dir, frame_id) for name, path in paths.items() if name in outputs]
+        files += [self.out_dir / name for name in entry.get("mesh_files", ()) if f"meshes_{name[-3:]}" in outputs]
+        return set(outputs) <= set(entry["outputs"]) and all(file.is_file() for file in files)
 
     def _check_inputs(self, dataset: KittiStereoDataset, frame_id: str) -> None:
         try:

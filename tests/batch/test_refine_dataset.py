@@ -171,13 +171,22 @@ def test_further_outputs_are_added_to_finished_frames(source: Path, tmp_path: Pa
     assert refine(source, tmp_path).resumed == FRAMES
 
 
-@pytest.mark.parametrize("name", ["data/000001.txt", "shapes/000001.npz", "overlays/000001.png"])
+@pytest.mark.parametrize("name", ["data/000001.txt", "shapes/000001.npz", "overlays/000001.png", "meshes/000001_1.ply"])
 def test_outputs_that_were_removed_are_made_again(source: Path, tmp_path: Path, name: str) -> None:
-    refine(source, tmp_path, overlays=True)
+    refine(source, tmp_path, overlays=True, meshes="ply")
     content = (tmp_path / name).read_bytes()
     (tmp_path / name).unlink()
-    assert refine(source, tmp_path, overlays=True).resumed == ("000000", "000002")
+    assert refine(source, tmp_path, overlays=True, meshes="ply").resumed == ("000000", "000002")
     assert (tmp_path / name).read_bytes() == content
+
+
+def test_removed_meshes_of_a_format_that_is_not_asked_for_stay_removed(source: Path, tmp_path: Path) -> None:
+    refine(source, tmp_path, meshes="ply")
+    refine(source, tmp_path, meshes="glb")
+    entry = json.loads((tmp_path / "summary.json").read_text())["frames"]["000000"]
+    assert entry["mesh_files"] == [f"meshes/000000_{line}.{kind}" for line in (1, 3) for kind in ("glb", "ply")]
+    (tmp_path / "meshes" / "000000_3.ply").unlink()
+    assert refine(source, tmp_path).resumed == refine(source, tmp_path, meshes="glb").resumed == FRAMES
 
 
 def test_too_little_memory_says_what_to_do(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
