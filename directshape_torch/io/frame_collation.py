@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -64,7 +65,8 @@ def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:
 def _same_field(a: DisparityField | None, b: DisparityField | None) -> bool:
     if a is None or b is None:
         return a is b
-    return torch.equal(a.coefficients, b.coefficients)
+    tensors = (field.name for field in fields(a) if isinstance(getattr(a, field.name), Tensor))
+    return a.size_wh == b.size_wh and all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
 
 
 def _grounds(grounds: Sequence[GroundPlane]) -> GroundPlane:

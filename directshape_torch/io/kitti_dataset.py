@@ -156,7 +156,9 @@ class KittiStereoDataset:
             folder = self.detections_dir / "data"
             known = sorted(path.stem for path in (folder if folder.is_dir() else self.detections_dir).glob("*.txt"))
         if frames is not None:
-            wanted = [f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames]
+            names = (f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames)
+            # A frame that is named twice is one frame.
+            wanted = list(dict.fromkeys(names))
             missing = [frame for frame in wanted if frame not in set(known)]
             if missing:
                 where = split if split is not None else self.detections_dir

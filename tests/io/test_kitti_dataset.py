@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -263,8 +264,9 @@ def test_ground_source_can_be_forced(root: Path, monkeypatch: pytest.MonkeyPatch
 def test_frames_split_and_order(root: Path) -> None:
     assert dataset(root).frame_ids == ("000000", "000003")
     assert dataset(root, frames=[3]).frame_ids == ("000003",)
+    assert dataset(root, frames=["000003", 0, 3]).frame_ids == ("000003", "000000")
     split = root / "val.txt"
-    split.write_text("000003\n000000\n\n")
+    split.write_text("000003\n000000\n\n000003\n")
     assert dataset(root, split=split).frame_ids == ("000003", "000000")
     assert len(dataset(root, split=split, frames=["000000"])) == 1
     with pytest.raises(InputError, match=r"frames: expected ids that occur in .*val\.txt, got 000004"):
@@ -365,3 +367,14 @@ def test_collate_refuses_nothing_and_mixed_fields(root: Path) -> None:
     mixed = [dataset(root).load("000000"), dataset(root, disparity_field=field).load("000003")]
     with pytest.raises(InputError, match="frames with the same residual disparity field"):
         collate(mixed)
+
+
+@pytest.mark.parametrize("name", ["coefficients", "vertical_coefficients", "hull_uv", "K_left"])
+def test_collate_compares_all_of_the_fields(root: Path, name: str) -> None:
+    field = DisparityField.constant(-0.5, (120, 64), CAMERA.K_left[0], CAMERA.K_right[0], CAMERA.T_right_cam[0])
+    equal = replace(field, **{name: getattr(field, name).clone()})
+    other = replace(field, **{name: getattr(field, name) + 0.01})
+    loaded = dataset(root, disparity_field=field).load("000000")
+    assert len(collate([loaded, dataset(root, disparity_field=equal).load("000003")])[0]) == 2
+    with pytest.raises(InputError, match="frames with the same residual disparity field"):
+        collate([loaded, dataset(root, disparity_field=other).load("000003")])
