@@ -1,1 +1,1 @@
-"""TBD"""
+"""The program `directshape`: one module a command."""

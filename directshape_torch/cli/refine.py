@@ -45,7 +45,8 @@ def _add_inputs(group: argparse._ArgumentGroup) -> None:
         "--ground",
         choices=("auto", "file", "stereo", "camera_height"),
         default="auto",
-        help="where ground planes come from (default: file, else stereo, else camera height)",
+        help="where ground planes come from (default: file, else stereo, else camera height; with --stereo-bias: "
+        "stereo, else file, else camera height)",
     )
     group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
 

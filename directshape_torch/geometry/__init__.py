@@ -1,1 +1,1 @@
-"""TBD"""
+"""Rigid motions, cameras, boxes, planes and the residual disparity of a rig."""

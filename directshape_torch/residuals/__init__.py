@@ -1,1 +1,1 @@
-"""TBD"""
+"""The residuals of the energy, each with its Jacobian, and robust norms."""

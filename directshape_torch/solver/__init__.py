@@ -1,1 +1,1 @@
-"""TBD"""
+"""The damped Gauss-Newton loop over a batch of independent problems."""

@@ -1,1 +1,1 @@
-"""TBD"""
+"""Pictures of results, pixels, shape priors and disparity fields."""
