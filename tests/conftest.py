@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import hypothesis
 import pytest
 import torch
+
+# The same examples in every run: a failure that comes and goes helps nobody.
+hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None)
+hypothesis.settings.load_profile("repeatable")
+# Tests run in several processes; PyTorch's threads would spin against one another.
+torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ import torch
 from directshape_torch.batch.mesh_files import scene_bytes
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
-from directshape_torch.io.atomic_files import write_bytes
+from directshape_torch.io.atomic_files import write_bytes, write_png
 from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path
@@ -88,3 +88,14 @@ def _columns(errors: Sequence[PoseErrors], rows: Sequence[int]) -> tuple[str, st
 def _aligned(rows: Sequence[Sequence[str]]) -> str:
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     return "\n".join("  ".join(f"{word:<{w}}" for word, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def write_observation_sheets(folder: Path, loaded: LoadedFrame) -> None:
+    """One picture `NNNNNN_LINE.png` a car with a left mask: its sampled pixels and what hides it."""
+    from directshape_torch.visualize.observation_sheet import observation_sheet
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for car, row in enumerate(loaded.row_of_detection):
+        if bool(loaded.detections.has_mask_left[car]):
+            line = loaded.input_objects[row].line_number
+            write_png(folder / f"{loaded.frame_id}_{line}.png", observation_sheet(loaded.frame, loaded.detections, car))

@@ -15,14 +15,7 @@ from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, hidden_pixels, occlusion_crops
-from directshape_torch.observation.pixel_sampling import (
-    PixelSelection,
-    SamplingSettings,
-    cell_thresholds,
-    cells_of_regions,
-    region_boxes,
-    sample_pixels,
-)
+from directshape_torch.observation.pixel_sampling import SamplingSettings, region_boxes, select_pixels
 from directshape_torch.scene import Detections, FrameBatch
 
 # Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
@@ -102,7 +95,7 @@ def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConf
         detections: B cars, whose initial poses fix regions and correspondence for the disparity field.
         config: density, regions, occlusion.
     """
-    regions = _regions(frames, detections, config)
+    regions = car_regions(frames, detections, config)
     left = _pack_side(frames, detections, "left", regions[0], config)
     right = _pack_side(frames, detections, "right", regions[1], config)
     hidden = None
@@ -132,22 +125,13 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
     return field.bias(uv_left), field.vertical(uv_left)
 
 
-def select_pixels(
-    magnitude: Tensor,  # (F, H, W) grey levels per pixel
-    sizes: Tensor,  # (F, 2)
-    frame_index: Tensor,  # (B,)
-    regions: Tensor,  # (B, 4)
-    config: SamplingConfig,
-) -> PixelSelection:
-    """Both rounds of the adaptive sampling, with thresholds only where cars are."""
-    settings = SamplingSettings(config.mode, config.density, config.min_pixels, config.max_pixels)
-    num_frames, height, width = magnitude.shape
-    needed = cells_of_regions(regions, frame_index, (num_frames, height, width), settings)
-    thresholds = cell_thresholds(magnitude, sizes, needed, settings)
-    return sample_pixels(magnitude, thresholds, regions, frame_index, settings)
+def sampling_settings(config: SamplingConfig) -> SamplingSettings:
+    """The part of the configuration that chooses pixels within a region."""
+    return SamplingSettings(config.mode, config.density, config.min_pixels, config.max_pixels)
 
 
-def _regions(frames: FrameBatch, d: Detections, config: SamplingConfig) -> tuple[Tensor, Tensor]:
+def car_regions(frames: FrameBatch, d: Detections, config: SamplingConfig) -> tuple[Tensor, Tensor]:
+    """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
     sizes = frames.sizes[d.frame_index]
     margins = {"margin_px": config.region_margin_px, "margin_share": config.region_margin_share}
     left = region_boxes(d.box_2d, d.mask_left, d.has_mask_left, sizes, join=True, **margins)
@@ -163,7 +147,7 @@ def _pack_side(
     left = side == "left"
     grey = grey_levels(frames.images_left if left else frames.images_right)
     magnitude = gradient_magnitude(image_gradient(grey, frames.sizes))
-    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, config)
+    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config))
     object_index, uv = chosen.object_index, chosen.uv
     if config.occlusion:
         visible = ~hidden_pixels(detections, side, object_index, uv, config.occlusion_order)

@@ -1,0 +1,50 @@
+"""What the refinement looks at, for one car: its pixels of both rounds, and what hides it (paper, both figures)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.config import SamplingConfig
+from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.observation.packing import car_regions, sampling_settings
+from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.visualize.sampling_picture import occlusion_picture, sampling_picture
+
+Picture = NDArray[np.uint8]
+_HEIGHT_PX = 320
+
+
+def observation_sheet(
+    frames: FrameBatch, detections: Detections, object_number: int, config: SamplingConfig | None = None
+) -> Picture:
+    """Sampled pixels (green: above the threshold, red: the strongest of their cell), masks and occlusion mask.
+
+    Args:
+        frames, detections: the scene.
+        object_number: the car; it needs a mask in the left image.
+        config: how pixels are sampled; default the refiner's.
+
+    Returns:
+        (320, w, 3) RGB uint8.
+
+    Raises:
+        InputError: no such car, or one without pixels in the left image.
+    """
+    config = SamplingConfig() if config is None else config
+    left, _ = car_regions(frames, detections, config)
+    magnitude = gradient_magnitude(image_gradient(grey_levels(frames.images_left), frames.sizes))
+    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, left, sampling_settings(config))
+    order = config.occlusion_order
+    panels = [
+        sampling_picture(frames, detections, left, chosen, object_number, order=order),
+        occlusion_picture(frames, detections, left, object_number, order=order),
+    ]
+    return np.concatenate([_of_height(panel) for panel in panels], axis=1)
+
+
+def _of_height(picture: Picture) -> Picture:
+    width = max(1, round(picture.shape[1] * _HEIGHT_PX / picture.shape[0]))
+    return np.asarray(cv2.resize(picture, (width, _HEIGHT_PX), interpolation=cv2.INTER_AREA), dtype=np.uint8)
