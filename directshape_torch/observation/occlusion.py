@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.pixel_sampling import MASK_THRESHOLD, region_pixels
+from directshape_torch.observation.regions import MASK_THRESHOLD, region_pixels
 from directshape_torch.scene import Detections
 
 Side = Literal["left", "right"]

@@ -16,7 +16,8 @@ from directshape_torch.observation.occlusion import (
     instances_in_front,
     occlusion_crops,
 )
-from directshape_torch.observation.pixel_sampling import MASK_THRESHOLD, PixelSelection
+from directshape_torch.observation.pixel_sampling import PixelSelection
+from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections, FrameBatch
 
 Picture = npt.NDArray[np.uint8]

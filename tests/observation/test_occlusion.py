@@ -10,7 +10,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.observation.occlusion import hidden_pixels, instances_in_front, occlusion_crops
-from directshape_torch.observation.pixel_sampling import region_pixels
+from directshape_torch.observation.regions import region_pixels
 from directshape_torch.scene import Detections, Occluders
 
 HEIGHT, WIDTH = 20, 30

@@ -1,0 +1,57 @@
+"""Regions of the cars, against hand-derived boxes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from directshape_torch.errors import InputError
+from directshape_torch.observation.regions import region_boxes, region_pixels
+
+
+def boxes_of(mask_box: tuple[int, int, int, int] | None, box: list[float], join: bool) -> list[int]:
+    masks = torch.zeros(1, 100, 200)
+    if mask_box is not None:
+        u0, v0, u1, v1 = mask_box
+        masks[0, v0 : v1 + 1, u0 : u1 + 1] = 0.9
+    has_mask = torch.tensor([mask_box is not None])
+    result: list[int] = region_boxes(torch.tensor([box]), masks, has_mask, torch.tensor([[100, 200]]), join=join)[
+        0
+    ].tolist()
+    return result
+
+
+def test_region_joins_mask_and_box_and_grows() -> None:
+    # Joined: u 40..100, v 30..50. Margins: 10 % of 60 = 6 horizontally, 4 at least vertically. Half open: + 1.
+    assert boxes_of((40, 35, 70, 50), [60.0, 30.0, 100.0, 45.0], join=True) == [34, 26, 107, 55]
+    assert boxes_of((40, 35, 70, 50), [60.0, 30.0, 100.0, 45.0], join=False) == [36, 31, 75, 55]
+    assert boxes_of(None, [60.0, 30.0, 100.5, 45.0], join=False) == [55, 26, 106, 50]
+
+
+def test_region_is_clipped_and_may_be_empty() -> None:
+    assert boxes_of(None, [-500.0, -20.0, 10.0, 40.0], join=False) == [0, 0, 15, 45]
+    assert boxes_of(None, [150.0, 60.0, 900.0, 300.0], join=False) == [145, 56, 200, 100]
+    for nowhere in ([-50.0, 0.0, -1.0, 9.0], [200.0, 0.0, 230.0, 9.0], [torch.nan] * 4, [20.0, 20.0, 10.0, 30.0]):
+        assert boxes_of(None, nowhere, join=True) == [0, 0, 0, 0]
+        assert boxes_of((40, 40, 60, 60), nowhere, join=True) == [36, 36, 65, 65]
+
+
+def test_all_zero_mask_counts_as_none_and_absent_mask_is_not_read() -> None:
+    box, sizes = torch.tensor([[60.0, 30.0, 100.0, 45.0]]), torch.tensor([[100, 200]])
+    empty = region_boxes(box, torch.zeros(1, 100, 200), torch.tensor([True]), sizes, join=True)
+    absent = region_boxes(box, torch.ones(1, 100, 200), torch.tensor([False]), sizes, join=True)
+    assert empty.tolist() == absent.tolist() == [[56, 26, 105, 50]]
+
+
+def test_region_pixels_are_row_major() -> None:
+    object_index, uv = region_pixels(torch.tensor([[3, 4, 5, 6], [0, 0, 0, 0], [7, 1, 8, 2]]))
+    assert object_index.tolist() == [0, 0, 0, 0, 2]
+    assert uv.tolist() == [[3, 4], [4, 4], [3, 5], [4, 5], [7, 1]]
+
+
+def test_wrong_regions_are_named() -> None:
+    zeros, sizes = torch.zeros(1, 40, 40), torch.tensor([[40, 40]])
+    with pytest.raises(InputError, match=r"has_mask: expected shape \(1,\)"):
+        region_boxes(torch.zeros(1, 4), zeros, torch.tensor([True, True]), sizes, join=True)
+    with pytest.raises(InputError, match=r"masks: expected shape \(1, H, W\)"):
+        region_boxes(torch.zeros(1, 4), zeros[0], torch.tensor([True]), sizes, join=True)
