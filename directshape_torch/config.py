@@ -191,6 +191,10 @@ class RefinerConfig:
         check_ranges(self)
 
 
+BUNDLED_CONFIGS = ("default", "paper", "fast")
+"""Names of the settings that come with the package, for `load_config`."""
+
+_CONFIG_FOLDER = Path(__file__).parent / "assets" / "configs"
 _ConfigT = TypeVar("_ConfigT")
 
 
@@ -256,7 +260,8 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     """Read a YAML file and apply `key.sub=value` overrides (values in YAML).
 
     Args:
-        path: the file; None for the defaults.
+        path: the file, or the name of one that comes with the package: "default", "paper" or "fast". None for the
+            defaults. A file of such a name in the working folder is "./paper".
         overrides: for example `["silhouette.weight=6", "solver.max_code=2.5"]`.
 
     Raises:
@@ -265,15 +270,18 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     Example:
         >>> load_config(None, ["solver.max_code=2.5"]).solver.max_code
         2.5
+        >>> load_config("paper").silhouette.form
+        'product'
     """
     import yaml
 
     mapping: dict[str, Any] = {}
     if path is not None:
         try:
-            mapping = yaml.safe_load(Path(path).read_text(encoding="utf-8")) or {}
+            mapping = yaml.safe_load(_config_file(path).read_text(encoding="utf-8")) or {}
         except (OSError, yaml.YAMLError) as error:
-            raise ConfigError(f"{path}: cannot be read as a YAML configuration: {error}") from error
+            names = f"bundled ones are {', '.join(BUNDLED_CONFIGS)}"
+            raise ConfigError(f"{path}: cannot be read as a YAML configuration: {error}; {names}") from error
         if not isinstance(mapping, dict):
             raise ConfigError(f"{path}: expected keys and values, got {mapping!r}")
     for override in overrides:
@@ -286,6 +294,10 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
             raise ConfigError(f"--set {override}: the value is not YAML") from error
         _set_nested(mapping, key.strip().split("."), value, override)
     return config_from_mapping(RefinerConfig, mapping)
+
+
+def _config_file(path: Path | str) -> Path:
+    return _CONFIG_FOLDER / f"{path}.yaml" if str(path) in BUNDLED_CONFIGS else Path(path)
 
 
 def _set_nested(mapping: dict[str, Any], keys: Sequence[str], value: Any, override: str) -> None:

@@ -17,7 +17,7 @@ import yaml
 
 from directshape_torch.config import RefinerConfig, config_to_mapping
 
-TARGET = Path(__file__).parent.parent / "configs" / "default.yaml"
+TARGET = Path(__file__).parent.parent / "directshape_torch" / "assets" / "configs" / "default.yaml"
 HEADER = """\
 # The default settings: the best we know. They are also what the program uses without --config.
 # Written by scripts/write_default_config.py from directshape_torch/config.py; a file may hold any subset of the keys.

@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 import yaml
 
-from directshape_torch.config import RefinerConfig, config_to_mapping, load_config
+import directshape_torch
+from directshape_torch.config import BUNDLED_CONFIGS, RefinerConfig, config_to_mapping, load_config
+from directshape_torch.errors import ConfigError
 
 ROOT = Path(__file__).parent.parent
 CONFIGS = ROOT / "configs"
@@ -24,6 +26,24 @@ def keys(mapping: Any, prefix: str = "") -> set[str]:
 
 def test_default_is_what_the_code_uses() -> None:
     assert load_config(CONFIGS / "default.yaml") == RefinerConfig()
+
+
+@pytest.mark.parametrize("name", BUNDLED_CONFIGS)
+def test_names_stand_for_the_files_of_the_package(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_repository = load_config(CONFIGS / f"{name}.yaml")
+    monkeypatch.chdir(tmp_path)
+    assert load_config(name) == load_config(Path(name)) == in_repository
+    (tmp_path / name).write_text("solver: {max_code: 1.5}")
+    assert load_config(f"./{name}").solver.max_code == 1.5
+
+
+def test_every_file_has_a_name_and_is_part_of_the_package() -> None:
+    folder = Path(directshape_torch.__file__).parent / "assets" / "configs"
+    assert sorted(path.stem for path in folder.glob("*.yaml")) == sorted(BUNDLED_CONFIGS)
+    # One place only: the folder at the top is a link.
+    assert CONFIGS.resolve() == folder.resolve()
+    with pytest.raises(ConfigError, match=r"papr: cannot be read .* bundled ones are default, paper, fast"):
+        load_config("papr")
 
 
 def test_default_is_what_its_script_writes() -> None:

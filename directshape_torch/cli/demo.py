@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from directshape_torch.cli.refine import add_config_option
+
 DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 
 _DESCRIPTION = """
@@ -23,6 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         metavar="DIR",
         help="folder for the results (default: %(default)s)",
     )
+    add_config_option(parser)
     parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
     parser.set_defaults(run=run)
 
@@ -44,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     dataset = KittiStereoDataset(
         DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training/masks"
     )
-    refiner = make_refiner(None, [], None, args.device)
+    refiner = make_refiner(args.config, [], None, args.device)
     with ProgressBar() as progress:
         summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress)
     for frame_id in dataset.frame_ids:

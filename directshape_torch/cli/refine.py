@@ -58,7 +58,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_settings(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--config", type=Path, metavar="FILE", help="settings of the refinement (YAML)")
+    add_config_option(group)
     group.add_argument(
         "--set",
         action="extend",
@@ -71,6 +71,13 @@ def _add_settings(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
     group.add_argument("--threads", type=int, metavar="N", help="of the CPU; 1 is by far the best on a busy machine")
     group.add_argument("--batch-frames", type=int, default=1, metavar="N", help="frames in one call (default: 1)")
+
+
+def add_config_option(group: argparse._ActionsContainer) -> None:
+    """`--config`, which stays text: ./paper is a file and paper the bundled settings."""
+    group.add_argument(
+        "--config", metavar="FILE|NAME", help="settings of the refinement (YAML), or default, paper or fast"
+    )
 
 
 def _frame_id(word: str) -> str:
@@ -112,7 +119,7 @@ def _limit_threads(num_threads: int | None) -> None:
     torch.set_num_threads(num_threads)
 
 
-def make_refiner(config: Path | None, overrides: list[str], prior: Path | None, device: str) -> DirectShapeRefiner:
+def make_refiner(config: str | None, overrides: list[str], prior: Path | None, device: str) -> DirectShapeRefiner:
     """The refiner that the options describe.
 
     Raises:

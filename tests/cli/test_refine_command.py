@@ -50,6 +50,12 @@ def test_reports_cars_statuses_time_and_memory(
     assert sum(call["cars"] for call in timings["calls"]) == 4
 
 
+def test_settings_have_names(source: Path, tmp_path: Path) -> None:
+    assert main(command(source, tmp_path, "--config", "paper")) == 0
+    settings = json.loads((tmp_path / "summary.json").read_text())["config"]["refiner"]
+    assert settings["silhouette"]["form"] == "product"
+
+
 def test_failed_frames_are_exit_code_1_and_named(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
