@@ -70,24 +70,3 @@ def halve_intrinsics(
         raise InputError("K", "shape (..., 3, 3)", f"{tuple(K.shape)}")
     level_from_full = K.new_tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
     return level_from_full @ K
-
-
-def image_pyramid(
-    images: Tensor,  # (F, C, H, W)
-    num_levels: int,
-) -> list[Tensor]:
-    """The images and their `num_levels - 1` coarser levels, finest first.
-
-    Raises:
-        InputError: no level asked for, or more levels than the images can be halved.
-
-    Example:
-        >>> [tuple(level.shape[2:]) for level in image_pyramid(torch.zeros(1, 3, 8, 12), 3)]
-        [(8, 12), (4, 6), (2, 3)]
-    """
-    if num_levels < 1:
-        raise InputError("num_levels", "at least 1", f"{num_levels}")
-    levels = [images]
-    for _ in range(num_levels - 1):
-        levels.append(halve(levels[-1]))
-    return levels

@@ -54,21 +54,6 @@ def _four_numbers(path: Path | str, line: Line) -> NDArray[np.float64]:
     return values
 
 
-def plane_ref_to_cam(
-    plane_ref: Sequence[float] | NDArray[np.float64],  # (4,)
-    t_cam_ref: Sequence[float] | NDArray[np.float64],  # (3,) metres
-) -> NDArray[np.float64]:
-    """The same plane in camera coordinates: `d_cam = d_ref - n . t_cam_ref`, as `x_cam = x_ref + t_cam_ref`.
-
-    Example:
-        >>> plane_ref_to_cam([0.0, -1.0, 0.0, 1.65], [0.06, 0.01, 0.0]).round(2).tolist()
-        [0.0, -1.0, 0.0, 1.66]
-    """
-    plane = np.array(plane_ref, dtype=np.float64)
-    plane[3] -= plane[:3] @ np.asarray(t_cam_ref, dtype=np.float64)
-    return plane
-
-
 def write_plane(path: Path | str, plane_ref: Sequence[float] | NDArray[np.float64]) -> None:
     """Write a plane `(a, b, c, d)` of the `ref` frame in AVOD's four lines."""
     numbers = " ".join(f"{value:.6e}" for value in plane_ref)

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.io.frame_detections import MatchingSummary, build_detections
-from directshape_torch.io.ground_plane_files import plane_ref_to_cam, read_plane
+from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame, mask_source
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
@@ -218,7 +219,9 @@ class KittiStereoDataset:
         path = self._plane_path(frame_id)
         if self.ground == "auto" and not path.is_file():
             return None
-        return torch.from_numpy(plane_ref_to_cam(read_plane(path), camera.t_cam_ref[0].double().numpy()))
+        plane_ref = torch.from_numpy(read_plane(path))
+        offset_cam = plane_ref_to_cam(plane_ref[:3], plane_ref[3], camera.t_cam_ref[0].double())
+        return torch.cat([plane_ref[:3], offset_cam[None]])
 
     def _plane_from_stereo(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera

@@ -21,12 +21,13 @@ from torch import Tensor
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.geometry import box3d, se3
+from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays, warp_to_right
 from directshape_torch.image.gradients import grey_levels
 from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.image.pyramid import halve, halve_intrinsics
-from directshape_torch.io.ground_plane_files import plane_ref_to_cam, read_plane
+from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import RefinedBox, write_result_text
@@ -148,8 +149,9 @@ def test_09_planes_point_up_and_move_with_the_camera(tmp_path: Path) -> None:
     on_ground_ref = np.array([4.0, 0.0, 11.0])
     on_ground_ref[1] = -(plane_ref[[0, 2]] @ on_ground_ref[[0, 2]] + plane_ref[3]) / plane_ref[1]
     t_cam_ref = camera().t_cam_ref[0].numpy()
-    plane_cam = plane_ref_to_cam(plane_ref, t_cam_ref)
-    assert abs(plane_cam[:3] @ (on_ground_ref + t_cam_ref) + plane_cam[3]) < 1e-12
+    normal, offset_ref = torch.from_numpy(plane_ref[:3]), torch.tensor(plane_ref[3])
+    offset_cam = plane_ref_to_cam(normal, offset_ref, torch.from_numpy(t_cam_ref))
+    assert abs(plane_ref[:3] @ (on_ground_ref + t_cam_ref) + offset_cam.item()) < 1e-12
 
 
 def result_at(code: Tensor, rotation_y: float) -> RefinementResult:
