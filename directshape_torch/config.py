@@ -78,7 +78,7 @@ class SilhouetteConfig:
 
     weight: float = 12.0
     form: Literal["closest_approach", "product"] = "closest_approach"
-    samples_per_ray: int = 32
+    samples_per_ray: int = 24
     probability_floor: float = 0.01
     residual_floor: float = 0.01
     min_zeta_per_m: float = 4.0
@@ -151,7 +151,7 @@ class SamplingConfig:
     mode: Literal["adaptive", "round_one", "uniform", "dense"] = "adaptive"
     density: float = 0.05
     min_pixels: int = 100
-    max_pixels: int = 3000
+    max_pixels: int = 1000
     region_margin_px: float = 4.0
     region_margin_share: float = 0.1
     occlusion_order: Literal["depth", "box_bottom"] = "depth"
@@ -177,8 +177,8 @@ class RefinerConfig:
     """Everything `DirectShapeRefiner` can be told."""
 
     stages: tuple[StageConfig, ...] = (
-        StageConfig(contour_width_px=2.0, image_level=1, max_iterations=12),
-        StageConfig(contour_width_px=0.5, image_level=0, max_iterations=16),
+        StageConfig(contour_width_px=2.0, image_level=1, max_iterations=10),
+        StageConfig(contour_width_px=0.5, image_level=0, max_iterations=12),
     )
     solver: SolverConfig = field(default_factory=SolverConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
