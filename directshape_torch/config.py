@@ -128,7 +128,7 @@ class PriorConfig:
 
     shape_weight: float = 0.15
     height_weight: float = 10.0
-    tilt_weight: float = 100.0
+    tilt_weight: float = 1000.0
     tilt_form: Literal["normal", "cosine"] = "normal"
     dimensions_weight: float = 0.5
     dimensions_sigma_m: tuple[float, float, float] = (0.1, 0.1, 0.4)
@@ -150,7 +150,7 @@ class SamplingConfig:
 
     mode: Literal["adaptive", "round_one", "uniform", "dense"] = "adaptive"
     density: float = 0.05
-    min_pixels: int = 100
+    min_pixels: int = 400
     max_pixels: int = 1000
     region_margin_px: float = 4.0
     region_margin_share: float = 0.1
