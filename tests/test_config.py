@@ -72,7 +72,7 @@ def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) 
         ("photometric.huber_grey_levels=.nan", "photometric.huber_grey_levels: expected a number above 0, got nan"),
         ("solver.max_code=.inf", "solver.max_code: expected a number above 0, got inf"),
         ("priors.dimensions_sigma_m=[0.1, 0, 0.1]", "priors.dimensions_sigma_m: expected a number above 0"),
-        ("sampling.max_pixels=50", "sampling.max_pixels: expected at least sampling.min_pixels = 100, got 50"),
+        ("sampling.max_pixels=50", "sampling.max_pixels: expected at least sampling.min_pixels = 400, got 50"),
         ("sampling.density=1.5", "sampling.density: expected a number above 0 and at most 1, got 1.5"),
     ],
 )
