@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
         write_scene(args.out / "scene.glb", loaded, args.out, refiner.prior)
-        write_observation_sheets(args.out / "observation", loaded)
+        write_observation_sheets(args.out / "observation", loaded, refiner.config.sampling)
         print(error_table(loaded, args.out))
     print(format_summary(summary))
     print(f"picture  {args.out / 'overlays' / f'{dataset.frame_ids[0]}.png'}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from directshape_torch.batch.mesh_files import scene_bytes
+from directshape_torch.config import SamplingConfig
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
 from directshape_torch.io.atomic_files import write_bytes, write_png
@@ -90,7 +91,7 @@ def _aligned(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(f"{word:<{w}}" for word, w in zip(row, widths, strict=True)).rstrip() for row in rows)
 
 
-def write_observation_sheets(folder: Path, loaded: LoadedFrame) -> None:
+def write_observation_sheets(folder: Path, loaded: LoadedFrame, config: SamplingConfig) -> None:
     """One picture `NNNNNN_LINE.png` a car with a left mask: its sampled pixels and what hides it."""
     from directshape_torch.visualize.observation_sheet import observation_sheet
 
@@ -98,4 +99,5 @@ def write_observation_sheets(folder: Path, loaded: LoadedFrame) -> None:
     for car, row in enumerate(loaded.row_of_detection):
         if bool(loaded.detections.has_mask_left[car]):
             line = loaded.input_objects[row].line_number
-            write_png(folder / f"{loaded.frame_id}_{line}.png", observation_sheet(loaded.frame, loaded.detections, car))
+            sheet = observation_sheet(loaded.frame, loaded.detections, car, config)
+            write_png(folder / f"{loaded.frame_id}_{line}.png", sheet)
