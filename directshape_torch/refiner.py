@@ -22,6 +22,7 @@ from directshape_torch.quality import FitQuality, fit_quality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.status import Status
 
@@ -43,9 +44,9 @@ class DirectShapeRefiner(nn.Module):
         True
     """
 
-    def __init__(self, prior: PCAShapePrior | None = None, config: RefinerConfig | None = None) -> None:
+    def __init__(self, prior: ShapePrior | None = None, config: RefinerConfig | None = None) -> None:
         super().__init__()
-        self.prior = PCAShapePrior.load_bundled() if prior is None else prior
+        self.prior: ShapePrior = PCAShapePrior.load_bundled() if prior is None else prior
         self.config = RefinerConfig() if config is None else config
 
     def forward(self, frames: FrameBatch, detections: Detections) -> RefinementResult:
@@ -190,12 +191,12 @@ def _without_empty_masks(detections: Detections, areas: Tensor) -> Detections:
     return replace(detections, has_mask_left=left, has_mask_right=right)
 
 
-def _check_fit(frames: FrameBatch, detections: Detections, prior: PCAShapePrior) -> None:
+def _check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
     for name, tensor in (("frames", frames.images_left), ("detections", detections.T_cam_obj)):
-        if tensor.dtype != prior.mean.dtype or tensor.device != prior.mean.device:
+        if tensor.dtype != prior.origin.dtype or tensor.device != prior.origin.device:
             raise InputError(
                 name,
-                f"dtype {prior.mean.dtype} on {prior.mean.device}, like the refiner",
+                f"dtype {prior.origin.dtype} on {prior.origin.device}, like the refiner",
                 f"{tensor.dtype} on {tensor.device}",
                 "move them together with .to(device, dtype)",
             )
@@ -212,7 +213,7 @@ def _check_fit(frames: FrameBatch, detections: Detections, prior: PCAShapePrior)
 
 
 def _assemble(
-    prior: PCAShapePrior,
+    prior: ShapePrior,
     frames: FrameBatch,
     detections: Detections,
     state: CarState,

@@ -11,7 +11,7 @@ from torch import Tensor
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.quality import FitQuality
-from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
 from directshape_torch.status import Status
 
@@ -74,7 +74,7 @@ class RefinementResult:
     input_dimensions_hwl: Tensor
     ground_source: tuple[str, ...]
     t_cam_ref: Tensor
-    prior: PCAShapePrior
+    prior: ShapePrior
 
     def __len__(self) -> int:
         return len(self.T_cam_obj)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
 
 
 def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
@@ -28,9 +28,10 @@ def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def hash_prior(prior: PCAShapePrior) -> str:
-    """The sha256 of a shape prior: of its buffers and bounds."""
-    return hash_tensors({"bounds_obj": prior.bounds_obj, **dict(prior.named_buffers())})
+def hash_prior(prior: ShapePrior) -> str:
+    """The sha256 of a shape prior: of its buffers, weights and bounds."""
+    tensors = {**dict(prior.named_buffers()), **dict(prior.named_parameters())}
+    return hash_tensors({"bounds_obj": prior.bounds_obj, **tensors})
 
 
 def hash_field(field: DisparityField | None) -> str | None:

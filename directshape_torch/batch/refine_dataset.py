@@ -76,7 +76,7 @@ class _Run:
         self.options, self.observer = options, observer
         self.prior_sha256 = hash_prior(refiner.prior)
         self.record = RunRecord(out_dir, run_manifest(dataset, refiner, self.prior_sha256))
-        self.timings = RunTimings(refiner.prior.mean.device)
+        self.timings = RunTimings(refiner.prior.origin.device)
 
     def execute(self) -> RunSummary:
         resumed = self.record.finished_frames(self.dataset, self.options.outputs)
@@ -103,7 +103,7 @@ class _Run:
     def _refine(self, batch: Sequence[_Ready]) -> None:
         if not batch:
             return
-        prior = self.refiner.prior.mean
+        prior = self.refiner.prior.origin
         frames, detections = collate([ready.loaded for ready in batch])
         frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
         try:
@@ -150,7 +150,7 @@ def run_manifest(dataset: KittiStereoDataset, refiner: DirectShapeRefiner, prior
         "classes": sorted(dataset.classes),
         "ground": dataset.ground,
         "camera_height_m": dataset.camera_height_m,
-        "dtype": str(refiner.prior.mean.dtype).removeprefix("torch."),
+        "dtype": str(refiner.prior.origin.dtype).removeprefix("torch."),
     }
     hashes = {"prior": prior_sha256, "stereo_bias": hash_field(dataset.disparity_field)}
     return RunManifest(package_version(), settings, hashes)

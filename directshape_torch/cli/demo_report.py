@@ -17,8 +17,8 @@ from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.result_files import read_shapes
-from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
 from directshape_torch.visualize.ground_grid import ground_grid
 
@@ -50,13 +50,13 @@ def error_table(loaded: LoadedFrame, out_dir: Path) -> str:
     return _aligned(rows)
 
 
-def write_scene(path: Path, loaded: LoadedFrame, out_dir: Path, prior: PCAShapePrior) -> None:
+def write_scene(path: Path, loaded: LoadedFrame, out_dir: Path, prior: ShapePrior) -> None:
     """All refined cars of a frame, painted, on a grid of 5 m, as binary glTF."""
     shapes = read_shapes(shapes_path(out_dir, loaded.frame_id))
     meshes: dict[str, trimesh.Trimesh] = {}
     for car, status in enumerate(shapes.statuses):
         if Status[status].is_refined:
-            code = torch.from_numpy(shapes.codes[car : car + 1]).to(prior.mean)
+            code = torch.from_numpy(shapes.codes[car : car + 1]).to(prior.origin)
             T_cam_obj = torch.from_numpy(shapes.T_cam_obj[car])
             mesh = sdf_to_mesh(prior.values(code)[0], prior.origin, prior.spacing_m, T_cam_obj)
             _paint(mesh, _PAINTS_RGB[car % len(_PAINTS_RGB)])

@@ -22,12 +22,12 @@ from directshape_torch.residuals.priors import (
     tilt_prior_normal,
 )
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
 
 
 def direct_terms(
     config: RefinerConfig,
-    prior: PCAShapePrior,
+    prior: ShapePrior,
     frames: FrameBatch,
     detections: Detections,
     cars: CarBatch,
@@ -52,7 +52,7 @@ def direct_terms(
     return terms + prior_terms(config, prior, cars)
 
 
-def prior_terms(config: RefinerConfig, prior: PCAShapePrior, cars: CarBatch) -> list[Term]:
+def prior_terms(config: RefinerConfig, prior: ShapePrior, cars: CarBatch) -> list[Term]:
     """Shape, height, tilt and dimensions, those of weight zero left out."""
     p = config.priors
 
@@ -70,7 +70,7 @@ def prior_terms(config: RefinerConfig, prior: PCAShapePrior, cars: CarBatch) -> 
     def dimensions(cars: CarBatch, at: ProjectedState) -> PriorResidual:
         code = at.state.code
         sigma = torch.tensor(p.dimensions_sigma_m, dtype=code.dtype, device=code.device)
-        return dimensions_prior(code, cars.detector_hwl, prior.dimensions_mean_hwl, prior.dimensions_basis_hwl, sigma)
+        return dimensions_prior(prior.dimensions_and_derivative(code), cars.detector_hwl, sigma)
 
     all_terms = [
         PriorTerm("shape", p.shape_weight, cars, shape),

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.shape.shape_prior import DimensionsDerivative
+
 
 class PriorResidual(NamedTuple):
     """Residual and Jacobian of a prior for B objects."""
@@ -49,9 +51,8 @@ def height_prior(
     origin_cam = -(R_cam_obj @ T_obj_cam[:, :3, 3:])[..., 0]
     n_over_ny = normal_cam / normal_cam[:, 1:2]
     residual = (n_over_ny * origin_cam).sum(-1) + offset / normal_cam[:, 1]
-    J = T_obj_cam.new_zeros(len(T_obj_cam), 1, 6 + num_codes)
-    J[:, 0, :3] = -(n_over_ny[:, None] @ R_cam_obj)[:, 0]
-    return PriorResidual(residual[:, None], J)
+    J_v = -(n_over_ny[:, None] @ R_cam_obj)
+    return PriorResidual(residual[:, None], torch.cat([J_v, J_v.new_zeros(len(J_v), 1, 3 + num_codes)], dim=-1))
 
 
 def tilt_prior_normal(T_obj_cam: Tensor, normal_cam: Tensor, num_codes: int) -> PriorResidual:
@@ -64,10 +65,9 @@ def tilt_prior_normal(T_obj_cam: Tensor, normal_cam: Tensor, num_codes: int) -> 
         tensor([[0., 0.]])
     """
     x, y, z = (T_obj_cam[:, :3, :3] @ normal_cam[..., None])[..., 0].unbind(-1)
-    J = T_obj_cam.new_zeros(len(T_obj_cam), 2, 6 + num_codes)
-    J[:, 0, 4], J[:, 0, 5] = z, -y
-    J[:, 1, 3], J[:, 1, 4] = y, -x
-    return PriorResidual(torch.stack([x, z], dim=-1), J)
+    zero = torch.zeros_like(x)
+    J_x, J_z = torch.stack([zero, z, -y], dim=-1), torch.stack([y, -x, zero], dim=-1)
+    return PriorResidual(torch.stack([x, z], dim=-1), _by_rotation(torch.stack([J_x, J_z], dim=1), num_codes))
 
 
 def tilt_prior_cosine(T_obj_cam: Tensor, normal_cam: Tensor, num_codes: int) -> PriorResidual:
@@ -78,28 +78,30 @@ def tilt_prior_cosine(T_obj_cam: Tensor, normal_cam: Tensor, num_codes: int) -> 
         tensor(0.)
     """
     x, y, z = (T_obj_cam[:, :3, :3] @ normal_cam[..., None])[..., 0].unbind(-1)
-    J = T_obj_cam.new_zeros(len(T_obj_cam), 1, 6 + num_codes)
-    J[:, 0, 3], J[:, 0, 5] = -z, x
-    return PriorResidual((1 + y)[:, None], J)
+    J_omega = torch.stack([-z, torch.zeros_like(x), x], dim=-1)[:, None]
+    return PriorResidual((1 + y)[:, None], _by_rotation(J_omega, num_codes))
+
+
+def _by_rotation(J_omega: Tensor, num_codes: int) -> Tensor:
+    """Jacobian by the whole state of a residual that only rotation changes, from its part (B, R, 3)."""
+    zeros = J_omega.new_zeros(*J_omega.shape[:2], 3 + num_codes)
+    return torch.cat([zeros[..., :3], J_omega, zeros[..., 3:]], dim=-1)
 
 
 def dimensions_prior(
-    code: Tensor,  # (B, K)
+    shape: DimensionsDerivative,  # of B shapes
     detector_hwl: Tensor,  # (B, 3) metres
-    mean_hwl: Tensor,  # (3,) dimensions of the mean shape
-    basis_hwl: Tensor,  # (3, K) metres per standard deviation
     sigma_hwl: Tensor,  # (3,) metres
 ) -> PriorResidual:
-    """Shape dimensions against the detector's, in the detector's standard deviations; linear in the code.
+    """Shape dimensions against the detector's, in the detector's standard deviations.
 
     A car seen from behind does not show its length: the detector's dimensions are information (not in the paper).
 
     Example:
-        >>> zero = torch.zeros(3, 1)
-        >>> dimensions_prior(torch.zeros(1, 1), torch.ones(1, 3), torch.zeros(3), zero, torch.ones(3)).residual
+        >>> shape = DimensionsDerivative(torch.zeros(1, 3), torch.zeros(1, 3, 2))
+        >>> dimensions_prior(shape, torch.ones(1, 3), torch.ones(3)).residual
         tensor([[-1., -1., -1.]])
     """
-    residual = (mean_hwl + code @ basis_hwl.T - detector_hwl) / sigma_hwl
-    J = code.new_zeros(len(code), 3, 6 + code.shape[1])
-    J[:, :, 6:] = basis_hwl / sigma_hwl[:, None]
-    return PriorResidual(residual, J)
+    J_residual_code = shape.J_hwl_code / sigma_hwl[:, None]
+    no_twist = J_residual_code.new_zeros(*J_residual_code.shape[:2], 6)
+    return PriorResidual((shape.hwl - detector_hwl) / sigma_hwl, torch.cat([no_twist, J_residual_code], dim=-1))

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
 from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.shape.zero_level import zero_level_extents
 
 # Codes within this many standard deviations of the mean are 'in use': the Lipschitz bound covers them.
@@ -145,6 +146,10 @@ class PCAShapePrior(nn.Module):
         """
         check_shape("code", code, ("B", self.num_codes))
         return self.dimensions_mean_hwl + code @ self.dimensions_basis_hwl.T
+
+    def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
+        """`dimensions_hwl` with its constant derivative, (B, 3) and (B, 3, K)."""
+        return DimensionsDerivative(self.dimensions_hwl(code), self.dimensions_basis_hwl.expand(len(code), -1, -1))
 
     def code_from_dimensions(
         self,

@@ -6,6 +6,7 @@ the object frame: x forward, y down, origin on the ground under the box centre.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
@@ -17,6 +18,13 @@ class SdfDerivatives(NamedTuple):
     value: Tensor  # (P,) metres
     gradient: Tensor  # (P, 3) d value / d point_obj
     J_value_code: Tensor  # (P, K) d value / d code, metres per standard deviation
+
+
+class DimensionsDerivative(NamedTuple):
+    """Outer dimensions of B shapes as a prior predicts them from the code, and their derivative."""
+
+    hwl: Tensor  # (B, 3) height, width, length, metres
+    J_hwl_code: Tensor  # (B, 3, K) metres per standard deviation
 
 
 @runtime_checkable
@@ -42,7 +50,12 @@ class BoundShape(Protocol):
 
 @runtime_checkable
 class ShapePrior(Protocol):
-    """A family of shapes with a whitened code: component k has standard deviation 1."""
+    """A family of shapes with a whitened code: component k has standard deviation 1.
+
+    The refiner, its terms, results, batch program and pictures know nothing else of a prior. A prior is an `nn.Module`,
+    so that it moves with `.to(...)` and lives in a `state_dict`; its dtype and device are those of `origin`. Nothing is
+    said of how a shape is encoded: derivatives may depend on the code.
+    """
 
     @property
     def num_codes(self) -> int: ...
@@ -50,6 +63,16 @@ class ShapePrior(Protocol):
     @property
     def bounds_obj(self) -> Tensor:
         """Lower and upper corner of the region where the field is known, (2, 3), metres."""
+        ...
+
+    @property
+    def origin(self) -> Tensor:
+        """Node (0, 0, 0) of the grid on which surfaces are measured and meshed, (3,), metres."""
+        ...
+
+    @property
+    def spacing_m(self) -> float:
+        """Distance between the nodes of that grid."""
         ...
 
     @property
@@ -66,4 +89,26 @@ class ShapePrior(Protocol):
         code: Tensor,  # (B, K)
     ) -> BoundShape:
         """The fields of B objects with these codes."""
+        ...
+
+    def values(
+        self,
+        code: Tensor,  # (B, K)
+    ) -> Tensor:  # (B, nx, ny, nz)
+        """Signed distance at the nodes of the measuring grid, metres: for boxes and meshes only."""
+        ...
+
+    def dimensions_and_derivative(
+        self,
+        code: Tensor,  # (B, K)
+    ) -> DimensionsDerivative:
+        """Predicted height, width and length; smooth in the code, unlike the extents of the zero level."""
+        ...
+
+    def named_buffers(self) -> Iterator[tuple[str, Tensor]]:
+        """Its constants by name, as of an `nn.Module`."""
+        ...
+
+    def named_parameters(self) -> Iterator[tuple[str, Tensor]]:
+        """Its trained weights by name, as of an `nn.Module`."""
         ...

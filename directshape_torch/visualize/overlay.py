@@ -158,7 +158,7 @@ def _initial_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCa
     detections, prior = loaded.detections, result.prior
     T_cam_obj = detections.T_cam_obj.double()
     corners = box_corners(T_cam_obj, detections.dimensions_hwl.double()).numpy()
-    mean = sdf_to_mesh(prior.mean, prior.origin, prior.spacing_m)
+    mean = sdf_to_mesh(prior.values(prior.initial_code(1))[0], prior.origin, prior.spacing_m)
     cars = []
     for car, line in enumerate(loaded.row_of_detection):
         T = T_cam_obj[car].numpy()

@@ -37,7 +37,7 @@ from directshape_torch.residuals.priors import dimensions_prior, height_prior, s
 from directshape_torch.residuals.silhouette import project_product
 from directshape_torch.residuals.state_chain import sdf_state_jacobian
 from directshape_torch.result import RefinementResult
-from directshape_torch.shape.shape_prior import SdfDerivatives
+from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 from directshape_torch.solver.damped_solve import damped_step
 
 ROOT = Path(__file__).parents[2]
@@ -296,7 +296,7 @@ def test_22_jacobians_are_out_in() -> None:
 
 def test_23_residuals_are_predicted_minus_observed() -> None:
     one = torch.ones(1, 3, dtype=torch.float64)
-    shape_is_larger = dimensions_prior(one[:, :1], one, 2 * one[0], 0 * one.T, one[0])
+    shape_is_larger = dimensions_prior(DimensionsDerivative(2 * one, 0 * one[:, :, None]), one, one[0])
     assert (shape_is_larger.residual > 0).all()
     # A car predicted lower (greater y) than the ground: positive.
     T = se3.inverse(box3d.pose_from_kitti(vector(0, 1.9, 10), torch.tensor(0.0).double()))[None]

@@ -78,7 +78,7 @@ def street(
     T_right_cam: Tensor | None = None,
 ) -> Street:
     """One frame with the given cars; everything in the dtype of the prior."""
-    dtype, count = prior.mean.dtype, len(location_cam)
+    dtype, count = prior.origin.dtype, len(location_cam)
     code = prior.initial_code(count) if code is None else code
     width, height = size_wh
     camera = stereo_camera(width, height, focal_px, dtype)
@@ -100,7 +100,7 @@ def street(
         torch.tensor([[0.0, -1.0, 0.0]], dtype=dtype), torch.tensor([CAMERA_HEIGHT_M], dtype=dtype), ("file",)
     )
     frames = FrameBatch(images[0], images[1], torch.tensor([[height, width]]), camera, ground, ("000000",))
-    dimensions = prior.dimensions_hwl(code)
+    dimensions = prior.dimensions_and_derivative(code).hwl
     corners = project(box_corners(T_cam_obj, dimensions), camera.K_left[:, None])
     last = torch.tensor([width - 1.0, height - 1.0], dtype=dtype)
     low, high = corners.amin(1).clamp_min(0).minimum(last), corners.amax(1).clamp_min(0).minimum(last)
@@ -123,7 +123,7 @@ TWO_CARS = ([(-1.3, CAMERA_HEIGHT_M, 8.0), (1.9, CAMERA_HEIGHT_M, 12.5)], [0.5, 
 
 def two_car_street(prior: PCAShapePrior) -> Street:
     """Cars at 8 and 12.5 m whose codes are not the mean's."""
-    code = torch.tensor([[0.8, -0.5, 0.6], [-0.7, 0.4, 0.5]], dtype=prior.mean.dtype)[:, : prior.num_codes]
+    code = torch.tensor([[0.8, -0.5, 0.6], [-0.7, 0.4, 0.5]], dtype=prior.origin.dtype)[:, : prior.num_codes]
     return street(prior, *TWO_CARS, code=code)
 
 

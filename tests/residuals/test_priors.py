@@ -22,6 +22,7 @@ from directshape_torch.residuals.priors import (
     tilt_prior_cosine,
     tilt_prior_normal,
 )
+from directshape_torch.shape.shape_prior import DimensionsDerivative
 
 NUM_CODES = 3
 NORMAL = torch.nn.functional.normalize(torch.tensor([0.02, -1.0, -0.03], dtype=torch.float64), dim=0)
@@ -48,9 +49,13 @@ def _cosine(state: CarState) -> PriorResidual:
     return tilt_prior_cosine(state.T_obj_cam, NORMAL.expand(len(state.code), 3), NUM_CODES)
 
 
+def _linear_dimensions(code: Tensor) -> DimensionsDerivative:
+    return DimensionsDerivative(MEAN_HWL + code @ BASIS_HWL.T, BASIS_HWL.expand(len(code), -1, -1))
+
+
 def _dimensions(state: CarState) -> PriorResidual:
     detector = torch.tensor([1.4, 1.7, 4.3], dtype=torch.float64).expand(len(state.code), 3)
-    return dimensions_prior(state.code, detector, MEAN_HWL, BASIS_HWL, SIGMA_HWL)
+    return dimensions_prior(_linear_dimensions(state.code), detector, SIGMA_HWL)
 
 
 PRIORS: dict[str, Callable[[CarState], PriorResidual]] = {
@@ -148,7 +153,8 @@ def test_neither_tilt_prior_minds_position_or_heading() -> None:
 def test_dimensions_by_hand() -> None:
     code = torch.tensor([[1.0, 0.0, -1.0]], dtype=torch.float64)
     # Height 1.5 + 0.1 - 0.02 = 1.58 against 1.4 at 0.1 m: 1.8 standard deviations.
-    residual = dimensions_prior(code, torch.tensor([[1.4, 1.6, 4.0]]).double(), MEAN_HWL, BASIS_HWL, SIGMA_HWL).residual
+    detector = torch.tensor([[1.4, 1.6, 4.0]], dtype=torch.float64)
+    residual = dimensions_prior(_linear_dimensions(code), detector, SIGMA_HWL).residual
     torch.testing.assert_close(residual[0, 0], torch.tensor(1.8, dtype=torch.float64))
 
 
