@@ -44,6 +44,7 @@ class SolverConfig:
         block_iterations: iterations between two looks at which cars go on.
         max_step_translation_m, max_step_rotation_rad, max_step_code: trust region; the whole step is scaled.
         max_code: bound of |code|, in standard deviations.
+        jacobian: "analytic" (hand-derived) or "autograd" (forward mode, several times slower): the same steps.
     """
 
     initial_damping: float = 1e-2
@@ -59,6 +60,7 @@ class SolverConfig:
     max_step_rotation_rad: float = 0.15
     max_step_code: float = 1.0
     max_code: float = 3.0
+    jacobian: Literal["analytic", "autograd"] = "analytic"
 
 
 @dataclass(frozen=True)

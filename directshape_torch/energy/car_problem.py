@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
+from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_state import CarState, retract
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
 from directshape_torch.energy.term import Term, TermLinearisation
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -46,9 +47,25 @@ class CarProblem:
         projected = self.project(state)
         self.terms = [term.at_stage(stage, projected) for term in self.terms]
 
-    def project(self, state: CarState) -> ProjectedState:
-        """Everything that the terms share at a state."""
-        return ProjectedState(self.prior, state, self.left, self.right, self.config.silhouette.samples_per_ray)
+    def project(
+        self,
+        state: CarState,
+        *,
+        frozen: ProjectedState | None = None,
+        root_iterations: int = ROOT_ITERATIONS,
+        moving_depths: bool = False,
+    ) -> ProjectedState:
+        """Everything that the terms share at a state; the options are those of `ProjectedState`."""
+        return ProjectedState(
+            self.prior,
+            state,
+            self.left,
+            self.right,
+            self.config.silhouette.samples_per_ray,
+            frozen=frozen,
+            root_iterations=root_iterations,
+            moving_depths=moving_depths,
+        )
 
     def cost(self, state: CarState) -> Tensor:
         return self.term_costs(state).sum(dim=1)
@@ -66,7 +83,11 @@ class CarProblem:
 
     def linearise_terms(self, state: CarState, with_fisher: bool = False) -> list[TermLinearisation]:
         """The linearisation of each term by itself."""
-        projected = self.project(state)
+        if self.config.solver.jacobian == "autograd":
+            rows = rows_by_autograd(self, state)
+            return [t.accumulate(r, J, with_fisher) for t, (r, J) in zip(self.terms, rows, strict=True)]
+        # Whoever differentiates a linearisation needs depths that follow the state.
+        projected = self.project(state, moving_depths=torch.is_grad_enabled())
         return [term.linearise(projected, with_fisher) for term in self.terms]
 
     def retract(self, state: CarState, step: Tensor) -> CarState:

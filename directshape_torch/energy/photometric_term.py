@@ -15,7 +15,7 @@ from torch import Tensor
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.projected_state import ProjectedState
-from directshape_torch.energy.term import TermLinearisation
+from directshape_torch.energy.term import ResidualRows, TermLinearisation
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.image.pyramid import halve, halve_sizes
@@ -25,11 +25,12 @@ from directshape_torch.residuals import robust
 from directshape_torch.residuals.photometric import (
     DSO_PATTERN,
     PhotometricResidual,
+    SurfaceDepth,
     depth_state_jacobian,
     photometric_residual,
     surface_slope,
 )
-from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root, attached_depth, first_crossing
+from directshape_torch.shape.raycast import attached_depth
 from directshape_torch.solver.normal_equations import Segments
 from directshape_torch.solver.problem import Stage
 
@@ -62,13 +63,6 @@ class _Fixed(NamedTuple):
     neighbour_weight: Tensor  # (Q, N) zero for neighbours that the mask says are not on the car
     images: GreyPair
     segments: Segments
-
-
-class _Surface(NamedTuple):
-    """Where the rays of the pixel set enter the shape."""
-
-    rays: ObjectRays
-    root: Root
 
 
 @dataclass(frozen=True)
@@ -109,28 +103,64 @@ class PhotometricTerm:
         usable, residual = self._usable_and_residual(projected, attached=True)
         return self._weighted_cost(self._norm(residual.residual).rho, usable)
 
+    def residuals(self, projected: ProjectedState) -> ResidualRows:
+        """All neighbourhood pixels of all pixels, R = Q N, the neighbours of one pixel side by side."""
+        usable, residual = self._usable_and_residual(projected, attached=True)
+        return self._rows(residual.residual, usable)
+
+    def jacobian(self, projected: ProjectedState) -> Tensor:
+        depth, residual, usable = self._depth_and_residual(projected)
+        J_residual_depth = torch.where(usable[:, None], residual.J_residual_depth, 0)
+        return (J_residual_depth[..., None] * depth.J_depth_state[:, None]).flatten(0, 1)
+
     def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
-        fixed = self._require()
-        surface = self._surface(projected)
-        points = surface.rays.at(surface.root.depth)
-        at = projected.shape.value_and_derivatives(points, surface.rays.object_index)
-        depth = depth_state_jacobian(points, at, surface.rays.direction_obj, self.config.min_ray_cosine)
-        residual = self._residual(surface.root.depth)
-        usable = self._is_usable(surface.root.found & ~depth.grazing, residual)
-        norm = self._norm(residual.residual)
-        weight = torch.where(usable, fixed.gradient_weight, torch.zeros_like(fixed.gradient_weight))
+        depth, residual, usable = self._depth_and_residual(projected)
+        norm, weight = self._norm_and_weight(residual.residual, usable)
         # All neighbours share one depth, so their rows are multiples of one: sum the multiples first.
         J = torch.where(usable[:, None], residual.J_residual_depth, torch.zeros_like(residual.J_residual_depth))
-        norm = robust.RobustValue(*(torch.where(usable[:, None], x, torch.zeros_like(x)) for x in norm))
-        first = weight * (fixed.neighbour_weight * norm.gradient_weight * J).sum(dim=1)
-        second = weight * (fixed.neighbour_weight * norm.hessian_weight * J * J).sum(dim=1)
-        gradient, hessian = fixed.segments.accumulate(depth.J_depth_state, first, second)
-        rho = self._weighted_cost(norm.rho, usable)
-        c = self._weight()
+        first = (weight * norm.gradient_weight * J).sum(dim=1)
+        second = (weight * norm.hessian_weight * J * J).sum(dim=1)
+        gradient, hessian = self._require().segments.accumulate(depth.J_depth_state, first, second)
+        return self._linearisation(self._weighted_cost(norm.rho, usable), gradient, hessian)
+
+    def accumulate(self, rows: ResidualRows, J: Tensor, with_fisher: bool = False) -> TermLinearisation:
+        neighbours = len(DSO_PATTERN)
+        usable = rows.usable[::neighbours]
+        norm, weight = self._norm_and_weight(rows.value.reshape(-1, neighbours), usable)
+        J = J.reshape(-1, neighbours, J.shape[-1])
+        segments = self._require().segments
+        first, second = weight * norm.gradient_weight, weight * norm.hessian_weight
+        parts = [segments.accumulate(J[:, n], first[:, n], second[:, n]) for n in range(neighbours)]
+        gradient, hessian = (torch.stack(sums).sum(dim=0) for sums in zip(*parts, strict=True))
+        return self._linearisation(self._weighted_cost(norm.rho, usable), gradient, hessian)
+
+    def _rows(self, residual: Tensor, usable: Tensor) -> ResidualRows:
+        neighbours = residual.shape[1]
+        object_index = self._require().object_index.repeat_interleave(neighbours)
+        return ResidualRows(residual.flatten(), object_index, usable.repeat_interleave(neighbours))
+
+    def _depth_and_residual(self, projected: ProjectedState) -> tuple[SurfaceDepth, PhotometricResidual, Tensor]:
+        """Depth with its hand-derived Jacobian, residuals there, and which pixels (Q,) of the set are usable."""
+        rays, root = projected.left.surface(self._require().pixel_index)
+        points = rays.at(root.depth)
+        at = projected.shape.value_and_derivatives(points, rays.object_index)
+        depth = depth_state_jacobian(points, at, rays.direction_obj, self.config.min_ray_cosine)
+        residual = self._residual(root.depth)
+        return depth, residual, self._is_usable(root.found & ~depth.grazing, residual)
+
+    def _norm_and_weight(self, residual: Tensor, usable: Tensor) -> tuple[robust.RobustValue, Tensor]:
+        """Robust norm and weight (Q, N) of each neighbourhood pixel, zero where it is not usable."""
+        norm = robust.RobustValue(*(torch.where(usable[:, None], x, torch.zeros_like(x)) for x in self._norm(residual)))
+        fixed = self._require()
+        weight = torch.where(usable, fixed.gradient_weight, torch.zeros_like(fixed.gradient_weight))
+        return norm, weight[:, None] * fixed.neighbour_weight
+
+    def _linearisation(self, pixel_cost: Tensor, gradient: Tensor, hessian: Tensor) -> TermLinearisation:
+        fixed, c = self._require(), self._weight()
         # The neighbourhoods of neighbouring samples overlap: a pixel counts once, with its neighbourhood's mean.
         per_pixel = fixed.segments.counts.to(torch.float64) / self.config.huber_grey_levels**2 / self.config.weight
         fisher = (c * per_pixel)[:, None, None] * hessian
-        cost = fixed.segments.sum(rho) * c
+        cost = fixed.segments.sum(pixel_cost) * c
         return TermLinearisation(cost, c[:, None] * gradient, c[:, None, None] * hessian, fisher)
 
     def agreement(self, projected: ProjectedState) -> tuple[Tensor, Tensor]:
@@ -227,13 +257,6 @@ class PhotometricTerm:
         gain = torch.where(left > 0, right / torch.where(left > 0, left, torch.ones_like(left)), torch.ones_like(left))
         return gain.clamp(*_GAIN_BOUNDS).to(fixed.intensity_left.dtype)
 
-    def _surface(self, projected: ProjectedState) -> _Surface:
-        view = projected.left
-        rows = self._require().pixel_index
-        rays = view.rays.select(rows)
-        marched = RayMarch(*(x[rows] for x in view.march))
-        return _Surface(rays, first_crossing(projected.shape, rays, marched, view.closest_depth[rows]))
-
     def _residual(self, depth: Tensor) -> PhotometricResidual:
         fixed = self._require()
         cars = self.cars
@@ -262,16 +285,12 @@ class PhotometricTerm:
     def _usable_and_residual(
         self, projected: ProjectedState, attached: bool = False
     ) -> tuple[Tensor, PhotometricResidual]:
-        surface = self._surface(projected)
-        at = projected.shape.value_and_derivatives(
-            surface.rays.at(surface.root.depth).detach(), surface.rays.object_index
-        )
-        _, grazing = surface_slope(
-            at.gradient.detach(), surface.rays.direction_obj.detach(), self.config.min_ray_cosine
-        )
-        on_surface = surface.root.found & ~grazing
-        depth = surface.root.depth
+        rays, root = projected.left.surface(self._require().pixel_index)
+        depth = root.depth.detach()
+        at = projected.shape.value_and_derivatives(rays.at(depth).detach(), rays.object_index)
+        _, grazing = surface_slope(at.gradient.detach(), rays.direction_obj.detach(), self.config.min_ray_cosine)
+        on_surface = root.found & ~grazing
         if attached:
-            depth = attached_depth(projected.shape, surface.rays, depth, on_surface)
+            depth = attached_depth(projected.shape, rays, depth, on_surface)
         residual = self._residual(depth)
         return self._is_usable(on_surface, residual), residual

@@ -11,7 +11,7 @@ from torch import Tensor
 from directshape_torch.config import SilhouetteConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
-from directshape_torch.energy.term import TermLinearisation
+from directshape_torch.energy.term import ResidualRows, TermLinearisation
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.silhouette import (
@@ -75,21 +75,35 @@ class SilhouetteTerm:
         residual = silhouette_residual(projection, self.foreground)
         return torch.where(view.march.crosses_bounds, residual, self._residual_of_a_miss())
 
+    def residuals(self, projected: ProjectedState) -> ResidualRows:
+        usable = self._view(projected).march.crosses_bounds
+        return ResidualRows(self.pixel_residual(projected), self.pixels.object_index, usable)
+
+    def jacobian(self, projected: ProjectedState) -> Tensor:
+        return self._rows(projected)[1]
+
     def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
-        view = self._view(projected)
-        form = self._rows_product if self.config.form == "product" else self._rows_closest_approach
-        residual, rows = form(projected.shape, view)
-        crosses = view.march.crosses_bounds
-        residual = torch.where(crosses, residual, self._residual_of_a_miss())
-        rows = torch.where(crosses[:, None], rows, torch.zeros_like(rows))
-        norm = robust.identity(residual, self.config.residual_floor)
-        gradient, hessian = self.segments.accumulate(rows, norm.gradient_weight, norm.hessian_weight)
+        return self.accumulate(*self._rows(projected), with_fisher)
+
+    def accumulate(self, rows: ResidualRows, J: Tensor, with_fisher: bool = False) -> TermLinearisation:
+        norm = robust.identity(rows.value, self.config.residual_floor)
+        gradient, hessian = self.segments.accumulate(J, norm.gradient_weight, norm.hessian_weight)
         fisher = torch.zeros_like(hessian)
         if with_fisher:
-            fisher = self.segments.accumulate(rows, norm.gradient_weight, torch.ones_like(residual))[1]
+            fisher = self.segments.accumulate(J, norm.gradient_weight, torch.ones_like(rows.value))[1]
         weight = self._weight()
         cost = self.segments.sum(norm.rho) * weight
         return TermLinearisation(cost, weight[:, None] * gradient, weight[:, None, None] * hessian, fisher)
+
+    def _rows(self, projected: ProjectedState) -> tuple[ResidualRows, Tensor]:
+        """Residuals and their hand-derived Jacobian from one pass."""
+        view = self._view(projected)
+        form = self._rows_product if self.config.form == "product" else self._rows_closest_approach
+        residual, J = form(projected.shape, view)
+        crosses = view.march.crosses_bounds
+        residual = torch.where(crosses, residual, self._residual_of_a_miss())
+        J = torch.where(crosses[:, None], J, torch.zeros_like(J))
+        return ResidualRows(residual, self.pixels.object_index, crosses), J
 
     def of_objects(self, keep: Tensor) -> SilhouetteTerm:
         rows = keep[self.pixels.object_index]

@@ -23,6 +23,18 @@ class TermLinearisation(NamedTuple):
     fisher: Tensor  # (B, D, D)
 
 
+class ResidualRows(NamedTuple):
+    """The residuals of a term, one by one, sorted by car.
+
+    `value` is differentiable by the state. Rows that are not usable (the residual's own skip rules) cost a constant:
+    their Jacobian is zero by definition and their value means nothing.
+    """
+
+    value: Tensor  # (R,)
+    object_index: Tensor  # (R,)
+    usable: Tensor  # (R,) bool
+
+
 class Term(Protocol):
     """One summand of the energy. Terms are immutable: a new stage makes a new term."""
 
@@ -39,6 +51,21 @@ class Term(Protocol):
 
     def linearise(self, projected: ProjectedState, with_fisher: bool = False) -> TermLinearisation:
         """Cost with hand-derived gradient and Gauss-Newton matrix."""
+        ...
+
+    def residuals(self, projected: ProjectedState) -> ResidualRows:
+        """Every residual (R,) by itself; differentiable by autograd, forward and reverse."""
+        ...
+
+    def jacobian(self, projected: ProjectedState) -> Tensor:
+        """Hand-derived Jacobian (R, D) of the residuals by the state, zero where they are not usable.
+
+        `linearise` does the same without ever keeping it; this is the readable form for tests and experiments.
+        """
+        ...
+
+    def accumulate(self, rows: ResidualRows, J: Tensor, with_fisher: bool = False) -> TermLinearisation:
+        """The linearisation from residuals and any Jacobian (R, D) of them."""
         ...
 
     def of_objects(self, keep: Tensor) -> Self:

@@ -32,6 +32,10 @@ class ObjectRays:
         return ObjectRays(self.origin_obj[index], self.direction_obj[index], self.object_index[index])
 
 
+# Below this slope along the ray a depth has no derivative that could be used.
+_LEAST_SLOPE = 1e-6
+
+
 class RayMarch(NamedTuple):
     """Signed distances at S samples of P rays, detached."""
 
@@ -50,15 +54,23 @@ class Root(NamedTuple):
 @torch.no_grad()
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
+    near, far, crosses_bounds = _interval(rays, bounds_obj)
+    share = (torch.arange(num_samples, dtype=near.dtype, device=near.device) + 0.5) / num_samples
+    depths = near[:, None] + (far - near)[:, None] * share
+    return RayMarch(depths, _sdf_at(shape, rays, depths), crosses_bounds)
+
+
+def _interval(rays: ObjectRays, bounds_obj: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     interval = ray_box_interval(rays.origin_obj, rays.direction_obj, bounds_obj)
     near = torch.where(interval.hit, interval.near, torch.ones_like(interval.near))
     far = torch.where(interval.hit, interval.far, torch.full_like(interval.far, 2.0))
-    share = (torch.arange(num_samples, dtype=near.dtype, device=near.device) + 0.5) / num_samples
-    depths = near[:, None] + (far - near)[:, None] * share
+    return near, far, interval.hit
+
+
+def _sdf_at(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:
     points = torch.addcmul(rays.origin_obj[:, None], depths[..., None], rays.direction_obj[:, None])
-    index = rays.object_index[:, None].expand(-1, num_samples)
-    sdf = shape.value(points.reshape(-1, 3), index.reshape(-1)).view_as(depths)
-    return RayMarch(depths, sdf, interval.hit)
+    index = rays.object_index[:, None].expand_as(depths)
+    return shape.value(points.reshape(-1, 3), index.reshape(-1)).view_as(depths)
 
 
 @torch.no_grad()
@@ -69,15 +81,41 @@ def closest_approach_depth(marched: RayMarch) -> Tensor:
     the derivative by the depth vanishes, so an error of this depth enters the closest distance only in second order.
     """
     sdf, depths = marched.sdf, marched.depths
-    last = sdf.shape[1] - 1
-    best = sdf.argmin(dim=1, keepdim=True)
-    before, here, after = (sdf.gather(1, i)[:, 0] for i in ((best - 1).clamp_min(0), best, (best + 1).clamp_max(last)))
+    best, neighbours = _least_sample(sdf)
+    offset = _vertex_offset(sdf.gather(1, torch.stack(neighbours, dim=1)), best, sdf.shape[1])
+    step = depths[:, 1] - depths[:, 0] if sdf.shape[1] > 1 else torch.zeros_like(offset)
+    return depths.gather(1, best[:, None])[:, 0] + offset * step
+
+
+def attached_closest_depth(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, marched: RayMarch) -> Tensor:
+    """`closest_approach_depth` as a differentiable function of rays and shape: which sample is least stays fixed.
+
+    Only the least sample and its neighbours are evaluated with a graph, a few points instead of S.
+    """
+    num_samples = marched.depths.shape[1]
+    near, far, _ = _interval(rays, bounds_obj)
+    best, neighbours = _least_sample(marched.sdf)
+    step = (far - near) / num_samples
+    depths = near[:, None] + (torch.stack(neighbours, dim=1).to(near.dtype) + 0.5) * step[:, None]
+    offset = _vertex_offset(_sdf_at(shape, rays, depths), best, num_samples)
+    if num_samples == 1:
+        step = torch.zeros_like(step)
+    return depths[:, 1] + offset * step
+
+
+def _least_sample(sdf: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+    """Number (P,) of the least sample of each ray, and the numbers of the one before it, of itself, of the next."""
+    best = sdf.argmin(dim=1)
+    return best, ((best - 1).clamp_min(0), best, (best + 1).clamp_max(sdf.shape[1] - 1))
+
+
+def _vertex_offset(sdf: Tensor, best: Tensor, num_samples: int) -> Tensor:
+    """Vertex of the parabola through three samples (P, 3), in sample distances from the middle; zero at the ends."""
+    before, here, after = sdf.unbind(1)
     curvature = before - 2 * here + after
-    inner = (best[:, 0] > 0) & (best[:, 0] < last) & (curvature > 0)
+    inner = (best > 0) & (best < num_samples - 1) & (curvature > 0)
     safe = torch.where(inner, curvature, torch.ones_like(curvature))
-    offset = torch.where(inner, 0.5 * (before - after) / safe, torch.zeros_like(here)).clamp(-0.5, 0.5)
-    step = depths[:, 1] - depths[:, 0] if last > 0 else torch.zeros_like(here)
-    return depths.gather(1, best)[:, 0] + offset * step
+    return torch.where(inner, 0.5 * (before - after) / safe, torch.zeros_like(here)).clamp(-0.5, 0.5)
 
 
 @torch.no_grad()
@@ -123,6 +161,15 @@ def _false_position(
     return best
 
 
+@torch.no_grad()
+def polished_depth(shape: BoundShape, rays: ObjectRays, root: Root, num_steps: int) -> Tensor:
+    """Depth (P,) of roots known nearly, by Newton steps: for states next to the one that the root belongs to."""
+    depth = root.depth
+    for _ in range(num_steps):
+        depth = depth - _newton_step(shape, rays, depth, root.found)
+    return depth
+
+
 def attached_depth(shape: BoundShape, rays: ObjectRays, root: Tensor, usable: Tensor) -> Tensor:
     """The depth of the root as a differentiable function of rays and shape: two Newton steps from the detached root.
 
@@ -131,7 +178,13 @@ def attached_depth(shape: BoundShape, rays: ObjectRays, root: Tensor, usable: Te
     """
     depth = root
     for _ in range(2):
-        at = shape.value_and_derivatives(rays.at(depth), rays.object_index)
-        slope = (at.gradient * rays.direction_obj).sum(-1)
-        depth = depth - torch.where(usable, at.value / torch.where(usable, slope, torch.ones_like(slope)), 0 * slope)
+        depth = depth - _newton_step(shape, rays, depth, usable)
     return root + (depth - depth.detach())
+
+
+def _newton_step(shape: BoundShape, rays: ObjectRays, depth: Tensor, usable: Tensor) -> Tensor:
+    at = shape.value_and_derivatives(rays.at(depth), rays.object_index)
+    slope = (at.gradient * rays.direction_obj).sum(-1)
+    regular = usable & (slope.abs() > _LEAST_SLOPE)
+    step = at.value / torch.where(regular, slope, torch.ones_like(slope))
+    return torch.where(regular, step, torch.zeros_like(step))

@@ -93,7 +93,7 @@ def test_a_pixel_that_lands_on_a_nearer_cars_mask_is_excluded() -> None:
         assert term.fixed is not None
         counts.append(term.fixed.segments.counts)
         if config is with_order:
-            uv = term._residual(term._surface(problem.project(state)).root.depth).uv_right
+            uv = term._residual(problem.project(state).left.surface(term.fixed.pixel_index)[1].depth).uv_right
             u, v = uv[term.fixed.object_index == 1].round().long().unbind(1)
             assert (scene.detections.mask_right[0, v, u] < 0.5).all()
     assert counts[0][0] == counts[1][0]

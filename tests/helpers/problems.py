@@ -51,10 +51,7 @@ def begun_problem(
 
 def frozen_like(problem: CarProblem, state: CarState, at: ProjectedState) -> ProjectedState:
     """The projection of another state whose intervals and sample depths stay those of `at`."""
-    projected = problem.project(state)
-    for view, fixed in ((projected.left, at.left), (projected.right, at.right)):
-        view.__dict__["march"], view.__dict__["closest_depth"] = fixed.march, fixed.closest_depth
-    return projected
+    return problem.project(state, frozen=at)
 
 
 def with_code(state: CarState, code: Any) -> CarState:
