@@ -1,0 +1,105 @@
+"""Which functions hold hand-derived derivatives, and which tests must catch a mistake in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_SE3_TESTS = tuple(
+    f"tests/geometry/test_se3_{name}.py"
+    for name in ("generators", "group", "adjoint", "exp_log", "series", "references", "gradients")
+)
+_ENERGY = "tests/energy/test_gradient_of_the_cost.py"
+
+
+@dataclass(frozen=True)
+class Target:
+    """Functions of one file (`Class.method` for methods) and the tests named for them, the quickest first."""
+
+    path: str
+    functions: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+TARGETS: dict[str, Target] = {
+    "se3_exp": Target(
+        "directshape_torch/geometry/se3.py",
+        ("hat", "generators", "_exp_coefficients", "exp", "from_rotation_translation"),
+        _SE3_TESTS,
+    ),
+    "se3_group": Target("directshape_torch/geometry/se3.py", ("inverse", "transform", "adjoint"), _SE3_TESTS),
+    "se3_log": Target("directshape_torch/geometry/se3.py", ("so3_log", "_quaternion", "log"), _SE3_TESTS),
+    "retract": Target("directshape_torch/energy/car_state.py", ("retract",), ("tests/energy/test_car_state.py",)),
+    "pinhole": Target(
+        "directshape_torch/geometry/pinhole.py", ("rays_from_pixels", "project"), ("tests/geometry/test_pinhole.py",)
+    ),
+    "stereo_warp": Target(
+        "directshape_torch/geometry/stereo.py",
+        ("warp_to_right", "_shifted", "right_rays"),
+        ("tests/geometry/test_stereo.py",),
+    ),
+    "bilinear": Target(
+        "directshape_torch/image/interpolate.py",
+        ("bilinear_with_gradient", "_cell"),
+        ("tests/image/test_interpolate.py",),
+    ),
+    "sdf_grid": Target(
+        "directshape_torch/shape/sdf_grid.py",
+        (
+            "GridShape.__init__",
+            "GridShape.value",
+            "GridShape.value_and_derivatives",
+            "GridShape._cells",
+            "GridShape._corner_values",
+            "GridShape._interpolate_basis",
+            "_along",
+            "_safe_norm",
+        ),
+        ("tests/shape/test_sdf_grid.py",),
+    ),
+    "ray_depth": Target(
+        "directshape_torch/shape/raycast.py",
+        ("ObjectRays.at", "attached_depth"),
+        ("tests/shape/test_raycast.py", "tests/residuals/test_photometric.py"),
+    ),
+    "state_chain": Target(
+        "directshape_torch/residuals/state_chain.py", ("sdf_state_jacobian",), ("tests/residuals/test_state_chain.py",)
+    ),
+    "silhouette": Target(
+        "directshape_torch/residuals/silhouette.py",
+        (
+            "project_closest_approach",
+            "project_product",
+            "log_one_minus_exp",
+            "clamp_foreground",
+            "silhouette_residual",
+            "residual_derivative_closest_approach",
+            "residual_derivative_product",
+        ),
+        ("tests/residuals/test_silhouette.py", "tests/residuals/test_silhouette_dilation.py"),
+    ),
+    "photometric": Target(
+        "directshape_torch/residuals/photometric.py",
+        ("surface_slope", "depth_state_jacobian", "photometric_residual"),
+        ("tests/residuals/test_photometric.py",),
+    ),
+    "priors": Target(
+        "directshape_torch/residuals/priors.py",
+        ("shape_prior", "height_prior", "tilt_prior_normal", "tilt_prior_cosine", "dimensions_prior"),
+        ("tests/residuals/test_priors.py",),
+    ),
+    "robust": Target(
+        "directshape_torch/residuals/robust.py",
+        ("quadratic", "huber", "truncated_huber", "identity"),
+        ("tests/residuals/test_robust.py",),
+    ),
+    "normal_equations": Target(
+        "directshape_torch/solver/normal_equations.py",
+        ("Segments._blocks", "Segments._over_blocks", "Segments.sum", "Segments.accumulate"),
+        ("tests/solver/test_normal_equations.py",),
+    ),
+    "covariance": Target(
+        "directshape_torch/covariance.py",
+        ("tangent_covariance", "covariance_xyz_yaw"),
+        ("tests/test_covariance.py",),
+    ),
+}
