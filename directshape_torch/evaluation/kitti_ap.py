@@ -1,0 +1,242 @@
+"""Average precision and orientation similarity of 3D object detections, by the rules of KITTI's own evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.errors import InputError
+from directshape_torch.evaluation.comparison import DEPTH_BINS_M
+from directshape_torch.evaluation.kitti_ap_files import ObjectsByFrame, load_frames
+from directshape_torch.evaluation.kitti_box_table import BoxTable, Floats, make_box_table
+from directshape_torch.evaluation.kitti_curve import (
+    Candidates,
+    Curve,
+    area_under_curve,
+    average_precision,
+    compute_curve,
+)
+from directshape_torch.evaluation.kitti_difficulty import (
+    COUNTED,
+    DIFFICULTIES,
+    IGNORED,
+    Difficulty,
+    detection_roles,
+    label_roles,
+)
+from directshape_torch.evaluation.kitti_overlaps import METRICS, Metric, Overlaps, find_overlaps
+
+MINIMUM_IOUS = (0.7, 0.5)
+# KITTI's mark of a result without an observation angle.
+_NO_ALPHA = -10.0
+_EVERYWHERE_M = (-np.inf, np.inf)
+
+
+@dataclass(frozen=True)
+class ApScore:
+    """Scores of one metric at one overlap and difficulty, in percent.
+
+    Attributes:
+        metric: 2d (image boxes), bev (bird's-eye view) or 3d.
+        minimum_iou: a detection is right if it overlaps its label by more than this.
+        difficulty: easy, moderate or hard.
+        num_labels: labels that count.
+        ap_r11, ap_r40: average precision over 11 and over 40 recall points.
+        ap_area: area under the same curve over its true recalls; for sets of fewer than 41 labels, where the devkit's
+            recall points cannot all be reached and both figures above fall short.
+        aos_r11, aos_r40: average orientation similarity, of 2d alone; None where the results carry no alpha.
+        curve: what the figures are made of.
+    """
+
+    metric: Metric
+    minimum_iou: float
+    difficulty: str
+    num_labels: int
+    ap_r11: float
+    ap_r40: float
+    ap_area: float
+    aos_r11: float | None
+    aos_r40: float | None
+    curve: Curve
+
+
+@dataclass(frozen=True)
+class DistanceScores:
+    """Scores of the labels whose depth along the optical axis lies within [`low_m`, `high_m`).
+
+    Labels beyond are ignored, and so are detections beyond that belong to no label.
+    """
+
+    low_m: float
+    high_m: float
+    scores: tuple[ApScore, ...]
+
+
+@dataclass(frozen=True)
+class KittiScores:
+    """Everything `evaluate_kitti` finds.
+
+    Attributes:
+        object_type: the class.
+        num_frames: frames evaluated.
+        num_frames_without_results: those of them that have no results; their labels are missed.
+        num_result_frames_unused: frames that have results and are not evaluated.
+        num_detections: detections of the class in the evaluated frames.
+        scores: for every metric, overlap and difficulty; bev and 3d are left out where no detection has a 3D box.
+        by_distance: the same for each bin of `DEPTH_BINS_M`; empty where no detection has a 3D box.
+    """
+
+    object_type: str
+    num_frames: int
+    num_frames_without_results: int
+    num_result_frames_unused: int
+    num_detections: int
+    scores: tuple[ApScore, ...]
+    by_distance: tuple[DistanceScores, ...]
+
+    def score(self, metric: str, minimum_iou: float, difficulty: str) -> ApScore:
+        """The scores of one cell.
+
+        Raises:
+            InputError: there is no such cell; names those that there are.
+        """
+        for score in self.scores:
+            if (score.metric, score.minimum_iou, score.difficulty) == (metric, minimum_iou, difficulty):
+                return score
+        known = [
+            ", ".join(dict.fromkeys(str(getattr(s, name)) for s in self.scores))
+            for name in ("metric", "minimum_iou", "difficulty")
+        ]
+        raise InputError("metric, minimum_iou, difficulty", "; ".join(known), f"{metric}; {minimum_iou}; {difficulty}")
+
+
+def evaluate_kitti(
+    labels: Path | str | ObjectsByFrame,
+    results: Path | str | ObjectsByFrame,
+    *,
+    split: Path | str | Sequence[str] | None = None,
+    object_type: str = "Car",
+) -> KittiScores:
+    """Score detections as KITTI's devkit (2017) does: 2D, bird's-eye view and 3D, at IoU 0.5 and 0.7.
+
+    Args:
+        labels: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`), or objects by frame id.
+        results: folder of result files `NNNNNN.txt` with scores, or above a folder `data` with them, or objects by
+            frame id. A frame without results counts as missed.
+        split: frame ids, or a file with one a line; default every frame that has labels.
+        object_type: the class to score; labels of its neighbour (Van for Car) are ignored.
+
+    Raises:
+        DataFormatError: a folder, a label file of the split or a line is missing or damaged, or a result has no score.
+        InputError: no frame has labels, or none has results.
+
+    Example: one car, found with perfect overlap.
+        >>> from directshape_torch.io.kitti_labels import parse_object
+        >>> from directshape_torch.io.text_files import Line
+        >>> text = "Car 0 0 0 100 100 200 180 1.5 1.6 3.9 1 1.6 20 0"
+        >>> label, result = (parse_object("a file", Line(1, t, t)) for t in (text, text + " 0.9"))
+        >>> evaluate_kitti({"000007": [label]}, {"000007": [result]}).score("3d", 0.7, "easy").ap_area
+        100.0
+    """
+    frames = load_frames(labels, results, split)
+    label_table = make_box_table(frames.labels)
+    detection_table = make_box_table(frames.results)
+    overlaps = find_overlaps(label_table, detection_table, object_type)
+    scene = _Scene(label_table, detection_table, overlaps, object_type)
+    distances = pairwise(DEPTH_BINS_M) if "3d" in _metrics(scene) else ()
+    return KittiScores(
+        object_type=object_type,
+        num_frames=len(frames.frame_ids),
+        num_frames_without_results=frames.num_without_results,
+        num_result_frames_unused=frames.num_results_unused,
+        num_detections=int((detection_table.type == object_type.lower()).sum()),
+        scores=tuple(_all_scores(scene, *_EVERYWHERE_M)),
+        by_distance=tuple(DistanceScores(a, b, tuple(_all_scores(scene, a, b))) for a, b in distances),
+    )
+
+
+@dataclass(frozen=True)
+class _Scene:
+    labels: BoxTable
+    detections: BoxTable
+    overlaps: Overlaps
+    object_type: str
+
+
+def _all_scores(scene: _Scene, low_m: float, high_m: float) -> Iterator[ApScore]:
+    similarity = _orientation_similarity(scene)
+    for metric in _metrics(scene):
+        for minimum_iou in MINIMUM_IOUS:
+            for difficulty in DIFFICULTIES:
+                candidates = _candidates(scene, metric, minimum_iou, difficulty, similarity, (low_m, high_m))
+                yield _score(metric, minimum_iou, difficulty, candidates)
+
+
+def _metrics(scene: _Scene) -> tuple[Metric, ...]:
+    """All of them, or 2d alone for a detector that gives no 3D box at all."""
+    is_type = scene.detections.type == scene.object_type.lower()
+    return METRICS if scene.detections.has_box_3d[is_type].any() or not is_type.any() else ("2d",)
+
+
+def _candidates(
+    scene: _Scene,
+    metric: Metric,
+    minimum_iou: float,
+    difficulty: Difficulty,
+    similarity: Floats | None,
+    depth_range_m: tuple[float, float],
+) -> Candidates:
+    label_role = label_roles(scene.labels, scene.object_type, difficulty)
+    detection_role = detection_roles(scene.detections, scene.object_type, difficulty)
+    near, far = depth_range_m
+    label_role[(label_role == COUNTED) & ~_within(scene.labels, near, far)] = IGNORED
+    may_be_wrong = (detection_role == COUNTED) & _within(scene.detections, near, far)
+    if metric == "2d":
+        # Seen from above and in space a DontCare region has no place, so that no detection lies in one.
+        may_be_wrong &= scene.overlaps.dont_care_share <= minimum_iou
+    enough = scene.overlaps.iou[metric] > minimum_iou
+    return Candidates(
+        label=scene.overlaps.label[enough],
+        detection=scene.overlaps.detection[enough],
+        iou=scene.overlaps.iou[metric][enough],
+        similarity=similarity[enough] if metric == "2d" and similarity is not None else None,
+        label_frame=scene.labels.frame,
+        label_role=label_role,
+        detection_role=detection_role,
+        score=scene.detections.score,
+        may_be_wrong=may_be_wrong,
+    )
+
+
+def _within(table: BoxTable, low_m: float, high_m: float) -> NDArray[np.bool_]:
+    return np.asarray((table.depth_m >= low_m) & (table.depth_m < high_m))
+
+
+def _orientation_similarity(scene: _Scene) -> Floats | None:
+    """Of each overlapping pair (P,), or None: one result without alpha suffices, as in the devkit."""
+    if (scene.detections.alpha == _NO_ALPHA).any():
+        return None
+    pairs = scene.overlaps
+    return np.asarray(0.5 + 0.5 * np.cos(scene.labels.alpha[pairs.label] - scene.detections.alpha[pairs.detection]))
+
+
+def _score(metric: Metric, minimum_iou: float, difficulty: Difficulty, candidates: Candidates) -> ApScore:
+    curve = compute_curve(candidates)
+    similarity = curve.orientation
+    return ApScore(
+        metric=metric,
+        minimum_iou=minimum_iou,
+        difficulty=difficulty.name,
+        num_labels=int((candidates.label_role == COUNTED).sum()),
+        ap_r11=average_precision(curve.precision, 11),
+        ap_r40=average_precision(curve.precision, 40),
+        ap_area=area_under_curve(curve),
+        aos_r11=None if similarity is None else average_precision(similarity, 11),
+        aos_r40=None if similarity is None else average_precision(similarity, 40),
+        curve=curve,
+    )

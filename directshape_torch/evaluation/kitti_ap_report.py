@@ -1,0 +1,138 @@
+"""KITTI scores as text and as JSON (schema 1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores
+from directshape_torch.evaluation.kitti_curve import NUM_RECALL_POINTS
+from directshape_torch.evaluation.kitti_difficulty import DIFFICULTIES
+from directshape_torch.io import atomic_files
+
+KITTI_SCORES_SCHEMA_VERSION = 1
+_NAMES = {"2d": "2D box", "bev": "bird's-eye view", "3d": "3D box"}
+_DISTANCE_DIFFICULTY = "moderate"
+
+
+def format_scores(scores: KittiScores) -> str:
+    """Tables for reading: average precision, orientation similarity where it is known, and precision by distance."""
+    parts = [_heading(scores), _ap_table(scores), _aos_table(scores), _distance_table(scores)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def write_scores_json(path: Path | str, scores: KittiScores) -> None:
+    """Write every score and curve as JSON; an open end of a distance bin is null."""
+    content = {
+        "schema_version": KITTI_SCORES_SCHEMA_VERSION,
+        "object_type": scores.object_type,
+        "num_frames": scores.num_frames,
+        "num_frames_without_results": scores.num_frames_without_results,
+        "num_result_frames_unused": scores.num_result_frames_unused,
+        "num_detections": scores.num_detections,
+        "scores": [_plain(score) for score in scores.scores],
+        "by_distance": [
+            {
+                "low_m": part.low_m,
+                "high_m": part.high_m if math.isfinite(part.high_m) else None,
+                "scores": [_plain(score) for score in part.scores],
+            }
+            for part in scores.by_distance
+        ],
+    }
+    atomic_files.write_json(path, content)
+
+
+def _plain(score: ApScore) -> dict[str, Any]:
+    curve = score.curve
+    return {
+        "metric": score.metric,
+        "minimum_iou": score.minimum_iou,
+        "difficulty": score.difficulty,
+        "num_labels": score.num_labels,
+        "ap_r11": score.ap_r11,
+        "ap_r40": score.ap_r40,
+        "ap_area": score.ap_area,
+        "aos_r11": score.aos_r11,
+        "aos_r40": score.aos_r40,
+        "thresholds": curve.thresholds.tolist(),
+        "recall": curve.recall.tolist(),
+        "precision": curve.precision.tolist(),
+        "orientation": None if curve.orientation is None else curve.orientation.tolist(),
+    }
+
+
+def _heading(scores: KittiScores) -> str:
+    counts = ", ".join(
+        f"{scores.score('2d', 0.7, difficulty.name).num_labels} {difficulty.name}" for difficulty in DIFFICULTIES
+    )
+    lines = [
+        f"{scores.object_type}: {scores.num_detections} detections in {scores.num_frames} frames; labels: {counts}"
+    ]
+    if scores.num_frames_without_results:
+        lines.append(f"{scores.num_frames_without_results} frames have no result file: their labels count as missed")
+    if scores.num_result_frames_unused:
+        lines.append(f"{scores.num_result_frames_unused} result files belong to no evaluated frame and are not used")
+    if "3d" not in {score.metric for score in scores.scores}:
+        lines.append("no detection has a 3D box: image boxes alone are scored")
+    if _has_few_labels(scores):
+        lines.append(
+            f"fewer than {NUM_RECALL_POINTS} labels cannot reach all recall points of the devkit, so that AP_R11 and "
+            "AP_R40 fall short there; the area under the curve does not"
+        )
+    return "\n".join(lines)
+
+
+def _has_few_labels(scores: KittiScores) -> bool:
+    return any(score.num_labels < NUM_RECALL_POINTS for score in scores.scores)
+
+
+def _ap_table(scores: KittiScores) -> str:
+    area = {"area": "ap_area"} if _has_few_labels(scores) else {}
+    return _table(scores.scores, "", {"AP_R11": "ap_r11", "AP_R40": "ap_r40"} | area)
+
+
+def _aos_table(scores: KittiScores) -> str:
+    known = [score for score in scores.scores if score.aos_r11 is not None]
+    return _table(known, "orientation, ", {"AOS_R11": "aos_r11", "AOS_R40": "aos_r40"}) if known else ""
+
+
+def _table(scores: Sequence[ApScore], prefix: str, figures: dict[str, str]) -> str:
+    """One line for each metric and overlap, one column for each figure and difficulty."""
+    columns = [f"{name} {difficulty.name}" for name in figures for difficulty in DIFFICULTIES]
+    rows = [[f"{prefix}in percent", "IoU >", *columns]]
+    for metric, minimum_iou in dict.fromkeys((s.metric, s.minimum_iou) for s in scores):
+        cells = {s.difficulty: s for s in scores if (s.metric, s.minimum_iou) == (metric, minimum_iou)}
+        values = [f"{getattr(cells[d.name], field):.2f}" for field in figures.values() for d in DIFFICULTIES]
+        rows.append([_NAMES[metric], str(minimum_iou), *values])
+    return _align(rows)
+
+
+def _distance_table(scores: KittiScores) -> str:
+    if not scores.by_distance:
+        return ""
+    rows = [
+        [
+            f"{_DISTANCE_DIFFICULTY}, by depth",
+            "labels",
+            *(f"{s.metric} {s.minimum_iou}" for s in _moderate(scores.scores)),
+        ]
+    ]
+    for part in scores.by_distance:
+        name = f"{part.low_m:.0f}-{part.high_m:.0f} m" if math.isfinite(part.high_m) else f"over {part.low_m:.0f} m"
+        moderate = _moderate(part.scores)
+        rows.append([name, str(moderate[0].num_labels), *(f"{s.ap_r40:.2f} ({s.ap_area:.2f})" for s in moderate)])
+    return "AP_R40 (area under the curve), in percent\n" + _align(rows)
+
+
+def _moderate(scores: Sequence[ApScore]) -> list[ApScore]:
+    return [score for score in scores if score.difficulty == _DISTANCE_DIFFICULTY]
+
+
+def _align(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines)
