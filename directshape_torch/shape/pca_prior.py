@@ -113,8 +113,12 @@ class PCAShapePrior(nn.Module):
     def lipschitz(self) -> float:
         """Bound of |gradient| on the grid over all codes of norm up to `CODE_NORM_IN_USE`."""
         if self._lipschitz is None:
-            self._lipschitz = float(_gradient_bound(self.mean, self.basis) / self.spacing_m)
+            self._lipschitz = self.lipschitz_within(CODE_NORM_IN_USE)
         return self._lipschitz
+
+    def lipschitz_within(self, code_norm: float) -> float:
+        """Bound of |gradient| on the grid over all codes of norm up to `code_norm`."""
+        return float(_gradient_bound(self.mean, self.basis, code_norm) / self.spacing_m)
 
     @property
     def dimensions_residual_std_hwl(self) -> Tensor:
@@ -275,6 +279,21 @@ class PCAShapePrior(nn.Module):
         self._lipschitz = None
 
 
+def training_codes(
+    sdf_samples: Tensor,  # (N, nx, ny, nz)
+    num_codes: int,
+    surface_band_m: float | None = 0.2,
+) -> Tensor:  # (N, K)
+    """The whitened codes of the samples that `PCAShapePrior.fit` with the same arguments is made from, float64.
+
+    Raises:
+        InputError: too few samples, or non-finite ones.
+    """
+    _check_samples(sdf_samples, num_codes)
+    samples = sdf_samples.double().flatten(1)
+    return _whitened_codes(samples - samples.mean(dim=0), _surface_weight(samples, surface_band_m), num_codes)[0]
+
+
 def _check_samples(sdf_samples: Tensor, num_codes: int) -> None:
     check_shape("sdf_samples", sdf_samples, ("N", "nx", "ny", "nz"))
     if num_codes < 1 or len(sdf_samples) <= num_codes:
@@ -306,14 +325,14 @@ def _whitened_codes(centred: Tensor, weight: Tensor, num_codes: int) -> tuple[Te
     return vectors * (len(centred) - 1) ** 0.5, eigenvalues[:num_codes] / eigenvalues.sum()
 
 
-def _gradient_bound(mean: Tensor, basis: Tensor) -> Tensor:
-    """Largest gradient (per node spacing) inside any cell, over all codes of norm up to `CODE_NORM_IN_USE`.
+def _gradient_bound(mean: Tensor, basis: Tensor, code_norm: float) -> Tensor:
+    """Largest gradient (per node spacing) inside any cell, over all codes of norm up to `code_norm`.
 
     In a cell each component of the trilinear gradient is a convex combination of four edge differences.
     """
     squared = torch.zeros_like(mean[1:, 1:, 1:])
     for axis in range(3):
-        edges = mean.diff(dim=axis).abs() + CODE_NORM_IN_USE * basis.diff(dim=axis).norm(dim=-1)
+        edges = mean.diff(dim=axis).abs() + code_norm * basis.diff(dim=axis).norm(dim=-1)
         for other in (a for a in range(3) if a != axis):
             count = edges.shape[other] - 1
             edges = torch.maximum(edges.narrow(other, 0, count), edges.narrow(other, 1, count))

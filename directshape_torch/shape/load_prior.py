@@ -1,0 +1,49 @@
+"""Shape priors of any kind from a file or by name: the file itself says of which kind it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from directshape_torch.errors import DataFormatError
+from directshape_torch.shape import kernel_pca_prior_file, neural_prior_file
+from directshape_torch.shape.neural_prior import NeuralShapePrior
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.tensor_file import read_description
+
+BUNDLED_PRIORS: Mapping[str, Callable[[], ShapePrior]] = {
+    "pca": PCAShapePrior.load_bundled,
+    "neural": NeuralShapePrior.load_bundled,
+}
+"""The priors that come with the package, by the name that `load_prior` knows them by."""
+
+_READERS: Mapping[str, Callable[[Path], ShapePrior]] = {
+    neural_prior_file.SCHEMA: neural_prior_file.read_neural_prior,
+    kernel_pca_prior_file.SCHEMA: kernel_pca_prior_file.read_kernel_prior,
+}
+
+
+def load_prior(source: Path | str) -> ShapePrior:
+    """A prior of any kind, float32 on the CPU.
+
+    Args:
+        source: "pca" or "neural" for a bundled one ("./neural" is a file), else a file of some prior's `save`.
+
+    Raises:
+        DataFormatError: no such file, or not a whole file of any kind that is known.
+
+    Example:
+        >>> load_prior("pca").num_codes == load_prior("neural").num_codes
+        True
+    """
+    bundled = BUNDLED_PRIORS.get(str(source)) if isinstance(source, str) else None
+    if bundled is not None:
+        return bundled()
+    path = Path(source)
+    if path.suffix != ".safetensors":
+        return PCAShapePrior.load(path)
+    schema = read_description(path).get("schema", "none")
+    if schema not in _READERS:
+        raise DataFormatError(path, f"schema {schema!r} is none of {', '.join(_READERS)}")
+    return _READERS[schema](path)

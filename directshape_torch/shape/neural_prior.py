@@ -1,0 +1,251 @@
+"""A small multilayer perceptron as a shape prior: code and point in, signed distance out. No grid anywhere.
+
+Every layer adds a shift that is linear in the code, so binding a code costs one small product a car. The point enters
+mirrored smoothly about the middle plane of the car: shapes are symmetric by construction.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from directshape_torch.checks import check_shape
+from directshape_torch.errors import InputError
+from directshape_torch.shape.pca_prior import PriorProvenance
+from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
+
+# Half width of the zone about the middle plane where the mirrored coordinate `sqrt(z^2 + s^2)` is rounded.
+MIRROR_ROUNDING_M = 0.2
+# Points of `values` that pass through the network together.
+_CHUNK_POINTS = 1 << 16
+
+
+class CodedLinear(nn.Module):
+    """`W x + C code + b`."""
+
+    def __init__(self, inputs: int, outputs: int, num_codes: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.randn(outputs, inputs) * inputs**-0.5)
+        self.code_weight = nn.Parameter(torch.randn(outputs, num_codes) * 0.3 * inputs**-0.5)
+        self.bias = nn.Parameter(torch.zeros(outputs))
+
+    def shift(self, code: Tensor) -> Tensor:
+        """`C code + b`, (B, outputs)."""
+        return code @ self.code_weight.T + self.bias
+
+
+class NeuralShapePrior(nn.Module):
+    """Signed distance by a network of sine and SiLU layers with a whitened code; implements `ShapePrior`.
+
+    All layers are smooth, so derivatives of any order exist inside the bounds. Its weights are parameters without
+    `requires_grad`, like those of a detector's frozen backbone; `prior.requires_grad_()` thaws them.
+
+    Args:
+        layer_widths: units of the hidden layers.
+        num_codes: K.
+        origin: node (0, 0, 0) of the measuring grid in the object frame, (3,), metres.
+        grid_shape: nodes of the measuring grid; it also spans the bounds of the field.
+        spacing_m: distance between its nodes.
+        provenance: where the weights come from.
+
+    Raises:
+        InputError: no hidden layer, or a grid without extent.
+
+    Example:
+        >>> prior = NeuralShapePrior.load_bundled()
+        >>> shape = prior.bind(prior.initial_code(2))
+        >>> at = shape.value_and_derivatives(torch.tensor([[0.0, -0.7, 0.0]]), torch.tensor([1]))
+        >>> bool(at.value < 0), at.gradient.shape, at.J_value_code.shape[1] == prior.num_codes
+        (True, torch.Size([1, 3]), True)
+    """
+
+    origin: Tensor
+    dimensions_mean_hwl: Tensor
+    dimensions_linear_hwl: Tensor
+    dimensions_quadratic_hwl: Tensor
+
+    def __init__(
+        self,
+        layer_widths: Sequence[int],
+        num_codes: int,
+        origin: Tensor,
+        grid_shape: tuple[int, int, int],
+        spacing_m: float,
+        provenance: PriorProvenance,
+    ) -> None:
+        super().__init__()
+        check_shape("origin", origin, (3,))
+        if not layer_widths or num_codes < 1:
+            raise InputError("layer_widths, num_codes", "at least one each", f"{list(layer_widths)}, {num_codes}")
+        if min(grid_shape) < 2 or not spacing_m > 0:
+            raise InputError("grid_shape, spacing_m", "two nodes along each axis", f"{grid_shape}, {spacing_m}")
+        widths = [3, *layer_widths, 1]
+        self.layers = nn.ModuleList(CodedLinear(a, b, num_codes) for a, b in itertools.pairwise(widths))
+        self.register_buffer("origin", origin)
+        self.register_buffer("dimensions_mean_hwl", origin.new_zeros(3))
+        self.register_buffer("dimensions_linear_hwl", origin.new_zeros(3, num_codes))
+        self.register_buffer("dimensions_quadratic_hwl", origin.new_zeros(3, num_codes, num_codes))
+        self.layer_widths, self.num_codes = tuple(layer_widths), num_codes
+        self.grid_shape, self.spacing_m = grid_shape, float(spacing_m)
+        self.provenance = provenance
+        self.to(origin).requires_grad_(False)
+
+    @property
+    def bounds_obj(self) -> Tensor:
+        """Lower and upper corner of the region that the network was trained for, (2, 3), metres."""
+        last_node = torch.tensor(self.grid_shape, dtype=self.origin.dtype, device=self.origin.device) - 1
+        return torch.stack([self.origin, self.origin + self.spacing_m * last_node])
+
+    @property
+    def lipschitz(self) -> float:
+        """Bound of |gradient| for every code: the product of the layers' gains. True, but far from tight."""
+        gain = 1.0
+        for layer in self.coded_layers():
+            gain *= float(torch.linalg.matrix_norm(layer.weight.detach().double(), 2))
+        return gain * _SILU_SLOPE ** (len(self.layer_widths) - 1)
+
+    def initial_code(self, num_objects: int) -> Tensor:
+        """Codes of the mean of the training cars, (B, K) zeros."""
+        return self.origin.new_zeros(num_objects, self.num_codes)
+
+    def bind(self, code: Tensor) -> NeuralShape:
+        """The fields of B objects with codes (B, K)."""
+        check_shape("code", code, ("B", self.num_codes))
+        layers = self.coded_layers()
+        return NeuralShape(
+            [layer.weight for layer in layers],
+            [layer.code_weight for layer in layers],
+            [layer.shift(code) for layer in layers],
+            self.bounds_obj,
+        )
+
+    def values(self, code: Tensor) -> Tensor:
+        """Signed distance at the nodes of the measuring grid, (B, nx, ny, nz), metres, for codes (B, K)."""
+        shape, nodes = self.bind(code), self._nodes()
+        fields = [
+            torch.cat(
+                [shape.value(part, part.new_full((len(part),), i).long()) for part in torch.split(nodes, _CHUNK_POINTS)]
+            )
+            for i in range(len(code))
+        ]
+        return torch.stack(fields).view(-1, *self.grid_shape) if fields else nodes.new_zeros(0, *self.grid_shape)
+
+    def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
+        """Height, width and length (B, 3), metres: a quadratic of the code, fitted to the training cars."""
+        check_shape("code", code, ("B", self.num_codes))
+        by_code = torch.einsum("dkl,bl->bdk", self.dimensions_quadratic_hwl, code)
+        hwl = self.dimensions_mean_hwl + code @ self.dimensions_linear_hwl.T + (by_code @ code[..., None])[..., 0]
+        return DimensionsDerivative(hwl, self.dimensions_linear_hwl + 2 * by_code)
+
+    def save(self, path: Path | str) -> None:
+        """Write a safetensors file, atomically."""
+        from directshape_torch.shape.neural_prior_file import write_neural_prior
+
+        write_neural_prior(self, Path(path))
+
+    @classmethod
+    def load(cls, path: Path | str) -> NeuralShapePrior:
+        """Read a file of `save`, float32 on the CPU.
+
+        Raises:
+            DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
+        """
+        from directshape_torch.shape.neural_prior_file import read_neural_prior
+
+        return read_neural_prior(Path(path))
+
+    @classmethod
+    def load_bundled(cls) -> NeuralShapePrior:
+        """The passenger cars that come with the package (`scripts/train_neural_prior.py`; licence of this project)."""
+        return cls.load(Path(__file__).parents[1] / "assets" / "neural_prior.safetensors")
+
+    def coded_layers(self) -> list[CodedLinear]:
+        """The layers in order, sine first."""
+        return [layer for layer in self.layers if isinstance(layer, CodedLinear)]
+
+    def _nodes(self) -> Tensor:
+        axes = [
+            self.origin[k] + self.spacing_m * torch.arange(n, dtype=self.origin.dtype, device=self.origin.device)
+            for k, n in enumerate(self.grid_shape)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
+
+
+class NeuralShape:
+    """The fields of B objects with fixed codes (a `BoundShape`): a network with one shift a layer and object."""
+
+    def __init__(
+        self, weights: Sequence[Tensor], code_weights: Sequence[Tensor], shifts: Sequence[Tensor], bounds_obj: Tensor
+    ) -> None:
+        self._weights, self._code_weights, self._shifts = weights, code_weights, shifts
+        self._bounds = bounds_obj
+
+    def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
+        """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
+        clamped, outward = self._split(points_obj)
+        x = torch.sin(self._linear(0, _mirrored(clamped), object_index))
+        for i in range(1, len(self._weights) - 1):
+            x = nn.functional.silu(self._linear(i, x, object_index))
+        return self._linear(-1, x, object_index)[:, 0] + _safe_norm(outward)
+
+    def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
+        """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
+
+        One sweep forward that keeps each layer's slope, one back: the chain rule by hand, made of differentiable
+        operations. Backward costs one product a layer, forward-mode would cost 3 + K of them.
+        """
+        clamped, outward = self._split(points_obj)
+        a = self._linear(0, _mirrored(clamped), object_index)
+        x, slopes = torch.sin(a), [torch.cos(a)]
+        for i in range(1, len(self._weights) - 1):
+            a = self._linear(i, x, object_index)
+            gate = torch.sigmoid(a)
+            x = a * gate
+            slopes.append(gate + x * (1 - gate))
+        value = self._linear(-1, x, object_index)[:, 0]
+        J_value_x = self._weights[-1].expand(len(points_obj), -1)
+        J_value_code = self._code_weights[-1].expand(len(points_obj), -1)
+        for i in reversed(range(len(slopes))):
+            J_value_a = J_value_x * slopes[i]
+            J_value_code = J_value_code + J_value_a @ self._code_weights[i]
+            J_value_x = J_value_a @ self._weights[i]
+        distance = _safe_norm(outward)
+        direction = outward / torch.where(distance > 0, distance, torch.ones_like(distance))[:, None]
+        gradient = J_value_x * _mirrored_slope(clamped)
+        # NaN is not equal to zero: a NaN point keeps its NaN to itself and passes none of it on.
+        gradient = torch.where(outward == 0, gradient, torch.zeros_like(gradient)) + direction
+        return SdfDerivatives(value + distance, gradient, J_value_code)
+
+    def _split(self, points_obj: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest points of the bounds and the way from there to the points, both (P, 3)."""
+        clamped = torch.minimum(torch.maximum(points_obj, self._bounds[0]), self._bounds[1])
+        return clamped, points_obj - clamped
+
+    def _linear(self, i: int, x: Tensor, object_index: Tensor) -> Tensor:
+        return x @ self._weights[i].T + self._shifts[i][object_index]
+
+
+_SILU_SLOPE = 1.0998393  # its largest derivative
+
+
+def _mirrored(points: Tensor) -> Tensor:
+    """`(x, y, sqrt(z^2 + s^2))`: the same for both halves of a car, and smooth."""
+    z = points[:, 2:]
+    return torch.cat([points[:, :2], (z * z + MIRROR_ROUNDING_M**2).sqrt()], dim=1)
+
+
+def _mirrored_slope(points: Tensor) -> Tensor:
+    z = points[:, 2:]
+    slope = z / (z * z + MIRROR_ROUNDING_M**2).sqrt()
+    return torch.cat([torch.ones_like(points[:, :2]), slope], dim=1)
+
+
+def _safe_norm(vector: Tensor) -> Tensor:
+    """Euclidean norm whose gradient at zero is zero instead of NaN."""
+    squared = (vector * vector).sum(-1)
+    positive = squared > 0
+    return torch.where(positive, torch.where(positive, squared, torch.ones_like(squared)).sqrt(), squared)
