@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(summary(outcomes, excluded))
     if options.json is not None:
         write_json(options.json, outcomes, excluded)
-    return 1 if any(outcome.verdict == "survived" for outcome in outcomes) else 0
+    return 0 if all(outcome.verdict in ("caught", "timed out") for outcome in outcomes) else 1
 
 
 def _parser() -> argparse.ArgumentParser:

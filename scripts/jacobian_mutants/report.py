@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,10 @@ def table(outcomes: Sequence[Outcome]) -> str:
 def summary(outcomes: Sequence[Outcome], excluded: Mapping[str | None, int]) -> str:
     """Counts of verdicts, and of excluded mutants by reason."""
     crashed = sum(outcome.verdict == "caught" and not is_wrong_number(outcome) for outcome in outcomes)
-    count = {verdict: sum(o.verdict == verdict for o in outcomes) for verdict in ("caught", "timed out", "survived")}
+    count = Counter(outcome.verdict for outcome in outcomes)
     lines = [
         f"{len(outcomes)} mutants: {count['caught']} caught ({crashed} of them because they crash), "
-        f"{count['timed out']} timed out, {count['survived']} survived"
+        f"{count['timed out']} timed out, {count['survived']} survived, {count['no verdict']} without a verdict"
     ]
     lines += [f"excluded as equivalent, {number}: {reason}" for reason, number in excluded.items()]
     return "\n".join(lines)
@@ -70,7 +71,7 @@ def _where(outcome: Outcome) -> str:
 
 def _verdict(outcome: Outcome) -> str:
     if outcome.verdict != "caught":
-        return outcome.verdict.upper()
+        return f"{outcome.verdict.upper()} {outcome.error}".rstrip()
     how = "" if is_wrong_number(outcome) else f" (crashes: {_short(outcome.error)})"
     return f"caught by {outcome.caught_by or 'the process'}{how}"
 

@@ -5,6 +5,7 @@ Processes are forked from a server that has PyTorch and pytest loaded already: a
 
 from __future__ import annotations
 
+import gc
 import io
 import multiprocessing
 import os
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from importlib.util import cache_from_source
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
@@ -22,7 +24,10 @@ from typing import Any, Literal
 
 from jacobian_mutants.mutants import Mutant
 
-Verdict = Literal["caught", "survived", "timed out"]
+# What every test file needs and no mutant changes; `torch.testing` imports the distributed tensors at first use.
+_PRELOADED = ("pytest", "torch", "torch.distributed.tensor", "torch.autograd.gradcheck", "hypothesis.strategies")
+
+Verdict = Literal["caught", "survived", "timed out", "no verdict"]
 COPIED = ("directshape_torch", "tests", "pyproject.toml")
 # A mutant may loop for ever, and one that does is found; the slowest named tests take 15 s on a busy machine.
 TIMEOUT_S = 180.0
@@ -57,7 +62,7 @@ class MutationRunner:
         # Before the server of processes starts: its children inherit these.
         os.environ.setdefault("OMP_NUM_THREADS", "1")
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["torch", "pytest", "numpy"])
+        self._context.set_forkserver_preload(list(_PRELOADED))
 
     def run(
         self,
@@ -70,11 +75,11 @@ class MutationRunner:
         Raises:
             TestsFailUnmutatedError: the tests of a target fail without a mutation.
         """
-        with self._copies() as copies, ThreadPoolExecutor(self.processes) as pool:
-            for target in dict.fromkeys(target for target, _ in mutants):
-                self._check_unmutated(target, tests_of[target], copies)
+        targets = dict.fromkeys(target for target, _ in mutants)
+        named = {target: tests_of[target] for target in targets}
+        with self._copies(named) as copies, ThreadPoolExecutor(self.processes) as pool:
             futures = {
-                pool.submit(self._outcome, target, mutant, tests_of[target], copies): i
+                pool.submit(self._outcome, target, mutant, named[target], copies): i
                 for i, (target, mutant) in enumerate(mutants)
             }
             outcomes: dict[int, Outcome] = {}
@@ -84,22 +89,21 @@ class MutationRunner:
         return [outcomes[i] for i in range(len(mutants))]
 
     @contextmanager
-    def _copies(self) -> Iterator[SimpleQueue[Path]]:
+    def _copies(self, tests_of: dict[str, tuple[str, ...]]) -> Iterator[SimpleQueue[Path]]:
+        """One copy of the tree a process, whose tests pass unmutated and are compiled already."""
         with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+            first = Path(folder) / "0"
+            for name in self.copied:
+                _copy(self.root / name, first / name)
+            for target, tests in tests_of.items():
+                verdict, test, error = self._run_tests(first, tests, write_bytecode=True)
+                if verdict != "survived":
+                    raise TestsFailUnmutatedError(f"{target}: {test or 'tests'} without mutation: {error or verdict}")
             copies: SimpleQueue[Path] = SimpleQueue()
-            for number in range(self.processes):
-                copy = Path(folder) / str(number)
-                for name in self.copied:
-                    _copy(self.root / name, copy / name)
-                copies.put(copy)
+            copies.put(first)
+            for number in range(1, self.processes):
+                copies.put(Path(shutil.copytree(first, Path(folder) / str(number))))
             yield copies
-
-    def _check_unmutated(self, target: str, tests: tuple[str, ...], copies: SimpleQueue[Path]) -> None:
-        copy = copies.get()
-        verdict, test, error = self._run_tests(copy, tests)
-        copies.put(copy)
-        if verdict != "survived":
-            raise TestsFailUnmutatedError(f"{target}: {test or 'its tests'} without a mutation: {error or verdict}")
 
     def _outcome(self, target: str, mutant: Mutant, tests: tuple[str, ...], copies: SimpleQueue[Path]) -> Outcome:
         copy = copies.get()
@@ -107,15 +111,19 @@ class MutationRunner:
             file = copy / mutant.path
             original = file.read_bytes()
             file.write_bytes(mutant.apply(original))
+            # Compiled code is told from its source by time and size, which a mutant may share with the original.
+            Path(cache_from_source(str(file))).unlink(missing_ok=True)
             verdict, test, error = self._run_tests(copy, tests)
             file.write_bytes(original)
             return Outcome(mutant, target, verdict, test, error)
         finally:
             copies.put(copy)
 
-    def _run_tests(self, copy: Path, tests: tuple[str, ...]) -> tuple[Verdict, str, str]:
+    def _run_tests(self, copy: Path, tests: tuple[str, ...], write_bytecode: bool = False) -> tuple[Verdict, str, str]:
         receiver, sender = self._context.Pipe(duplex=False)
-        process = self._context.Process(target=_run_pytest, args=(str(copy), tests, sender), daemon=True)
+        process = self._context.Process(
+            target=_run_pytest, args=(str(copy), tests, sender, write_bytecode), daemon=True
+        )
         process.start()
         sender.close()
         if not receiver.poll(TIMEOUT_S):
@@ -123,11 +131,12 @@ class MutationRunner:
             process.join()
             return "timed out", "", f"no verdict after {TIMEOUT_S:.0f} s"
         try:
-            failed, test, error = receiver.recv()
+            answer: tuple[Verdict, str, str] = receiver.recv()
+            return answer
         except EOFError:
-            failed, test, error = True, "", "the process ended without a verdict"
-        process.join()
-        return ("caught" if failed else "survived"), test, error
+            return "no verdict", "", "the process ended before its tests did"
+        finally:
+            process.join()
 
 
 def _copy(source: Path, destination: Path) -> None:
@@ -157,25 +166,28 @@ class _FirstFailure:
             self.error = str(report.longrepr if crash is None else crash.message).strip().splitlines()[0]
 
 
-def _run_pytest(copy: str, tests: tuple[str, ...], sender: Connection) -> None:
-    """In a process of its own: the named tests against the copy; sends (failed, test, error)."""
+def _run_pytest(copy: str, tests: tuple[str, ...], sender: Connection, write_bytecode: bool) -> None:
+    """In a process of its own: the named tests against the copy; sends (verdict, failed test, its error)."""
     import pytest
 
-    sys.dont_write_bytecode = True
+    # What the server loaded stays: collecting garbage among it would cost half a second a mutant.
+    gc.freeze()
+    sys.dont_write_bytecode = not write_bytecode
     os.chdir(copy)
     # The copy must win over an installed package and over the checkout.
     sys.path.insert(0, copy)
     plugin = _FirstFailure()
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", f"--rootdir={copy}"]
+        options = ["-x", "-q", f"--rootdir={copy}", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
+        options += [option for name in ("cacheprovider", "xdist") for option in ("-p", f"no:{name}")]
         status = pytest.main([*options, *tests], plugins=[plugin])
-    # An empty selection (5) or a usage error (4) is no verdict of the tests.
-    error = plugin.error or ("" if status in (0, 1) else f"pytest ended with status {int(status)}")
     foreign = _imported_from_elsewhere(Path(copy))
     if foreign:
-        sender.send((True, "", f"{foreign} was not imported from the copy"))
-    else:
-        sender.send((status != 0, plugin.test, error))
+        sender.send(("no verdict", "", f"{foreign} was not imported from the copy"))
+    elif plugin.test or status == 0:
+        sender.send(("caught" if plugin.test else "survived", plugin.test, plugin.error))
+    else:  # no tests selected, a usage error
+        sender.send(("no verdict", "", f"pytest ended with status {int(status)}"))
     sender.close()
 
 

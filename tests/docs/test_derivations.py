@@ -1,0 +1,67 @@
+"""The derivations name tests that exist, link to pages that exist, and say where the paper is inexact."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted((ROOT / "docs" / "derivations").glob("*.md"))
+RESIDUAL_PAGES = [page for page in PAGES if page.name != "README.md"]
+NAMED_TEST = re.compile(r"tests/[\w/]+\.py(?:::\w+)?")
+
+
+def functions_of(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
+@pytest.mark.parametrize("page", RESIDUAL_PAGES, ids=lambda page: page.stem)
+def test_every_named_test_exists(page: Path) -> None:
+    names = NAMED_TEST.findall(page.read_text(encoding="utf-8"))
+
+    assert names
+    for name in names:
+        path, separator, function = name.partition("::")
+        assert separator, f"{name}: name the test, not only its file"
+        assert (ROOT / path).is_file(), name
+        assert function.startswith("test_"), name
+        assert function in functions_of(ROOT / path), name
+
+
+@pytest.mark.parametrize("page", RESIDUAL_PAGES, ids=lambda page: page.stem)
+def test_every_inexact_point_names_its_test(page: Path) -> None:
+    _, _, rest = page.read_text(encoding="utf-8").partition("## Where the paper's text is inexact")
+    rows = [line for line in rest.splitlines() if line.startswith("| ")][1:]
+
+    assert rows
+    for row in rows:
+        assert NAMED_TEST.search(row.split("|")[-2]), row
+
+
+@pytest.mark.parametrize("page", RESIDUAL_PAGES, ids=lambda page: page.stem)
+def test_every_page_sets_our_symbols_beside_the_papers(page: Path) -> None:
+    assert "| ours | the paper's | meaning |" in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_relative_link_leads_to_a_file(page: Path) -> None:
+    for link in re.findall(r"\]\((?!https?://)([^)#]+)", page.read_text(encoding="utf-8")):
+        assert (page.parent / link).exists(), link
+
+
+def test_the_overview_lists_every_page() -> None:
+    overview = (ROOT / "docs" / "derivations" / "README.md").read_text(encoding="utf-8")
+
+    for page in RESIDUAL_PAGES:
+        assert f"({page.name})" in overview
+
+
+def test_every_named_file_of_the_overview_exists() -> None:
+    overview = (ROOT / "docs" / "derivations" / "README.md").read_text(encoding="utf-8")
+
+    for name in re.findall(r"`((?:geometry|residuals|shape|image)/\w+\.py)`", overview):
+        assert (ROOT / "directshape_torch" / name).is_file(), name
