@@ -36,7 +36,7 @@ def known_depth_from_labels(
 ) -> KnownDepth:
     """Pixels on the near sides of fully visible cars; empty where a frame has none."""
     parts = [
-        _pixels_of_car(o, size_wh, camera)
+        known_depth_of_car(o, size_wh, camera)
         for o in objects
         if o.type in CLASSES
         and o.has_box_3d
@@ -49,15 +49,39 @@ def known_depth_from_labels(
     return KnownDepth(uv, torch.cat([empty, *(part.depth_m for part in parts)]))
 
 
-def _pixels_of_car(car: KittiObject, size_wh: tuple[int, int], camera: StereoCamera) -> KnownDepth:
-    K = camera.K_left[0].double()
-    location_ref = torch.tensor(car.location_ref, dtype=torch.float64)
-    rotation_y = torch.tensor(car.rotation_y, dtype=torch.float64)
+def known_depth_of_car(
+    car: KittiObject,
+    size_wh: tuple[int, int],
+    camera: StereoCamera,  # one frame
+) -> KnownDepth:
+    """Pixels on the near sides of one car, at most 400 of them, whether or not something hides it."""
+    location_ref, rotation_y, hwl = _box(car)
     T_cam_obj = pose_from_kitti(location_ref + camera.t_cam_ref[0].double(), rotation_y)
-    hwl = torch.tensor(car.hwl, dtype=torch.float64)
-    uv = _grid_in_box(project(box_corners(T_cam_obj, hwl), K), size_wh)
-    T_obj_cam = inverse(T_cam_obj)
-    direction_obj = rays_from_pixels(uv, K) @ T_obj_cam[:3, :3].T
+    uv = _grid_in_box(project(box_corners(T_cam_obj, hwl), camera.K_left[0].double()), size_wh)
+    depth = depth_of_near_side(car, uv, camera)
+    chosen = _thinned(torch.nonzero(depth.isfinite())[:, 0])
+    return KnownDepth(uv[chosen], depth[chosen])
+
+
+def depth_of_near_side(
+    car: KittiObject,
+    uv_left: Tensor,  # (P, 2) pixels, float64
+    camera: StereoCamera,  # one frame
+) -> Tensor:  # (P,)
+    """Depth at left pixels of the band of bumpers and doors, 10 cm within the car's box; NaN where a ray misses it.
+
+    Example:
+        >>> from directshape_torch.io.kitti_labels import parse_object
+        >>> from directshape_torch.io.text_files import Line
+        >>> car = parse_object("labels", Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 4.0 0 1.6 22 -1.5708", ""))
+        >>> P = torch.tensor([[[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]])
+        >>> camera = StereoCamera.from_projections(P, P - torch.tensor([[[0.0, 0, 0, 378], [0] * 4, [0] * 4]]))
+        >>> depth_of_near_side(car, torch.tensor([[600.0, 215.0], [100.0, 215.0]]).double(), camera)
+        tensor([20.1000,     nan], dtype=torch.float64)
+    """
+    location_ref, rotation_y, hwl = _box(car)
+    T_obj_cam = inverse(pose_from_kitti(location_ref + camera.t_cam_ref[0].double(), rotation_y))
+    rays_cam = rays_from_pixels(uv_left, camera.K_left[0].double())
     height, half_width, half_length = hwl[0], hwl[1] / 2 - _SETBACK_M, hwl[2] / 2 - _SETBACK_M
     bounds = torch.stack(
         [
@@ -65,13 +89,19 @@ def _pixels_of_car(car: KittiObject, size_wh: tuple[int, int], camera: StereoCam
             torch.stack([half_length, torch.zeros_like(height), half_width]),
         ]
     )
-    interval = ray_box_interval(T_obj_cam[:3, 3], direction_obj, bounds)
-    depth = interval.near
-    points_obj = transform(T_obj_cam, depth[:, None] * rays_from_pixels(uv, K))
+    interval = ray_box_interval(T_obj_cam[:3, 3], rays_cam @ T_obj_cam[:3, :3].T, bounds)
+    points_obj = transform(T_obj_cam, interval.near[:, None] * rays_cam)
     level = -points_obj[:, 1] / height
     on_band = interval.hit & (level > _BAND[0]) & (level < _BAND[1])
-    chosen = _thinned(torch.nonzero(on_band)[:, 0])
-    return KnownDepth(uv[chosen], depth[chosen])
+    return torch.where(on_band, interval.near, torch.nan)
+
+
+def _box(car: KittiObject) -> tuple[Tensor, Tensor, Tensor]:
+    """Bottom centre in `ref` (3,), heading (), and height, width, length (3,), float64."""
+    location_ref, rotation_y, hwl = (
+        torch.tensor(value, dtype=torch.float64) for value in (car.location_ref, car.rotation_y, car.hwl)
+    )
+    return location_ref, rotation_y, hwl
 
 
 def _grid_in_box(corners_uv: Tensor, size_wh: tuple[int, int]) -> Tensor:
