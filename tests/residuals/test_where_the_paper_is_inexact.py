@@ -77,14 +77,14 @@ def test_derivative_by_the_twist_is_not_that_by_the_increment() -> None:
 
 
 def test_the_mean_of_the_shapes_depends_on_the_point_too() -> None:
-    """`Phi(X) = V(X) z + Phi_mean`, read as it stands, has no pose Jacobian at z = 0: the gradient of V(X) z is zero."""
+    """`V(X) z + Phi_mean` with a constant mean would have no pose Jacobian at z = 0, where V(X) z is zero."""
     prior = ellipsoid_prior()
-    point = torch.tensor([[0.63, -0.2, -0.91]], dtype=torch.float64)
+    point = torch.tensor([[0.63, -0.27, -0.91]], dtype=torch.float64)
     shape, index = prior.bind(prior.initial_code(1)), torch.zeros(1, dtype=torch.long)
     J_v = sdf_state_jacobian(point, shape.value_and_derivatives(point, index))[0, :3]
     numeric = central_differences(lambda v: shape.value(point + v, index), torch.zeros(3, dtype=torch.float64))[0]
     torch.testing.assert_close(J_v, numeric, rtol=1e-7, atol=1e-9)
-    assert float(J_v.norm()) > 0.9
+    assert float(J_v.norm()) > 0.5
 
 
 # Silhouette
