@@ -67,7 +67,9 @@ def _add_settings(group: argparse._ArgumentGroup) -> None:
         metavar="KEY=VALUE",
         help="single settings, e.g. photometric.weight=2",
     )
-    group.add_argument("--prior", type=Path, metavar="FILE", help="shape prior (npz); default: the bundled one")
+    group.add_argument(
+        "--prior", metavar="FILE|NAME", help="shape prior of any kind, or the bundled pca (default) or neural"
+    )
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
     group.add_argument("--threads", type=int, metavar="N", help="of the CPU; 1 is by far the best on a busy machine")
     group.add_argument("--batch-frames", type=int, default=1, metavar="N", help="frames in one call (default: 1)")
@@ -119,7 +121,7 @@ def _limit_threads(num_threads: int | None) -> None:
     torch.set_num_threads(num_threads)
 
 
-def make_refiner(config: str | None, overrides: list[str], prior: Path | None, device: str) -> DirectShapeRefiner:
+def make_refiner(config: str | None, overrides: list[str], prior: Path | str | None, device: str) -> DirectShapeRefiner:
     """The refiner that the options describe.
 
     Raises:
@@ -129,11 +131,10 @@ def make_refiner(config: str | None, overrides: list[str], prior: Path | None, d
     """
     from directshape_torch.config import load_config
     from directshape_torch.refiner import DirectShapeRefiner
-    from directshape_torch.shape.pca_prior import PCAShapePrior
+    from directshape_torch.shape.load_prior import load_prior
 
     settings = load_config(config, overrides)
-    shapes = PCAShapePrior.load_bundled() if prior is None else PCAShapePrior.load(prior)
-    return DirectShapeRefiner(shapes, settings).to(find_device(device))
+    return DirectShapeRefiner(load_prior("pca" if prior is None else prior), settings).to(find_device(device))
 
 
 def find_device(name: str) -> torch.device:

@@ -104,8 +104,9 @@ class KernelPCAShapePrior(nn.Module):
     def lipschitz(self) -> float:
         """Bound of |gradient|: the subspace's over the largest |c| that a code of norm `CODE_NORM_IN_USE` can have."""
         largest = self.offset.norm() + CODE_NORM_IN_USE * torch.linalg.matrix_norm(self.linear, 2)
-        # Every kernel is at most 1, so no sum of them is longer than the sum of their weights' lengths.
-        largest = largest + self.weights.norm(dim=1).sum()
+        # No value of a function is larger than its norm in the space of the kernel, because k(z, z) = 1.
+        norms_squared = (self.weights * (_gaussian(self.anchors, self.anchors, self.kernel_width) @ self.weights)).sum()
+        largest = largest + norms_squared.clamp_min(0).sqrt()
         return self.subspace.lipschitz_within(float(largest))
 
     def initial_code(self, num_objects: int) -> Tensor:
@@ -145,9 +146,9 @@ class KernelPCAShapePrior(nn.Module):
         num_codes: int,
         provenance: PriorProvenance,
         num_components: int = 32,
-        feature_width: float = 2.0,
-        kernel_width: float = 1.5,
-        ridge: float = 0.1,
+        feature_width: float = 4.0,
+        kernel_width: float = 4.0,
+        ridge: float = 1.0,
     ) -> KernelPCAShapePrior:
         """Kernel principal components of N signed distance grids and the regression back to grids.
 
@@ -215,8 +216,8 @@ class CurvedGridShape:
 
 def _kernel_components(coordinates: Tensor, num_codes: int, feature_width: float) -> Tensor:
     """Leading kernel principal components (N, K) of the samples (N, M), mean 0 and variance 1 each."""
-    squared = torch.cdist(coordinates, coordinates) ** 2
-    kernel = torch.exp(-0.5 * squared / (feature_width**2 * squared.mean()))
+    width = feature_width * float((torch.cdist(coordinates, coordinates) ** 2).mean().sqrt())
+    kernel = _gaussian(coordinates, coordinates, width)
     centred = kernel - kernel.mean(0) - kernel.mean(1, keepdim=True) + kernel.mean()
     vectors = torch.linalg.eigh(centred).eigenvectors.flip(1)[:, :num_codes]
     # A component's sign is free: let it go with the linear component that it resembles most.
@@ -226,13 +227,17 @@ def _kernel_components(coordinates: Tensor, num_codes: int, feature_width: float
     return aligned
 
 
+def _gaussian(a: Tensor, b: Tensor, width: float) -> Tensor:
+    return torch.exp(-0.5 * torch.cdist(a, b) ** 2 / width**2)
+
+
 def _ridge_regression(
     anchors: Tensor, targets: Tensor, kernel_width: float, ridge: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Offset (M,), linear part (M, K) and kernel weights (N, M): least squares first, kernels for what it leaves."""
     design = torch.cat([torch.ones_like(anchors[:, :1]), anchors], dim=1)
     solution = torch.linalg.lstsq(design, targets).solution
-    kernel = torch.exp(-0.5 * torch.cdist(anchors, anchors) ** 2 / kernel_width**2)
+    kernel = _gaussian(anchors, anchors, kernel_width)
     penalised = kernel + ridge * torch.eye(len(anchors), dtype=kernel.dtype, device=kernel.device)
     weights = torch.linalg.solve(penalised, targets - design @ solution)
     return solution[0], solution[1:].T, weights

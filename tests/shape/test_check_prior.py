@@ -1,0 +1,98 @@
+"""A prior that cannot be refined is refused when the refiner is made, with the reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT
+from torch import Tensor, nn
+
+from directshape_torch.errors import InputError
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
+
+AUTOGRAD = replace(DEFAULT, solver=replace(DEFAULT.solver, jacobian="autograd"))
+
+
+class Wrapped(nn.Module):
+    """The ellipsoids, with a fault that a test puts in by overriding one method."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inner = ellipsoid_prior()
+
+    def __getattr__(self, name: str) -> object:
+        return nn.Module.__getattr__(self, name) if name == "inner" else getattr(self.inner, name)
+
+
+class OnlyValues:
+    """A bound shape that knows no derivatives."""
+
+    def __init__(self, shape: GridShape) -> None:
+        self.value = shape.value
+
+
+class WithoutDerivatives(Wrapped):
+    def bind(self, code: Tensor) -> OnlyValues:
+        return OnlyValues(self.inner.bind(code))
+
+
+class Transposed(GridShape):
+    def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
+        at = super().value_and_derivatives(points_obj, object_index)
+        return at._replace(J_value_code=at.J_value_code.T)
+
+
+class TransposedCodeDerivative(Wrapped):
+    def bind(self, code: Tensor) -> Transposed:
+        shape = self.inner.bind(code)
+        return Transposed(shape.values, shape.basis, shape.origin, shape.spacing_m)
+
+
+class NoDimensionsDerivative(Wrapped):
+    def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
+        at = self.inner.dimensions_and_derivative(code)
+        return at._replace(J_hwl_code=torch.full_like(at.J_hwl_code, torch.nan))
+
+
+class Detached(Wrapped):
+    """Derivatives of its own, but none that autograd could find."""
+
+    def bind(self, code: Tensor) -> GridShape:
+        return self.inner.bind(code.detach())
+
+
+def test_a_wrapped_prior_without_fault_is_taken() -> None:
+    DirectShapeRefiner(Wrapped(), AUTOGRAD)
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (nn.Linear(1, 1), r"prior: expected a ShapePrior, got Linear without \['num_codes', 'bounds_obj'"),
+        (WithoutDerivatives(), r"expected a BoundShape, got OnlyValues without \['value_and_derivatives'\]"),
+        (TransposedCodeDerivative(), r"J_value_code: expected a tensor of shape \(1, 3\) at one point, got \(3, 1\)"),
+        (NoDimensionsDerivative(), r"dimensions_and_derivative: J_hwl_code: expected finite numbers, got \[\[\[nan"),
+    ],
+)
+def test_a_prior_without_gradients_is_refused(prior: nn.Module, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        DirectShapeRefiner(prior, DEFAULT)
+
+
+def test_autograd_needs_a_graph_from_the_code() -> None:
+    DirectShapeRefiner(Detached(), DEFAULT)
+    with pytest.raises(InputError, match=r"expected a graph from points and code .* got none from code; compute it"):
+        DirectShapeRefiner(Detached(), AUTOGRAD)
+
+
+def test_a_refiner_can_be_made_in_inference_mode() -> None:
+    with torch.inference_mode():
+        DirectShapeRefiner(ellipsoid_prior(), DEFAULT)
+    prior = ellipsoid_prior()
+    with torch.inference_mode():
+        DirectShapeRefiner(prior, AUTOGRAD)
