@@ -1,0 +1,417 @@
+"""Average precision as KITTI measures it: every rule by hand, a slow reference, known scores of real detectors."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.kitti_devkit import devkit_curves
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores, evaluate_kitti
+from directshape_torch.evaluation.kitti_curve import score_thresholds
+from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.text_files import Line
+
+DIFFICULTIES = ("easy", "moderate", "hard")
+
+
+def line(
+    slot: int = 0,
+    *,
+    kind: str = "Car",
+    width: float = 100,
+    height: float = 50,
+    shift: float = 0,
+    z: float = 20,
+    occluded: int = 0,
+    truncated: float = 0,
+    alpha: float = 0,
+    score: float | None = None,
+) -> str:
+    """A car 4 m x 2 m x 1.5 m in a place of its own (`slot`), in the image 300 px and on the road 10 m from the next.
+
+    `shift` moves the 3D box along its length.
+    """
+    box_2d = f"{300 * slot} 100 {300 * slot + width} {100 + height}"
+    text = f"{kind} {truncated} {occluded} {alpha} {box_2d} 1.5 2 4 {10 * slot + shift} 1.6 {z} 0"
+    return text if score is None else f"{text} {score}"
+
+
+def objects(*lines: str) -> list[KittiObject]:
+    return [parse_object("a file", Line(number, text, text)) for number, text in enumerate(lines, start=1)]
+
+
+def evaluate(labels: list[str], results: list[str], object_type: str = "Car") -> KittiScores:
+    """The scores of one frame."""
+    return evaluate_kitti({"0": objects(*labels)}, {"0": objects(*results)}, object_type=object_type)
+
+
+def precision(score: ApScore, count: int) -> list[float]:
+    """The first values of the curve; the rest must be 0, as beyond the last threshold."""
+    assert score.curve.precision.shape == (41,)
+    assert not score.curve.precision[count:].any()
+    return score.curve.precision[:count].tolist()
+
+
+class TestDifficulty:
+    @pytest.mark.parametrize(
+        ("label", "counts"),
+        [
+            (line(height=40.5, occluded=0, truncated=0.15), (1, 1, 1)),
+            (line(height=40), (0, 1, 1)),  # a label must be HIGHER than 40 px
+            (line(height=25.5, occluded=1, truncated=0.30), (0, 1, 1)),
+            (line(height=25), (0, 0, 0)),
+            (line(occluded=1), (0, 1, 1)),
+            (line(occluded=2), (0, 0, 1)),
+            (line(occluded=3), (0, 0, 0)),
+            (line(truncated=0.16), (0, 1, 1)),
+            (line(truncated=0.31), (0, 0, 1)),
+            (line(truncated=0.51), (0, 0, 0)),
+            (line(kind="Van"), (0, 0, 0)),
+            (line(kind="DontCare"), (0, 0, 0)),
+        ],
+    )
+    def test_which_labels_count(self, label: str, counts: tuple[int, int, int]) -> None:
+        scores = evaluate([label], [line(score=1)])
+        assert tuple(scores.score("3d", 0.7, name).num_labels for name in DIFFICULTIES) == counts
+
+    @pytest.mark.parametrize(("height", "easy", "moderate"), [(40, 1 / 2, 1 / 2), (39.9, 1, 1 / 2), (24.9, 1, 1)])
+    def test_a_wrong_detection_counts_from_the_least_height_on(
+        self, height: float, easy: float, moderate: float
+    ) -> None:
+        scores = evaluate([line()], [line(1, height=height, score=0.9), line(score=0.5)])
+        assert precision(scores.score("3d", 0.7, "easy"), 1) == [easy]
+        assert precision(scores.score("3d", 0.7, "moderate"), 1) == [moderate]
+
+    def test_finding_a_label_that_is_too_hard_is_neither_right_nor_wrong(self) -> None:
+        scores = evaluate([line(), line(1, occluded=2)], [line(score=0.5), line(1, score=0.9)])
+        assert precision(scores.score("3d", 0.7, "moderate"), 1) == [1]
+        assert precision(scores.score("3d", 0.7, "hard"), 2) == [1, 1]
+
+    def test_a_small_detection_is_taken_only_where_there_is_no_other(self) -> None:
+        """The small box overlaps its label by 24/26, the full one by 26/30; only the full one can be right."""
+        labels, other = [line(height=26), line(1)], line(1, score=0.7)
+        small, full = line(height=24, score=0.9), line(height=30, score=0.8)
+        both, alone = (evaluate(labels, [small, *more, other]).score("2d", 0.7, "hard") for more in ([full], []))
+        # The small one has the better score and hides the full one's from the choice of thresholds.
+        assert both.curve.thresholds.tolist() == alone.curve.thresholds.tolist() == [0.7]
+        assert (precision(both, 1), both.curve.recall.tolist()) == ([1], [1])
+        assert (precision(alone, 1), alone.curve.recall.tolist()) == ([1], [0.5])
+
+    def test_a_small_detection_of_another_class_is_ignored_too(self) -> None:
+        """The devkit asks for the height first: the small cyclist takes the car, which then cannot be right."""
+        small, full = line(kind="Cyclist", height=24, score=0.9), line(kind="Cyclist", height=26, score=0.9)
+        for cyclist, thresholds in ((small, [0.7]), (full, [0.8, 0.7])):
+            results = [cyclist, line(height=26, score=0.8), line(1, score=0.7)]
+            score = evaluate([line(height=26), line(1)], results).score("2d", 0.7, "hard")
+            assert score.curve.thresholds.tolist() == thresholds
+
+
+class TestNeighboursAndRegions:
+    def test_a_van_may_be_found_and_may_be_missed(self) -> None:
+        for results in ([line(score=0.5), line(1, score=0.9)], [line(score=0.5)]):
+            score = evaluate([line(), line(1, kind="Van")], results).score("3d", 0.7, "easy")
+            assert precision(score, 1) == [1]
+            assert score.ap_area == 100
+
+    def test_a_detection_of_a_lorry_is_wrong(self) -> None:
+        scores = evaluate([line(), line(1, kind="Truck")], [line(score=0.5), line(1, score=0.9)])
+        assert precision(scores.score("3d", 0.7, "easy"), 1) == [0.5]
+
+    def test_people_who_sit_are_neighbours_of_pedestrians_whatever_the_case(self) -> None:
+        labels = [line(kind="pedestrian"), line(1, kind="Person_sitting")]
+        results = [line(kind="Pedestrian", score=0.5), line(1, kind="PEDESTRIAN", score=0.9), line(2, score=1)]
+        score = evaluate(labels, results, "Pedestrian").score("bev", 0.5, "easy")
+        assert precision(score, 1) == [1]
+
+    def test_a_van_in_the_results_is_no_car(self) -> None:
+        scores = evaluate([line()], [line(kind="Van", score=0.9)])
+        assert scores.num_detections == 0
+        assert scores.score("2d", 0.5, "easy").ap_area == 0
+
+    def test_detections_in_a_region_nobody_labelled_are_not_wrong_in_the_image(self) -> None:
+        """The region holds 60 of 100 columns of the detection: 0.6 of its own area, whatever the region's."""
+        region = "DontCare -1 -1 -10 340 0 900 900 -1 -1 -1 -1000 -1000 -1000 -10"
+        scores = evaluate([line(), region], [line(score=0.5), line(1, score=0.9)])
+        assert precision(scores.score("2d", 0.5, "easy"), 1) == [1]
+        assert precision(scores.score("2d", 0.7, "easy"), 1) == [0.5]
+        for metric in ("bev", "3d"):
+            assert precision(scores.score(metric, 0.5, "easy"), 1) == [0.5]
+
+    def test_two_regions_excuse_a_detection_once(self) -> None:
+        region = "DontCare -1 -1 -10 290 0 900 900 -1 -1 -1 -1000 -1000 -1000 -10"
+        results = [line(score=0.5), line(1, score=0.9), line(1, score=0.8), line(5, score=0.7)]
+        scores = evaluate([line(), region, region], results)
+        assert precision(scores.score("2d", 0.7, "easy"), 1) == [0.5]
+
+
+class TestMatching:
+    def test_overlap_must_be_larger_than_the_threshold(self) -> None:
+        """Half of the box is an IoU of exactly one half."""
+        half, more = (evaluate([line()], [line(width=width, score=1)]) for width in (50, 51))
+        assert half.score("2d", 0.5, "easy").ap_area == 0
+        assert more.score("2d", 0.5, "easy").ap_area == 100
+
+    def test_each_metric_looks_at_its_own_box(self) -> None:
+        """A shift by 0.5 of 4 m leaves (4 - 0.5) / (4 + 0.5) = 0.78, one by 1 m 0.6, one by 2 m 1/3."""
+        for shift, found in ((0.5, {0.7, 0.5}), (1, {0.5}), (2, set())):
+            scores = evaluate([line()], [line(shift=shift, score=1)])
+            for iou in (0.7, 0.5):
+                assert scores.score("2d", iou, "easy").ap_area == 100
+                for metric in ("bev", "3d"):
+                    assert scores.score(metric, iou, "easy").ap_area == (100 if iou in found else 0)
+
+    def test_thresholds_take_the_best_score_and_counting_the_largest_overlap(self) -> None:
+        """Of label 0, A overlaps more and B scores higher; the thresholds are B's score and that of label 1.
+
+        Above 0.8 there is B alone: 1 of 1 is right, its orientation too. Above 0.2 label 0 takes A, whose alpha is off
+        by a quarter turn (similarity 1/2), B is wrong and label 1 is found: 2 of 3 are right, similarity 1.5 of 3.
+        """
+        a, b = line(width=99, alpha=math.pi / 2, score=0.3), line(width=80, score=0.8)
+        score = evaluate([line(), line(1)], [a, b, line(1, score=0.2)]).score("2d", 0.7, "easy")
+        assert score.curve.thresholds.tolist() == [0.8, 0.2]
+        assert precision(score, 2) == pytest.approx([1, 2 / 3])
+        assert score.curve.orientation is not None
+        assert score.curve.orientation[:3].tolist() == pytest.approx([1, 0.5, 0])
+
+    def test_a_detection_serves_one_label(self) -> None:
+        score = evaluate([line(), line()], [line(score=1)]).score("3d", 0.7, "easy")
+        assert score.num_labels == 2
+        assert (precision(score, 1), score.curve.recall.tolist()) == ([1], [0.5])
+
+    def test_frames_do_not_mix(self) -> None:
+        labels = {"1": objects(line()), "2": objects(line())}
+        results = {"1": objects(line(score=0.9), line(score=0.8)), "2": []}
+        score = evaluate_kitti(labels, results).score("3d", 0.7, "easy")
+        assert (precision(score, 1), score.curve.recall.tolist()) == ([1], [0.5])
+
+
+class TestCurve:
+    def test_precision_is_the_best_at_any_lower_threshold(self) -> None:
+        """From the top: right, wrong, right, right: 1/1, 2/3, 3/4, so the second becomes 3/4."""
+        results = [line(0, score=0.9), line(7, score=0.8), line(1, score=0.7), line(2, score=0.6)]
+        score = evaluate([line(0), line(1), line(2)], results).score("3d", 0.7, "easy")
+        assert precision(score, 3) == [1, 0.75, 0.75]
+        assert score.curve.recall.tolist() == pytest.approx([1 / 3, 2 / 3, 1])
+        # R11 takes every fourth of 41 values, of which the first is 1; R40 leaves the first out.
+        assert score.ap_r11 == pytest.approx(100 / 11)
+        assert score.ap_r40 == pytest.approx(100 * 1.5 / 40)
+        assert score.ap_area == pytest.approx(100 * 2.5 / 3)
+
+    @pytest.mark.parametrize("num_labels", [41, 80, 200])
+    def test_everything_found_is_100_percent(self, num_labels: int) -> None:
+        labels = {str(k): objects(line()) for k in range(num_labels)}
+        results = {str(k): objects(line(score=k)) for k in range(num_labels)}
+        score = evaluate_kitti(labels, results).score("3d", 0.7, "easy")
+        assert (score.ap_r11, score.ap_r40, score.ap_area) == pytest.approx((100, 100, 100))
+
+    def test_thresholds_come_as_close_to_each_recall_as_they_can(self) -> None:
+        """Of 80 labels the first is closest to recall 0, and then every second is one fortieth further."""
+        assert score_thresholds(np.arange(80.0, 0, -1), 80).tolist() == [80, *range(79, 0, -2)]
+
+    def test_the_last_score_is_always_a_threshold(self) -> None:
+        """The third of 80 would be passed over for the fourth, if there were one."""
+        assert score_thresholds(np.array([3.0, 2, 1]), 80).tolist() == [3, 2, 1]
+
+    def test_half_found(self) -> None:
+        """40 of 80: thresholds at recall 0, 1/40 .. 20/40, where precision is 1: 6 of 11 and 20 of 40 points."""
+        labels = {str(k): objects(line()) for k in range(80)}
+        results = {str(k): objects(line(score=k)) for k in range(40)}
+        scores = evaluate_kitti(labels, results)
+        score = scores.score("3d", 0.7, "easy")
+        assert scores.num_frames_without_results == 40
+        assert (score.ap_r11, score.ap_r40, score.ap_area) == pytest.approx((600 / 11, 50, 50))
+
+    def test_scores_may_have_any_range(self) -> None:
+        scores = evaluate([line(), line(1)], [line(score=-3000), line(1, score=1e12)])
+        assert scores.score("3d", 0.7, "easy").curve.thresholds.tolist() == [1e12, -3000]
+
+
+class TestOrientation:
+    @pytest.mark.parametrize(("off_by", "percent"), [(0, 100), (math.pi / 3, 75), (math.pi / 2, 50), (math.pi, 0)])
+    def test_all_off_by_the_same_angle(self, off_by: float, percent: float) -> None:
+        labels = {str(k): objects(line(alpha=1)) for k in range(41)}
+        results = {str(k): objects(line(alpha=1 - off_by, score=k)) for k in range(41)}
+        score = evaluate_kitti(labels, results).score("2d", 0.7, "easy")
+        assert (score.ap_r40, score.aos_r11, score.aos_r40) == pytest.approx((100, percent, percent))
+
+    def test_wrong_detections_have_no_similarity(self) -> None:
+        scores = evaluate([line()], [line(score=0.5), line(1, score=0.9)])
+        orientation = scores.score("2d", 0.7, "easy").curve.orientation
+        assert orientation is not None
+        assert orientation[:2].tolist() == [0.5, 0]
+
+    def test_it_belongs_to_image_boxes(self) -> None:
+        scores = evaluate([line()], [line(score=1)])
+        assert scores.score("2d", 0.7, "easy").aos_r11 == pytest.approx(100 / 11)
+        for metric in ("bev", "3d"):
+            score = scores.score(metric, 0.7, "easy")
+            assert (score.aos_r11, score.aos_r40, score.curve.orientation) == (None, None, None)
+
+    def test_one_result_without_alpha_leaves_it_out(self) -> None:
+        scores = evaluate([line()], [line(score=1), line(1, kind="Cyclist", alpha=-10, score=0.1)])
+        assert scores.score("2d", 0.7, "easy").aos_r40 is None
+
+
+class TestDistance:
+    def test_labels_and_wrong_detections_beyond_a_bin_are_left_out(self) -> None:
+        labels = [line(0, z=5), line(1, z=25)]
+        results = [line(0, z=5, score=0.5), line(1, z=25, score=0.5), line(2, z=25, score=0.9)]
+        by_distance = {part.low_m: part for part in evaluate(labels, results).by_distance}
+        expected = {0: (1, [1.0]), 10: (0, [0.0]), 20: (1, [0.5]), 30: (0, [0.0]), 45: (0, [0.0])}
+        assert by_distance.keys() == expected.keys()
+        for low, (num_labels, values) in expected.items():
+            (score,) = (
+                s for s in by_distance[low].scores if (s.metric, s.minimum_iou, s.difficulty) == ("3d", 0.7, "moderate")
+            )
+            assert (score.num_labels, precision(score, 1)) == (num_labels, values)
+
+    def test_a_detection_across_the_border_belongs_to_its_label(self) -> None:
+        scores = evaluate([line(z=20.05)], [line(z=19.95, score=1)])
+        areas = {part.low_m: part.scores[-1].ap_area for part in scores.by_distance}
+        assert areas == {0: 0, 10: 0, 20: 100, 30: 0, 45: 0}
+
+
+class TestWhatIsEvaluated:
+    def test_a_frame_without_results_counts_as_missed(self) -> None:
+        scores = evaluate_kitti({"1": objects(line()), "2": objects(line())}, {"2": objects(line(score=1))})
+        assert (scores.num_frames, scores.num_frames_without_results) == (2, 1)
+        assert scores.score("3d", 0.7, "easy").ap_area == 50
+
+    def test_a_split_chooses_frames(self) -> None:
+        labels = {name: objects(line()) for name in ("1", "2", "3")}
+        results = {name: objects(line(shift=9 if name == "3" else 0, score=1)) for name in ("1", "2", "3", "4")}
+        scores = evaluate_kitti(labels, results, split=["1", "2", "1"])
+        assert (scores.num_frames, scores.num_result_frames_unused, scores.num_detections) == (2, 2, 2)
+        assert scores.score("3d", 0.7, "easy").ap_area == 100
+
+    def test_a_detector_without_3d_boxes_is_scored_in_the_image_alone(self) -> None:
+        result = "Car -1 -1 -10 0 100 100 150 -1 -1 -1 -1000 -1000 -1000 -10 0.9"
+        scores = evaluate([line()], [result])
+        assert {score.metric for score in scores.scores} == {"2d"}
+        assert scores.score("2d", 0.7, "easy").ap_area == 100
+        assert scores.by_distance == ()
+        with pytest.raises(InputError, match=r"expected 2d; .*got 3d"):
+            scores.score("3d", 0.7, "easy")
+
+    def test_empty_results_score_nothing_everywhere(self) -> None:
+        scores = evaluate([line()], [])
+        assert len(scores.scores) == 18
+        assert all(score.ap_r40 == score.ap_r11 == score.ap_area == 0 for score in scores.scores)
+
+    def test_no_counted_label(self) -> None:
+        scores = evaluate([], [line(score=1)])
+        assert all(score.num_labels == 0 and score.ap_r11 == 0 for score in scores.scores)
+
+
+class TestFilesAndErrors:
+    @pytest.fixture
+    def folders(self, tmp_path: Path) -> tuple[Path, Path]:
+        for folder, text in (("labels", line()), ("results/data", line(score=1))):
+            (tmp_path / folder).mkdir(parents=True)
+            for frame in ("000001", "000002"):
+                (tmp_path / folder / f"{frame}.txt").write_text(text + "\n")
+        return tmp_path / "labels", tmp_path / "results"
+
+    def test_folders_and_a_split_file(self, folders: tuple[Path, Path], tmp_path: Path) -> None:
+        (tmp_path / "val.txt").write_text("000002\n")
+        assert evaluate_kitti(*folders).num_frames == 2
+        scores = evaluate_kitti(str(folders[0]), str(folders[1] / "data"), split=str(tmp_path / "val.txt"))
+        assert (scores.num_frames, scores.num_result_frames_unused) == (1, 1)
+        assert scores.score("3d", 0.7, "easy").ap_area == 100
+
+    def test_a_result_without_score(self, folders: tuple[Path, Path]) -> None:
+        path = folders[1] / "data" / "000002.txt"
+        path.write_text(f"{line(score=1)}\n\n{line(1)}\n")
+        with pytest.raises(DataFormatError, match=r"000002.txt, line 3: a result without score: .*column 16"):
+            evaluate_kitti(*folders)
+
+    def test_a_broken_line_is_named(self, folders: tuple[Path, Path]) -> None:
+        (folders[0] / "000001.txt").write_text("Car 0 0 zero 0 100 100 150 1.5 2 4 0 1.6 20 0\n")
+        with pytest.raises(DataFormatError, match=r"000001.txt, line 1: column 4 is 'zero', not a finite number"):
+            evaluate_kitti(*folders)
+
+    def test_a_folder_that_is_missing(self, folders: tuple[Path, Path]) -> None:
+        with pytest.raises(DataFormatError, match="labl: is no folder of labels"):
+            evaluate_kitti(folders[0].parent / "labl", folders[1])
+        with pytest.raises(DataFormatError, match="result: is no folder of results"):
+            evaluate_kitti(folders[0], folders[1].parent / "result")
+
+    def test_folders_without_files(self, folders: tuple[Path, Path], tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        with pytest.raises(InputError, match=r"labels: expected label files NNNNNN\.txt"):
+            evaluate_kitti(tmp_path / "empty", folders[1])
+        with pytest.raises(InputError, match=r"results: expected result files such as 000001\.txt"):
+            evaluate_kitti(folders[0], tmp_path / "empty")
+
+    def test_a_split_with_a_frame_that_has_no_labels(self, folders: tuple[Path, Path]) -> None:
+        with pytest.raises(InputError, match="labels of frame 000009, which the split names"):
+            evaluate_kitti(*folders, split=["000001", "000009"])
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> list[tuple[list[KittiObject], list[KittiObject]]]:
+    """Frames whose boxes crowd together, with equal scores and overlaps, and heights at the limits."""
+    heights, columns = st.sampled_from([24.0, 24.9, 25.0, 26.0, 39.9, 40.0, 41.0]), st.sampled_from([0, 2, 5, 8, 60])
+
+    def thing(kinds: tuple[str, ...], with_score: bool) -> str:
+        kind, u, x = draw(st.sampled_from(kinds)), draw(columns), draw(st.sampled_from([0.0, 0.2, 0.5, 0.6, 8.0]))
+        truncated, occluded = draw(st.sampled_from([0, 0.2, 0.4])), draw(st.sampled_from([0, 0, 1, 2]))
+        box_2d = f"{u} 0 {u + draw(st.sampled_from([60, 66]))} {draw(heights)}"
+        box_3d = f"{draw(st.sampled_from([1.5, 1.7]))} 2 4 {x} 1.6 20 0"
+        if kind == "DontCare":
+            truncated, occluded, box_3d = -1, -1, "-1 -1 -1 -1000 -1000 -1000 0"
+        text = f"{kind} {truncated} {occluded} {draw(st.sampled_from([-1.0, 0.0, 2.0]))} {box_2d} {box_3d}"
+        return f"{text} {draw(st.sampled_from([0.1, 0.3, 0.5, 0.9]))}" if with_score else text
+
+    frames = []
+    for _ in range(draw(st.integers(1, 4))):
+        labels = [thing(("Car", "Car", "Van", "Truck", "DontCare"), False) for _ in range(draw(st.integers(0, 5)))]
+        results = [thing(("Car", "Car", "Car", "Cyclist"), True) for _ in range(draw(st.integers(0, 6)))]
+        frames.append((objects(*labels), objects(*results)))
+    return frames
+
+
+@settings(max_examples=25)
+@given(scenes())
+def test_equals_the_devkit_taken_frame_by_frame(frames: list[tuple[list[KittiObject], list[KittiObject]]]) -> None:
+    labels = {str(k): frame[0] for k, frame in enumerate(frames)}
+    results = {str(k): frame[1] for k, frame in enumerate(frames)}
+    for score in evaluate_kitti(labels, results).scores:
+        expected, orientation = devkit_curves(frames, score.metric, score.minimum_iou, score.difficulty)
+        np.testing.assert_allclose(score.curve.precision, expected, atol=1e-12)
+        if score.metric == "2d":
+            np.testing.assert_allclose(score.curve.orientation, orientation, atol=1e-12)
+
+
+@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: KITTI labels needed")
+def test_agrees_with_known_scores_in_every_cell(tmp_path: Path) -> None:
+    """3769 frames, two detectors; the curves of the first at IoU 0.7 are the official evaluator's, six decimals."""
+    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti_eval"
+    known = json.loads((root / "expected.json").read_text())
+    labels = _extract(root / "label_2.zip", tmp_path) / "label_2"
+    for detector in ("frustum_pointnet", "pointgnn"):
+        results = _extract(root / known[detector]["results"], tmp_path / detector)
+        scores = evaluate_kitti(labels, results, split=root / "val.txt")
+        assert (scores.num_frames, scores.num_frames_without_results, len(scores.scores)) == (3769, 0, 18)
+        for score in scores.scores:
+            iou = str(score.minimum_iou)
+            cell = known[detector]["reimplementation"][score.metric][iou][score.difficulty]
+            assert score.num_labels == cell["n_gt"]
+            assert (score.ap_r11, score.ap_r40) == pytest.approx((cell["R11"], cell["R40"]), abs=1e-3)
+            curve = known["precision_curves"][detector][f"{score.metric}_{iou}_{score.difficulty}"]
+            np.testing.assert_allclose(score.curve.precision, curve, atol=1e-6)
+
+
+def _extract(archive: Path, folder: Path) -> Path:
+    with zipfile.ZipFile(archive) as file:
+        file.extractall(folder)
+    return folder
