@@ -1,1 +1,1 @@
-"""Comparing refined with rough detections: matching to labels, errors, overlaps and their confidence."""
+"""Results against labels: KITTI's scores, what a refinement changed, matching, errors, overlaps, confidence."""

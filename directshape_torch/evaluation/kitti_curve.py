@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +104,7 @@ def score_thresholds(scores: Floats, num_labels: int) -> Floats:
     return np.array(chosen, dtype=np.float64)
 
 
-def average_precision(sampled: Floats, recall_points: int) -> float:
+def average_precision(sampled: Floats, recall_points: Literal[11, 40]) -> float:
     """Mean, in percent, of a curve (41,) over 11 recall points (0, 0.1 .. 1) or over 40 (without 0).
 
     Example:
