@@ -64,6 +64,23 @@ class SolverConfig:
 
 
 @dataclass(frozen=True)
+class BackwardConfig:
+    """Gradients through the refinement, for training in front of it.
+
+    Attributes:
+        mode: "none" (no graph), "unroll" (repeats the last iterations), "implicit" (implicit function theorem at the
+            final stage) or "implicit_gauss_newton" (the same with the Gauss-Newton matrix: cheaper, biased).
+        unroll_iterations: how many of the last iterations are repeated.
+        max_remaining_step: implicit modes give no gradient to cars whose next Newton step would exceed this share of
+            the trust region.
+    """
+
+    mode: Literal["none", "unroll", "implicit", "implicit_gauss_newton"] = "none"
+    unroll_iterations: int = 5
+    max_remaining_step: float = 0.1
+
+
+@dataclass(frozen=True)
 class SilhouetteConfig:
     """Silhouette term, left and right.
 
@@ -188,6 +205,7 @@ class RefinerConfig:
     priors: PriorConfig = field(default_factory=PriorConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
+    backward: BackwardConfig = field(default_factory=BackwardConfig)
 
     def __post_init__(self) -> None:
         check_ranges(self)

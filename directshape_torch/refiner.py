@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
+from directshape_torch.backward import attached_state
 from directshape_torch.config import RefinerConfig
 from directshape_torch.covariance import covariance_xyz_yaw, tangent_covariance
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.direct_terms import direct_terms
+from directshape_torch.energy.direct_terms import direct_terms, stacked_weights
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
@@ -21,9 +23,10 @@ from directshape_torch.observation.pixel_sampling import MASK_THRESHOLD
 from directshape_torch.quality import FitQuality, fit_quality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.gauss_newton import minimise
+from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.status import Status
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
@@ -34,9 +37,12 @@ class DirectShapeRefiner(nn.Module):
     """Refines pose and shape of cars in stereo frames (paper: DirectShape).
 
     Args:
-        prior: family of shapes; default the bundled prior of parametric cars. It is a submodule: its grids are
-            buffers that move with `.to(...)` and live in the `state_dict`.
+        prior: family of shapes in any encoding; default the bundled grids of parametric cars. It is a submodule: its
+            tensors move with `.to(...)` and live in the `state_dict`.
         config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
+
+    Raises:
+        InputError: a prior without the members or derivatives that `ShapePrior` lists.
 
     Example:
         >>> refiner = DirectShapeRefiner()
@@ -48,26 +54,44 @@ class DirectShapeRefiner(nn.Module):
         super().__init__()
         self.prior: ShapePrior = PCAShapePrior.load_bundled() if prior is None else prior
         self.config = RefinerConfig() if config is None else config
+        needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
+        check_prior(self.prior, by_autograd=needs_graph)
 
-    def forward(self, frames: FrameBatch, detections: Detections) -> RefinementResult:
+    def forward(
+        self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
+    ) -> RefinementResult:
         """Refine every car of one or several frames.
+
+        With `config.backward.mode` other than "none" pose and code of the result carry gradients to the masks, the
+        images, the prior's tensors and the term weights, with "unroll" to the input poses as well.
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
             detections: B cars in any order.
+            term_weights: (B,) factors of named terms for each car, beside the weights of the configuration: how far a
+                network trusts each of them.
 
         Returns:
             Poses, shapes, statuses, costs and covariances, in the order of the detections. Cars that cannot be refined
             keep their input pose and say why; they touch no other car.
 
         Raises:
-            InputError: frames, detections and prior do not fit together.
+            InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
+                wanted of a prior that has none.
         """
         _check_fit(frames, detections, self.prior)
-        with torch.no_grad():
-            return self._refine(frames, detections)
+        differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
+        # Half precision cannot hold pixel coordinates: under autocast everything here stays in the inputs' precision.
+        with torch.set_grad_enabled(differentiate), torch.autocast(frames.images_left.device.type, enabled=False):
+            if torch.compiler.is_compiling():
+                # One break in the graph of a compiled model around it; the loop decides by values all the time.
+                refine: Callable[..., RefinementResult] = torch.compiler.disable(self._refine)  # type: ignore[no-untyped-call]
+                return refine(frames, detections, term_weights)
+            return self._refine(frames, detections, term_weights)
 
-    def _refine(self, frames: FrameBatch, detections: Detections) -> RefinementResult:
+    def _refine(
+        self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
+    ) -> RefinementResult:
         input_state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
         observation, failure = self._observe(frames, detections)
         usable = failure < 0
@@ -75,12 +99,14 @@ class DirectShapeRefiner(nn.Module):
         state, status = input_state, failure.clone()
         outcome = None
         if len(rows):
-            outcome = self._minimise(frames, detections, observation, usable)
+            outcome = self._minimise(frames, detections, observation, usable, term_weights)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
         return _assemble(self.prior, frames, detections, state, status, rows, outcome)
 
-    def problem(self, frames: FrameBatch, detections: Detections) -> tuple[CarProblem, CarState]:
+    def problem(
+        self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
+    ) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
         _check_fit(frames, detections, self.prior)
         detections = _without_empty_masks(detections, _mask_areas(detections))
@@ -88,7 +114,8 @@ class DirectShapeRefiner(nn.Module):
         cars = CarBatch.from_scene(frames, detections)
         terms = direct_terms(self.config, self.prior, frames, detections, cars, observation)
         state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
-        return CarProblem(self.prior, terms, observation.left, observation.right, self.config), state
+        weights = stacked_weights(term_weights, terms, state.code)
+        return CarProblem(self.prior, terms, observation.left, observation.right, self.config, weights), state
 
     def _initial_code(self, detections: Detections) -> Tensor:
         return self.prior.initial_code(len(detections)).to(detections.T_cam_obj)
@@ -121,30 +148,29 @@ class DirectShapeRefiner(nn.Module):
         return observation, code
 
     def _minimise(
-        self, frames: FrameBatch, detections: Detections, observation: Observation | None, usable: Tensor
+        self,
+        frames: FrameBatch,
+        detections: Detections,
+        observation: Observation | None,
+        usable: Tensor,
+        term_weights: Mapping[str, Tensor] | None,
     ) -> _Outcome:
         assert observation is not None
         seen = observation.of_objects(usable)
         cars = CarBatch.from_scene(frames, detections).of_objects(usable)
         terms = direct_terms(self.config, self.prior, frames, detections, cars, seen)
-        problem = CarProblem(self.prior, terms, seen.left, seen.right, self.config)
+        weights = stacked_weights(term_weights, terms, self._initial_code(detections))
+        problem = CarProblem(
+            self.prior, terms, seen.left, seen.right, self.config, None if weights is None else weights[usable]
+        )
         T_cam_obj = detections.T_cam_obj[usable]
         initial = CarState(se3.inverse(T_cam_obj), self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj))
-        start = search_start(problem, initial, cars, self.config.search)
-        minimum = minimise(problem, initial, self.config.solver, start)
-        covariance = tangent_covariance(problem, minimum.state)
-        return _Outcome(
-            minimum.state,
-            minimum.status,
-            minimum.iterations,
-            minimum.cost_history,
-            tuple(term.name for term in problem.terms),
-            problem.term_costs(initial),
-            problem.term_costs(minimum.state),
-            covariance,
-            covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
-            fit_quality(problem, minimum.state),
-        )
+        record = torch.is_grad_enabled() and self.config.backward.mode == "unroll"
+        with torch.no_grad():
+            start = search_start(problem, initial, cars, self.config.search)
+            minimum = minimise(problem, initial, self.config.solver, start, record)
+            outcome = _outcome_of(problem, initial, minimum)
+        return replace(outcome, state=attached_state(problem, initial, start, minimum, self.config))
 
 
 @dataclass(frozen=True)
@@ -161,6 +187,22 @@ class _Outcome:
     covariance: Tensor
     covariance_xyz_yaw: Tensor
     quality: FitQuality
+
+
+def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState]) -> _Outcome:
+    covariance = tangent_covariance(problem, minimum.state)
+    return _Outcome(
+        minimum.state,
+        minimum.status,
+        minimum.iterations,
+        minimum.cost_history,
+        tuple(term.name for term in problem.terms),
+        problem.term_costs(initial),
+        problem.term_costs(minimum.state),
+        covariance,
+        covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
+        fit_quality(problem, minimum.state),
+    )
 
 
 def _no_outcome(state: CarState, unknowns: int) -> _Outcome:

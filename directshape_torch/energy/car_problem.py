@@ -25,6 +25,7 @@ class CarProblem:
         terms: summands of the energy.
         left, right: packed pixels whose rays the terms share.
         config: stages, trust region, samples per ray.
+        term_weights: (B, T) factors of the terms of each car, beside their own weights; None for 1.
     """
 
     def __init__(
@@ -34,11 +35,13 @@ class CarProblem:
         left: PixelSamples,
         right: PixelSamples,
         config: RefinerConfig,
+        term_weights: Tensor | None = None,
     ) -> None:
         self.prior = prior
         self.terms = list(terms)
         self.left, self.right = left, right
         self.config = config
+        self.term_weights = term_weights
 
     def stages(self) -> list[Stage]:
         return [Stage(s.contour_width_px, s.image_level, s.max_iterations) for s in self.config.stages]
@@ -73,22 +76,41 @@ class CarProblem:
     def term_costs(self, state: CarState) -> Tensor:
         """Cost (B, T) of each term; differentiable by autograd."""
         projected = self.project(state)
-        return torch.stack([term.cost(projected) for term in self.terms], dim=1)
+        costs = torch.stack([term.cost(projected) for term in self.terms], dim=1)
+        return costs if self.term_weights is None else costs * self.term_weights.to(torch.float64)
 
     def linearise(self, state: CarState) -> Linearisation:
-        parts = self.linearise_terms(state)
-        return Linearisation(
-            sum_of([p.cost for p in parts]), sum_of([p.gradient for p in parts]), sum_of([p.hessian for p in parts])
-        )
+        return _total(self.linearise_terms(state))
 
     def linearise_terms(self, state: CarState, with_fisher: bool = False) -> list[TermLinearisation]:
         """The linearisation of each term by itself."""
         if self.config.solver.jacobian == "autograd":
             rows = rows_by_autograd(self, state)
-            return [t.accumulate(r, J, with_fisher) for t, (r, J) in zip(self.terms, rows, strict=True)]
-        # Whoever differentiates a linearisation needs depths that follow the state.
-        projected = self.project(state, moving_depths=torch.is_grad_enabled())
-        return [term.linearise(projected, with_fisher) for term in self.terms]
+            parts = [t.accumulate(r, J, with_fisher) for t, (r, J) in zip(self.terms, rows, strict=True)]
+            return self._weighted(parts)
+        projected = self.project(state)
+        return self._weighted([term.linearise(projected, with_fisher) for term in self.terms])
+
+    def linearise_differentiably(self, state: CarState) -> Linearisation:
+        """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
+        projected = self.project(state, moving_depths=True)
+        return _total(self._weighted([term.linearise(projected) for term in self.terms]))
+
+    def free_unknowns(self, state: CarState) -> Tensor:
+        """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
+        free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
+        return torch.cat([free_pose, state.code.abs() < self.config.solver.max_code], dim=1)
+
+    def _weighted(self, parts: list[TermLinearisation]) -> list[TermLinearisation]:
+        if self.term_weights is None:
+            return parts
+        columns = self.term_weights.to(torch.float64).unbind(dim=1)
+        return [
+            TermLinearisation(
+                w * p.cost, w[:, None] * p.gradient, *(w[:, None, None] * x for x in (p.hessian, p.fisher))
+            )
+            for w, p in zip(columns, parts, strict=True)
+        ]
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         return retract(state, step, self.config.solver.max_code)
@@ -106,7 +128,14 @@ class CarProblem:
             self.left.of_objects(keep),
             self.right.of_objects(keep),
             self.config,
+            None if self.term_weights is None else self.term_weights[keep],
         )
+
+
+def _total(parts: Sequence[TermLinearisation]) -> Linearisation:
+    return Linearisation(
+        sum_of([p.cost for p in parts]), sum_of([p.gradient for p in parts]), sum_of([p.hessian for p in parts])
+    )
 
 
 def sum_of(tensors: Sequence[Tensor]) -> Tensor:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Mapping, Sequence
 
+import torch
+from torch import Tensor
+
+from directshape_torch.checks import check_shape
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.photometric_term import GreyPair, PhotometricTerm
@@ -11,6 +15,7 @@ from directshape_torch.energy.prior_terms import PriorTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.silhouette_term import silhouette_term
 from directshape_torch.energy.term import Term
+from directshape_torch.errors import InputError
 from directshape_torch.image.gradients import grey_levels
 from directshape_torch.observation.packing import Observation
 from directshape_torch.residuals.priors import (
@@ -95,3 +100,25 @@ def _photometric_term(
         hidden_right=observation.hidden_right,
         mask_left=detections.mask_left,
     )
+
+
+def stacked_weights(weights: Mapping[str, Tensor] | None, terms: Sequence[Term], code: Tensor) -> Tensor | None:
+    """Factors (B, T) of the terms from those given by name, 1 for the others.
+
+    Args:
+        weights: (B,) by name of the term; None for none.
+        terms: T terms.
+        code: (B, K), for number, dtype and device.
+
+    Raises:
+        InputError: no such term (a misspelt name, or a term of weight zero), or a wrong shape.
+    """
+    if weights is None:
+        return None
+    names = [term.name for term in terms]
+    for name, weight in weights.items():
+        if name not in names:
+            raise InputError("term_weights", f"names among {', '.join(names)}", repr(name))
+        check_shape(f"term_weights[{name!r}]", weight, (len(code),))
+    ones = code.new_ones(len(code))
+    return torch.stack([weights[name].to(code) if name in weights else ones for name in names], dim=1)

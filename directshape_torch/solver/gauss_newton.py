@@ -15,6 +15,25 @@ from directshape_torch.status import Status
 
 
 @dataclass(frozen=True)
+class Iteration(Generic[StateT]):
+    """What must be known to repeat one iteration of all B problems.
+
+    Attributes:
+        stage: number of its stage.
+        state: states before it.
+        damping: (B,) Marquardt's mu.
+        accepted: (B,) bool: the step was taken; false for problems that took no part.
+        improved: (B,) bool: it led to the best state of the stage so far.
+    """
+
+    stage: int
+    state: StateT
+    damping: Tensor
+    accepted: Tensor
+    improved: Tensor
+
+
+@dataclass(frozen=True)
 class Minimum(Generic[StateT]):
     """Result of a minimisation.
 
@@ -24,12 +43,16 @@ class Minimum(Generic[StateT]):
         iterations: (B,) iterations done.
         cost_history: cost of the current state after each iteration, (B, iterations done in all), NaN where a problem
             took no part. Costs of different stages are not comparable.
+        stage_starts: states at which each stage began and fixed its sets.
+        trajectory: all iterations in order, if they were asked for.
     """
 
     state: StateT
     status: Tensor
     iterations: Tensor
     cost_history: Tensor
+    stage_starts: tuple[StateT, ...] = ()
+    trajectory: tuple[Iteration[StateT], ...] = ()
 
 
 @dataclass
@@ -47,8 +70,45 @@ class _Progress(Generic[StateT]):
     iterations: Tensor  # (B,)
 
 
+@dataclass(frozen=True)
+class _Log(Generic[StateT]):
+    """What is kept of the iterations of one stage."""
+
+    history: list[Tensor]
+    trajectory: list[Iteration[StateT]] | None
+    stage: int
+
+    def add(
+        self,
+        all_states: StateT,
+        rows: Tensor,
+        before: tuple[StateT, Tensor],
+        accepted: Tensor,
+        improved: Tensor,
+        cost: Tensor,
+    ) -> None:
+        nan = cost.new_full((len(all_states[0]),), torch.nan)
+        self.history.append(nan.index_copy(0, rows, cost))
+        if self.trajectory is not None:
+            state, damping = before
+            none = torch.zeros_like(nan, dtype=torch.bool)
+            self.trajectory.append(
+                Iteration(
+                    self.stage,
+                    put_rows(all_states, rows, state),
+                    torch.zeros_like(nan).index_copy(0, rows, damping),
+                    none.index_copy(0, rows, accepted),
+                    none.index_copy(0, rows, improved),
+                )
+            )
+
+
 def minimise(
-    problem: Problem[StateT], initial: StateT, config: SolverConfig, start: StateT | None = None
+    problem: Problem[StateT],
+    initial: StateT,
+    config: SolverConfig,
+    start: StateT | None = None,
+    record: bool = False,
 ) -> Minimum[StateT]:
     """Run the stages of a problem one after the other, then compare the outcome with the input.
 
@@ -59,6 +119,7 @@ def minimise(
         initial: their input states, returned where a problem fails and compared with the outcome.
         config: damping, acceptance, convergence.
         start: where the iterations begin; default the input states.
+        record: keep the trajectory.
     """
     with torch.no_grad():
         state = initial if start is None else start
@@ -68,14 +129,20 @@ def minimise(
         iterations = torch.zeros(num_problems, dtype=torch.long, device=device)
         converged = torch.zeros(num_problems, dtype=torch.bool, device=device)
         history: list[Tensor] = []
+        starts: list[StateT] = []
+        trajectory: list[Iteration[StateT]] | None = [] if record else None
         for stage in problem.stages():
             problem.begin_stage(stage, state)
-            state, converged, failure, done = _run_stage(problem, stage, state, failure, config, history)
+            starts.append(state)
+            number = len(starts) - 1
+            log = _Log(history, trajectory, number)
+            state, converged, failure, done = _run_stage(problem, stage, state, failure, config, log)
             iterations = iterations + done
         status = _final_status(problem, initial, state, converged, failure)
         refined = (status == Status.converged.code) | (status == Status.max_iterations.code)
         columns = torch.stack(history, dim=1) if history else torch.empty(num_problems, 0, device=device)
-        return Minimum(where_rows(refined, state, initial), status, iterations, columns)
+        final = where_rows(refined, state, initial)
+        return Minimum(final, status, iterations, columns, tuple(starts), tuple(trajectory or ()))
 
 
 def _run_stage(
@@ -84,7 +151,7 @@ def _run_stage(
     state: StateT,
     failure: Tensor,
     config: SolverConfig,
-    history: list[Tensor],
+    log: _Log[StateT],
 ) -> tuple[StateT, Tensor, Tensor, Tensor]:
     num_problems = len(failure)
     converged = torch.zeros_like(failure, dtype=torch.bool)
@@ -95,9 +162,9 @@ def _run_stage(
     done = 0
     while done < stage.max_iterations and len(rows):
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
-            _iterate(part, progress, config)
-            column = torch.full_like(failure, torch.nan, dtype=torch.float64)
-            history.append(column.index_copy(0, rows, progress.at_state.cost))
+            before = (progress.state, progress.damping)
+            accepted, improved = _iterate(part, progress, config)
+            log.add(state, rows, before, accepted, improved, progress.at_state.cost)
             done += 1
         # The only synchronisation of a block: which problems go on.
         keep = progress.running
@@ -129,7 +196,8 @@ def _begin(problem: Problem[StateT], state: StateT, failure: Tensor, config: Sol
     )
 
 
-def _iterate(problem: Problem[StateT], p: _Progress[StateT], config: SolverConfig) -> None:
+def _iterate(problem: Problem[StateT], p: _Progress[StateT], config: SolverConfig) -> tuple[Tensor, Tensor]:
+    """One iteration of a batch; which steps were accepted and which of them made the best state."""
     step, solvable = damped_step(p.at_state.hessian, p.at_state.gradient, p.damping)
     step = limit_step(step, problem.step_limits().to(step))
     candidate = problem.retract(p.state, step)
@@ -161,6 +229,7 @@ def _iterate(problem: Problem[StateT], p: _Progress[StateT], config: SolverConfi
     p.damping = torch.where(p.damping > 0, adapted, p.damping)
     p.converged = p.converged | settled | stuck
     p.running = p.running & ~settled & ~stuck & (p.failure < 0)
+    return accepted, better
 
 
 def _is_finite(at: Linearisation) -> Tensor:

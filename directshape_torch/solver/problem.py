@@ -72,6 +72,18 @@ class Problem(Protocol[StateT]):
         ...
 
 
+class DifferentiableProblem(Problem[StateT], Protocol):
+    """A problem whose linearisation can be differentiated, by the state and by whatever the problem is made of."""
+
+    def linearise_differentiably(self, state: StateT) -> Linearisation:
+        """`linearise` with an autograd graph to the state and to the problem's own inputs."""
+        ...
+
+    def free_unknowns(self, state: StateT) -> Tensor:
+        """Unknowns (B, D) that are not held by a bound, bool."""
+        ...
+
+
 def take_rows(state: StateT, index: Tensor) -> StateT:
     """Rows of every tensor of a state."""
     return type(state)(*(x[index] for x in state))

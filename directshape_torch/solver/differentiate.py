@@ -1,0 +1,174 @@
+"""Derivatives of a minimum by whatever the problem is made of: unrolled iterations, or the implicit function theorem.
+
+Both give back the minimum's own values with an autograd graph attached. Sets that a stage fixes (pixels, counts, zeta),
+accepted steps and damping are constants.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from directshape_torch.solver.damped_solve import damped_step, limit_step
+from directshape_torch.solver.gauss_newton import Iteration, Minimum
+from directshape_torch.solver.problem import DifferentiableProblem, Linearisation, StateT, take_rows, where_rows
+
+
+class NotStationaryWarning(UserWarning):
+    """Problems without implicit gradient, because their iterations ended too far from a stationary point."""
+
+
+def unrolled_state(
+    problem: DifferentiableProblem[StateT],
+    start: StateT,
+    minimum: Minimum[StateT],
+    rows: Tensor,
+    num_iterations: int,
+) -> StateT:
+    """The states of some problems as functions of the problem (and of the start), by repeating their last steps.
+
+    Args:
+        problem: those problems alone, no stage begun.
+        start: their states before the first iteration, with a graph where wanted; it counts for problems that took
+            no more than `num_iterations` steps.
+        minimum: of all problems, with its trajectory.
+        rows: (R,) which of them.
+        num_iterations: how many of its last steps are repeated for each problem; memory grows with it.
+
+    Returns:
+        States of the R problems: the values of `minimum`, the derivatives of the repeated steps.
+    """
+    trajectory = [_rows_of(iteration, rows) for iteration in minimum.trajectory]
+    if not trajectory:
+        return _with_values(take_rows(minimum.state, rows), start)
+    led_to_the_end = _steps_that_led_to_the_end(trajectory)
+    from_the_end = led_to_the_end.long().flip(0).cumsum(0).flip(0)
+    repeated = led_to_the_end & (from_the_end <= num_iterations)
+    state = where_rows(from_the_end[0] <= num_iterations, start, _first_states(trajectory, repeated))
+    stages, begun = problem.stages(), -1
+    for iteration, taken in zip(trajectory, repeated, strict=True):
+        if not bool(taken.any()):
+            continue
+        if iteration.stage != begun:
+            begun = iteration.stage
+            problem.begin_stage(stages[begun], take_rows(minimum.stage_starts[begun], rows))
+        state = where_rows(taken, _step(problem, state, iteration.damping), state)
+    return _with_values(take_rows(minimum.state, rows), state)
+
+
+def _steps_that_led_to_the_end(trajectory: Sequence[Iteration[StateT]]) -> Tensor:
+    """(N, R) bool: accepted steps, without those after the best state of a stage, which is where the next begins."""
+    accepted, improved = (torch.stack([getattr(it, name) for it in trajectory]) for name in ("accepted", "improved"))
+    stage = torch.tensor([it.stage for it in trajectory], device=accepted.device)
+    counts = torch.zeros_like(accepted)
+    for number in sorted({it.stage for it in trajectory}):
+        own = stage == number
+        still_to_improve = improved[own].long().flip(0).cumsum(0).flip(0) > 0
+        counts[own] = accepted[own] & still_to_improve
+    return counts
+
+
+def _first_states(trajectory: Sequence[Iteration[StateT]], repeated: Tensor) -> StateT:
+    """The recorded state of each problem before its first repeated step."""
+    state = trajectory[-1].state
+    for iteration, taken in zip(reversed(trajectory), repeated.flip(0), strict=True):
+        state = where_rows(taken, iteration.state, state)
+    return state
+
+
+def implicit_state(
+    problem: DifferentiableProblem[StateT],
+    minimum: Minimum[StateT],
+    rows: Tensor,
+    *,
+    exact: bool,
+    max_remaining_step: float,
+) -> StateT:
+    """The states of some problems as functions of the problem, by the implicit function theorem at the final stage.
+
+    At a minimum the gradient g(state, theta) is zero, hence `d state / d theta = -(dg/dstate)^-1 dg/dtheta`: D
+    backward passes through g for the Jacobian and one solve for each problem, whatever the number of iterations.
+
+    Args:
+        problem: those problems alone, no stage begun.
+        minimum: of all problems.
+        rows: (R,) which of them.
+        exact: True takes the exact Jacobian of g, False the Gauss-Newton matrix in its place, which lacks the
+            second derivatives of the residuals: cheaper and biased.
+        max_remaining_step: problems whose next Newton step would exceed this share of the trust region are not at a
+            stationary point: no gradient, and a `NotStationaryWarning` that names them.
+
+    Returns:
+        States of the R problems: the values of `minimum`; unknowns at a bound are constants.
+    """
+    state = take_rows(minimum.state, rows)
+    problem.begin_stage(problem.stages()[-1], take_rows(minimum.stage_starts[-1], rows))
+    free = problem.free_unknowns(state)
+    delta = torch.zeros(free.shape, dtype=torch.float64, device=free.device)
+    at, J = _gradient_and_its_jacobian(problem, state, delta, exact)
+    both = free[:, :, None] & free[:, None, :]
+    J = torch.where(both, J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
+    factor, pivots, info = torch.linalg.lu_factor_ex(J)
+    gradient = torch.where(free, at.gradient, torch.zeros_like(at.gradient))
+    remaining = torch.linalg.lu_solve(factor, pivots, gradient.detach()[..., None])[..., 0]
+    size = (remaining.abs() / problem.step_limits().to(remaining)).amax(dim=-1)
+    stationary = (info == 0) & size.isfinite() & (size <= max_remaining_step)
+    _warn_of_the_others(stationary, rows)
+    # The graph runs through the gradient alone; where it is not used the system is replaced, so that no NaN passes.
+    safe = torch.where(stationary[:, None, None], J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
+    gradient = torch.where(stationary[:, None], gradient, torch.zeros_like(gradient))
+    step = -torch.linalg.solve(safe, gradient[..., None])[..., 0]
+    return _with_values(state, problem.retract(state, step - step.detach()))
+
+
+def _gradient_and_its_jacobian(
+    problem: DifferentiableProblem[StateT], state: StateT, delta: Tensor, exact: bool
+) -> tuple[Linearisation, Tensor]:
+    """g with its graph to the problem, and its Jacobian (R, D, D) by the tangent at the state, without one."""
+    if not exact:
+        at = problem.linearise_differentiably(state)
+        return at, at.hessian.detach()
+    delta = delta.requires_grad_()
+    at = problem.linearise_differentiably(problem.retract(state, delta))
+    # Each row of g belongs to one problem, so the sum over the problems has the rows of all of them at once.
+    rows = [torch.autograd.grad(g.sum(), delta, retain_graph=True)[0] for g in at.gradient.unbind(dim=1)]
+    return at, torch.stack(rows, dim=1)
+
+
+def _warn_of_the_others(stationary: Tensor, rows: Tensor) -> None:
+    others = rows[~stationary].tolist()
+    if others:
+        warnings.warn(
+            f"no implicit gradient for problems {_listed(others)}: their iterations ended away from a stationary "
+            "point (more iterations or a smaller cost_tolerance would help)",
+            NotStationaryWarning,
+            stacklevel=2,
+        )
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
+
+
+def _step(problem: DifferentiableProblem[StateT], state: StateT, damping: Tensor) -> StateT:
+    at = problem.linearise_differentiably(state)
+    step, _ = damped_step(at.hessian, at.gradient, damping)
+    return problem.retract(state, limit_step(step, problem.step_limits().to(step)))
+
+
+def _rows_of(iteration: Iteration[StateT], rows: Tensor) -> Iteration[StateT]:
+    return Iteration(
+        iteration.stage,
+        take_rows(iteration.state, rows),
+        iteration.damping[rows],
+        iteration.accepted[rows],
+        iteration.improved[rows],
+    )
+
+
+def _with_values(values: StateT, graph: StateT) -> StateT:
+    """The values of one state and the derivatives of the other."""
+    return type(values)(*(v.detach() + (x - x.detach()) for v, x in zip(values, graph, strict=True)))
