@@ -84,7 +84,7 @@ TARGETS: dict[str, Target] = {
     ),
     "priors": Target(
         "directshape_torch/residuals/priors.py",
-        ("shape_prior", "height_prior", "tilt_prior_normal", "tilt_prior_cosine", "dimensions_prior"),
+        ("shape_prior", "height_prior", "tilt_prior_normal", "tilt_prior_cosine", "_by_rotation", "dimensions_prior"),
         ("tests/residuals/test_priors.py",),
     ),
     "robust": Target(
