@@ -1,0 +1,157 @@
+"""Real image content for the laboratory: frames of a data set, and cars placed into them at will."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import box_corners
+from directshape_torch.geometry.pinhole import project, rays_from_pixels
+from directshape_torch.geometry.stereo import right_rays
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.raycast import ObjectRays, march
+
+DEMO_FOLDER = Path(__file__).parents[1] / "assets" / "demo"
+
+_MASK_SAMPLES_PER_RAY = 32
+# Masks of near cars are drawn on a coarser lattice: the laboratory needs a plausible contour, not every pixel of it.
+_MASK_ROWS = 80
+
+
+@dataclass(frozen=True)
+class LaboratoryScene:
+    """One frame with its detections, float64."""
+
+    frame: FrameBatch
+    detections: Detections
+    source: str
+
+
+def load_scene(data: Path | None = None, frame_id: str | None = None) -> LaboratoryScene:
+    """The bundled demo frame, or a frame of a data set in KITTI's layout (with `detections` and masks beside it).
+
+    Args:
+        data: folder that holds `training/`, with masks in `training/masks` and results in `detections/<name>`; None
+            for the bundled frame.
+        frame_id: default the frame with most cars that have masks in both images.
+
+    Raises:
+        DataFormatError: a folder is missing or damaged.
+        InputError: no frame with a car that has masks.
+
+    Example:
+        >>> load_scene().detections.T_cam_obj.dtype
+        torch.float64
+    """
+    root = DEMO_FOLDER if data is None else data
+    dataset = KittiStereoDataset(root, _detections_folder(root), root / "training" / "masks", dtype=torch.float64)
+    frames = dataset.frame_ids if frame_id is None else (frame_id,)
+    best, most = None, 0
+    for name in frames:
+        loaded = dataset.load(name)
+        d = loaded.detections
+        both = d.has_mask_left & d.has_mask_right
+        if int(both.sum()) > most:
+            best, most = (
+                LaboratoryScene(loaded.frame, select_detections(d, both.nonzero()[:, 0]), name),
+                int(both.sum()),
+            )
+    if best is None:
+        raise InputError("data", f"a frame of {root} with a car that has masks in both images", "none")
+    return replace(best, source=f"{'the bundled demo' if data is None else data.name} frame {best.source}")
+
+
+def _detections_folder(root: Path) -> Path:
+    folders = sorted(path for path in (root / "detections").glob("*") if path.is_dir())
+    if not folders:
+        raise DataFormatError(root / "detections", "holds no folder of detections", cure="give a folder <name>/data")
+    return folders[0]
+
+
+def select_detections(d: Detections, rows: Tensor) -> Detections:
+    """Some of the detections, in that order; a row may be repeated. Other instances stay as occluders."""
+    names = (
+        "frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right",
+        "has_mask_left", "has_mask_right",
+    )  # fmt: skip
+    return replace(d, **{name: getattr(d, name)[rows] for name in names})
+
+
+def place_cars(
+    scene: LaboratoryScene,
+    prior: PCAShapePrior,
+    T_cam_obj: Tensor,  # (B, 4, 4)
+    code: Tensor,  # (B, K)
+) -> Detections:
+    """Detections of cars that are not in the picture: their true masks, over whatever the images show there."""
+    frame = scene.frame
+    count, (height, width) = len(T_cam_obj), frame.images_left.shape[2:]
+    corners = box_corners(T_cam_obj, prior.dimensions_mean_hwl.expand(count, 3))
+    # A car at the camera has corners behind it.
+    uv = project(torch.cat([corners[..., :2], corners[..., 2:].clamp_min(0.3)], dim=-1), frame.camera.K_left[0])
+    limit = uv.new_tensor([width - 1, height - 1])
+    box = torch.cat([uv.amin(dim=1).clamp_min(0).minimum(limit), uv.amax(dim=1).clamp_min(0).minimum(limit)], dim=1)
+    masks = {
+        side: torch.stack([_mask(scene, prior, T_cam_obj[b], code[b], side, box[b]) for b in range(count)])
+        for side in ("left", "right")
+    }
+    return Detections(
+        frame_index=torch.zeros(count, dtype=torch.long),
+        T_cam_obj=T_cam_obj,
+        dimensions_hwl=prior.dimensions_mean_hwl.expand(count, 3).clone(),
+        box_2d=box,
+        score=torch.ones(count, dtype=T_cam_obj.dtype),
+        mask_left=masks["left"],
+        mask_right=masks["right"],
+        has_mask_left=masks["left"].flatten(1).any(dim=1),
+        has_mask_right=masks["right"].flatten(1).any(dim=1),
+    )
+
+
+def _mask(
+    scene: LaboratoryScene, prior: PCAShapePrior, T_cam_obj: Tensor, code: Tensor, side: str, box_left: Tensor
+) -> Tensor:
+    """Silhouette (H, W) of one car, drawn on a lattice as fine as its size in the image needs."""
+    camera = scene.frame.camera
+    height, width = scene.frame.images_left.shape[2:]
+    focal, depth = float(camera.K_left[0, 0, 0]), float(T_cam_obj[2, 3])
+    stride = max(1, round(1.6 * focal / depth / _MASK_ROWS))
+    # Room for the largest shapes, and for the disparity in the right image.
+    u0, v0, u1, v1 = (int(x) for x in box_left)
+    margin = round(0.8 * focal / depth)
+    shift = round(focal * float(camera.baseline[0]) / depth) if side == "right" else 0
+    rows = torch.arange(max(0, v0 - margin), min(height, v1 + margin + 1), stride)
+    columns = torch.arange(max(0, u0 - margin - shift), min(width, u1 + margin + 1), stride)
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    hit = _hits(scene, prior, se3.inverse(T_cam_obj), code, side, torch.stack([u, v], dim=-1).reshape(-1, 2))
+    mask = code.new_zeros(height, width)
+    fine = hit.reshape(v.shape).to(code).repeat_interleave(stride, dim=0).repeat_interleave(stride, dim=1)
+    if len(rows) and len(columns):
+        part = mask[int(rows[0]) :, int(columns[0]) :]
+        part[: fine.shape[0], : fine.shape[1]] = fine[: part.shape[0], : part.shape[1]]
+    return mask
+
+
+def _hits(
+    scene: LaboratoryScene, prior: PCAShapePrior, T_obj_cam: Tensor, code: Tensor, side: str, uv: Tensor
+) -> Tensor:
+    """Whether the rays of pixels (P, 2) of one side meet the shape, (P,)."""
+    camera = scene.frame.camera
+    uv = uv.to(code.dtype)
+    if side == "left":
+        direction = rays_from_pixels(uv, camera.K_left[0])
+        origin = torch.zeros_like(direction)
+    else:
+        rays = right_rays(uv, camera.K_right[0], camera.T_right_cam[0])
+        origin, direction = rays.origin_cam, rays.direction_cam
+    R, t = T_obj_cam[:3, :3], T_obj_cam[:3, 3]
+    object_rays = ObjectRays(origin @ R.T + t, direction @ R.T, torch.zeros(len(uv), dtype=torch.long))
+    marched = march(prior.bind(code[None]), object_rays, prior.bounds_obj, _MASK_SAMPLES_PER_RAY)
+    return marched.crosses_bounds & (marched.sdf < 0).any(dim=1)
