@@ -20,6 +20,8 @@ from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivat
 
 # Half width of the zone about the middle plane where the mirrored coordinate `sqrt(z^2 + s^2)` is rounded.
 MIRROR_ROUNDING_M = 0.2
+# Typical frequency of the first layer before training: details of cars are a few decimetres large.
+FIRST_RADIANS_PER_M = 3.0
 # Points of `values` that pass through the network together.
 _CHUNK_POINTS = 1 << 16
 
@@ -93,6 +95,7 @@ class NeuralShapePrior(nn.Module):
         self.grid_shape, self.spacing_m = grid_shape, float(spacing_m)
         self.provenance = provenance
         self.to(origin).requires_grad_(False)
+        self.coded_layers()[0].weight.mul_(FIRST_RADIANS_PER_M)
 
     @property
     def bounds_obj(self) -> Tensor:

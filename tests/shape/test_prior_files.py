@@ -1,0 +1,130 @@
+"""Files of priors of every kind: round trips, dispatch by content, and what is said of a wrong or truncated file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.kitti_folder import write_data_set
+from helpers.priors import kernel_prior, prior_of
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from directshape_torch.cli.main import main
+from directshape_torch.errors import DataFormatError
+from directshape_torch.io.result_files import read_shapes
+from directshape_torch.shape.load_prior import load_prior
+from directshape_torch.shape.neural_prior import NeuralShapePrior
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+MODULES: dict[str, Callable[[], nn.Module]] = {
+    "pca": ellipsoid_prior,
+    "neural": NeuralShapePrior.load_bundled,
+    "kernel_pca": kernel_prior,
+}
+
+
+def write(kind: str, folder: Path) -> Path:
+    path = folder / ("prior.npz" if kind == "pca" else "prior.safetensors")
+    prior = prior_of(kind)
+    assert isinstance(prior, nn.Module)
+    prior.save(path)
+    return path
+
+
+@pytest.mark.parametrize("kind", MODULES)
+def test_a_file_says_of_which_kind_it_is(kind: str, tmp_path: Path) -> None:
+    path, prior = write(kind, tmp_path), prior_of(kind)
+    read = load_prior(path)
+    assert type(read) is type(prior)
+    assert read.origin.dtype == torch.float32
+    assert not [p for p in read.named_parameters() if p[1].requires_grad]
+    code = torch.linspace(-1, 1, prior.num_codes)[None]
+    # Grids of the kernel prior are kept in float16.
+    torch.testing.assert_close(read.values(code).double(), prior.values(code.double()), atol=2e-3, rtol=0)
+    first = path.read_bytes()
+    prior.save(path)
+    assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_names_are_bundled_priors_and_paths_are_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert isinstance(load_prior("pca"), PCAShapePrior)
+    assert isinstance(load_prior("neural"), NeuralShapePrior)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataFormatError, match="no such file"):
+        load_prior("./neural")
+    with pytest.raises(DataFormatError, match="no such file"):
+        load_prior(Path("neural"))
+
+
+def test_the_bundled_network_is_a_small_file_of_ours() -> None:
+    prior = NeuralShapePrior.load_bundled()
+    assert prior.provenance.licence == "Apache-2.0"
+    assert prior.provenance.num_samples == 600
+    asset = Path(load_prior.__code__.co_filename).parents[1] / "assets" / "neural_prior.safetensors"
+    assert asset.stat().st_size < 1_000_000
+    # KITTI's labelled cars: 1.53, 1.63, 3.88 m.
+    hwl = prior.dimensions_and_derivative(prior.initial_code(1)).hwl[0]
+    torch.testing.assert_close(hwl, torch.tensor([1.53, 1.63, 3.88]), atol=0.12, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["neural", "kernel_pca"])
+def test_wrong_files_say_what_is_wrong(kind: str, tmp_path: Path) -> None:
+    good, bad = write(kind, tmp_path), tmp_path / "bad.safetensors"
+    content = good.read_bytes()
+    for damaged in (content[:5], content[:200], content[:-4], b"", b"no tensors at all" * 100):
+        bad.write_bytes(damaged)
+        with pytest.raises(DataFormatError, match=r"bad\.safetensors: not a whole safetensors file"):
+            load_prior(bad)
+    tensors, description = load_file(good), json.loads(_metadata(good)["description"])
+    name = sorted(tensors)[0]
+
+    def changed(**changes: object) -> Path:
+        save_file(tensors, bad, {"description": json.dumps({**description, **changes})})
+        return bad
+
+    with pytest.raises(DataFormatError, match="schema 'other/9' is none of directshape_torch"):
+        load_prior(changed(schema="other/9"))
+    with pytest.raises(DataFormatError, match=r"prior.*; make one with: python scripts/"):
+        load_prior(changed(provenance={"made_at": "home"}))
+    save_file(tensors, bad)
+    with pytest.raises(DataFormatError, match="schema 'none' is none of"):
+        load_prior(bad)
+    kept = tensors.pop(name)
+    with pytest.raises(DataFormatError, match=name.split(".")[-1]):
+        load_prior(changed())
+    tensors[name] = torch.full_like(kept, torch.nan)
+    with pytest.raises(DataFormatError, match=f"{name} holds values that are no finite"):
+        load_prior(changed())
+    tensors[name] = kept.flatten()[:1]
+    with pytest.raises(DataFormatError, match="expected"):
+        load_prior(changed())
+    wrong_kind = PCAShapePrior.load if kind == "neural" else NeuralShapePrior.load
+    with pytest.raises(DataFormatError, match=r"prior\.safetensors"):
+        wrong_kind(good)
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        return dict(file.metadata())
+
+
+@pytest.mark.parametrize("kind", MODULES)
+def test_the_refine_command_takes_every_kind(kind: str, tmp_path: Path) -> None:
+    root, out = tmp_path / "kitti", tmp_path / "out"
+    root.mkdir()
+    write_data_set(root, ("000000",))
+    words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks", "--out", out]
+    options = ["--prior", write(kind, tmp_path), "--device", "cpu", "--meshes", "ply", "--overlays"]
+    assert main([str(word) for word in (*words, *options, "--set", "stages=[{max_iterations: 2}]")]) == 0
+    shapes = read_shapes(out / "shapes" / "000000.npz")
+    assert shapes.codes.shape == (2, prior_of(kind).num_codes)
+    assert set(shapes.statuses) <= {"converged", "max_iterations", "rejected_worse"}
+    assert len(list((out / "meshes").glob("*.ply"))) == sum(s != "rejected_worse" for s in shapes.statuses)
