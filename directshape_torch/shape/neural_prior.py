@@ -22,8 +22,8 @@ from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivat
 MIRROR_ROUNDING_M = 0.2
 # Typical frequency of the first layer before training: details of cars are a few decimetres large.
 FIRST_RADIANS_PER_M = 3.0
-# Points of `values` that pass through the network together.
-_CHUNK_POINTS = 1 << 16
+# Points whose value is computed together: their units stay in a core's cache, which is twice as fast.
+_CHUNK_POINTS = 4096
 
 
 class CodedLinear(nn.Module):
@@ -129,12 +129,8 @@ class NeuralShapePrior(nn.Module):
     def values(self, code: Tensor) -> Tensor:
         """Signed distance at the nodes of the measuring grid, (B, nx, ny, nz), metres, for codes (B, K)."""
         shape, nodes = self.bind(code), self._nodes()
-        fields = [
-            torch.cat(
-                [shape.value(part, part.new_full((len(part),), i).long()) for part in torch.split(nodes, _CHUNK_POINTS)]
-            )
-            for i in range(len(code))
-        ]
+        owners = torch.arange(len(code), device=nodes.device)
+        fields = [shape.value(nodes, owner.expand(len(nodes))) for owner in owners]
         return torch.stack(fields).view(-1, *self.grid_shape) if fields else nodes.new_zeros(0, *self.grid_shape)
 
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
@@ -189,6 +185,10 @@ class NeuralShape:
 
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
+        parts = zip(torch.split(points_obj, _CHUNK_POINTS), torch.split(object_index, _CHUNK_POINTS), strict=True)
+        return torch.cat([self._value(points, index) for points, index in parts])
+
+    def _value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         clamped, outward = self._split(points_obj)
         x = torch.sin(self._linear(0, _mirrored(clamped), object_index))
         for i in range(1, len(self._weights) - 1):
@@ -229,7 +229,7 @@ class NeuralShape:
         return clamped, points_obj - clamped
 
     def _linear(self, i: int, x: Tensor, object_index: Tensor) -> Tensor:
-        return x @ self._weights[i].T + self._shifts[i][object_index]
+        return torch.addmm(self._shifts[i].index_select(0, object_index), x, self._weights[i].T)
 
 
 _SILU_SLOPE = 1.0998393  # its largest derivative
