@@ -1,0 +1,96 @@
+"""`directshape evaluate-shape`: refined shapes against true surfaces."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
+
+_DESCRIPTION = """
+Measure shapes before (mean shape at the pose of the detection) and after a refinement against true surfaces:
+completeness, accuracy, F1 and RMSE over the distance tau, 0.05 to 1.0 m, as the paper defines them, with n and
+bootstrap intervals over cars. Counted are Car labels at least 25 px high, occluded <= 1, truncated <= 0.5.
+"""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the command and its options."""
+    parser = subparsers.add_parser(
+        "evaluate-shape", help="refined shapes against true surfaces", description=_DESCRIPTION
+    )
+    _add_inputs(parser)
+    _add_outputs(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_inputs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/calib ..")
+    parser.add_argument("--detections", type=Path, required=True, metavar="DIR", help="what went into the refinement")
+    parser.add_argument("--refined", type=Path, required=True, metavar="OUT", help="output folder of 'refine'")
+    parser.add_argument(
+        "--truth",
+        choices=("disparity", "points"),
+        required=True,
+        help="training/disp_occ_0 inside masks (KITTI Stereo 2015), or training/points with depth_2 and instance_2",
+    )
+    parser.add_argument("--masks", type=Path, metavar="DIR", help="with disparity: which pixels belong to a car")
+    parser.add_argument("--labels", type=Path, metavar="DIR", help="default: ROOT/training/label_2")
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all that have truth")
+    chosen.add_argument("--frames", nargs="+", metavar="ID", help="frame ids")
+    parser.add_argument("--tracks", type=Path, metavar="FILE", help="JSON: which labels show the same physical car")
+    parser.add_argument("--prior", metavar="FILE|NAME", help="the shape prior of the refinement (default: pca)")
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
+    parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all curves")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each label, surface and tau")
+    parser.add_argument("--plots", type=Path, metavar="DIR", help="write the curves over tau as PNG")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate, print and write; returns the exit code.
+
+    Raises:
+        DirectShapeError: for the main program to show.
+    """
+    from directshape_torch.batch.content_hashes import hash_prior
+    from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+    from directshape_torch.evaluation.shape_error_cars import evaluate_shapes
+    from directshape_torch.evaluation.shape_error_report import (
+        format_shape_scores,
+        write_shape_scores_csv,
+        write_shape_scores_json,
+    )
+    from directshape_torch.shape.load_prior import load_prior
+
+    prior = load_prior("pca" if args.prior is None else args.prior)
+    scores = evaluate_shapes(
+        args.data,
+        args.detections,
+        args.refined,
+        prior,
+        truth=args.truth,
+        masks=args.masks,
+        labels_dir=args.labels,
+        frames=args.frames,
+        split=args.split,
+        tracks=args.tracks,
+        prior_sha256=hash_prior(prior),
+        bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
+    )
+    print(format_shape_scores(scores), end="")
+    if args.json is not None:
+        write_shape_scores_json(args.json, scores)
+    if args.csv is not None:
+        write_shape_scores_csv(args.csv, scores.cars)
+    if args.plots is not None:
+        from directshape_torch.cli.evaluate_shape_plots import write_plots
+
+        write_plots(args.plots, scores)
+    return 0

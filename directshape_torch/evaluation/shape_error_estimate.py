@@ -1,0 +1,84 @@
+"""Points on the surface of an estimated car: spread evenly over it, or where given pixels see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.evaluation.shape_error import Points
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.shape.raycast import ObjectRays, Root, closest_approach_depth, first_crossing, march
+from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.shape_prior import ShapePrior
+
+_SAMPLES_PER_RAY = 96
+# A sampled point lies on a triangle, up to some millimetres off the surface that a ray meets; along grazing rays more.
+_SELF_OCCLUSION_MARGIN_M = 0.03
+
+
+@dataclass(frozen=True)
+class EstimatedCar:
+    """One car as a refinement sees it.
+
+    Attributes:
+        prior: the family of shapes.
+        code: (K,) standard deviations.
+        T_cam_obj: (4, 4) object to left camera.
+    """
+
+    prior: ShapePrior
+    code: Tensor
+    T_cam_obj: Tensor
+
+    def sampled_points(self, count: int, seed: int) -> Points:
+        """`count` points (count, 3) in camera coordinates, uniform by area over the whole closed surface.
+
+        Raises:
+            MeshError: the shape has no surface.
+        """
+        from trimesh.sample import sample_surface
+
+        values = self.prior.values(self._code())[0]
+        mesh = sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, self.T_cam_obj)
+        return np.asarray(sample_surface(mesh, count, seed=seed)[0], dtype=np.float64)
+
+    def points_at_pixels(
+        self,
+        uv_left: NDArray[np.float64],  # (P, 2)
+        K_left: Tensor,  # (3, 3)
+    ) -> Points:
+        """Where the rays of left pixels first meet the surface, (Q, 3) in camera coordinates; rays that miss are left
+        out."""
+        rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double())
+        root = self._first_surface(rays_cam)
+        return np.asarray((root.depth.double()[:, None] * rays_cam)[root.found].numpy())
+
+    def is_turned_to_camera(
+        self,
+        points_cam: Points,  # (N, 3) on the surface, in front of the camera
+    ) -> NDArray[np.bool_]:  # (N,)
+        """Whether no other part of the same car hides a point of its surface from the left camera."""
+        points = torch.from_numpy(points_cam)
+        root = self._first_surface(points / points[:, 2:])
+        hidden = root.found & (root.depth.double() < points[:, 2] - _SELF_OCCLUSION_MARGIN_M)
+        return np.asarray(~hidden.numpy())
+
+    def _first_surface(self, rays_cam: Tensor) -> Root:
+        """Depths of the first hits of rays (P, 3) of unit depth from the camera's centre."""
+        T_obj_cam = se3.inverse(self.T_cam_obj.double())
+        like = self.prior.origin
+        origin = T_obj_cam[:3, 3].expand(len(rays_cam), 3).to(like)
+        index = torch.zeros(len(rays_cam), dtype=torch.int64, device=like.device)
+        rays = ObjectRays(origin, (rays_cam @ T_obj_cam[:3, :3].T).to(like), index)
+        shape = self.prior.bind(self._code())
+        marched = march(shape, rays, self.prior.bounds_obj, _SAMPLES_PER_RAY)
+        root = first_crossing(shape, rays, marched, closest_approach_depth(marched))
+        return Root(root.depth.cpu(), root.found.cpu())
+
+    def _code(self) -> Tensor:
+        return self.code[None].to(self.prior.origin)

@@ -1,0 +1,166 @@
+"""Shape scores as text, CSV and JSON (schema 1)."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from directshape_torch.evaluation.bootstrap import Estimate
+from directshape_torch.evaluation.shape_error import TAUS_M
+from directshape_torch.evaluation.shape_error_cars import EvaluatedCar, ShapeScores
+from directshape_torch.evaluation.shape_error_summary import METRICS, ShapeCurve, SurfaceSummary
+from directshape_torch.io import atomic_files
+
+SHAPE_SCORES_SCHEMA_VERSION = 1
+PRINTED_TAUS_M = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0)
+TITLES = {"completeness": "completeness", "accuracy": "accuracy", "f1": "F1", "rmse_m": "RMSE"}
+SURFACES = {
+    "segment": "one ray-cast point for each pixel of the car's segment whose true disparity is known",
+    "visible": "points that the left image shows, of the truth and of 4000 uniform by area on the estimate",
+    "whole": "the true surface points as supplied, and 4000 uniform by area on the closed estimate",
+}
+_PLAIN = ("frame_id", "detection_line", "label_line", "car", "status", "depth_m", "segment")
+
+
+def format_shape_scores(scores: ShapeScores) -> str:
+    """Tables for reading: for each surface and metric one line a distance tau."""
+    parts = [_heading(scores)]
+    for surface in scores.surfaces:
+        parts.append(_surface_heading(surface))
+        parts += [_curve_table(curve) for curve in surface.curves]
+    return "\n\n".join(parts) + "\n"
+
+
+def write_shape_scores_json(path: Path | str, scores: ShapeScores) -> None:
+    """Write the figures of every surface at every tau; what is undefined is null."""
+    content = {
+        "schema_version": SHAPE_SCORES_SCHEMA_VERSION,
+        "truth": scores.truth,
+        "num_frames": scores.num_frames,
+        "num_labels_counted": scores.num_labels_counted,
+        "num_without_truth": scores.num_without_truth,
+        "num_without_detection": scores.num_without_detection,
+        "tracks_known": scores.tracks_known,
+        "surfaces": [
+            {
+                "surface": surface.surface,
+                "num_rows": surface.num_rows,
+                "num_cars": surface.num_cars,
+                "mean_num_true": surface.mean_num_true,
+                "curves": [_plain_curve(curve) for curve in surface.curves],
+            }
+            for surface in scores.surfaces
+        ],
+    }
+    atomic_files.write_json(path, content)
+
+
+def write_shape_scores_csv(path: Path | str, cars: Sequence[EvaluatedCar]) -> None:
+    """Write one line for each label, surface and tau: counts of points and the four metrics, before and after."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    figures = ("num_estimated", *METRICS)
+    pairs = [f"{name}_{when}" for name in figures for when in ("before", "after")]
+    writer.writerow([*_PLAIN, "surface", "tau_m", "num_true", *pairs])
+    for car in cars:
+        for surface, after in car.after.items():
+            sides = (car.before[surface], after)
+            values = {name: [getattr(side, name) for side in sides] for name in METRICS}
+            for k, tau in enumerate(after.taus_m.tolist()):
+                row = [getattr(car, name) for name in _PLAIN] + [surface, tau, after.num_true]
+                row += [side.num_estimated for side in sides]
+                row += [float(value[k]) for name in METRICS for value in values[name]]
+                writer.writerow([_cell(value) for value in row])
+    atomic_files.write_text(path, text.getvalue())
+
+
+def _cell(value: Any) -> Any:
+    """An undefined RMSE is an empty cell."""
+    if isinstance(value, float):
+        return f"{value:.6g}" if math.isfinite(value) else ""
+    return value
+
+
+def _plain_curve(curve: ShapeCurve) -> dict[str, Any]:
+    limits = curve.sampling_limit
+    return {
+        "metric": curve.metric,
+        "taus_m": list(curve.taus_m),
+        "num_rows": list(curve.num_rows),
+        "summaries": [None if summary is None else asdict(summary) for summary in curve.summaries],
+        "sampling_limit": None if limits is None else [x if math.isfinite(x) else None for x in limits],
+    }
+
+
+def _heading(scores: ShapeScores) -> str:
+    cars = scores.surfaces[0].num_cars
+    identity = "physical cars" if scores.tracks_known else "cars (each label counts as a car of its own)"
+    statuses = Counter(car.status for car in scores.cars)
+    lines = [
+        f"{len(scores.cars)} of {scores.num_labels_counted} counted labels in {scores.num_frames} frames, {cars} "
+        f"{identity}; {scores.num_without_truth} have no true surface, {scores.num_without_detection} no detection",
+        "refinement: " + ", ".join(f"{name} {count}" for name, count in sorted(statuses.items())),
+        "before: mean shape at the pose of the detection; after: refined shape and pose; means over labels",
+    ]
+    if scores.truth == "disparity":
+        lines.append(
+            "segments are the given masks, not an object map: "
+            + ", ".join(f"{c.frame_id} {c.segment}" for c in _few(scores))
+        )
+    lines.append("in brackets: 95 % intervals, bootstrap over cars" if cars > 1 else "one car: no intervals")
+    return "\n".join(lines)
+
+
+def _few(scores: ShapeScores, most: int = 8) -> Sequence[EvaluatedCar]:
+    return scores.cars[:most]
+
+
+def _surface_heading(surface: SurfaceSummary) -> str:
+    name = f"{surface.surface.upper()}: {SURFACES[surface.surface]}"
+    return f"{name}\n{surface.num_rows} labels, {surface.num_cars} cars, {surface.mean_num_true:.0f} true points each"
+
+
+def _curve_table(curve: ShapeCurve) -> str:
+    limited = curve.sampling_limit is not None
+    rows = [[TITLES[curve.metric], "n", "before", "after", "change", *(["sampling limit"] if limited else [])]]
+    for k, tau in enumerate(curve.taus_m):
+        if not any(math.isclose(tau, printed) for printed in PRINTED_TAUS_M) and curve.taus_m == TAUS_M:
+            continue
+        summary = curve.summaries[k]
+        estimates = ["-"] * 3
+        if summary is not None:
+            estimates = [
+                _with_interval(curve.metric, estimate, sign=estimate is summary.change)
+                for estimate in (summary.before, summary.after, summary.change)
+            ]
+        limit = [_number(curve.metric, curve.sampling_limit[k])] if curve.sampling_limit is not None else []
+        rows.append([f"tau {tau:.2f} m", str(curve.num_rows[k]), *estimates, *limit])
+    return _align(rows)
+
+
+def _with_interval(metric: str, estimate: Estimate, sign: bool) -> str:
+    value = _number(metric, estimate.value, sign)
+    if estimate.low is None or estimate.high is None:
+        return value
+    low, high = (_number(metric, bound, sign).split(" ")[0] for bound in (estimate.low, estimate.high))
+    return f"{value} [{low}, {high}]"
+
+
+def _number(metric: str, value: float, sign: bool = False) -> str:
+    if not math.isfinite(value):
+        return "-"
+    plus = "+" if sign else ""
+    return f"{value:{plus}.3f} m" if metric == "rmse_m" else f"{100 * value:{plus}.1f} %"
+
+
+def _align(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines)

@@ -1,0 +1,181 @@
+"""True points spread over the whole surface of cars, and which of them the left image shows."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.errors import DataFormatError
+from directshape_torch.evaluation.shape_error import Points, ShapeError, shape_error
+from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
+from directshape_torch.io.image_files import read_file_bytes, read_single_channel
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.scene import StereoCamera
+
+NUM_ESTIMATED_POINTS = 4000
+# Sets of fewer visible points say nothing about a surface.
+MINIMUM_VISIBLE_POINTS = 20
+_SEED, _LIMIT_SEED = 0, 1
+_INSTANCES_FROM = 1000
+# How far behind the depth map a point may lie and still be the surface that is seen there.
+_DEPTH_MARGIN_M = 0.03
+
+
+@dataclass(frozen=True)
+class SceneDepth:
+    """What the left image of a scene shows at every pixel.
+
+    Attributes:
+        depth_m: (H, W) along the optical axis, 0 where there is nothing.
+        instance: (H, W) 1000 + k for the car of the k-th label line, from 1; less for anything else.
+        K_left: (3, 3) pixels.
+    """
+
+    depth_m: NDArray[np.float64]
+    instance: NDArray[np.int64]
+    K_left: NDArray[np.float64]
+
+    def shows(self, points_cam: Points, own: int) -> NDArray[np.bool_]:
+        """Which points (N, 3) of the true surface of an instance are seen.
+
+        The depth of a slanted surface changes within a pixel, so a point may lie as deep as the deepest of its own car
+        in the 3 x 3 pixels around it.
+        """
+        column, row, in_image = self._pixels(points_cam)
+        own_depth = np.where(self.instance == own, self.depth_m, -np.inf)
+        padded = np.pad(own_depth, 1, constant_values=-np.inf)
+        height, width = own_depth.shape
+        window = [padded[dv : dv + height, du : du + width] for dv in range(3) for du in range(3)]
+        deepest = np.maximum.reduce(window)[row, column]
+        belongs = self.instance[row, column] == own
+        return np.asarray(in_image & belongs & (points_cam[:, 2] <= deepest + _DEPTH_MARGIN_M))
+
+    def hides(self, points_cam: Points, own: int) -> NDArray[np.bool_]:
+        """Which points (N, 3) of an estimated surface lie outside the image or behind another instance.
+
+        Points before or behind the background are not hidden: there the estimate shows what is not there.
+        """
+        column, row, in_image = self._pixels(points_cam)
+        instance, depth = self.instance[row, column], self.depth_m[row, column]
+        other = (instance >= _INSTANCES_FROM) & (instance != own)
+        return np.asarray(~in_image | (other & (depth < points_cam[:, 2])))
+
+    def _pixels(self, points_cam: Points) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        in_front = points_cam[:, 2] > 0
+        projected = points_cam @ self.K_left.T
+        uv = np.rint(projected[:, :2] / np.where(in_front, projected[:, 2], 1.0)[:, None])
+        limit = np.array(self.depth_m.shape[::-1]) - 1
+        in_image = in_front & (uv >= 0).all(axis=1) & (uv <= limit).all(axis=1)
+        column, row = np.clip(uv, 0, limit).astype(np.int64).T
+        return column, row, in_image
+
+
+@dataclass(frozen=True)
+class SurfaceTruth:
+    """Points on the true surface of one car, uniform by area.
+
+    Attributes:
+        segment: which pixels show it, for reports.
+        points_cam: (N, 3) left camera frame, metres.
+        visible: (N,) bool, seen in the left image.
+        scene: what that image shows.
+        own: number of the car's instance in it.
+    """
+
+    segment: str
+    points_cam: Points
+    visible: NDArray[np.bool_]
+    scene: SceneDepth
+    own: int
+
+    def errors(self, car: EstimatedCar) -> dict[str, ShapeError]:
+        """Errors of 4000 points of an estimated car: on the "whole" surface, and of the "visible" parts of both."""
+        return self._compare(self.points_cam, self.visible, car)
+
+    def sampling_limit(self, car: EstimatedCar) -> dict[str, ShapeError]:
+        """Errors of a car against as many other points of its own surface: what a perfect estimate would have."""
+        others = car.sampled_points(NUM_ESTIMATED_POINTS, _LIMIT_SEED)
+        seen = np.flatnonzero(self._seen(car, others))[: int(self.visible.sum())]
+        kept = np.union1d(seen, np.arange(min(len(self.points_cam), len(others))))
+        return self._compare(others[kept], np.isin(kept, seen), car)
+
+    def _compare(self, true: Points, visible: NDArray[np.bool_], car: EstimatedCar) -> dict[str, ShapeError]:
+        points = car.sampled_points(NUM_ESTIMATED_POINTS, _SEED)
+        errors = {"whole": shape_error(true, points)}
+        if visible.sum() >= MINIMUM_VISIBLE_POINTS:
+            errors["visible"] = shape_error(true[visible], points[self._seen(car, points)])
+        return errors
+
+    def _seen(self, car: EstimatedCar, points_cam: Points) -> NDArray[np.bool_]:
+        return car.is_turned_to_camera(points_cam) & ~self.scene.hides(points_cam, self.own)
+
+
+@dataclass(frozen=True)
+class SurfaceSource:
+    """Surface points, depth maps and instance images of rendered scenes.
+
+    Attributes:
+        training: folder with `points/NNNNNN_LINE.npz` (array `points` (N, 3) in `ref`, the frame of the labels; LINE of
+            the label file, from 1), `depth_2/NNNNNN.png` (depth x 256) and `instance_2/NNNNNN.png`.
+    """
+
+    training: Path
+
+    def frame_ids(self) -> tuple[str, ...]:
+        """The frames that have surface points."""
+        return tuple(sorted({path.stem.split("_")[0] for path in (self.training / "points").glob("*_*.npz")}))
+
+    def truths(
+        self, frame_id: str, labels: Sequence[KittiObject], camera: StereoCamera
+    ) -> Mapping[int, SurfaceTruth]:  # by line number of the label
+        """The surfaces of the labels of a frame that have points.
+
+        Raises:
+            DataFormatError: a file is missing or damaged.
+        """
+        scene = self._scene(frame_id, camera.K_left[0])
+        found = {}
+        for label in labels:
+            path = self.training / "points" / f"{frame_id}_{label.line_number}.npz"
+            if path.is_file():
+                points_cam = read_surface_points(path) + camera.t_cam_ref[0].double().numpy()
+                own = _INSTANCES_FROM + label.line_number
+                visible = scene.shows(points_cam, own)
+                found[label.line_number] = SurfaceTruth(f"instance {own}", points_cam, visible, scene, own)
+        return found
+
+    def _scene(self, frame_id: str, K_left: Tensor) -> SceneDepth:
+        paths = [self.training / folder / f"{frame_id}.png" for folder in ("depth_2", "instance_2")]
+        depth, instance = (read_single_channel(path) for path in paths)
+        if depth.dtype != np.uint16:
+            raise DataFormatError(paths[0], f"expected 16 bits (metres times 256), got {depth.dtype}")
+        if depth.shape != instance.shape:
+            raise DataFormatError(paths[1], f"has shape {instance.shape}, the depth map {depth.shape}")
+        return SceneDepth(depth / 256.0, instance.astype(np.int64), K_left.double().numpy())
+
+
+def read_surface_points(path: Path) -> Points:
+    """The array `points` (N, 3) of an npz file, metres, float64.
+
+    Raises:
+        DataFormatError: no such file or array, another shape, no points, or numbers that are not finite.
+    """
+    # From memory: numpy leaves the file open when it turns out to be no archive.
+    content = io.BytesIO(read_file_bytes(path))
+    try:
+        with np.load(content, allow_pickle=False) as archive:
+            points = np.asarray(archive["points"])
+    except (ValueError, zipfile.BadZipFile, EOFError, AttributeError, TypeError, KeyError) as error:
+        raise DataFormatError(path, f"is no npz file with an array 'points' ({error})") from error
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise DataFormatError(path, f"expected 'points' of shape (N, 3), got {points.shape}")
+    if points.dtype.kind != "f" or not np.isfinite(points).all():
+        raise DataFormatError(path, "holds points that are not finite numbers")
+    return points.astype(np.float64)
