@@ -23,11 +23,13 @@ class StageConfig:
         contour_width_px: softness of the projected contour; zeta = f / (z_input * contour_width_px).
         image_level: pyramid level of the photometric term; 0 is full resolution.
         max_iterations: Gauss-Newton iterations at most.
+        unknowns: which of them move: "both", "pose" or "shape".
     """
 
     contour_width_px: float = 0.5
     image_level: int = 0
     max_iterations: int = 20
+    unknowns: Literal["both", "pose", "shape"] = "both"
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,40 @@ class PhotometricConfig:
 
 
 @dataclass(frozen=True)
+class PointCloudConfig:
+    """Point cloud from dense stereo, for the methods "geometric" (Engelmann et al., GCPR 2016) and "combined".
+
+    Attributes:
+        weight: factor of the mean Huber norm of the signed distances, per square metre.
+        huber_m: corner of the Huber norm.
+        matcher: disparity where the frames bring none: "sgbm" (OpenCV) or "elas" (optional package).
+        pixels: points of the left instance "mask" where there is one, else of the 2D box; or always of the "box".
+        min_height_m, max_height_m: points between these heights above the ground plane count.
+        max_distance_m: and within this distance of the detection's centre, along the ground.
+        min_points: with fewer of them "geometric" leaves the car alone (status too_few_points) and "combined" has the
+            images only.
+        max_points: of more, every n-th is used.
+        order: "alternating" (pose, then shape, as in the paper by Engelmann et al.) or "joint", for "geometric"; the
+            other methods follow `stages`.
+        rounds: of the alternation at most; once the cost has settled the rest changes nothing.
+        max_iterations: Gauss-Newton iterations of one half of a round, or of the joint refinement.
+    """
+
+    weight: float = 300.0
+    huber_m: float = 0.1
+    matcher: Literal["sgbm", "elas"] = "sgbm"
+    pixels: Literal["mask", "box"] = "mask"
+    min_height_m: float = 0.1
+    max_height_m: float = 3.0
+    max_distance_m: float = 2.5
+    min_points: int = 200
+    max_points: int = 2000
+    order: Literal["alternating", "joint"] = "alternating"
+    rounds: int = 8
+    max_iterations: int = 4
+
+
+@dataclass(frozen=True)
 class PriorConfig:
     """Priors on shape and pose.
 
@@ -193,8 +229,13 @@ class SearchConfig:
 
 @dataclass(frozen=True)
 class RefinerConfig:
-    """Everything `DirectShapeRefiner` can be told."""
+    """Everything `DirectShapeRefiner` can be told.
 
+    Attributes:
+        method: terms of the energy: "direct" (images), "geometric" (the rival's: point cloud) or "combined" (both).
+    """
+
+    method: Literal["direct", "geometric", "combined"] = "direct"
     stages: tuple[StageConfig, ...] = (
         StageConfig(contour_width_px=2.0, image_level=1, max_iterations=10),
         StageConfig(contour_width_px=0.5, image_level=0, max_iterations=12),
@@ -202,6 +243,7 @@ class RefinerConfig:
     solver: SolverConfig = field(default_factory=SolverConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)
     photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
+    point_cloud: PointCloudConfig = field(default_factory=PointCloudConfig)
     priors: PriorConfig = field(default_factory=PriorConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)

@@ -40,6 +40,15 @@ _RANGES: dict[str, tuple[float, float]] = {
     "photometric.gradient_constant_grey_levels": _POSITIVE,
     "photometric.lost_grey_levels": _POSITIVE,
     "photometric.min_ray_cosine": (0, 0.999),
+    "point_cloud.weight": _NOT_NEGATIVE,
+    "point_cloud.huber_m": _POSITIVE,
+    "point_cloud.min_height_m": (-100, 100),
+    "point_cloud.max_height_m": (-100, 100),
+    "point_cloud.max_distance_m": _POSITIVE,
+    "point_cloud.min_points": _NOT_NEGATIVE,
+    "point_cloud.max_points": (1, math.inf),
+    "point_cloud.rounds": (1, 1000),
+    "point_cloud.max_iterations": (1, math.inf),
     "priors.shape_weight": _NOT_NEGATIVE,
     "priors.height_weight": _NOT_NEGATIVE,
     "priors.tilt_weight": _NOT_NEGATIVE,
@@ -74,13 +83,25 @@ def check_ranges(config: Any) -> None:
         group, _, key = path.partition(".")
         if key:
             _check(path, getattr(getattr(config, group), key), low, high)
+    _check_last_stage(config)
     for path, low_value, high_value in (
         ("silhouette.max_zeta_per_m", config.silhouette.min_zeta_per_m, config.silhouette.max_zeta_per_m),
+        ("point_cloud.max_height_m", config.point_cloud.min_height_m, config.point_cloud.max_height_m),
+        ("point_cloud.max_points", config.point_cloud.min_points, config.point_cloud.max_points),
         ("sampling.max_pixels", config.sampling.min_pixels, config.sampling.max_pixels),
         ("solver.max_damping", config.solver.min_damping, config.solver.max_damping),
     ):
         if low_value > high_value:
             raise ConfigError(f"{path}: expected at least {path.replace('max', 'min')} = {low_value}, got {high_value}")
+
+
+def _check_last_stage(config: Any) -> None:
+    """Implicit gradients are those of the final stage, where pose and shape must both have come to rest."""
+    key, value, needed = "stages[-1].unknowns", config.stages[-1].unknowns, "both"
+    if config.method == "geometric":
+        key, value, needed = "point_cloud.order", config.point_cloud.order, "joint"
+    if config.backward.mode.startswith("implicit") and value != needed:
+        raise ConfigError(f"{key}: backward.mode {config.backward.mode} needs {needed}, got {value}")
 
 
 def _check(path: str, value: Any, low: float, high: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,7 +14,8 @@ from directshape_torch.covariance import covariance_xyz_yaw, tangent_covariance
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.direct_terms import direct_terms, stacked_weights
+from directshape_torch.energy.direct_terms import stacked_weights
+from directshape_torch.energy.method import method_terms
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
@@ -28,6 +29,8 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.status import Status
+from directshape_torch.stereo_matching.car_points import PointSamples, car_points
+from directshape_torch.stereo_matching.dense_disparity import with_disparity
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
 _MIN_DEPTH_M = 1.0
@@ -79,27 +82,32 @@ class DirectShapeRefiner(nn.Module):
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
                 wanted of a prior that has none.
         """
+        if torch.compiler.is_compiling():
+            # One break in the graph of a compiled model around it: the loop decides by values all the time.
+            return torch.compiler.disable(self._checked_refine)(frames, detections, term_weights)  # type: ignore[no-any-return, no-untyped-call]
+        return self._checked_refine(frames, detections, term_weights)
+
+    def _checked_refine(
+        self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
+    ) -> RefinementResult:
         _check_fit(frames, detections, self.prior)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
         # Half precision cannot hold pixel coordinates: under autocast everything here stays in the inputs' precision.
         with torch.set_grad_enabled(differentiate), torch.autocast(frames.images_left.device.type, enabled=False):
-            if torch.compiler.is_compiling():
-                # One break in the graph of a compiled model around it; the loop decides by values all the time.
-                refine: Callable[..., RefinementResult] = torch.compiler.disable(self._refine)  # type: ignore[no-untyped-call]
-                return refine(frames, detections, term_weights)
             return self._refine(frames, detections, term_weights)
 
     def _refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
         input_state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
-        observation, failure = self._observe(frames, detections)
+        points = self._points(frames, detections)
+        observation, failure = self._observe(frames, detections, points)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
         state, status = input_state, failure.clone()
         outcome = None
         if len(rows):
-            outcome = self._minimise(frames, detections, observation, usable, term_weights)
+            outcome = self._minimise(frames, detections, (observation, points), usable, term_weights)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
         return _assemble(self.prior, frames, detections, state, status, rows, outcome)
@@ -112,7 +120,8 @@ class DirectShapeRefiner(nn.Module):
         detections = _without_empty_masks(detections, _mask_areas(detections))
         observation = pack_pixels(frames, detections, self.config.sampling)
         cars = CarBatch.from_scene(frames, detections)
-        terms = direct_terms(self.config, self.prior, frames, detections, cars, observation)
+        points = self._points(frames, detections)
+        terms = method_terms(self.config, self.prior, frames, detections, cars, observation, points)
         state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
         weights = stacked_weights(term_weights, terms, state.code)
         return CarProblem(self.prior, terms, observation.left, observation.right, self.config, weights), state
@@ -120,7 +129,17 @@ class DirectShapeRefiner(nn.Module):
     def _initial_code(self, detections: Detections) -> Tensor:
         return self.prior.initial_code(len(detections)).to(detections.T_cam_obj)
 
-    def _observe(self, frames: FrameBatch, detections: Detections) -> tuple[Observation | None, Tensor]:
+    def _points(self, frames: FrameBatch, detections: Detections) -> PointSamples | None:
+        """Stereo points of all cars, for the methods that use them."""
+        if self.config.method == "direct" or not len(detections):
+            return None
+        detections = _without_empty_masks(detections, _mask_areas(detections))
+        cloud = self.config.point_cloud
+        return car_points(with_disparity(frames, cloud.matcher), detections, cloud)
+
+    def _observe(
+        self, frames: FrameBatch, detections: Detections, points: PointSamples | None
+    ) -> tuple[Observation | None, Tensor]:
         """Packed pixels of all cars and, for each car, the code of the status that forbids its refinement, or -1."""
         code = torch.full((len(detections),), -1, device=detections.T_cam_obj.device)
         if not len(detections):
@@ -138,9 +157,11 @@ class DirectShapeRefiner(nn.Module):
         )
         # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
         too_few = torch.minimum(left + right, areas.sum(dim=1)) < self.config.sampling.min_usable_pixels
+        lacking = [(too_few, Status.too_few_pixels), (~has_mask, Status.no_mask)]
+        if self.config.method == "geometric" and points is not None:
+            lacking = [(points.counts < self.config.point_cloud.min_points, Status.too_few_points)]
         for condition, status in (
-            (too_few, Status.too_few_pixels),
-            (~has_mask, Status.no_mask),
+            *lacking,
             (~in_front, Status.behind_camera),
             (~finite, Status.non_finite),
         ):
@@ -151,14 +172,16 @@ class DirectShapeRefiner(nn.Module):
         self,
         frames: FrameBatch,
         detections: Detections,
-        observation: Observation | None,
+        seen_by_all: tuple[Observation | None, PointSamples | None],
         usable: Tensor,
         term_weights: Mapping[str, Tensor] | None,
     ) -> _Outcome:
+        observation, points = seen_by_all
         assert observation is not None
         seen = observation.of_objects(usable)
         cars = CarBatch.from_scene(frames, detections).of_objects(usable)
-        terms = direct_terms(self.config, self.prior, frames, detections, cars, seen)
+        points = None if points is None else points.of_objects(usable)
+        terms = method_terms(self.config, self.prior, frames, detections, cars, seen, points)
         weights = stacked_weights(term_weights, terms, self._initial_code(detections))
         problem = CarProblem(
             self.prior, terms, seen.left, seen.right, self.config, None if weights is None else weights[usable]

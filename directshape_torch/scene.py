@@ -170,6 +170,8 @@ class FrameBatch(_TensorRecord):
         camera: calibration of the frames.
         ground: a ground plane for each frame, in the left camera frame.
         frame_ids: a name for each frame.
+        disparity: (F, H, W) measured `u_left - u_right` of the left pixels, NaN where unknown, for the methods that fit
+            a point cloud; None: they match the images themselves.
     """
 
     images_left: Tensor
@@ -178,6 +180,7 @@ class FrameBatch(_TensorRecord):
     camera: StereoCamera
     ground: GroundPlane
     frame_ids: tuple[str, ...]
+    disparity: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("images_left", self.images_left, ("F", 3, "H", "W"), "stack images as (F, 3, H, W) in [0, 1]")
@@ -190,6 +193,11 @@ class FrameBatch(_TensorRecord):
             left, right = getattr(self.images_left, what), getattr(self.images_right, what)
             if left != right:
                 raise InputError("images_right", f"the {what} of images_left ({left})", str(right))
+        if self.disparity is not None:
+            check_shape("disparity", self.disparity, (num_frames, height, width))
+            if self.disparity.dtype != self.images_left.dtype or self.disparity.device != self.images_left.device:
+                got = f"{self.disparity.dtype} on {self.disparity.device}"
+                raise InputError("disparity", f"{self.images_left.dtype} on {self.images_left.device}", got)
         _check_at_most_one("images_left", self.images_left)
         _check_at_most_one("images_right", self.images_right)
         if len(self.frame_ids) != num_frames:

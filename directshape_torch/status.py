@@ -16,6 +16,7 @@ class Status(enum.Enum):
     singular = "the normal equations are singular; add a prior, more pixels, or damping"
     non_finite = "the cost or its derivatives are not finite at the input; look for NaN in images, masks or pose"
     rejected_worse = "the result had a higher cost than the input, which is returned instead"
+    too_few_points = "fewer stereo points on the car than point_cloud.min_points; it is far, hidden, or badly matched"
 
     @property
     def code(self) -> int:

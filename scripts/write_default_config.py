@@ -37,6 +37,8 @@ def default_yaml() -> str:
 
 
 def _section(name: str, part: Any) -> str:
+    if isinstance(part, str):
+        return _comment(_descriptions(RefinerConfig)[name], "") + yaml.safe_dump({name: part})
     if not dataclasses.is_dataclass(part):
         stages = "".join(
             f"  - {yaml.safe_dump(config_to_mapping(s), default_flow_style=True, width=200)}" for s in part

@@ -42,6 +42,12 @@ def _add_inputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
     group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
     group.add_argument(
+        "--disparity",
+        type=Path,
+        metavar="DIR",
+        help="disparity maps NNNNNN.png of any stereo method (KITTI's 16 bits), for --method geometric or combined",
+    )
+    group.add_argument(
         "--ground",
         choices=("auto", "file", "stereo", "camera_height"),
         default="auto",
@@ -59,6 +65,11 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
 
 def _add_settings(group: argparse._ArgumentGroup) -> None:
     add_config_option(group)
+    group.add_argument(
+        "--method",
+        choices=("direct", "geometric", "combined"),
+        help="images (default), the stereo point cloud (Engelmann et al., GCPR 2016), or both",
+    )
     group.add_argument(
         "--set",
         action="extend",
@@ -100,7 +111,9 @@ def run(args: argparse.Namespace) -> int:
 
     _limit_threads(args.threads)
     options = RefineOptions(args.meshes, args.overlays, args.batch_frames)
-    refiner = make_refiner(args.config, args.set, args.prior, args.device)
+    chosen = [] if args.method is None else [f"method={args.method}"]
+    refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device)
+    _check_disparity_is_used(args.disparity, refiner.config.method)
     with ProgressBar() as progress:
         summary = refine_dataset(_make_dataset(args), refiner, args.out, options, progress)
     for warning in summary.warnings:
@@ -108,6 +121,11 @@ def run(args: argparse.Namespace) -> int:
     print(format_summary(summary))
     print(f"results  {args.out}")
     return summary.exit_code
+
+
+def _check_disparity_is_used(folder: Path | None, method: str) -> None:
+    if folder is not None and method == "direct":
+        raise InputError("--disparity", "a method that uses it", "direct", "add --method geometric or combined")
 
 
 def _limit_threads(num_threads: int | None) -> None:
@@ -170,6 +188,7 @@ def _make_dataset(args: argparse.Namespace) -> KittiStereoDataset:
         ground=args.ground,
         camera_height_m=args.camera_height,
         disparity_field=None if args.stereo_bias is None else DisparityField.load(args.stereo_bias),
+        disparity_dir=args.disparity,
     )
 
 

@@ -10,11 +10,12 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_state import CarState, retract
+from directshape_torch.energy.method import method_stages
 from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
 from directshape_torch.energy.term import Term, TermLinearisation
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.problem import Linearisation, Stage
+from directshape_torch.solver.problem import Linearisation, Stage, Unknowns
 
 
 class CarProblem:
@@ -26,6 +27,7 @@ class CarProblem:
         left, right: packed pixels whose rays the terms share.
         config: stages, trust region, samples per ray.
         term_weights: (B, T) factors of the terms of each car, beside their own weights; None for 1.
+        unknowns: which of them move, until a stage says otherwise.
     """
 
     def __init__(
@@ -36,17 +38,20 @@ class CarProblem:
         right: PixelSamples,
         config: RefinerConfig,
         term_weights: Tensor | None = None,
+        unknowns: Unknowns = "both",
     ) -> None:
         self.prior = prior
         self.terms = list(terms)
         self.left, self.right = left, right
         self.config = config
         self.term_weights = term_weights
+        self.unknowns = unknowns
 
     def stages(self) -> list[Stage]:
-        return [Stage(s.contour_width_px, s.image_level, s.max_iterations) for s in self.config.stages]
+        return method_stages(self.config)
 
     def begin_stage(self, stage: Stage, state: CarState) -> None:
+        self.unknowns = stage.unknowns
         projected = self.project(state)
         self.terms = [term.at_stage(stage, projected) for term in self.terms]
 
@@ -80,7 +85,7 @@ class CarProblem:
         return costs if self.term_weights is None else costs * self.term_weights.to(torch.float64)
 
     def linearise(self, state: CarState) -> Linearisation:
-        return _total(self.linearise_terms(state))
+        return self._without_held(_total(self.linearise_terms(state)))
 
     def linearise_terms(self, state: CarState, with_fisher: bool = False) -> list[TermLinearisation]:
         """The linearisation of each term by itself."""
@@ -94,12 +99,27 @@ class CarProblem:
     def linearise_differentiably(self, state: CarState) -> Linearisation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
         projected = self.project(state, moving_depths=True)
-        return _total(self._weighted([term.linearise(projected) for term in self.terms]))
+        return self._without_held(_total(self._weighted([term.linearise(projected) for term in self.terms])))
 
     def free_unknowns(self, state: CarState) -> Tensor:
         """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
         free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
-        return torch.cat([free_pose, state.code.abs() < self.config.solver.max_code], dim=1)
+        free = torch.cat([free_pose, state.code.abs() < self.config.solver.max_code], dim=1)
+        return free & self._moving(state.code)
+
+    def _moving(self, code: Tensor) -> Tensor:
+        """Unknowns (D,) that the stage moves."""
+        is_pose = torch.arange(6 + code.shape[1], device=code.device) < 6
+        return is_pose if self.unknowns == "pose" else ~is_pose if self.unknowns == "shape" else is_pose | ~is_pose
+
+    def _without_held(self, at: Linearisation) -> Linearisation:
+        """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
+        if self.unknowns == "both":
+            return at
+        moving = self._moving(at.gradient[:, 6:])
+        identity = torch.eye(len(moving), dtype=at.hessian.dtype, device=at.hessian.device)
+        hessian = torch.where(moving[:, None] & moving, at.hessian, identity)
+        return Linearisation(at.cost, torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian)
 
     def _weighted(self, parts: list[TermLinearisation]) -> list[TermLinearisation]:
         if self.term_weights is None:
@@ -129,6 +149,7 @@ class CarProblem:
             self.right.of_objects(keep),
             self.config,
             None if self.term_weights is None else self.term_weights[keep],
+            self.unknowns,
         )
 
 

@@ -37,6 +37,7 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
         camera=_cameras([item.frame.camera for item in loaded]),
         ground=_grounds([item.frame.ground for item in loaded]),
         frame_ids=tuple(frame_id for item in loaded for frame_id in item.frame.frame_ids),
+        disparity=_disparities([item.frame.disparity for item in loaded], size_hw),
     )
     return frame, _detections([item.detections for item in loaded], size_hw)
 
@@ -49,6 +50,16 @@ def _largest_size(loaded: Sequence[LoadedFrame]) -> tuple[int, int]:
 def _padded(images: Sequence[Tensor], size_hw: tuple[int, int]) -> Tensor:
     height, width = size_hw
     return torch.cat([pad(image, (0, width - image.shape[-1], 0, height - image.shape[-2])) for image in images])
+
+
+def _disparities(maps: Sequence[Tensor | None], size_hw: tuple[int, int]) -> Tensor | None:
+    known = [disparity for disparity in maps if disparity is not None]
+    if not known:
+        return None
+    if len(known) < len(maps):
+        raise InputError("loaded", "frames with disparity maps, or frames without", f"{len(known)} of {len(maps)} with")
+    # Zero is no disparity, like NaN.
+    return _padded(known, size_hw)
 
 
 def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:

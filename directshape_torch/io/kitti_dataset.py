@@ -15,6 +15,7 @@ from torch import Tensor
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
+from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.io.frame_detections import MatchingSummary, build_detections
 from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.image_files import find_image, read_rgb
@@ -72,6 +73,8 @@ class KittiStereoDataset:
             field stereo comes first, for plane files share the bias of the disparities they were made from.
         camera_height_m: height of the camera above a level ground, the last resort.
         disparity_field: residual disparity of the rig, or None.
+        disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with the disparity maps of any stereo method, for the
+            methods that fit a point cloud; None: they match the images themselves.
         dtype: of the tensors.
 
     Raises:
@@ -91,6 +94,7 @@ class KittiStereoDataset:
         ground: GroundSource = "auto",
         camera_height_m: float = DEFAULT_CAMERA_HEIGHT_M,
         disparity_field: DisparityField | None = None,
+        disparity_dir: Path | str | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if ground not in get_args(GroundSource):
@@ -102,6 +106,9 @@ class KittiStereoDataset:
         self.ground = ground
         self.camera_height_m = camera_height_m
         self.disparity_field = disparity_field
+        self.disparity_dir = (
+            None if disparity_dir is None else _existing_folder(Path(disparity_dir), "is no folder of disparity maps")
+        )
         self.dtype = dtype
         self.frame_ids = self._choose_frames(split, frames)
 
@@ -125,6 +132,7 @@ class KittiStereoDataset:
             camera=camera,
             ground=ground,
             frame_ids=(frame_id,),
+            disparity=self._disparity(frame_id, (height, width)),
         )
         objects = read_objects(self.detection_path(frame_id))
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
@@ -139,6 +147,8 @@ class KittiStereoDataset:
             "calibration": self.training / "calib" / f"{frame_id}.txt",
             "detections": self.detection_path(frame_id),
         }
+        if self.disparity_dir is not None:
+            files["disparity"] = self._disparity_path(self.disparity_dir, frame_id)
         plane = self._plane_path(frame_id)
         if self.ground in ("auto", "file") and plane.is_file():
             files["ground_plane"] = plane
@@ -183,6 +193,18 @@ class KittiStereoDataset:
     def _read_camera(self, frame_id: str) -> StereoCamera:
         calibration = read_calibration(self.training / "calib" / f"{frame_id}.txt")
         return to_stereo_camera([calibration], self.disparity_field, self.dtype)
+
+    def _disparity(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
+        if self.disparity_dir is None:
+            return None
+        disparity = read_disparity(self._disparity_path(self.disparity_dir, frame_id), size_hw)
+        return torch.from_numpy(disparity)[None].to(self.dtype)
+
+    @staticmethod
+    def _disparity_path(folder: Path, frame_id: str) -> Path:
+        """Submissions to KITTI Stereo 2015 call the first pair of a scene `NNNNNN_10`."""
+        first_pair = folder / f"{frame_id}_10.png"
+        return first_pair if first_pair.is_file() else folder / f"{frame_id}.png"
 
     def _labels(self, frame_id: str) -> list[KittiObject] | None:
         path = self.training / "label_2" / f"{frame_id}.txt"

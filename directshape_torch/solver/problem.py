@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, Self, TypeVar
+from typing import Literal, NamedTuple, Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
+
+Unknowns = Literal["both", "pose", "shape"]
+"""The unknowns that a stage moves."""
 
 
 class Linearisation(NamedTuple):
@@ -32,11 +35,13 @@ class Stage:
         contour_width_px: softness of the projected contour.
         image_level: pyramid level of the photometric term, 0 is full resolution.
         max_iterations: Gauss-Newton iterations at most.
+        unknowns: which of them move; the others are constants of the stage, a matter of the problem alone.
     """
 
     contour_width_px: float
     image_level: int
     max_iterations: int
+    unknowns: Unknowns = "both"
 
 
 StateT = TypeVar("StateT", bound=tuple[Tensor, ...])

@@ -40,7 +40,9 @@ def match_disparity(
     """
     import cv2
 
-    _check_pair(image_left, image_right, num_disparities)
+    check_pair(image_left, image_right)
+    if num_disparities <= 0 or num_disparities % 16:
+        raise InputError("num_disparities", "a positive multiple of 16", str(num_disparities))
     # The padding keeps the leftmost columns, whose matches lie outside of the right image for large disparities only.
     pad = (0, 0, num_disparities, 0, cv2.BORDER_REPLICATE)
     left, right = (
@@ -66,11 +68,14 @@ def match_disparity(
     return disparity
 
 
-def _check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8], num_disparities: int) -> None:
+def check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8]) -> None:
+    """Raise `InputError` unless both are RGB images (H, W, 3) of uint8 and of one size.
+
+    Example:
+        >>> check_pair(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5, 3), np.uint8))
+    """
     for name, image in (("image_left", image_left), ("image_right", image_right)):
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise InputError(name, "an RGB image (H, W, 3) of uint8", f"{image.shape} of {image.dtype}")
     if image_left.shape != image_right.shape:
         raise InputError("image_right", f"the size of the left image {image_left.shape}", f"{image_right.shape}")
-    if num_disparities <= 0 or num_disparities % 16:
-        raise InputError("num_disparities", "a positive multiple of 16", str(num_disparities))

@@ -1,0 +1,119 @@
+"""Stereo points of each car: the point cloud that the geometric method fits (Engelmann et al., GCPR 2016)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import PointCloudConfig
+from directshape_torch.errors import InputError
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.stereo_matching.points import points_from_disparity
+
+_MASK_THRESHOLD = 0.5
+
+
+@dataclass(frozen=True)
+class PointSamples:
+    """P points of B cars, sorted by object.
+
+    Attributes:
+        object_index: (P,) ascending.
+        points_cam: (P, 3) metres.
+        counts: (B,) points that passed the filters, before the reduction to `max_points`.
+    """
+
+    object_index: Tensor
+    points_cam: Tensor
+    counts: Tensor
+
+    def __len__(self) -> int:
+        return len(self.object_index)
+
+    def of_objects(self, keep: Tensor) -> PointSamples:
+        """The points of the objects where `keep` (B,) holds, renumbered.
+
+        Example:
+            >>> points = PointSamples(torch.tensor([0, 1, 1]), torch.zeros(3, 3), torch.tensor([1, 2]))
+            >>> points.of_objects(torch.tensor([False, True])).object_index
+            tensor([0, 0])
+        """
+        new_number = torch.cumsum(keep.long(), 0) - 1
+        rows = keep[self.object_index].nonzero()[:, 0]
+        return PointSamples(new_number[self.object_index[rows]], self.points_cam[rows], self.counts[keep])
+
+
+def car_points(frames: FrameBatch, detections: Detections, config: PointCloudConfig) -> PointSamples:
+    """Points of the left pixels of every car, freed of the rig's bias and filtered by height and distance.
+
+    Args:
+        frames: F frames with disparity.
+        detections: B cars with finite or NaN poses; a car without a pose has no points.
+        config: pixels, filters, numbers.
+
+    Returns:
+        The points, differentiable by the disparity.
+
+    Raises:
+        InputError: the frames have no disparity.
+    """
+    disparity = frames.disparity
+    if disparity is None:
+        raise InputError("frames.disparity", "a disparity map of each frame", "None", "use with_disparity")
+    pixels = _pixels(frames, detections, config)
+    object_index, v, u = (pixels & _known(disparity)[detections.frame_index]).nonzero(as_tuple=True)
+    frame = detections.frame_index[object_index]
+    camera = frames.camera
+    points_cam = points_from_disparity(
+        torch.stack([u, v], dim=-1).to(disparity),
+        disparity[frame, v, u],
+        camera.K_left[frame],
+        camera.K_right[frame],
+        camera.T_right_cam[frame],
+        camera.disparity_field,
+    )
+    passed = _passes(frames, detections, config, object_index, points_cam.detach()).nonzero()[:, 0]
+    object_index, points_cam = object_index[passed], points_cam[passed]
+    counts = torch.bincount(object_index, minlength=len(detections))
+    kept = _every_nth(object_index, counts, config.max_points)
+    return PointSamples(object_index[kept], points_cam[kept], counts)
+
+
+def _pixels(frames: FrameBatch, d: Detections, config: PointCloudConfig) -> Tensor:
+    """Left pixels (B, H, W) of each car: of its mask where it has one, else of its 2D box."""
+    height, width = frames.images_left.shape[2:]
+    box = d.box_2d[:, :, None]
+    u, v = (torch.arange(n, device=box.device) for n in (width, height))
+    in_columns, in_rows = (u >= box[:, 0]) & (u <= box[:, 2]), (v >= box[:, 1]) & (v <= box[:, 3])
+    in_box = in_rows[:, :, None] & in_columns[:, None, :]
+    if config.pixels == "box":
+        return in_box
+    return torch.where(d.has_mask_left[:, None, None], d.mask_left > _MASK_THRESHOLD, in_box)
+
+
+def _known(disparity: Tensor) -> Tensor:
+    """Pixels whose disparity is a number; no measurement is written as NaN, zero or less."""
+    return disparity.isfinite() & (disparity > 0)
+
+
+def _passes(
+    frames: FrameBatch, detections: Detections, config: PointCloudConfig, object_index: Tensor, points_cam: Tensor
+) -> Tensor:
+    """Which points (P,) are above the ground and near the detection; NaN fails every comparison."""
+    frame = detections.frame_index[object_index]
+    normal = frames.ground.normal[frame]
+    height = (normal * points_cam).sum(-1) + frames.ground.offset[frame]
+    offset = points_cam - detections.T_cam_obj[object_index, :3, 3]
+    along_ground = offset - (offset * normal).sum(-1, keepdim=True) * normal
+    near: Tensor = along_ground.norm(dim=-1) <= config.max_distance_m
+    return near & (height >= config.min_height_m) & (height <= config.max_height_m)
+
+
+def _every_nth(object_index: Tensor, counts: Tensor, most: int) -> Tensor:
+    """Rows of at most `most` points of each object, evenly spread over its pixels in row-major order."""
+    first = torch.cumsum(counts, 0) - counts
+    place = torch.arange(len(object_index), device=counts.device) - first[object_index]
+    stride = (counts + most - 1) // most
+    return (place % stride.clamp_min(1)[object_index] == 0).nonzero()[:, 0]
