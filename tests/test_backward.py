@@ -25,7 +25,7 @@ from directshape_torch.solver.differentiate import NotStationaryWarning
 SETTLED = replace(
     DEFAULT,
     stages=(StageConfig(2.0, 1, 10), StageConfig(1.0, 0, 40)),
-    # Sets that a stage fixes at its start, the gain among them, are constants for the gradients but not for differences.
+    # Sets that a stage fixes at its start, the gain among them, are constants for gradients but not for differences.
     photometric=replace(DEFAULT.photometric, gain=False),
     solver=replace(DEFAULT.solver, cost_tolerance=0.0, step_tolerance=1e-9, accept_every_step=True, initial_damping=0),
 )
@@ -60,9 +60,9 @@ class Inputs:
         elif what == "weights":
             weights = {"silhouette_left": torch.ones(len(detections), dtype=torch.float64) * (1 + by)}
         elif what == "basis":
-            prior = _with(prior, basis=prior.basis + by * self.basis_direction)
+            prior = _prior_with(basis=prior.basis + by * self.basis_direction)
         elif what == "mean":
-            prior = _with(prior, mean=prior.mean + by * self.mean_direction)
+            prior = _prior_with(mean=prior.mean + by * self.mean_direction)
         elif what == "pose":
             shift = torch.zeros_like(detections.T_cam_obj)
             shift[:, 0, 3] = 1.0
@@ -70,7 +70,7 @@ class Inputs:
         return DirectShapeRefiner(prior, config)(frames, detections, weights)
 
 
-def _with(prior: PCAShapePrior, **tensors: Tensor) -> PCAShapePrior:
+def _prior_with(**tensors: Tensor) -> PCAShapePrior:
     copy = ellipsoid_prior()
     for name, tensor in tensors.items():
         setattr(copy, name, tensor)
@@ -106,7 +106,7 @@ def test_modes_agree_with_each_other_and_with_differences(inputs: Inputs, what: 
     ends = [float(_summary(inputs.refine(SETTLED, what, sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
     assert abs(implicit) > 1e-4
-    # The best state by the cost may stand some steps before the point where the gradient vanishes: unrolling ends there.
+    # The best state by the cost may stand some steps before the point where the gradient vanishes.
     assert abs(unrolled - implicit) < 1e-3 + 0.02 * abs(implicit)
     # A difference of refinements crosses borders of pixels and of grid cells, where the gradient jumps.
     assert abs(numeric - unrolled) < 1e-3 + 0.02 * abs(unrolled)
@@ -242,7 +242,7 @@ def _nodes(output: Tensor) -> int:
 
 
 def test_under_autocast_it_computes_in_the_precision_of_its_inputs() -> None:
-    prior, scene = cached_street()
+    _, scene = cached_street()
     low = ellipsoid_prior(torch.float32)
     frames = scene.frames.to(dtype=torch.float32)
     detections = disturbed(scene.detections).to(dtype=torch.float32)
@@ -259,20 +259,23 @@ def test_a_compiled_model_around_it_has_one_break_in_its_graph(inputs: Inputs) -
     class Model(torch.nn.Module):
         def __init__(self, refine: Callable[..., RefinementResult]) -> None:
             super().__init__()
-            self.bias, self.refine = torch.nn.Parameter(torch.zeros((), dtype=torch.float64)), refine
+            self.log_weight = torch.nn.Parameter(torch.zeros((), dtype=torch.float64))
+            self.refine = refine
 
         def forward(self, frames: FrameBatch, detections: Detections) -> Tensor:
-            masks = detections.mask_left + self.bias
-            return self.refine(frames, replace(detections, mask_left=masks)).T_cam_obj * 2
+            weights = {"silhouette_right": torch.exp(self.log_weight) * torch.ones_like(detections.score)}
+            return self.refine(frames, detections, weights).T_cam_obj * 2
 
     model = Model(DirectShapeRefiner(inputs.prior, _mode("implicit", DEFAULT, max_remaining_step=1e9)))
-    detections = replace(inputs.detections, mask_left=inputs.mask)
+    arguments = (inputs.scene.frames, inputs.detections)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        compiled = torch.compile(model, backend="eager")
-        output = compiled(inputs.scene.frames, detections)
-    torch.testing.assert_close(output, model(inputs.scene.frames, detections), rtol=0, atol=1e-12)
-    (gradient,) = torch.autograd.grad(output[:, :3, 3].sum(), model.bias)
+        reasons = torch._dynamo.explain(model)(*arguments).break_reasons
+        torch._dynamo.reset()
+        output = torch.compile(model, backend="eager")(*arguments)
+    torch._dynamo.reset()
+    torch.testing.assert_close(output, model(*arguments), rtol=0, atol=1e-12)
+    (gradient,) = torch.autograd.grad(output[:, :3, 3].sum(), model.log_weight)
     assert gradient.isfinite()
     assert gradient != 0
-    torch._dynamo.reset()
+    assert len(reasons) == 1
