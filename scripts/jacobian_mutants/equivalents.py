@@ -22,7 +22,44 @@ class Equivalent:
         return same and self.after in (None, mutant.after)
 
 
-EQUIVALENTS: tuple[Equivalent, ...] = ()
+_OF_ZERO = "the negative of zero is zero"
+_EITHER_SIGN = "a quaternion and its negative are the same rotation, and so3_log turns it to w >= 0"
+_BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its value nor its derivative gets anywhere"
+
+EQUIVALENTS: tuple[Equivalent, ...] = (
+    Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
+    Equivalent(
+        "_quaternion",
+        "row / row.norm(dim=-1, keepdim=True)",
+        "(-(row / row.norm(dim=-1, keepdim=True)))",
+        _EITHER_SIGN,
+    ),
+    *(
+        Equivalent("_quaternion", row, f"(-{row})", _EITHER_SIGN)
+        for row in (
+            "torch.stack([four_squared[..., 0], a, b, c], dim=-1)",
+            "torch.stack([a, four_squared[..., 1], d, e], dim=-1)",
+            "torch.stack([b, d, four_squared[..., 2], f], dim=-1)",
+            "torch.stack([c, e, f, four_squared[..., 3]], dim=-1)",
+        )
+    ),
+    Equivalent(
+        "project",
+        "K @ points_cam[..., None]",
+        "(-(K @ points_cam[..., None]))",
+        "both sides of the ratio u = h_x / h_z change sign",
+    ),
+    Equivalent("log_one_minus_exp", "-0.5", "(0.5)", _BRANCH_NOT_TAKEN),
+    Equivalent("log_one_minus_exp", "-1.0", "(1.0)", _BRANCH_NOT_TAKEN),
+    Equivalent(
+        "residual_derivative_closest_approach",
+        "zeta * closest_sdf",
+        "(-(zeta * closest_sdf))",
+        "only its magnitude is compared with the saturation",
+    ),
+)
 
 
 def reason_for(mutant: Mutant, equivalents: Iterable[Equivalent] = EQUIVALENTS) -> str | None:

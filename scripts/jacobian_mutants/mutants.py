@@ -21,6 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 _SHAPE_MAKERS = {"new_zeros", "zeros", "expand", "reshape", "view", "view_as", "repeat", "eye", "arange", "range"}
+_ZERO_MAKERS = {"new_zeros", "zeros", "zeros_like"}
 # Which two arguments of a call change places.
 _SWAPPED_ARGUMENTS = {"cross": (0, 1), "lerp": (0, 1), "_along": (1, 2), "where": (1, 2)}
 _ARITHMETIC = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.MatMult, ast.Pow)
@@ -88,8 +89,10 @@ def _negative(node: ast.expr) -> ast.expr:
 
 
 def _is_tensor_like(node: ast.expr) -> bool:
-    """Something that may hold numbers, and that no other rule flips."""
-    return isinstance(node, ast.Name | ast.Attribute | ast.Subscript | ast.Call)
+    """Something that may hold numbers other than zero, and that no other rule flips."""
+    if isinstance(node, ast.Call):
+        return _called_name(node) not in _ZERO_MAKERS
+    return isinstance(node, ast.Name | ast.Attribute | ast.Subscript)
 
 
 def _is_arithmetic(node: ast.AST) -> bool:

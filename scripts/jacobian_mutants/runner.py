@@ -1,4 +1,4 @@
-"""Runs mutants: pytest collects the named tests once, then a process is forked for each mutant.
+"""Runs mutants: pytest runs the named tests once as they are, then a process is forked for each mutant.
 
 In the fork the mutated function gets its changed code object, so that every module that imported it sees the mutant,
 and the tests run until the first fails. Nothing is written: neither the checkout nor a copy of it is edited.
@@ -45,7 +45,6 @@ class Job:
     tests: tuple[str, ...]
     source: bytes  # of the file without a mutation
     mutants: tuple[Mutant, ...]
-    check_unmutated: bool
 
 
 class TestsFailUnmutatedError(Exception):
@@ -78,10 +77,10 @@ class MutationRunner:
         Raises:
             TestsFailUnmutatedError: the tests of a target fail without a mutation.
         """
-        chunks: list[tuple[str, list[Mutant], bool]] = []
+        chunks: list[tuple[str, list[Mutant]]] = []
         for target in dict.fromkeys(target for target, _ in mutants):
             own = [mutant for name, mutant in mutants if name == target]
-            chunks += [(target, own[i : i + _CHUNK], i == 0) for i in range(0, len(own), _CHUNK)]
+            chunks += [(target, own[i : i + _CHUNK]) for i in range(0, len(own), _CHUNK)]
         with ThreadPoolExecutor(self.processes) as pool:
             try:
                 done = pool.map(lambda chunk: self._run_chunk(*chunk, tests_of[chunk[0]], finished), chunks)
@@ -91,24 +90,18 @@ class MutationRunner:
                 raise
 
     def _run_chunk(
-        self,
-        target: str,
-        mutants: list[Mutant],
-        check_unmutated: bool,
-        tests: tuple[str, ...],
-        finished: Callable[[Outcome], None],
+        self, target: str, mutants: list[Mutant], tests: tuple[str, ...], finished: Callable[[Outcome], None]
     ) -> list[Outcome]:
         source = (self.root / mutants[0].path).read_bytes()
-        job = Job(str(self.root), tests, source, tuple(mutants), check_unmutated)
+        job = Job(str(self.root), tests, source, tuple(mutants))
         receiver, sender = self._context.Pipe(duplex=False)
         process = self._context.Process(target=_collect_and_fork, args=(job, sender))
         process.start()
         sender.close()
+        verdict, test, error = _received(receiver)
+        if verdict != "survived":
+            raise TestsFailUnmutatedError(f"{target}: {test or 'tests'} without a mutation: {error or verdict}")
         outcomes = []
-        if check_unmutated:
-            verdict, test, error = _received(receiver)
-            if verdict != "survived":
-                raise TestsFailUnmutatedError(f"{target}: {test or 'tests'} without a mutation: {error or verdict}")
         for mutant in mutants:
             outcomes.append(Outcome(mutant, target, *_received(receiver)))
             finished(outcomes[-1])
@@ -125,7 +118,7 @@ def _received(receiver: Connection) -> tuple[Verdict, str, str]:
 
 
 def _collect_and_fork(job: Job, sender: Connection) -> None:
-    """In a process of its own: collects the tests of a job and sends a verdict for each of its mutants."""
+    """In a process of its own: sends the verdict of a job's tests without a mutation, then one for each mutant."""
     import pytest
 
     # Imported here, and not in the server of processes, which has to stay free of what mutants change.
@@ -138,6 +131,5 @@ def _collect_and_fork(job: Job, sender: Connection) -> None:
         options += [option for name in ("cacheprovider", "xdist") for option in ("-p", f"no:{name}")]
         pytest.main([*options, *job.tests], plugins=[plugin])
     if plugin.collection_error:
-        for _ in range(len(job.mutants) + job.check_unmutated):
-            sender.send(("no verdict", "", plugin.collection_error))
+        sender.send(("no verdict", "", plugin.collection_error))
     sender.close()

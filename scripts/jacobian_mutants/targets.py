@@ -8,7 +8,11 @@ _SE3_TESTS = tuple(
     f"tests/geometry/test_se3_{name}.py"
     for name in ("generators", "group", "adjoint", "exp_log", "series", "references", "gradients")
 )
-_ENERGY = "tests/energy/test_gradient_of_the_cost.py"
+_ROWS = (
+    "tests/energy/test_autograd_jacobian.py::test_linearise_is_accumulate_of_residuals_and_jacobian",
+    "tests/energy/test_autograd_jacobian.py::test_rows_of_every_term_agree",
+)
+_COST = "tests/energy/test_gradient_of_the_cost.py"
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,51 @@ TARGETS: dict[str, Target] = {
         "directshape_torch/solver/normal_equations.py",
         ("Segments._blocks", "Segments._over_blocks", "Segments.sum", "Segments.accumulate"),
         ("tests/solver/test_normal_equations.py",),
+    ),
+    "silhouette_term": Target(
+        "directshape_torch/energy/silhouette_term.py",
+        tuple(
+            f"SilhouetteTerm.{name}"
+            for name in (
+                "at_stage",
+                "pixel_residual",
+                "_rows",
+                "_rows_closest_approach",
+                "_rows_product",
+                "accumulate",
+                "_weight",
+                "_residual_of_a_miss",
+            )
+        ),
+        (*_ROWS, f"{_COST}::test_silhouette_step_is_the_papers", "tests/energy/test_constant_sets.py"),
+    ),
+    "photometric_term": Target(
+        "directshape_torch/energy/photometric_term.py",
+        tuple(
+            f"PhotometricTerm.{name}"
+            for name in (
+                "jacobian",
+                "linearise",
+                "accumulate",
+                "_depth_and_residual",
+                "_norm_and_weight",
+                "_linearisation",
+                "_weight",
+                "_weighted_cost",
+                "_lost_cost",
+            )
+        ),
+        (*_ROWS, "tests/energy/test_photometric_sums.py", "tests/energy/test_constant_sets.py"),
+    ),
+    "prior_terms": Target(
+        "directshape_torch/energy/prior_terms.py",
+        tuple(f"PriorTerm.{name}" for name in ("cost", "jacobian", "linearise", "accumulate", "_rows")),
+        (*_ROWS, "tests/energy/test_terms.py::test_a_prior_costs_half_its_weight_times_the_square"),
+    ),
+    "rays_of_a_state": Target(
+        "directshape_torch/energy/projected_state.py",
+        ("ProjectedView.__init__",),
+        (f"{_COST}::test_g_is_the_gradient_of_the_reported_cost",),
     ),
     "covariance": Target(
         "directshape_torch/covariance.py",

@@ -59,6 +59,16 @@ def test_series_and_closed_form_meet() -> None:
         torch.testing.assert_close(se3.log(se3.exp(twist)), twist, atol=1e-13, rtol=0)
 
 
-def test_angle_pi_itself() -> None:
-    R = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
-    torch.testing.assert_close(se3.so3_log(R).abs(), torch.tensor([math.pi, 0.0, 0.0], dtype=torch.float64))
+@pytest.mark.parametrize("axis", range(3))
+def test_angle_pi_itself(axis: int) -> None:
+    diagonal = -torch.ones(3, dtype=torch.float64)
+    diagonal[axis] = 1.0
+    expected = torch.zeros(3, dtype=torch.float64)
+    expected[axis] = math.pi
+    torch.testing.assert_close(se3.so3_log(torch.diag(diagonal)).abs(), expected)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_quaternions_have_unit_length(regime: str) -> None:
+    w, xyz = se3._quaternion(se3.exp(twists(regime))[:, :3, :3])
+    torch.testing.assert_close(w * w + (xyz * xyz).sum(-1), torch.ones_like(w), atol=1e-14, rtol=0)

@@ -94,6 +94,14 @@ def test_a_point_behind_the_right_camera_is_finite_and_flagged() -> None:
     assert warped.J_pixel_depth.isfinite().all()
 
 
+def test_in_front_is_told_by_the_depth_and_not_by_the_row() -> None:
+    """A pixel above the image, as a neighbour of the first row may be, is in front of the camera all the same."""
+    above = torch.tensor([[300.0, -5.0]], dtype=torch.float64)
+    warped = warp_to_right(rays_from_pixels(above, K_LEFT), DEPTH[:1], K_LEFT, torch.eye(4, dtype=torch.float64))
+    assert warped.in_front.all()
+    torch.testing.assert_close(warped.uv_right, above)
+
+
 def test_neighbourhoods_share_one_depth() -> None:
     rays = rays_from_pixels(UV[:, None] + torch.tensor([[0.0, 0.0], [2.0, 0.0]]), K_LEFT)
     both = warp_to_right(rays, DEPTH[:, None], K_RIGHT, GENERAL)

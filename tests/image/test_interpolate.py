@@ -82,6 +82,14 @@ def test_outside_is_clamped_flagged_and_flat() -> None:
     assert gradient.tolist() == [[0.0, 4.0], [0.0, 7.0], [1.0, 0.0], [4.0, 0.0], [0.0, 0.0]]
 
 
+def test_beyond_the_last_column_is_the_last_column() -> None:
+    image = torch.tensor([[[1.0, 2.0, 4.0, 8.0], [1.0, 3.0, 9.0, 27.0], [0.0, 5.0, 6.0, 7.0]]], dtype=torch.float64)
+    uv = torch.tensor([[7.0, 0.0], [2.0, 9.0], [7.0, 9.0]], dtype=torch.float64)
+    for sizes in (None, torch.tensor([[3, 4]])):
+        value, _, _ = bilinear_with_gradient(image, torch.zeros(3, dtype=torch.long), uv, sizes)
+        assert value.tolist() == [8.0, 6.0, 7.0]
+
+
 def test_last_row_and_column_are_inside() -> None:
     image = torch.tensor([[[1.0, 2.0], [5.0, 9.0]]], dtype=torch.float64)
     value, gradient, inside = bilinear_with_gradient(image, torch.tensor(0), torch.tensor([1.0, 1.0]).double())
