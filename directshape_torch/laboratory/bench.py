@@ -12,7 +12,7 @@ from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.direct_terms import direct_terms
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
 from directshape_torch.energy.term import Term
 from directshape_torch.geometry import se3
 from directshape_torch.laboratory.regimes import Regime, seeded
@@ -20,6 +20,7 @@ from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
 from directshape_torch.residuals.photometric import surface_slope
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.raycast import ObjectRays, Root
 from directshape_torch.solver.problem import Stage
 
 TERM_NAMES = (
@@ -27,12 +28,26 @@ TERM_NAMES = (
     "shape", "height", "tilt_normal", "tilt_cosine", "dimensions",
 )  # fmt: skip
 
-# Brackets shrink superlinearly: far more iterations than float64 can use; Newton's steps from there are quadratic.
-ROOT_ITERATIONS = 60
+# Brackets shrink superlinearly: more iterations than float64 can use; Newton's steps from there are quadratic.
+ROOT_ITERATIONS = 20
 _NEWTON_STEPS = 5
 _CELLS_TO_CHOOSE_FROM = 3000
 _CONTOUR = 3.0
 _GRAZING_COSINE = 0.3
+
+
+class _RememberedView(ProjectedView):
+    """A view that finds each set of surface roots once: hundreds of displaced states start from them."""
+
+    def __init__(self, view: ProjectedView) -> None:
+        self.__dict__.update(view.__dict__)
+        self._found: dict[int, tuple[Tensor, tuple[ObjectRays, Root]]] = {}
+
+    def surface(self, rows: Tensor) -> tuple[ObjectRays, Root]:
+        # The rows are kept beside what was found, so that no other tensor can take over their identity.
+        if id(rows) not in self._found:
+            self._found[id(rows)] = rows, super().surface(rows)
+        return self._found[id(rows)][1]
 
 
 @dataclass(frozen=True)
@@ -114,6 +129,7 @@ class Bench:
         for p in (problem, other):
             p.begin_stage(stage, start)
         projected = problem.project(drawn.state, root_iterations=ROOT_ITERATIONS)
+        projected.left, projected.right = _RememberedView(projected.left), _RememberedView(projected.right)
         return cls(regime, problem, _named(problem, other), drawn.state, projected, cars)
 
 

@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 
 STEP_RATIO = 4.0
-STEPS: tuple[float, ...] = tuple(8e-3 / STEP_RATIO**k for k in range(9))
+STEPS: tuple[float, ...] = tuple(8e-3 / STEP_RATIO**k for k in range(8))
 """Metres, radians, standard deviations, pixels: the units of the argument."""
 
-# Displacements that are no more than rounding: what the function changes by is its noise.
-_JITTER = 1e-14
-_NUM_JITTERS = 4
+# Displacements so small that the function is linear along them, to many digits more than it has: what its value at the
+# centre lacks to the mean of both ends is rounding.
+_JITTER = 1e-11
+_NUM_JITTERS = 6
 
 
 class Probe(NamedTuple):
@@ -94,10 +95,10 @@ def _noise(evaluate: Evaluate, centre: Sequence[Probe], units: Tensor, seed: int
     noise = [eps * probe.value.abs() for probe in centre]
     for _ in range(_NUM_JITTERS):
         direction = torch.rand(len(units), generator=generator, dtype=torch.float64).to(units) * 2 - 1
-        for j, probe in enumerate(evaluate(_JITTER * units * direction)):
-            noise[j] = torch.maximum(noise[j], (probe.value - centre[j].value).abs())
-    # A handful of samples may find a row quiet by luck: no row is taken to be quieter than half of them.
-    return [torch.maximum(n, n.median()) if len(n) else n for n in noise]
+        ends = [evaluate(sign * _JITTER * units * direction) for sign in (1, -1)]
+        for j, (plus, minus) in enumerate(zip(*ends, strict=True)):
+            noise[j] = torch.maximum(noise[j], 0.5 * (plus.value + minus.value - 2 * centre[j].value).abs())
+    return noise
 
 
 def _column(

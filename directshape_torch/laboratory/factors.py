@@ -41,8 +41,13 @@ def exponential(bench: Bench) -> Experiment:
     twist = se3.log(bench.state.T_obj_cam)
     T = se3.exp(twist)
     generated = se3.generators(twist.dtype) @ T[:, None]
-    J = torch.einsum("bgij,bgk->bijk", generated, left_jacobian(twist))[:, :3]
-    return factor_experiment("exp", lambda x: se3.exp(x)[:, :3].flatten(1), twist, J.flatten(1, 2))
+    J = torch.einsum("bgij,bgk->bijk", generated, left_jacobian(twist))
+
+    def columns(T: Tensor) -> Tensor:
+        return T[:, :3].transpose(1, 2).flatten(1, 2)
+
+    # Columns of the rotation and the translation are the vectors of this output.
+    return factor_experiment("exp", lambda x: columns(se3.exp(x)), twist, columns(J), block=3)
 
 
 def left_jacobian(twist: Tensor) -> Tensor:

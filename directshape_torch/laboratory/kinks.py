@@ -29,8 +29,10 @@ LOST = "right image border or occluder"
 HUBER = "Huber corner"
 RULES = (HIT, GRAZING, LOST, SATURATION, HUBER, TRILINEAR, BILINEAR)
 
-# A sample whose share in a row is smaller cannot move the row by what the bounds allow, kink or not.
+# A sample whose share in a row is smaller cannot move the row by what the bounds allow, kink or not. Rows shorter than a
+# millionth of the longest are judged by that millionth, their samples too.
 _IRRELEVANT_SHARE = 1e-9
+_FLAT_SHARE = 1e-6
 
 
 def trilinear_cell(prior: PCAShapePrior, points_obj: Tensor) -> Tensor:
@@ -73,7 +75,9 @@ def relevant_samples(term: Term, projected: ProjectedState) -> Tensor | None:
         return None
     view = projected.left if term.side == "left" else projected.right
     share = residual_derivative_product(view.march.sdf, term.zeta, term.foreground)[1].abs()
-    return share > _IRRELEVANT_SHARE * share.amax(dim=1, keepdim=True)
+    if not len(share):
+        return share > 0
+    return share > _IRRELEVANT_SHARE * share.amax(dim=1, keepdim=True).clamp_min(float(_FLAT_SHARE * share.max()))
 
 
 def _silhouette_branches(

@@ -25,7 +25,7 @@ BOUND = 1e-6
 DEPTH_TWO_STEPS = "depth, two attached Newton steps"
 DEPTH_ONE_STEP = "depth, one attached Newton step (wrong on purpose)"
 PIXEL_COST = "photometric cost of one pixel"
-_RESOLUTION_SHARE = 0.1
+_RESOLUTION_SHARE = 0.25
 _MAX_PIXELS = 24
 
 AttachedDepth = Callable[[BoundShape, ObjectRays, Tensor, Tensor], Tensor]

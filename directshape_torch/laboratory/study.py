@@ -92,13 +92,13 @@ def run_study(
         if empty:
             without[regime.name] = empty
             report(f"{regime.name}: {empty} of {plan.num_states} states see no valid pixel; only their priors count")
-        if "float64" in plan.dtypes:
-            comparisons += compare_subjects(bench, plan.subjects)
+        found = compare_subjects(bench, plan.subjects) if "float64" in plan.dtypes else []
+        comparisons += found
         if "float32" in plan.dtypes:
             terms = [name for name in plan.subjects if name in TERM_NAMES]
             losses += precision_loss(bench, terms)
         skips += skip_costs(bench)
-        report(f"{regime.name}: done")
+        report(f"{regime.name}: {_in_a_line(found)}")
     return StudyResult(tuple(comparisons), tuple(losses), tuple(skips), without)
 
 
@@ -108,3 +108,14 @@ def compare_subjects(bench: Bench, names: Sequence[str]) -> list[Comparison]:
         found = [c for name in names if name in FACTORS for c in compare(FACTORS[name](bench), bench.regime.name)]
         terms = [name for name in names if name in TERM_NAMES]
         return found + (compare(term_experiment(bench, terms), bench.regime.name) if terms else [])
+
+
+def _in_a_line(found: Sequence[Comparison]) -> str:
+    if not found:
+        return "done"
+    worst = {
+        pair: max(found, key=lambda c: c.errors[pair].maximum) for pair in ("analytic-autograd", "analytic-numeric")
+    }
+    errors = ", ".join(f"{pair} at most {c.errors[pair].maximum:.0e} ({c.name})" for pair, c in worst.items())
+    excluded = sum(sum(c.excluded.values()) for c in found) / max(1, sum(c.entries for c in found))
+    return f"{errors}, {100 * excluded:.2f} % excluded"

@@ -20,12 +20,21 @@ class Subject:
         analytic: (R, D) hand-derived.
         autograd: (R, D).
         usable: (R,) false where a skip rule of the residual itself makes the row constant by definition.
+        block: so many consecutive rows are the components of one vector and are compared relative to their common
+            norm: the vertical part of a warp by depth is next to nothing, and so is its own norm.
     """
 
     name: str
     analytic: Tensor
     autograd: Tensor
     usable: Tensor
+    block: int = 1
+
+    @property
+    def norm(self) -> Tensor:
+        """Norm (R,) of each row, or of the vector that it belongs to."""
+        own = torch.maximum(self.analytic.norm(dim=1), self.autograd.norm(dim=1))
+        return own.reshape(-1, self.block).norm(dim=1).repeat_interleave(self.block)
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,7 @@ def factor_experiment(
     analytic: Tensor,  # (P, m, n)
     branches: BranchIds | None = None,
     units: Tensor | None = None,
+    block: int | None = None,
 ) -> Experiment:
     """A function that maps each of P inputs (n,) to m outputs, as R = P m rows of n unknowns.
 
@@ -63,6 +73,7 @@ def factor_experiment(
         analytic: hand-derived Jacobians.
         branches: from inputs (P, n) to ids (P,) or (P, k) of the smooth piece that each input is in, by rule.
         units: (n,) see `sweep`; default ones.
+        block: see `Subject`; default all m outputs.
 
     Example:
         >>> x = torch.tensor([[2.0], [3.0]], dtype=torch.float64)
@@ -81,8 +92,8 @@ def factor_experiment(
 
     autograd = forward_mode_columns(function, at)
     usable = torch.ones(len(at) * num_outputs, dtype=torch.bool, device=at.device)
-    subject = Subject(name, analytic.flatten(0, 1), autograd.flatten(0, 1), usable)
-    return Experiment((subject,), evaluate, torch.ones_like(at[0]) if units is None else units)
+    subject = Subject(name, analytic.flatten(0, 1), autograd.flatten(0, 1), usable, block or num_outputs)
+    return Experiment((subject,), evaluate, at.new_ones(at.shape[1]) if units is None else units)
 
 
 def forward_mode_columns(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:

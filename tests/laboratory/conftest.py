@@ -1,0 +1,42 @@
+"""One small bench of each regime, built once: a prior of two codes keeps the differences quick."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from directshape_torch.laboratory.bench import Bench
+from directshape_torch.laboratory.regimes import REGIMES
+from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+@cache
+def small_prior() -> PCAShapePrior:
+    return PCAShapePrior.load_bundled().double().with_num_codes(2)
+
+
+@cache
+def demo_scene() -> LaboratoryScene:
+    return load_scene()
+
+
+@cache
+def small_bench(regime: str, states: int = 2, pixels: int = 10) -> Bench:
+    return Bench.build(demo_scene(), small_prior(), REGIMES[regime], states, pixels_per_car=pixels)
+
+
+@pytest.fixture
+def bench_of():  # type: ignore[no-untyped-def]
+    return small_bench
+
+
+@pytest.fixture
+def scene() -> LaboratoryScene:
+    return demo_scene()
+
+
+@pytest.fixture
+def prior() -> PCAShapePrior:
+    return small_prior()

@@ -1,0 +1,75 @@
+"""Right Jacobians pass, wrong ones do not, and what is left out is counted."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch.laboratory.comparison import Comparison, PairError, compare, quantile
+from directshape_torch.laboratory.subjects import Experiment, Subject, factor_experiment
+
+X = torch.linspace(-1.3, 1.7, 12, dtype=torch.float64)[:, None]
+
+
+def sine(analytic: Tensor) -> list[Comparison]:
+    return compare(factor_experiment("sine", torch.sin, X, analytic[:, None]), "typical")
+
+
+def test_a_right_jacobian_keeps_its_bounds() -> None:
+    (found,) = sine(torch.cos(X))
+    assert found.broken_bounds() == []
+    assert (found.entries, found.compared, found.excluded) == (12, 12, {})
+    assert found.errors["analytic-numeric"].maximum < 1e-9
+    assert found.curve is not None
+
+
+@pytest.mark.parametrize(("wrong", "broken"), [(-1.0, 2), (1 + 1e-5, 2), (1 + 1e-8, 1)])
+def test_a_wrong_one_breaks_them(wrong: float, broken: int) -> None:
+    """A slip of 1e-8 is seen by autograd alone, which is why there are three."""
+    (found,) = sine(wrong * torch.cos(X))
+    assert len(found.broken_bounds()) == broken
+
+
+def test_one_wrong_row_among_many_is_enough() -> None:
+    J = torch.cos(X)
+    J[5] *= 1.001
+    assert len(sine(J)[0].broken_bounds()) == 2
+
+
+def test_nan_is_not_within_a_bound() -> None:
+    J = torch.cos(X)
+    J[0] = math.nan
+    assert sine(J)[0].broken_bounds()
+
+
+def test_a_row_that_both_jacobians_call_constant_must_not_move() -> None:
+    """Differences are the only witness against two Jacobians that are wrong in the same way."""
+    (evaluate, units) = (lambda e: (e.evaluate, e.units))(factor_experiment("f", torch.sin, X, torch.cos(X)[:, None]))
+    zero = torch.zeros_like(X)
+    subject = Subject("f", zero, zero, torch.ones(12, dtype=torch.bool))
+    (found,) = compare(Experiment((subject,), evaluate, units), "typical")
+    assert found.zero_rows == 12
+    assert found.errors["analytic-numeric"].maximum == math.inf
+
+
+def test_unusable_rows_are_counted_and_not_judged() -> None:
+    usable = torch.arange(12) < 10
+    good = factor_experiment("f", torch.sin, X, torch.cos(X)[:, None])
+    wrong = torch.where(usable[:, None], torch.cos(X), 7.0)
+    (found,) = compare(Experiment((Subject("f", wrong, wrong, usable),), good.evaluate, good.units), "typical")
+    assert (found.entries, found.skipped_rows, found.broken_bounds()) == (10, 2, [])
+
+
+def test_exclusions_are_limited_in_the_typical_regime() -> None:
+    errors = {"analytic-numeric": PairError(0.0, 0.0)}
+    found = [Comparison("f", regime, 100, 97, {"kink": 3}, 0, 0, 0, errors) for regime in ("typical", "grazing")]
+    assert "3.0 percent" in found[0].broken_bounds()[0]
+    assert found[1].broken_bounds() == []
+
+
+def test_quantile_of_nothing_is_nan() -> None:
+    assert math.isnan(quantile(torch.zeros(0), 0.5))
+    assert quantile(torch.tensor([3.0, 1.0, 2.0]), 0.5) == 2.0

@@ -1,0 +1,93 @@
+"""The regimes draw what their names say, and the same every time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.pinhole import project
+from directshape_torch.laboratory.bench import TERM_NAMES, Bench
+from directshape_torch.laboratory.regimes import REGIMES, checked_name, regimes_named
+from directshape_torch.laboratory.scenes import LaboratoryScene
+from directshape_torch.residuals.photometric import surface_slope
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+BenchOf = Callable[..., Bench]
+
+
+@pytest.mark.parametrize(("regime", "depth_m"), [("far_80m", 80.0), ("near_3m", 3.0)])
+def test_distance(bench_of: BenchOf, regime: str, depth_m: float) -> None:
+    z = se3.inverse(bench_of(regime).state.T_obj_cam)[:, 2, 3]
+    assert ((z - depth_m).abs() < 0.3 + 0.03 * depth_m).all()
+
+
+def test_rotations(bench_of: BenchOf) -> None:
+    angle = se3.log(bench_of("identity_rotation").state.T_obj_cam)[:, 3:].norm(dim=1)
+    assert angle.tolist() == pytest.approx([0.0, 1e-7], abs=1e-12)
+    angle = se3.log(bench_of("near_pi_rotation").state.T_obj_cam)[:, 3:].norm(dim=1)
+    assert (torch.pi - angle).tolist() == pytest.approx([0.0, 1e-7], abs=1e-12)
+
+
+def test_codes(bench_of: BenchOf) -> None:
+    assert (bench_of("code_zero").state.code == 0).all()
+    assert (bench_of("code_three_sigma").state.code.abs() == 3).all()
+
+
+def test_cars_are_cut_by_the_image_border(bench_of: BenchOf, scene: LaboratoryScene) -> None:
+    origin = se3.inverse(bench_of("image_border").state.T_obj_cam)[:, :3, 3]
+    u = project(origin, scene.frame.camera.K_left[0])[:, 0]
+    width = float(scene.frame.sizes[0, 1])
+    assert torch.minimum(u.abs(), (u - width).abs()).max() < 20
+
+
+def test_pixels_of_a_regime(bench_of: BenchOf, prior: PCAShapePrior) -> None:
+    at = bench_of("contour")
+    term = at.terms["silhouette_left"]
+    points = at.projected.left.rays.at(at.projected.left.closest_depth)
+    sdf = at.projected.shape.value(points, at.problem.left.object_index)
+    assert len(sdf) > 5
+    assert ((term.zeta * sdf).abs() < 3).all()  # type: ignore[attr-defined]
+
+    at = bench_of("grazing")
+    rays, root = at.projected.left.surface(torch.arange(len(at.problem.left)))
+    gradient = at.projected.shape.value_and_derivatives(rays.at(root.depth), rays.object_index).gradient
+    assert len(rays.object_index) > 5
+    assert surface_slope(gradient, rays.direction_obj, 0.31)[1].all()
+
+    at = bench_of("grid_border")
+    points = at.projected.right.rays.at(at.projected.right.closest_depth)
+    lower, upper = prior.bounds_obj
+    assert len(points) > 5
+    assert (torch.minimum(points - lower, upper - points).amin(dim=1) < prior.spacing_m).float().mean() > 0.9
+
+
+def test_pixels_per_car_are_limited(bench_of: BenchOf) -> None:
+    for regime in ("contour", "typical"):
+        assert bench_of(regime).pixels_per_car.max() <= 2 * 10 + 10
+        assert bench_of(regime).pixels_per_car.min() > 0
+
+
+def test_draws_repeat_and_do_not_depend_on_other_regimes(scene: LaboratoryScene, prior: PCAShapePrior) -> None:
+    torch.manual_seed(5)
+    first = Bench.build(scene, prior, REGIMES["far_80m"], 2, seed=3, pixels_per_car=4)
+    torch.manual_seed(6)
+    again = Bench.build(scene, prior, REGIMES["far_80m"], 2, seed=3, pixels_per_car=4)
+    other = Bench.build(scene, prior, REGIMES["far_80m"], 2, seed=4, pixels_per_car=4)
+    assert torch.equal(first.state.T_obj_cam, again.state.T_obj_cam)
+    assert torch.equal(first.problem.left.uv, again.problem.left.uv)
+    assert not torch.equal(first.state.T_obj_cam, other.state.T_obj_cam)
+
+
+def test_all_terms_in_all_forms(bench_of: BenchOf) -> None:
+    assert tuple(bench_of("typical").terms) == TERM_NAMES
+
+
+def test_unknown_names_list_the_known_ones() -> None:
+    with pytest.raises(InputError, match=r"regime: expected one of typical, near_optimum, .*got 'far'.*far_80m"):
+        regimes_named(["far"])
+    with pytest.raises(InputError, match="the nearest is photometric"):
+        checked_name("term", "fotometric", list(TERM_NAMES))

@@ -1,0 +1,95 @@
+"""The command: exit codes, files, clear messages; a wrong Jacobian is reported as broken."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from directshape_torch.energy.prior_terms import PriorTerm
+from directshape_torch.laboratory.regimes import regimes_named
+from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
+from directshape_torch.laboratory.study import StudyPlan, run_study
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+_SCRIPT = Path(__file__).parents[2] / "scripts" / "check_gradients.py"
+_QUICK = ["--states", "1", "--pixels", "4", "--regime", "far_80m", "--no-second", "--no-paper-depth"]
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("check_gradients", _SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(autouse=True)
+def _small_prior(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = PCAShapePrior.load_bundled().with_num_codes(2)
+    monkeypatch.setattr(PCAShapePrior, "load_bundled", lambda: small)
+
+
+def test_tables_and_files(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
+    assert script.main([*_QUICK, "--term", "shape", "warp", "--out", str(tmp_path)]) == 0
+    printed = capsys.readouterr().out
+    assert "far_80m" in printed
+    assert "BROKEN" not in printed
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "summary.md", "jacobians.csv", "float32.csv", "skip_rules.csv", "shape.png", "warp.png",
+    }  # fmt: skip
+    assert "**All bounds hold.**" in (tmp_path / "summary.md").read_text()
+    header, *lines = (tmp_path / "jacobians.csv").read_text().splitlines()
+    assert header.startswith("subject,regime,entries,compared")
+    assert len(lines) == 2
+
+
+def test_a_wrong_jacobian_makes_the_exit_code_one(
+    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right = PriorTerm.jacobian
+    monkeypatch.setattr(PriorTerm, "jacobian", lambda self, projected: -right(self, projected))
+    assert script.main([*_QUICK, "--term", "height", "--dtype", "float64"]) == 1
+    assert "BROKEN   height, far_80m: analytic-autograd error 2.0e+00" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("option", "message"), [
+    (["--term", "fotometric"], "term: expected one of exp, .*photometric, .*got 'fotometric'.*nearest is photometric"),
+    (["--regime", "mars"], "regime: expected one of typical, .*got 'mars'"),
+    (["--states", "0"], "--states: expected at least 1"),
+    (["--data", "nowhere"], "nowhere/detections: holds no folder"),
+])  # fmt: skip
+def test_wrong_use(script: ModuleType, capsys: pytest.CaptureFixture[str], option: list[str], message: str) -> None:
+    assert script.main(option) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    import re
+
+    assert re.search(message, error)
+
+
+def _without_masks(scene: LaboratoryScene) -> LaboratoryScene:
+    none = torch.zeros_like(scene.detections.has_mask_left)
+    return replace(scene, detections=replace(scene.detections, has_mask_left=none, has_mask_right=none))
+
+
+def test_states_without_pixels_are_counted_and_do_not_crash() -> None:
+    said: list[str] = []
+    plan = StudyPlan(regimes=tuple(regimes_named(["typical"])), num_states=2, pixels_per_car=4)
+    prior = PCAShapePrior.load_bundled().double()
+    study = run_study(_without_masks(load_scene()), prior, plan, said.append)
+    assert study.states_without_pixels == {"typical": 2}
+    assert "2 of 2 states see no valid pixel" in said[0]
+    by_name = {c.name: c for c in study.comparisons}
+    assert by_name["photometric"].entries == 0
+    assert by_name["shape"].compared == 2 * 2 * 8
+    assert study.broken_bounds() == []
