@@ -19,7 +19,7 @@ from pathlib import Path
 from jacobian_mutants.equivalents import reason_for
 from jacobian_mutants.mutants import Mutant, mutants_of
 from jacobian_mutants.report import summary, table, write_json
-from jacobian_mutants.runner import MutationRunner, Outcome, TestsFailUnmutatedError
+from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError
 from jacobian_mutants.targets import TARGETS, Target
 from tqdm import tqdm
 
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         tests_of = {name: target.tests for name, target in targets.items()}
         try:
             outcomes = MutationRunner(ROOT, options.processes).run(mutants, tests_of, finished)
-        except TestsFailUnmutatedError as error:
+        except UnmutatedFailureError as error:
             print(error, file=sys.stderr)
             return 2
     print(table(outcomes))

@@ -29,6 +29,8 @@ _BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its val
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("_by_rotation", "zeros[..., :3]", "(-zeros[..., :3])", _OF_ZERO),
+    Equivalent("_by_rotation", "zeros[..., 3:]", "(-zeros[..., 3:])", _OF_ZERO),
     Equivalent("_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     Equivalent(
         "_quaternion",

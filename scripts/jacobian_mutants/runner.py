@@ -47,7 +47,7 @@ class Job:
     mutants: tuple[Mutant, ...]
 
 
-class TestsFailUnmutatedError(Exception):
+class UnmutatedFailureError(Exception):
     """The tests named for a target fail, or could not be run, without any mutation."""
 
 
@@ -75,7 +75,7 @@ class MutationRunner:
         """Outcomes in the order of `mutants` (target, mutant); also checks that the tests pass unmutated.
 
         Raises:
-            TestsFailUnmutatedError: the tests of a target fail without a mutation.
+            UnmutatedFailureError: the tests of a target fail without a mutation.
         """
         chunks: list[tuple[str, list[Mutant]]] = []
         for target in dict.fromkeys(target for target, _ in mutants):
@@ -85,7 +85,7 @@ class MutationRunner:
             try:
                 done = pool.map(lambda chunk: self._run_chunk(*chunk, tests_of[chunk[0]], finished), chunks)
                 return [outcome for outcomes in done for outcome in outcomes]
-            except TestsFailUnmutatedError:
+            except UnmutatedFailureError:
                 pool.shutdown(cancel_futures=True)
                 raise
 
@@ -100,7 +100,7 @@ class MutationRunner:
         sender.close()
         verdict, test, error = _received(receiver)
         if verdict != "survived":
-            raise TestsFailUnmutatedError(f"{target}: {test or 'tests'} without a mutation: {error or verdict}")
+            raise UnmutatedFailureError(f"{target}: {test or 'tests'} without a mutation: {error or verdict}")
         outcomes = []
         for mutant in mutants:
             outcomes.append(Outcome(mutant, target, *_received(receiver)))

@@ -62,11 +62,16 @@ TARGETS: dict[str, Target] = {
     ),
     "ray_depth": Target(
         "directshape_torch/shape/raycast.py",
-        ("ObjectRays.at", "attached_depth"),
+        ("ObjectRays.at", "attached_depth", "polished_depth", "_newton_step"),
         ("tests/shape/test_raycast.py", "tests/residuals/test_photometric.py"),
     ),
     "state_chain": Target(
         "directshape_torch/residuals/state_chain.py", ("sdf_state_jacobian",), ("tests/residuals/test_state_chain.py",)
+    ),
+    "point_cloud": Target(
+        "directshape_torch/residuals/point_cloud.py",
+        ("points_in_object", "point_cloud_residual"),
+        ("tests/residuals/test_point_cloud.py",),
     ),
     "silhouette": Target(
         "directshape_torch/residuals/silhouette.py",

@@ -1,0 +1,155 @@
+"""Mutants are what they claim to be, the tests named for them exist, and a survivor is reported; a sample is run."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+_ROOT = Path(__file__).resolve().parents[2]
+if str(_ROOT / "scripts") not in sys.path:
+    sys.path.insert(0, str(_ROOT / "scripts"))
+
+import mutate_jacobians  # noqa: E402
+from jacobian_mutants.equivalents import EQUIVALENTS, reason_for  # noqa: E402
+from jacobian_mutants.mutants import Mutant, mutants_of  # noqa: E402
+from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError  # noqa: E402
+from jacobian_mutants.targets import TARGETS, Target  # noqa: E402
+
+
+def changes(body: str) -> set[tuple[str, str, str]]:
+    source = f"def f(a, b, x, J):\n    {body}\n".encode()
+    made = mutants_of("f.py", source, ("f",))
+    for mutant in made:
+        compile(mutant.apply(source), "f.py", "exec")
+    return {(m.kind, m.before, m.after) for m in made}
+
+
+def test_a_difference() -> None:
+    assert changes("return a - b") == {
+        ("sign flip", "a - b", "(-(a - b))"),
+        ("sign flip", "a - b", "(a + b)"),
+        ("dropped term", "a - b", "(a)"),
+        ("dropped term", "a - b", "(-b)"),
+    }
+
+
+def test_products_quotients_and_powers() -> None:
+    assert ("dropped factor", "a * b", "(b)") in changes("return a * b")
+    assert changes("return 1 / b") == {("sign flip", "1 / b", "(-(1 / b))"), ("dropped factor", "1 / b", "(1)")}
+    assert ("dropped factor", "a ** 2", "(a)") in changes("return a ** 2")
+    assert ("swapped axes", "a @ b", "(a.mT @ b)") in changes("return a @ b")
+    assert ("swapped axes", "a.transpose(1, 2)", "(a)") in changes("return a.transpose(1, 2)")
+
+
+def test_components_and_order() -> None:
+    assert ("swapped components", "x[..., 1]", "x[..., 0]") in changes("return x[..., 1]")
+    assert ("swapped components", "x[..., 0]", "x[..., 1]") in changes("return x[..., 0]")
+    assert ("swapped components", "x[:, :3]", "x[:, 3:6]") in changes("return x[:, :3]")
+    assert ("swapped components", "x[:, 3:6]", "x[:, 0:3]") in changes("return x[:, 3:6]")
+    assert ("swapped components", "J[0, 4]", "J[0, 3]") in changes("J[0, 4] = a")
+    assert ("sign flip", "a", "(-a)") in changes("J[0, 4] = a")
+    assert ("swapped components", "[a, b]", "[b, a]") in changes("return stack([a, b])")
+    assert ("swapped components", "(a, b)", "(b, a)") in changes("a, b = x.unbind(-1)")
+    assert ("swapped arguments", "cross(a, b)", "(cross(b, a))") in changes("return cross(a, b)")
+    assert ("sign flip", "a", "(-a)") in changes("return Result(a)")
+
+
+def test_what_is_no_arithmetic_of_a_jacobian_stays() -> None:
+    assert changes("return x.new_zeros(len(a), 6 + b)") == set()
+    assert changes("return x.sum(-1)") == set()
+    assert changes("raise ValueError(a - b)") == set()
+    assert changes("J[0] = torch.zeros_like(a)") == {("swapped components", "J[0]", "J[1]")}
+
+
+def test_methods_are_found_by_qualified_name_and_missing_ones_are_an_error() -> None:
+    source = b"class A:\n    def f(self, a):\n        return -a\n"
+    (mutant,) = mutants_of("a.py", source, ("A.f",))
+    assert mutant.apply(source) == source.replace(b"-a", b"(a)")
+    assert mutant.line == 3
+    with pytest.raises(KeyError, match=r"A\.g"):
+        mutants_of("a.py", source, ("A.g",))
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_named_functions_and_tests_exist(name: str) -> None:
+    target = TARGETS[name]
+    assert mutants_of(target.path, (_ROOT / target.path).read_bytes(), target.functions)
+    for test in target.tests:
+        path, _, function = test.partition("::")
+        assert f"def {function}" in (_ROOT / path).read_text(encoding="utf-8")
+
+
+def test_every_exclusion_is_of_a_mutant_that_is_made() -> None:
+    """An exclusion whose code has changed would hide a mutant of the new code."""
+    made = [mutant for _, mutant in mutate_jacobians.all_mutants(_ROOT, TARGETS)]
+    for equivalent in EQUIVALENTS:
+        assert any(equivalent.matches(mutant) for mutant in made), equivalent
+        assert len(equivalent.reason) > 20
+    assert sum(reason_for(mutant) is not None for mutant in made) < 0.05 * len(made)
+
+
+@pytest.fixture
+def small_tree(tmp_path: Path) -> tuple[Path, Target]:
+    """A module whose tests see its product but not its sum."""
+    (tmp_path / "small_module_for_mutants.py").write_text(
+        "def f(a, b):\n    return a * b\n\n\ndef g(a):\n    return a + 0\n"
+    )
+    (tmp_path / "test_small.py").write_text(
+        "from small_module_for_mutants import f, g\n\n"
+        "def test_f():\n    assert f(2, 3) == 6\n\ndef test_g():\n    assert g(0) == 0\n"
+    )
+    return tmp_path, Target("small_module_for_mutants.py", ("f", "g"), ("test_small.py",))
+
+
+def _run(root: Path, target: Target) -> tuple[list[Outcome], list[Mutant]]:
+    mutants = mutants_of(target.path, (root / target.path).read_bytes(), target.functions)
+    seen: list[Mutant] = []
+    runner = MutationRunner(root, processes=1)
+    outcomes = runner.run([("t", m) for m in mutants], {"t": target.tests}, lambda o: seen.append(o.mutant))
+    return outcomes, seen
+
+
+def test_verdicts_of_a_small_tree(small_tree: tuple[Path, Target]) -> None:
+    root, target = small_tree
+    before = (root / target.path).read_bytes()
+    outcomes, seen = _run(root, target)
+    assert [o.mutant for o in outcomes] == seen
+    of_f = [o for o in outcomes if o.mutant.function == "f"]
+    assert {o.verdict for o in of_f} == {"caught"}
+    assert {o.caught_by for o in of_f} == {"test_small.py::test_f"}
+    assert of_f[0].error.startswith("assert")
+    assert {o.verdict for o in outcomes if o.mutant.function == "g"} == {"survived"}
+    assert (root / target.path).read_bytes() == before
+
+
+def test_tests_that_fail_without_a_mutation_are_an_error(small_tree: tuple[Path, Target]) -> None:
+    root, target = small_tree
+    (root / "test_small.py").write_text("def test_nothing():\n    raise AssertionError('broken')\n")
+    with pytest.raises(UnmutatedFailureError, match=r"t: test_small\.py::test_nothing without a mutation"):
+        _run(root, target)
+    (root / "test_small.py").write_text("import a_module_that_is_not_there\n")
+    with pytest.raises(UnmutatedFailureError, match="cannot be imported"):
+        _run(root, target)
+
+
+def test_a_survivor_ends_the_command_with_1(
+    small_tree: tuple[Path, Target], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    root, target = small_tree
+    monkeypatch.setattr(mutate_jacobians, "ROOT", root)
+    monkeypatch.setattr(mutate_jacobians, "TARGETS", {"t": target})
+    report = tmp_path / "report.json"
+    assert mutate_jacobians.main(["--processes", "1", "--json", str(report)]) == 1
+    assert "SURVIVED" in capsys.readouterr().out
+    verdicts = [outcome["verdict"] for outcome in json.loads(report.read_text())["outcomes"]]
+    assert verdicts.count("survived") == 4
+
+
+def test_a_sample_of_the_real_mutants_is_caught(capsys: pytest.CaptureFixture[str]) -> None:
+    quick = ["state_chain", "priors", "pinhole", "silhouette"]
+    targets = [argument for name in quick for argument in ("--target", name)]
+    assert mutate_jacobians.main([*targets, "--sample", "3", "--seed", "7", "--processes", "1"]) == 0
+    assert "3 mutants: 3 caught" in capsys.readouterr().out
