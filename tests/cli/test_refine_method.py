@@ -1,0 +1,88 @@
+"""`directshape refine --method` and `--disparity` as a user types them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.exact_disparity import exact_disparity
+from helpers.kitti_folder import CODE, write_data_set
+from helpers.synthetic_scene import TWO_CARS, street
+
+from directshape_torch.cli.main import main
+from directshape_torch.io.disparity_files import write_disparity
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.result_files import read_shapes
+
+QUICK = ("--set", "point_cloud.rounds=1", "point_cloud.min_points=50", "stages=[{max_iterations: 2}]")
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames and their exact disparity, one file named as KITTI Stereo 2015 does."""
+    import torch
+
+    root = tmp_path_factory.mktemp("kitti")
+    prior = write_data_set(root, ("000000", "000001"))
+    scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=torch.float64))
+    disparity = exact_disparity(prior, scene)[0].numpy()
+    for name in ("000000", "000001_10"):
+        write_disparity(root / "disparity" / f"{name}.png", disparity)
+    return root
+
+
+def refine(root: Path, out: Path, *extra: str) -> int:
+    words = ["refine", "--data", root, "--detections", root / "detections", "--out", out, "--prior", root / "prior.npz"]
+    words += ["--masks", root / "masks", "--device", "cpu", *QUICK, *extra]
+    return main([str(word) for word in words])
+
+
+@pytest.mark.parametrize("method", ["geometric", "combined"])
+def test_a_method_with_disparity_maps(source: Path, tmp_path: Path, method: str) -> None:
+    assert refine(source, tmp_path, "--method", method, "--disparity", str(source / "disparity")) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["config"]["refiner"]["method"] == method
+    assert set(summary["inputs"]["000001"]) >= {"disparity", "image_left"}
+    for frame_id in ("000000", "000001"):
+        shapes = read_shapes(tmp_path / "shapes" / f"{frame_id}.npz")
+        assert "point_cloud" in shapes.term_names
+        assert ("photometric" in shapes.term_names) == (method == "combined")
+
+
+def test_without_maps_the_images_are_matched(source: Path, tmp_path: Path) -> None:
+    assert refine(source, tmp_path, "--method", "geometric", "--frames", "0") == 0
+    assert "disparity" not in json.loads((tmp_path / "summary.json").read_text())["inputs"]["000000"]
+
+
+def test_maps_that_nobody_reads_are_an_error(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert refine(source, tmp_path, "--disparity", str(source / "disparity")) == 2
+    assert "--disparity: expected a method that uses it, got direct; add --method" in capsys.readouterr().err
+    assert refine(source, tmp_path, "--method", "geometric", "--disparity", str(tmp_path / "none")) == 2
+    assert "is no folder of disparity maps" in capsys.readouterr().err
+
+
+def test_a_bad_map_fails_its_frame_alone(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = Path(shutil.copytree(source / "disparity", tmp_path / "disparity"))
+    write_disparity(folder / "000000.png", np.ones((9, 9)))
+    out = tmp_path / "out"
+    assert refine(source, out, "--method", "geometric", "--disparity", str(folder)) == 1
+    assert "frame 000000 failed: " in (message := capsys.readouterr().err)
+    assert "000000.png: has 9 x 9 pixels, the left image 160 x 120" in message
+    assert (out / "data" / "000001.txt").is_file()
+
+
+def test_frames_of_several_sizes_keep_their_maps(source: Path) -> None:
+    from directshape_torch.io.frame_collation import collate
+
+    dataset = KittiStereoDataset(source, source / "detections", source / "masks", disparity_dir=source / "disparity")
+    loaded = [dataset.load(frame_id) for frame_id in dataset.frame_ids]
+    together = collate(loaded)[0].disparity
+    assert together is not None
+    np.testing.assert_array_equal(together[1], loaded[1].frame.disparity[0])  # type: ignore[index]
+    bare = KittiStereoDataset(source, source / "detections", source / "masks").load("000000")
+    assert collate([bare])[0].disparity is None
+    with pytest.raises(ValueError, match="loaded: expected frames with disparity maps, or frames without, got 1 of 2"):
+        collate([bare, loaded[1]])

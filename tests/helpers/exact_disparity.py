@@ -1,0 +1,43 @@
+"""The disparity map of the synthetic street, ray cast and exact to rounding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.scene import FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
+from directshape_torch.stereo_matching.points import disparity_of_depth
+from helpers.synthetic_scene import Street, cached_street
+
+
+def exact_disparity(prior: PCAShapePrior, scene: Street) -> Tensor:
+    """(1, H, W) pixels; NaN where no car is."""
+    camera = scene.frames.camera
+    height, width = scene.frames.images_left.shape[2:]
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    uv = torch.stack([u, v], dim=-1).reshape(-1, 2).to(prior.origin)
+    rays_cam = rays_from_pixels(uv, camera.K_left)
+    shape, depth = prior.bind(scene.code), torch.full_like(uv[:, 0], torch.inf)
+    for i, T_obj_cam in enumerate(se3.inverse(scene.detections.T_cam_obj)):
+        own = torch.full_like(depth, i, dtype=torch.long)
+        rays = ObjectRays(T_obj_cam[:3, 3].expand_as(rays_cam), rays_cam @ T_obj_cam[:3, :3].T, own)
+        marched = march(shape, rays, prior.bounds_obj, 48)
+        root = first_crossing(shape, rays, marched, closest_approach_depth(marched), 12)
+        depth = torch.where(root.found & (root.depth < depth), root.depth, depth)
+    disparity = disparity_of_depth(uv, depth, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])[:, 0]
+    return torch.where(depth.isfinite(), disparity, torch.nan).view(1, height, width)
+
+
+@lru_cache(maxsize=2)
+def measured_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, Street]:
+    """The two-car street whose frames bring their exact disparity."""
+    prior, scene = cached_street(dtype)
+    frames: FrameBatch = replace(scene.frames, disparity=exact_disparity(prior, scene))
+    return prior, replace(scene, frames=frames)

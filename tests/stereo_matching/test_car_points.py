@@ -1,0 +1,132 @@
+"""The points of each car: where they lie, which pass the filters, and how many are kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.exact_disparity import measured_street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M
+
+from directshape_torch.config import PointCloudConfig
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.stereo_matching.car_points import PointSamples, car_points
+
+ALL = PointCloudConfig(min_points=1, max_points=100_000, min_height_m=-1.0, max_distance_m=5.0)
+
+
+def points_of(config: PointCloudConfig = ALL, **changes: object) -> PointSamples:
+    scene = measured_street()[1]
+    frames = {name: value for name, value in changes.items() if name == "disparity"}
+    others = {name: value for name, value in changes.items() if name != "disparity"}
+    return car_points(replace(scene.frames, **frames), replace(scene.detections, **others), config)  # type: ignore[arg-type]
+
+
+def test_every_masked_pixel_gives_a_point_on_the_surface() -> None:
+    prior, scene = measured_street()
+    points = points_of()
+    assert torch.equal(points.counts, (scene.detections.mask_left > 0.5).flatten(1).sum(1))
+    assert torch.equal(torch.bincount(points.object_index), points.counts)
+    T = se3.inverse(scene.detections.T_cam_obj)[points.object_index]
+    sdf = prior.bind(scene.code).value(se3.transform(T, points.points_cam), points.object_index)
+    assert sdf.abs().max() < 1e-6
+
+
+def test_heights_are_above_the_plane() -> None:
+    points = points_of(replace(ALL, min_height_m=0.5, max_height_m=1.0))
+    height = CAMERA_HEIGHT_M - points.points_cam[:, 1]
+    assert 0.5 <= height.min() < 0.55
+    assert 0.95 < height.max() <= 1.0
+    everything = CAMERA_HEIGHT_M - points_of().points_cam[:, 1]
+    assert len(points) == int(((everything >= 0.5) & (everything <= 1.0)).sum())
+
+
+def test_distances_are_along_the_ground_from_the_centre_of_the_detection() -> None:
+    detections = measured_street()[1].detections
+    lifted = detections.T_cam_obj.clone()
+    lifted[:, 1, 3] -= 7.0
+    points = points_of(replace(ALL, max_distance_m=1.6), T_cam_obj=lifted)
+    offset = (points.points_cam - detections.T_cam_obj[points.object_index, :3, 3])[:, [0, 2]].norm(dim=-1)
+    assert 1.5 < offset.max() <= 1.6
+    assert 0 < len(points) < len(points_of())
+
+
+def test_without_a_mask_or_by_option_the_box_counts() -> None:
+    detections = measured_street()[1].detections
+    box = points_of(replace(ALL, pixels="box"))
+    # Where the map knows nothing there is no point, so the first car's box holds its own pixels and some of the other.
+    assert (box.counts >= points_of().counts).all()
+    absent = torch.tensor([True, False])
+    mixed = points_of(has_mask_left=absent)
+    assert torch.equal(mixed.counts, torch.where(absent, points_of().counts, box.counts))
+    narrow = detections.box_2d.clone()
+    narrow[:, 2] = narrow[:, 0] + 4
+    assert (points_of(replace(ALL, pixels="box"), box_2d=narrow).counts < box.counts).all()
+
+
+@pytest.mark.parametrize("unknown", [torch.nan, 0.0, -1.0, torch.inf])
+def test_pixels_without_a_disparity_give_no_point(unknown: float) -> None:
+    scene = measured_street()[1]
+    assert scene.frames.disparity is not None
+    spoiled = scene.frames.disparity.clone()
+    spoiled[:, :, ::2] = unknown
+    points = points_of(disparity=spoiled)
+    assert points.points_cam.isfinite().all()
+    assert torch.equal(points.counts, (scene.detections.mask_left[:, :, 1::2] > 0.5).flatten(1).sum(1))
+
+
+def test_of_too_many_every_nth_is_kept() -> None:
+    everything, some = points_of(), points_of(replace(ALL, max_points=100))
+    assert torch.equal(some.counts, everything.counts)
+    kept = torch.bincount(some.object_index)
+    assert (kept <= 100).all()
+    assert (kept > 50).all()
+    first = everything.points_cam[everything.object_index == 0]
+    stride = -(-len(first) // 100)
+    torch.testing.assert_close(some.points_cam[some.object_index == 0], first[::stride])
+
+
+def test_the_rigs_bias_is_taken_off() -> None:
+    scene = measured_street()[1]
+    camera, (height, width) = scene.frames.camera, scene.frames.images_left.shape[2:]
+    field = DisparityField.constant(-0.7, (width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
+    assert scene.frames.disparity is not None
+    frames = replace(
+        scene.frames,
+        disparity=scene.frames.disparity - 0.7,
+        camera=replace(camera, disparity_field=field.to(dtype=torch.float64)),
+    )
+    torch.testing.assert_close(car_points(frames, scene.detections, ALL).points_cam, points_of().points_cam)
+
+
+def test_a_car_without_a_pose_has_no_points_and_touches_no_other() -> None:
+    T_cam_obj = measured_street()[1].detections.T_cam_obj.clone()
+    T_cam_obj[0] = torch.nan
+    points, healthy = points_of(T_cam_obj=T_cam_obj), points_of()
+    assert points.counts.tolist() == [0, int(healthy.counts[1])]
+    assert torch.equal(points.points_cam, healthy.points_cam[healthy.object_index == 1])
+
+
+def test_the_points_of_some_objects() -> None:
+    points = points_of()
+    second = points.of_objects(torch.tensor([False, True]))
+    assert torch.equal(second.points_cam, points.points_cam[points.object_index == 1])
+    assert (second.object_index == 0).all()
+    nothing = points.of_objects(torch.tensor([False, False]))
+    assert len(nothing) == len(nothing.counts) == 0
+
+
+def test_frames_without_disparity_are_an_error() -> None:
+    with pytest.raises(InputError, match=r"frames\.disparity: expected a disparity map of each frame, got None"):
+        points_of(disparity=None)
+
+
+def test_a_disparity_of_another_size_or_type_is_an_error() -> None:
+    frames = measured_street()[1].frames
+    with pytest.raises(InputError, match=r"disparity: expected shape \(1, 120, 160\)"):
+        replace(frames, disparity=torch.zeros(1, 120, 161, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"disparity: expected torch\.float64 on cpu, got torch\.float32"):
+        replace(frames, disparity=torch.zeros(1, 120, 160))
