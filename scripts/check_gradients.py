@@ -25,6 +25,7 @@ import torch
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.paper_depth import PaperDepthError, paper_depth_errors
+from directshape_torch.laboratory.paper_refinement import paper_refinements
 from directshape_torch.laboratory.regimes import regimes_named
 from directshape_torch.laboratory.report import LaboratoryReport, console_table, summary, write_report
 from directshape_torch.laboratory.scenes import load_scene
@@ -33,6 +34,7 @@ from directshape_torch.laboratory.study import StudyPlan, run_study, subjects_na
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 DTYPES = ("float64", "float32")
+_REFINED_CARS = 24
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
         bench = Bench.build(scene, prior, regime, plan.num_states, plan.seed, plan.pixels_per_car)
         second += second_derivatives(bench) if args.second else []
         paper += paper_depth_errors(bench) if args.paper_depth else []
-    report = LaboratoryReport(scene.source, plan, study, second, paper)
+    refinements = paper_refinements(scene, prior, _REFINED_CARS, plan.seed) if args.paper_depth else []
+    report = LaboratoryReport(scene.source, plan, study, second, paper, refinements)
     print(console_table(study.comparisons))
     if args.out is None:
         print(summary(report))

@@ -104,9 +104,8 @@ class Bench:
         config = RefinerConfig() if config is None else config
         generator = seeded(seed, regime)
         drawn = regime.draw(scene, prior, num_states, generator)
-        sampling = replace(config.sampling, min_pixels=_CELLS_TO_CHOOSE_FROM, max_pixels=_CELLS_TO_CHOOSE_FROM)
-        if regime.pixels == "sampled":
-            sampling = replace(config.sampling, min_pixels=pixels_per_car, max_pixels=pixels_per_car)
+        cells = pixels_per_car if regime.pixels == "sampled" else _CELLS_TO_CHOOSE_FROM
+        sampling = replace(config.sampling, min_pixels=cells, max_pixels=cells, occlusion=regime.occlusion)
         observation = pack_pixels(scene.frame, drawn.detections, sampling)
         cars = CarBatch.from_scene(scene.frame, drawn.detections)
         stage_config = config.stages[regime.stage]

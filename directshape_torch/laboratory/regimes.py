@@ -41,6 +41,7 @@ class Regime:
         draw: from scene, prior, number of states and generator.
         pixels: which pixels of the cars take part.
         stage: of the settings: 1 is the fine one, 0 has a softer contour and half the image resolution.
+        occlusion: whether cars hide one another; cars that were placed each on its own must not.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Regime:
     draw: Callable[[LaboratoryScene, PCAShapePrior, int, torch.Generator], DrawnStates]
     pixels: Pixels = "sampled"
     stage: int = 1
+    occlusion: bool = False
 
 
 _GROUND_Y_M = 1.65
@@ -158,8 +160,8 @@ def _with_yaw(*yaws: float) -> Callable[..., DrawnStates]:
 REGIMES: Mapping[str, Regime] = {
     r.name: r
     for r in (
-        Regime("typical", "detections of the frame, off by 0.15 m, 2 deg, code N(0, 0.8)", _typical),
-        Regime("near_optimum", "refined states, off by 1 cm, 0.1 deg", _near_optimum),
+        Regime("typical", "detections of the frame, off by 0.15 m, 2 deg, code N(0, 0.8)", _typical, occlusion=True),
+        Regime("near_optimum", "refined states, off by 1 cm, 0.1 deg", _near_optimum, occlusion=True),
         Regime("far_80m", "80 m away", _far, stage=0),
         Regime("near_3m", "3 m away", _near),
         Regime("image_border", "cut in half by the left or right image border", _cut),

@@ -14,6 +14,7 @@ from typing import Any
 from directshape_torch.io.atomic_files import write_bytes, write_text
 from directshape_torch.laboratory.comparison import BOUNDS, PAIRS, Comparison
 from directshape_torch.laboratory.paper_depth import PaperDepthError
+from directshape_torch.laboratory.paper_refinement import PaperRefinement
 from directshape_torch.laboratory.plots import v_curves_png
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.laboratory.second_derivatives import SecondDerivativeCheck
@@ -93,6 +94,7 @@ class LaboratoryReport:
     study: StudyResult
     second: Sequence[SecondDerivativeCheck] = ()
     paper: Sequence[PaperDepthError] = ()
+    refinements: Sequence[PaperRefinement] = ()
 
     def broken_bounds(self) -> list[str]:
         """One sentence for each bound that does not hold."""
@@ -108,6 +110,7 @@ def write_report(out: Path, report: LaboratoryReport) -> None:
         "skip_rules.csv": records_csv(study.skips),
         "second_derivatives.csv": records_csv(report.second),
         "paper_depth.csv": records_csv(report.paper),
+        "paper_refinements.csv": records_csv(report.refinements),
     }
     for name, text in tables.items():
         if text:
@@ -140,6 +143,7 @@ def summary(report: LaboratoryReport) -> str:
         "What the skip rules take": _skip_table(study.skips),
         "Second derivatives": _second_table(report.second),
         "The paper's depth derivative, -1 / cos(theta), against the exact one": _paper_table(report.paper),
+        "Whole refinements with the paper's depth derivative": _refinement_table(report.refinements),
     }
     parts += [f"## {title}\n\n{table}" for title, table in sections.items() if table]
     return "\n\n".join(parts) + "\n"
@@ -223,5 +227,20 @@ def _paper_table(errors: Sequence[PaperDepthError]) -> str:
     header = [
         "what is approximated", "regime", "rays", "row error, median", "95 %", "gradient error, median",
         "step turns by (median / max)", "step moves by", "and turns the car by",
+    ]  # fmt: skip
+    return _table(header, rows)
+
+
+def _refinement_table(refinements: Sequence[PaperRefinement]) -> str:
+    rows = [
+        [r.solver, r.cars, f"{r.converged_exact} / {r.converged_paper}",
+         f"{r.iterations_exact:.1f} / {r.iterations_paper:.1f}", f"{r.cost_higher} / {r.cost_lower}",
+         f"{100 * r.apart_m_median:.2g} / {100 * r.apart_m:.2g} cm",
+         f"{r.apart_deg_median:.2g} / {r.apart_deg:.2g} deg"]
+        for r in refinements
+    ]  # fmt: skip
+    header = [
+        "solver", "cars", "converged, exact / paper", "iterations, exact / paper",
+        "final cost higher / lower with the paper's", "final poses apart by (median / max)", "and",
     ]  # fmt: skip
     return _table(header, rows)

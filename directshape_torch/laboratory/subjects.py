@@ -34,7 +34,8 @@ class Subject:
     def norm(self) -> Tensor:
         """Norm (R,) of each row, or of the vector that it belongs to."""
         own = torch.maximum(self.analytic.norm(dim=1), self.autograd.norm(dim=1))
-        return own.reshape(-1, self.block).norm(dim=1).repeat_interleave(self.block)
+        of_vector: Tensor = own.reshape(-1, self.block).norm(dim=1)
+        return of_vector.repeat_interleave(self.block)
 
 
 @dataclass(frozen=True)
