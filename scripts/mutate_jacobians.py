@@ -44,7 +44,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     excluded = Counter(reason_for(mutant) for _, mutant in everything if reason_for(mutant) is not None)
     if options.sample is not None:
         mutants = random.Random(options.seed).sample(mutants, min(options.sample, len(mutants)))
-    with tqdm(total=len(mutants), unit="mutant", file=sys.stderr, disable=None) as bar:
+    # In a log file a line every half minute is enough.
+    interval_s = 0.1 if sys.stderr.isatty() else 30.0
+    with tqdm(
+        total=len(mutants), unit="mutant", file=sys.stderr, mininterval=interval_s, maxinterval=interval_s
+    ) as bar:
 
         def finished(outcome: Outcome) -> None:
             if outcome.verdict == "survived":

@@ -31,6 +31,7 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("_by_rotation", "zeros[..., :3]", "(-zeros[..., :3])", _OF_ZERO),
     Equivalent("_by_rotation", "zeros[..., 3:]", "(-zeros[..., 3:])", _OF_ZERO),
+    Equivalent("dimensions_prior", "no_twist", "(-no_twist)", _OF_ZERO),
     Equivalent("_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     Equivalent(
         "_quaternion",

@@ -83,7 +83,7 @@ class MutationRunner:
             chunks += [(target, own[i : i + _CHUNK]) for i in range(0, len(own), _CHUNK)]
         with ThreadPoolExecutor(self.processes) as pool:
             try:
-                done = pool.map(lambda chunk: self._run_chunk(*chunk, tests_of[chunk[0]], finished), chunks)
+                done = pool.map(lambda chunk: self._run_chunk(chunk[0], chunk[1], tests_of[chunk[0]], finished), chunks)
                 return [outcome for outcomes in done for outcome in outcomes]
             except UnmutatedFailureError:
                 pool.shutdown(cancel_futures=True)

@@ -91,6 +91,11 @@ TARGETS: dict[str, Target] = {
         ("surface_slope", "depth_state_jacobian", "photometric_residual"),
         ("tests/residuals/test_photometric.py",),
     ),
+    "point_cloud": Target(
+        "directshape_torch/residuals/point_cloud.py",
+        ("points_in_object", "point_cloud_distance", "point_cloud_residual"),
+        ("tests/residuals/test_point_cloud.py",),
+    ),
     "priors": Target(
         "directshape_torch/residuals/priors.py",
         ("shape_prior", "height_prior", "tilt_prior_normal", "tilt_prior_cosine", "_by_rotation", "dimensions_prior"),
@@ -140,6 +145,16 @@ TARGETS: dict[str, Target] = {
             )
         ),
         (*_ROWS, "tests/energy/test_photometric_sums.py", "tests/energy/test_constant_sets.py"),
+    ),
+    "point_cloud_term": Target(
+        "directshape_torch/energy/point_cloud_term.py",
+        ("PointCloudTerm.cost", "PointCloudTerm.accumulate", "PointCloudTerm._weight"),
+        ("tests/energy/test_point_cloud_term.py",),
+    ),
+    "held_unknowns": Target(
+        "directshape_torch/energy/car_problem.py",
+        ("CarProblem._moving", "CarProblem._without_held"),
+        ("tests/energy/test_point_cloud_term.py",),
     ),
     "prior_terms": Target(
         "directshape_torch/energy/prior_terms.py",
