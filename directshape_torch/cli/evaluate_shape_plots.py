@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.evaluation.comparison_summary import MetricSummary
-from directshape_torch.evaluation.shape_error_cars import ShapeScores
 from directshape_torch.evaluation.shape_error_report import TITLES
+from directshape_torch.evaluation.shape_error_scores import ShapeScores
 from directshape_torch.evaluation.shape_error_summary import ShapeCurve
 from directshape_torch.visualize.shape_curves import TauCurve, TauPanel, write_tau_plot
 
@@ -21,7 +21,7 @@ def write_plots(folder: Path, scores: ShapeScores) -> None:
         MissingDependencyError: matplotlib is not installed.
     """
     for surface in scores.surfaces:
-        title = f"{surface.surface}: {surface.num_rows} labels, {surface.num_cars} cars"
+        title = f"{surface.surface}: n = {surface.num_rows}, cars = {surface.num_cars}"
         title += " (bands: 95 %, over cars)" if surface.num_cars > 1 else ""
         write_tau_plot(folder / f"shape_{surface.surface}.png", [_panel(curve) for curve in surface.curves], title)
 

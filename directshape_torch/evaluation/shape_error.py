@@ -66,10 +66,11 @@ def shape_error(
     """Compare two sets of points of one car (paper, section IV.B).
 
     The paper: "we measure completeness (% of ground-truth (GT) points with at least one estimated point within a
-    certain distance tau), accuracy (% of estimated points with at least one GT point within tau) and F1 score (2 completeness
-    accuracy / (completeness + accuracy)) for the GT segments [..]. To more precisely measure the accuracy, we
-    additionally compute the RMSE: For each GT point, we search within tau and compute the distance to the closest
-    estimate point. The RMSE is only computed for those GT points with matched estimated points."
+    certain distance tau), accuracy (% of estimated points with at least one GT point within tau) and F1 score
+    (2 completeness accuracy / (completeness + accuracy)) for the GT segments in the KITTI Stereo 2015 benchmark. To
+    more precisely measure the accuracy, we additionally compute the RMSE: For each GT point, we search within tau and
+    compute the distance to the closest estimate point. The RMSE is only computed for those GT points with matched
+    estimated points."
 
     It leaves open, and here it is: "within" is at most tau; distances are Euclidean, in 3D; without any match F1 is 0
     and RMSE undefined; what the points of a surface are, and how cars are averaged, is for the caller (see

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, get_args
+from typing import Protocol, get_args
 
 import torch
 
@@ -15,6 +15,7 @@ from directshape_torch.evaluation.comparison_summary import BootstrapSettings
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.shape_error import ShapeError
 from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
+from directshape_torch.evaluation.shape_error_scores import EvaluatedCar, ShapeScores, TruthKind
 from directshape_torch.evaluation.shape_error_segment import FOLDER, SegmentSource
 from directshape_torch.evaluation.shape_error_summary import SurfaceSummary, summarise_surface
 from directshape_torch.evaluation.shape_error_surface import SurfaceSource
@@ -26,8 +27,6 @@ from directshape_torch.io.result_files import ShapeArrays, read_shapes
 from directshape_torch.io.text_files import read_lines
 from directshape_torch.scene import StereoCamera
 from directshape_torch.shape.shape_prior import ShapePrior
-
-TruthKind = Literal["disparity", "points"]
 
 
 class Truth(Protocol):
@@ -51,59 +50,6 @@ class TruthSource(Protocol):
     def frame_ids(self) -> tuple[str, ...]: ...
 
     def truths(self, frame_id: str, labels: Sequence[KittiObject], camera: StereoCamera) -> Mapping[int, Truth]: ...
-
-
-@dataclass(frozen=True)
-class EvaluatedCar:
-    """One label with a detection and a true surface.
-
-    Attributes:
-        frame_id: the frame.
-        detection_line, label_line: lines of their files, from 1.
-        car: name of the physical car, or of the label where it is not known.
-        status: how the refinement of the car ended.
-        depth_m: of the label's box along the optical axis, metres.
-        segment: which pixels of the left image are the car's.
-        before: errors of the mean shape at the pose of the detection, by the name of the surface.
-        after: errors of the refined shape.
-        sampling_limit: what points alone would leave to a perfect estimate.
-    """
-
-    frame_id: str
-    detection_line: int
-    label_line: int
-    car: str
-    status: str
-    depth_m: float
-    segment: str
-    before: dict[str, ShapeError]
-    after: dict[str, ShapeError]
-    sampling_limit: dict[str, ShapeError]
-
-
-@dataclass(frozen=True)
-class ShapeScores:
-    """Everything `evaluate_shapes` finds.
-
-    Attributes:
-        truth: kind of ground truth.
-        cars: in the order of frames and detection lines.
-        surfaces: figures for each kind of surface.
-        num_frames: frames evaluated.
-        num_labels_counted: labels that count in these frames.
-        num_without_truth: of these, labels without a true surface: no mask, no disparity in it, or no points.
-        num_without_detection: of the others, labels that no detection was refined for.
-        tracks_known: whether physical cars are known; else every label is taken for a car of its own.
-    """
-
-    truth: TruthKind
-    cars: tuple[EvaluatedCar, ...]
-    surfaces: tuple[SurfaceSummary, ...]
-    num_frames: int
-    num_labels_counted: int
-    num_without_truth: int
-    num_without_detection: int
-    tracks_known: bool
 
 
 def evaluate_shapes(

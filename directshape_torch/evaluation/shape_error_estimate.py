@@ -17,8 +17,6 @@ from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
 
 _SAMPLES_PER_RAY = 96
-# A sampled point lies on a triangle, up to some millimetres off the surface that a ray meets; along grazing rays more.
-_SELF_OCCLUSION_MARGIN_M = 0.03
 
 
 @dataclass(frozen=True)
@@ -47,26 +45,25 @@ class EstimatedCar:
         mesh = sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, self.T_cam_obj)
         return np.asarray(sample_surface(mesh, count, seed=seed)[0], dtype=np.float64)
 
+    def depth_at_pixels(
+        self,
+        uv_left: NDArray[np.float64],  # (P, 2)
+        K_left: Tensor,  # (3, 3)
+    ) -> NDArray[np.float64]:  # (P,)
+        """Depth along the optical axis where the rays of left pixels first meet the surface, NaN where they miss it."""
+        root = self._first_surface(rays_from_pixels(torch.from_numpy(uv_left), K_left.double()))
+        return np.where(root.found.numpy(), root.depth.double().numpy(), np.nan)
+
     def points_at_pixels(
         self,
         uv_left: NDArray[np.float64],  # (P, 2)
         K_left: Tensor,  # (3, 3)
     ) -> Points:
-        """Where the rays of left pixels first meet the surface, (Q, 3) in camera coordinates; rays that miss are left
-        out."""
-        rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double())
-        root = self._first_surface(rays_cam)
-        return np.asarray((root.depth.double()[:, None] * rays_cam)[root.found].numpy())
-
-    def is_turned_to_camera(
-        self,
-        points_cam: Points,  # (N, 3) on the surface, in front of the camera
-    ) -> NDArray[np.bool_]:  # (N,)
-        """Whether no other part of the same car hides a point of its surface from the left camera."""
-        points = torch.from_numpy(points_cam)
-        root = self._first_surface(points / points[:, 2:])
-        hidden = root.found & (root.depth.double() < points[:, 2] - _SELF_OCCLUSION_MARGIN_M)
-        return np.asarray(~hidden.numpy())
+        """The points of these depths, (Q, 3) in camera coordinates; rays that miss are left out."""
+        depth = self.depth_at_pixels(uv_left, K_left)
+        rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double()).numpy()
+        hit = np.isfinite(depth)
+        return np.asarray(depth[hit, None] * rays_cam[hit])
 
     def _first_surface(self, rays_cam: Tensor) -> Root:
         """Depths of the first hits of rays (P, 3) of unit depth from the camera's centre."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from directshape_torch.evaluation.bootstrap import Estimate
 from directshape_torch.evaluation.shape_error import TAUS_M
-from directshape_torch.evaluation.shape_error_cars import EvaluatedCar, ShapeScores
+from directshape_torch.evaluation.shape_error_scores import EvaluatedCar, ShapeScores
 from directshape_torch.evaluation.shape_error_summary import METRICS, ShapeCurve, SurfaceSummary
 from directshape_torch.io import atomic_files
 
@@ -123,7 +123,8 @@ def _few(scores: ShapeScores, most: int = 8) -> Sequence[EvaluatedCar]:
 
 def _surface_heading(surface: SurfaceSummary) -> str:
     name = f"{surface.surface.upper()}: {SURFACES[surface.surface]}"
-    return f"{name}\n{surface.num_rows} labels, {surface.num_cars} cars, {surface.mean_num_true:.0f} true points each"
+    counts = f"n = {surface.num_rows}, cars = {surface.num_cars}, mean {surface.mean_num_true:.0f} true points"
+    return f"{name}\n{counts}"
 
 
 def _curve_table(curve: ShapeCurve) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -43,7 +44,7 @@ class SceneDepth:
     K_left: NDArray[np.float64]
 
     def shows(self, points_cam: Points, own: int) -> NDArray[np.bool_]:
-        """Which points (N, 3) of the true surface of an instance are seen.
+        """Which points (N, 3) on the surface of an instance are seen.
 
         The depth of a slanted surface changes within a pixel, so a point may lie as deep as the deepest of its own car
         in the 3 x 3 pixels around it.
@@ -57,15 +58,30 @@ class SceneDepth:
         belongs = self.instance[row, column] == own
         return np.asarray(in_image & belongs & (points_cam[:, 2] <= deepest + _DEPTH_MARGIN_M))
 
-    def hides(self, points_cam: Points, own: int) -> NDArray[np.bool_]:
-        """Which points (N, 3) of an estimated surface lie outside the image or behind another instance.
+    def with_estimate(self, car: EstimatedCar, points_cam: Points, own: int) -> SceneDepth:
+        """The image that would show an estimate in place of the true car: the other cars hide what is behind them.
 
-        Points before or behind the background are not hidden: there the estimate shows what is not there.
+        Estimate and truth are then asked in the same way which of their points are seen, pixel by pixel, so that a
+        perfect estimate loses the same points at its outline. Before and behind the background it is seen: there it
+        shows what is not there.
+
+        Args:
+            car: the estimate.
+            points_cam: (N, 3) points all over its surface, which say where in the image it may be.
+            own: number of the instance.
         """
-        column, row, in_image = self._pixels(points_cam)
-        instance, depth = self.instance[row, column], self.depth_m[row, column]
-        other = (instance >= _INSTANCES_FROM) & (instance != own)
-        return np.asarray(~in_image | (other & (depth < points_cam[:, 2])))
+        column, row, _ = self._pixels(points_cam)
+        rows = slice(max(0, row.min() - 1), row.max() + 2)
+        columns = slice(max(0, column.min() - 1), column.max() + 2)
+        v, u = np.mgrid[: self.depth_m.shape[0], : self.depth_m.shape[1]][:, rows, columns]
+        uv = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
+        depth, instance = self.depth_m.copy(), np.where(self.instance == own, 0, self.instance)
+        car_depth = car.depth_at_pixels(uv, torch.from_numpy(self.K_left)).reshape(u.shape)
+        is_hidden = (instance[rows, columns] >= _INSTANCES_FROM) & (depth[rows, columns] < car_depth)
+        shown = np.isfinite(car_depth) & ~is_hidden
+        depth[rows, columns][shown] = car_depth[shown]
+        instance[rows, columns][shown] = own
+        return SceneDepth(depth, instance, self.K_left)
 
     def _pixels(self, points_cam: Points) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
         in_front = points_cam[:, 2] > 0
@@ -114,7 +130,7 @@ class SurfaceTruth:
         return errors
 
     def _seen(self, car: EstimatedCar, points_cam: Points) -> NDArray[np.bool_]:
-        return car.is_turned_to_camera(points_cam) & ~self.scene.hides(points_cam, self.own)
+        return self.scene.with_estimate(car, points_cam, self.own).shows(points_cam, self.own)
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,10 @@ class TauCurve:
 
 @dataclass(frozen=True)
 class TauPanel:
-    """One panel: what its y axis shows, where that ends (None: where the lines do), and its lines."""
+    """One panel: what its y axis shows, where that ends (None: where the lines do), and its lines.
+
+    All panels of a picture have lines of the same names.
+    """
 
     y_label: str
     y_max: float | None
@@ -69,11 +72,14 @@ def write_tau_plot(path: Path | str, panels: Sequence[TauPanel], title: str) -> 
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingDependencyError("matplotlib", "plot", "plotting shape errors") from error
-    figure = Figure(figsize=(_PANEL_INCHES * len(panels), _PANEL_INCHES + 0.3), layout="constrained")
+    figure = Figure(figsize=(_PANEL_INCHES * len(panels), _PANEL_INCHES + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         _draw(axes, panel)
+    handles, names = axes.get_legend_handles_labels()
+    # Below the panels: the curves leave no corner of a panel free in all cases.
+    figure.legend(handles, names, loc="outside lower center", ncols=max(1, len(names)))
     content = io.BytesIO()
     # Without the software's version, so that equal curves give equal bytes.
     figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
@@ -90,4 +96,3 @@ def _draw(axes: Any, panel: TauPanel) -> None:
     axes.set_xlim(left=0)
     axes.set_ylim(0, panel.y_max)
     axes.grid(alpha=0.3)
-    axes.legend(loc="best")

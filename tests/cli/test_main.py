@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,8 +18,8 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         program.main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    for command in ("refine", "demo", "compare", "build-prior", "calibrate-stereo"):
-        assert f"\n    {command}" in text
+    for command in ("refine", "demo", "compare", "evaluate", "evaluate-shape", "build-prior", "calibrate-stereo"):
+        assert re.search(rf"^ {{4}}{command}\s", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize("arguments", [[], ["refin"], ["refine"], ["compare", "--labels", "x"]])

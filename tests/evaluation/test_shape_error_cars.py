@@ -1,0 +1,290 @@
+"""Shapes of a whole refinement against true surfaces: a tiny street whose truth is known, and a real frame."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers.kitti_folder import CODE, write_data_set
+from helpers.synthetic_scene import TWO_CARS, stereo_camera
+
+from directshape_torch.cli.main import main
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+from directshape_torch.evaluation.matching import CountedLabels
+from directshape_torch.evaluation.shape_error_cars import evaluate_shapes
+from directshape_torch.evaluation.shape_error_scores import ShapeScores
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.io.atomic_files import write_png
+from directshape_torch.io.instance_masks import FrameJsonMasks
+from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
+from directshape_torch.io.kitti_labels import poses_cam, read_objects
+from directshape_torch.io.result_files import read_shapes, write_shapes
+from directshape_torch.shape.load_prior import load_prior
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.stereo_matching.points import disparity_of_depth
+
+FRAMES = ("000000", "000001")
+# The second car is 18 px high.
+BOTH = CountedLabels(minimum_height_px=10.0)
+FEW = BootstrapSettings(num_draws=200)
+T_CAM_OBJ = pose_from_kitti(torch.tensor(TWO_CARS[0], dtype=torch.float64), torch.tensor(TWO_CARS[1]).double())
+
+
+def surface_depth(prior: PCAShapePrior, car: int, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Depths at pixels of a car by a search in steps of 4 mm, with nothing of the library's ray casting."""
+    camera = stereo_camera(160, 120, 150.0)
+    rays = rays_from_pixels(torch.from_numpy(np.stack([u, v], -1)).double(), camera.K_left[0])
+    T_obj_cam = torch.linalg.inv(T_CAM_OBJ[car])
+    depths = torch.arange(float(T_CAM_OBJ[car, 2, 3]) - 3, float(T_CAM_OBJ[car, 2, 3]) + 3, 0.004, dtype=torch.float64)
+    points = depths[None, :, None] * rays[:, None]
+    points_obj = points @ T_obj_cam[:3, :3].T + T_obj_cam[:3, 3]
+    flat = points_obj.reshape(-1, 3)
+    shape = prior.bind(torch.tensor(CODE, dtype=torch.float64))
+    inside = shape.value(flat, torch.full((len(flat),), car)).view(len(u), -1) < 0
+    return depths[inside.to(torch.uint8).argmax(dim=1)].numpy() - 0.002
+
+
+def write_truth(root: Path, prior: PCAShapePrior) -> None:
+    """The ground truth of both kinds; the cars are the same in every frame."""
+    masks = FrameJsonMasks(root / "masks").read(FRAMES[0], (120, 160))
+    left = [np.asarray(mask.probability) > 0.5 for mask in masks if mask.side == "left"]
+    depth, instance = np.full((120, 160), 100.0), np.zeros((120, 160), dtype=np.uint16)
+    for car, inside in enumerate(left):
+        v, u = np.nonzero(inside)
+        depth[v, u], instance[v, u] = surface_depth(prior, car, v, u), 1001 + car
+    camera = stereo_camera(160, 120, 150.0)
+    v, u = np.nonzero(instance)
+    uv, calibration = torch.from_numpy(np.stack([u, v], -1)).double(), (camera.K_left[0], camera.K_right[0])
+    disparity = np.zeros((120, 160))
+    disparity[v, u] = disparity_of_depth(uv, torch.from_numpy(depth[v, u]), *calibration, camera.T_right_cam[0])[:, 0]
+    values = prior.values(torch.tensor(CODE, dtype=torch.float64))
+    for frame_id in FRAMES:
+        training = root / "training"
+        write_png(training / "disp_occ_0" / f"{frame_id}.png", np.rint(256 * disparity).astype(np.uint16))
+        write_png(training / "depth_2" / f"{frame_id}.png", np.rint(256 * depth).astype(np.uint16))
+        write_png(training / "instance_2" / f"{frame_id}.png", instance)
+        (training / "points").mkdir(exist_ok=True)
+        for car in range(2):
+            mesh = sdf_to_mesh(values[car], prior.origin, prior.spacing_m, T_CAM_OBJ[car])
+            # Area-uniform, in the frame of the labels.
+            corners = mesh.triangles
+            area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+            # Not the seeds of the estimate's points: equal streams would pick equal triangles.
+            rng = np.random.default_rng(100 + car)
+            chosen = corners[rng.choice(len(area), size=4000, p=area / area.sum())]
+            weights = rng.dirichlet([1.0, 1.0, 1.0], size=4000)
+            points = (weights[:, :, None] * chosen).sum(axis=1) - camera.t_cam_ref[0].numpy()
+            np.savez(training / "points" / f"{frame_id}_{car + 1}.npz", points=points.astype(np.float32))
+
+
+def write_perfect(source: Path, target: Path) -> None:
+    """The shape files of `source` with the true poses and codes."""
+    for frame_id in FRAMES:
+        shapes = read_shapes(source / "shapes" / f"{frame_id}.npz")
+        perfect = dataclasses.replace(shapes, codes=np.array(CODE), T_cam_obj=T_CAM_OBJ.numpy())
+        write_shapes(target / "shapes" / f"{frame_id}.npz", perfect)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set, `refined` (one step of a refinement) and `perfect`."""
+    root = tmp_path_factory.mktemp("kitti")
+    prior = write_data_set(root, FRAMES)
+    write_truth(root, prior)
+    words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks"]
+    words += ["--out", root / "refined", "--prior", root / "prior.npz", "--device", "cpu"]
+    assert main([*map(str, words), "--set", "stages=[{max_iterations: 1}]"]) == 0
+    write_perfect(root / "refined", root / "perfect")
+    return root
+
+
+def evaluate(root: Path, refined: str = "perfect", truth: str = "disparity", **options: Any) -> ShapeScores:
+    settings: dict[str, Any] = {"counted": BOTH, "bootstrap": FEW, "masks": root / "masks", "truth": truth} | options
+    prior = load_prior(root / "prior.npz")
+    return evaluate_shapes(root, root / "detections", root / refined, prior, **settings)
+
+
+def command(root: Path, refined: Path, *extra: str) -> list[str]:
+    words = ["evaluate-shape", "--data", root, "--detections", root / "detections", "--refined", refined]
+    return [*map(str, words), "--prior", str(root / "prior.npz"), "--draws", "200", *extra]
+
+
+def test_the_truth_itself_is_perfect_on_segments(root: Path) -> None:
+    scores = evaluate(root)
+    assert (scores.num_frames, scores.num_labels_counted) == (2, 4)
+    assert (scores.num_without_truth, scores.num_without_detection, len(scores.cars)) == (0, 0, 4)
+    assert [(car.frame_id, car.detection_line, car.label_line) for car in scores.cars] == [
+        (frame_id, line, label) for frame_id in FRAMES for line, label in ((1, 1), (3, 2))
+    ]
+    (surface,) = scores.surfaces
+    assert (surface.surface, surface.num_rows, surface.num_cars) == ("segment", 4, 4)
+    for car in scores.cars:
+        error = car.after["segment"]
+        # Disparities are rounded to 1/256 px, up to 4 mm at 12.5 m.
+        assert error.completeness[0] > 0.99
+        assert error.accuracy[0] > 0.99
+        assert error.rmse_m[0] < 0.01
+        assert car.before["segment"].completeness[0] < 0.9
+        assert car.sampling_limit == {}
+
+
+def test_the_truth_itself_is_perfect_on_surfaces_up_to_sampling(root: Path) -> None:
+    scores = evaluate(root, truth="points")
+    assert {surface.surface for surface in scores.surfaces} == {"whole", "visible"}
+    for car in scores.cars:
+        assert car.segment == f"instance {1000 + car.label_line}"
+        assert car.after["whole"].num_true == 4000
+        assert 800 < car.after["visible"].num_true < 2400
+        for name, error in car.after.items():
+            limit = car.sampling_limit[name]
+            assert error.completeness == pytest.approx(limit.completeness, abs=0.04)
+            assert error.accuracy == pytest.approx(limit.accuracy, abs=0.04)
+            assert error.f1[3] > 0.99
+            assert car.before[name].f1[1] < error.f1[1]
+
+
+def test_a_car_moved_by_a_known_amount(root: Path, tmp_path: Path) -> None:
+    """0.3 m along the optical axis: the point of a ray moves by 0.3 m / (share of the ray's slant), so hardly any
+    distance to the moved surface exceeds 0.3 m, and none falls below what the surface's slant allows."""
+    for frame_id in FRAMES:
+        shapes = read_shapes(root / "perfect" / "shapes" / f"{frame_id}.npz")
+        moved = shapes.T_cam_obj.copy()
+        moved[:, 2, 3] += 0.3
+        write_shapes(tmp_path / "shapes" / f"{frame_id}.npz", dataclasses.replace(shapes, T_cam_obj=moved))
+    for car in evaluate(root, refined=str(tmp_path)).cars:
+        error = car.after["segment"]
+        assert error.completeness[5] > 0.9  # tau 0.3 m
+        assert error.completeness[0] < 0.25  # tau 0.05 m
+        assert 0.15 < error.rmse_m[9] < 0.3
+
+
+def test_without_detection_and_without_truth_are_counted(root: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(root, tmp_path / "kitti"))
+    (copy / "training" / "points" / "000001_1.npz").unlink()
+    lines = (copy / "detections" / "data" / "000000.txt").read_text().splitlines()
+    elsewhere = re.sub(r"^(Car \S+ \S+ \S+) \S+ \S+ \S+ \S+", r"\1 0 0 5 5", lines[2])
+    (copy / "detections" / "data" / "000000.txt").write_text("\n".join([*lines[:2], elsewhere]) + "\n")
+    scores = evaluate(copy, truth="points")
+    assert (scores.num_labels_counted, scores.num_without_truth, scores.num_without_detection) == (4, 1, 1)
+    assert [(car.frame_id, car.label_line) for car in scores.cars] == [("000000", 1), ("000001", 2)]
+
+
+def test_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = ["--json", str(tmp_path / "s.json"), "--csv", str(tmp_path / "s.csv"), "--plots", str(tmp_path / "plots")]
+    extra = ["--truth", "disparity", "--masks", str(root / "masks"), *files]
+    assert main(command(root, root / "perfect", *extra)) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("2 of 2 counted labels in 2 frames, 2 cars (each label counts as a car of its own)")
+    assert "segments are the given masks, not an object map: 000000 left mask 0, 000001 left mask 0" in text
+    assert "95 % intervals, bootstrap over cars" in text
+    assert re.search(r"\ntau 0.05 m  2  .*  100.0 % \[100.0, 100.0\]", text)
+    content = json.loads((tmp_path / "s.json").read_text())
+    assert (content["schema_version"], content["truth"]) == (1, "disparity")
+    (surface,) = content["surfaces"]
+    assert [curve["metric"] for curve in surface["curves"]] == ["completeness", "accuracy", "f1", "rmse_m"]
+    for curve in surface["curves"]:
+        assert len(curve["taus_m"]) == len(curve["summaries"]) == len(curve["num_rows"]) == 20
+    with (tmp_path / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 2 * 20
+    assert rows[0]["surface"] == "segment"
+    assert float(rows[0]["completeness_after"]) > 0.99
+    picture = cv2.imread(str(tmp_path / "plots" / "shape_segment.png"))
+    assert picture.shape[1] > 1000
+    assert picture.std() > 5
+
+
+def test_the_documented_format_is_the_one_written(root: Path, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "file_formats.md").read_text(encoding="utf-8")
+    documented = text[text.index("## Shape scores (`evaluate-shape") :]
+    files = ["--json", str(tmp_path / "s.json"), "--csv", str(tmp_path / "s.csv")]
+    assert main(command(root, root / "perfect", "--truth", "points", *files)) == 0
+    content = json.loads((tmp_path / "s.json").read_text())
+    for part in (content, content["surfaces"][0], content["surfaces"][0]["curves"][0]):
+        for name in part:
+            assert f'"{name}":' in documented
+    for name in (tmp_path / "s.csv").read_text().splitlines()[0].split(","):
+        assert f"`{re.sub('_(before|after)$', '', name)}`" in documented
+
+
+def test_errors_name_what_is_wrong(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def fails(refined: Path, *extra: str) -> str:
+        assert main(command(root, refined, *extra)) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("\n") == 1
+        return captured.err
+
+    masks = ("--masks", str(root / "masks"))
+    assert "masks: expected masks of the left images" in fails(root / "perfect", "--truth", "disparity")
+    assert "has no shapes/NNNNNN.npz" in fails(tmp_path, "--truth", "points")
+    assert "frames: expected frames with ground truth, got 000009" in fails(
+        root / "perfect", "--truth", "points", "--frames", "000009"
+    )
+    assert "000000.npz: cannot be read" in fails(tmp_path, "--truth", "points", "--frames", "000000")
+    (tmp_path / "shapes").mkdir()
+    (tmp_path / "shapes" / "000000.npz").write_bytes(b"no archive")
+    assert "000000.npz: is no readable npz file" in fails(tmp_path, "--truth", "disparity", *masks)
+    assert "holds codes of another shape prior" in fails(root / "perfect", "--truth", "points", "--prior", "pca")
+    assert "is not a folder of masks" in fails(
+        root / "perfect", "--truth", "disparity", "--masks", str(tmp_path / "no")
+    )
+    empty = tmp_path / "empty"
+    (empty / "training").mkdir(parents=True)
+    assert "training/points: is no folder of ground truth" in fails(
+        root / "perfect", "--truth", "points", "--data", str(empty)
+    )
+    assert "holds no folder 'training'" in fails(root / "perfect", "--truth", "points", "--data", str(tmp_path / "no"))
+
+
+def test_library_errors(root: Path) -> None:
+    with pytest.raises(InputError, match="truth: expected one of disparity, points, got 'lidar'"):
+        evaluate(root, truth="lidar")
+    with pytest.raises(InputError, match="frames or split, got both"):
+        evaluate(root, frames=["000000"], split="x")
+    with pytest.raises(InputError, match="a counted label with a detection and a true surface, got none in 2 frames"):
+        evaluate(root, counted=CountedLabels(types=("Van",)))
+
+
+def test_detections_of_another_run_are_named(root: Path, tmp_path: Path) -> None:
+    for frame_id in FRAMES:
+        first = (root / "detections" / "data" / f"{frame_id}.txt").read_text().splitlines()[0]
+        (tmp_path / f"{frame_id}.txt").write_text(first + "\n")
+    prior = load_prior(root / "prior.npz")
+    with pytest.raises(DataFormatError, match="names line 3 of a detection file that has 1 lines"):
+        evaluate_shapes(root, tmp_path, root / "perfect", prior, truth="points", counted=BOTH)
+
+
+@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: frame 007322 needed")
+def test_the_label_of_a_real_frame_beats_a_noisy_detection(tmp_path: Path) -> None:
+    """A shape file with the label's pose and the mean shape: KITTI's truth must agree with KITTI's label."""
+    data = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
+    detections = data / "detections" / "noisy_stereo"
+    words = ["refine", "--data", data, "--detections", detections, "--masks", data / "training" / "masks"]
+    words += ["--frames", "007322", "--out", tmp_path, "--device", "cpu", "--threads", "1"]
+    assert main([*map(str, words), "--set", "stages=[{max_iterations: 1}]"]) == 0
+    path = tmp_path / "shapes" / "007322.npz"
+    shapes = read_shapes(path)
+    camera = to_stereo_camera([read_calibration(data / "training" / "calib" / "007322.txt")], dtype=torch.float64)
+    labels = read_objects(data / "training" / "label_2" / "007322.txt")[:1]
+    T_label = poses_cam(labels, camera.t_cam_ref[0]).numpy()
+    write_shapes(path, dataclasses.replace(shapes, T_cam_obj=T_label, codes=np.zeros_like(shapes.codes)))
+    masks = data / "training" / "masks"
+    scores = evaluate_shapes(data, detections, tmp_path, load_prior("pca"), truth="disparity", masks=masks)
+    (car,) = scores.cars
+    assert car.after["segment"].num_true == 13563
+    assert car.after["segment"].f1[3] > 0.8
+    assert car.before["segment"].f1[3] < 0.3
