@@ -140,7 +140,9 @@ def test_a_stage_holds_the_unknowns_that_it_does_not_move() -> None:
     assert [stage.unknowns for stage in joint.stages()] == ["both"]
     torch.testing.assert_close(of_pose, torch.cat([full.gradient[:, :6], 0 * full.gradient[:, 6:]], dim=1))
     torch.testing.assert_close(of_shape, torch.cat([0 * full.gradient[:, :6], full.gradient[:, 6:]], dim=1))
-    hessian = pose.linearise(state).hessian
+    at = pose.linearise(state)
+    hessian = at.hessian
+    torch.testing.assert_close(at.cost, full.cost)
     torch.testing.assert_close(hessian[:, :6, :6], full.hessian[:, :6, :6])
     assert (hessian[:, 6:, :6] == 0).all()
     assert pose.free_unknowns(state)[0].tolist() == [True] * 6 + [False] * 3
