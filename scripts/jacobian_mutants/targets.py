@@ -91,11 +91,6 @@ TARGETS: dict[str, Target] = {
         ("surface_slope", "depth_state_jacobian", "photometric_residual"),
         ("tests/residuals/test_photometric.py",),
     ),
-    "point_cloud": Target(
-        "directshape_torch/residuals/point_cloud.py",
-        ("points_in_object", "point_cloud_distance", "point_cloud_residual"),
-        ("tests/residuals/test_point_cloud.py",),
-    ),
     "priors": Target(
         "directshape_torch/residuals/priors.py",
         ("shape_prior", "height_prior", "tilt_prior_normal", "tilt_prior_cosine", "_by_rotation", "dimensions_prior"),
