@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
         pixels_per_car=args.pixels,
     )
-    scene = load_scene(args.data, args.frame)
+    scene = load_scene(args.data, args.frame, args.detections, args.masks)
     prior = (PCAShapePrior.load_bundled() if args.prior is None else PCAShapePrior.load(args.prior)).double()
     study = run_study(scene, prior, plan, report=lambda line: print(line, file=sys.stderr))
     second: list[SecondDerivativeCheck] = []
@@ -86,6 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--dtype", nargs="+", choices=DTYPES, default=list(DTYPES), help="default both")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="KITTI's layout; default the bundled demo frame")
     parser.add_argument("--frame", metavar="ID", help="frame of --data; default the one with most masked cars")
+    parser.add_argument("--detections", type=Path, metavar="DIR", help="default the first folder in ROOT/detections")
+    parser.add_argument("--masks", type=Path, metavar="DIR", help="default ROOT/training/masks")
     parser.add_argument("--prior", type=Path, metavar="FILE", help="default the bundled shape prior")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pixels", type=int, default=64, metavar="N", help="pixels per car and side (default 64)")

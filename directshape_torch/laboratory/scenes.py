@@ -20,9 +20,9 @@ from directshape_torch.shape.raycast import ObjectRays, march
 
 DEMO_FOLDER = Path(__file__).parents[1] / "assets" / "demo"
 
-_MASK_SAMPLES_PER_RAY = 32
+_MASK_SAMPLES_PER_RAY = 24
 # Masks of near cars are drawn on a coarser lattice: the laboratory needs a plausible contour, not every pixel of it.
-_MASK_ROWS = 80
+_MASK_ROWS = 30
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,19 @@ class LaboratoryScene:
     source: str
 
 
-def load_scene(data: Path | None = None, frame_id: str | None = None) -> LaboratoryScene:
-    """The bundled demo frame, or a frame of a data set in KITTI's layout (with `detections` and masks beside it).
+def load_scene(
+    data: Path | None = None,
+    frame_id: str | None = None,
+    detections_dir: Path | None = None,
+    masks: Path | None = None,
+) -> LaboratoryScene:
+    """The bundled demo frame, or a frame of a data set in KITTI's layout.
 
     Args:
-        data: folder that holds `training/`, with masks in `training/masks` and results in `detections/<name>`; None
-            for the bundled frame.
+        data: folder that holds `training/`; None for the bundled frame.
         frame_id: default the frame with most cars that have masks in both images.
+        detections_dir: default the first folder in `detections` of the data set.
+        masks: default `training/masks` of the data set.
 
     Raises:
         DataFormatError: a folder is missing or damaged.
@@ -51,7 +57,8 @@ def load_scene(data: Path | None = None, frame_id: str | None = None) -> Laborat
         torch.float64
     """
     root = DEMO_FOLDER if data is None else data
-    dataset = KittiStereoDataset(root, _detections_folder(root), root / "training" / "masks", dtype=torch.float64)
+    detections_dir = detections_dir or _detections_folder(root)
+    dataset = KittiStereoDataset(root, detections_dir, masks or root / "training" / "masks", dtype=torch.float64)
     frames = dataset.frame_ids if frame_id is None else (frame_id,)
     best, most = None, 0
     for name in frames:

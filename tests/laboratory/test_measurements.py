@@ -17,9 +17,12 @@ from directshape_torch.laboratory.paper_depth import (
     row_factors,
     scaled_linearisation,
 )
+from directshape_torch.laboratory.paper_refinement import paper_refinements
+from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.laboratory.single_precision import ALL_TERMS, cast, precision_loss
 from directshape_torch.laboratory.skip_rules import OFF_MASK, skip_costs
 from directshape_torch.laboratory.steps import gauss_newton_step, step_shift
+from directshape_torch.shape.pca_prior import PCAShapePrior
 
 BenchOf = Callable[..., Bench]
 
@@ -104,3 +107,13 @@ def test_skip_rules_are_counted(bench_of: BenchOf) -> None:
     assert (OFF_MASK, "photometric") in costs
     grazing = {c.rule: c for c in skip_costs(bench_of("grazing"))}[kinks.GRAZING]
     assert grazing.rows > 0
+
+
+def test_refinements_with_the_papers_derivative(scene: LaboratoryScene, prior: PCAShapePrior) -> None:
+    """The same energy from the same starts: the two ways end near each other, and are not the same."""
+    damped, undamped = paper_refinements(scene, prior, 2)
+    assert (damped.solver, undamped.solver) == ("damped", "undamped")
+    assert 1e-6 < damped.apart_m_median <= damped.apart_m < 0.2
+    assert damped.iterations_exact > 1
+    assert damped.cost_higher + damped.cost_lower <= damped.cars == 2
+    assert undamped.iterations_exact != damped.iterations_exact
