@@ -68,6 +68,11 @@ TARGETS: dict[str, Target] = {
     "state_chain": Target(
         "directshape_torch/residuals/state_chain.py", ("sdf_state_jacobian",), ("tests/residuals/test_state_chain.py",)
     ),
+    "point_cloud": Target(
+        "directshape_torch/residuals/point_cloud.py",
+        ("points_in_object", "point_cloud_residual"),
+        ("tests/residuals/test_point_cloud.py",),
+    ),
     "silhouette": Target(
         "directshape_torch/residuals/silhouette.py",
         (
