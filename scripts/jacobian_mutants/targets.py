@@ -70,7 +70,7 @@ TARGETS: dict[str, Target] = {
     ),
     "point_cloud": Target(
         "directshape_torch/residuals/point_cloud.py",
-        ("points_in_object", "point_cloud_residual"),
+        ("points_in_object", "point_cloud_distance", "point_cloud_residual"),
         ("tests/residuals/test_point_cloud.py",),
     ),
     "silhouette": Target(
@@ -154,7 +154,7 @@ TARGETS: dict[str, Target] = {
     "prior_terms": Target(
         "directshape_torch/energy/prior_terms.py",
         tuple(f"PriorTerm.{name}" for name in ("cost", "jacobian", "linearise", "accumulate", "_rows")),
-        (*_ROWS, "tests/energy/test_terms.py::test_a_prior_costs_half_its_weight_times_the_square"),
+        ("tests/energy/test_prior_sums.py", *_ROWS[:1], "tests/energy/test_terms.py"),
     ),
     "rays_of_a_state": Target(
         "directshape_torch/energy/projected_state.py",
