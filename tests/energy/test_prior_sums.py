@@ -38,4 +38,7 @@ def test_sums_over_the_residuals(config: str) -> None:
             own = rows[car, :, car]
             torch.testing.assert_close(part.hessian[car], term.weight * own.T @ own, rtol=1e-9, atol=1e-12)
             torch.testing.assert_close(part.fisher[car], term.weight * own.T @ own, rtol=1e-9, atol=1e-12)
+        per_car = rows.shape[1]
+        owners = term.residuals(problem.project(state)).object_index
+        assert owners.tolist() == [0] * per_car + [1] * per_car
         assert (part.gradient.abs().amax(dim=1) > 0).all()
