@@ -152,7 +152,7 @@ class PointCloudConfig:
         max_iterations: Gauss-Newton iterations of one half of a round, or of the joint refinement.
     """
 
-    weight: float = 300.0
+    weight: float = 30.0
     huber_m: float = 0.1
     matcher: Literal["sgbm", "elas"] = "sgbm"
     pixels: Literal["mask", "box"] = "mask"
@@ -160,7 +160,7 @@ class PointCloudConfig:
     max_height_m: float = 3.0
     max_distance_m: float = 2.5
     min_points: int = 200
-    max_points: int = 2000
+    max_points: int = 1000
     order: Literal["alternating", "joint"] = "alternating"
     rounds: int = 8
     max_iterations: int = 4

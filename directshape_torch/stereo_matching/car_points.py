@@ -84,13 +84,18 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
 def _pixels(frames: FrameBatch, d: Detections, config: PointCloudConfig) -> Tensor:
     """Left pixels (B, H, W) of each car: of its mask where it has one, else of its 2D box."""
     height, width = frames.images_left.shape[2:]
-    box = d.box_2d[:, :, None]
-    u, v = (torch.arange(n, device=box.device) for n in (width, height))
-    in_columns, in_rows = (u >= box[:, 0]) & (u <= box[:, 2]), (v >= box[:, 1]) & (v <= box[:, 3])
-    in_box = in_rows[:, :, None] & in_columns[:, None, :]
-    if config.pixels == "box":
-        return in_box
-    return torch.where(d.has_mask_left[:, None, None], d.mask_left > _MASK_THRESHOLD, in_box)
+    u, v = (torch.arange(n, device=d.box_2d.device) for n in (width, height))
+    u_min, v_min, u_max, v_max = d.box_2d[:, :, None].unbind(1)
+    rows, columns = frames.sizes[d.frame_index, :, None].unbind(1)
+    in_box = _grid((v >= v_min) & (v <= v_max), (u >= u_min) & (u <= u_max))
+    masked = (d.mask_left > _MASK_THRESHOLD) if config.pixels == "mask" else in_box
+    # Whatever the padding of a smaller frame holds is no part of it.
+    return torch.where(d.has_mask_left[:, None, None], masked, in_box) & _grid(v < rows, u < columns)
+
+
+def _grid(of_row: Tensor, of_column: Tensor) -> Tensor:
+    """Pixels (B, H, W) whose row (B, H) and column (B, W) both hold."""
+    return of_row[:, :, None] & of_column[:, None, :]
 
 
 def _known(disparity: Tensor) -> Tensor:

@@ -42,4 +42,6 @@ def _elas_module() -> Any:
     try:
         return importlib.import_module("elas")
     except ImportError as error:
-        raise MissingDependencyError("pyelas", "elas", "point_cloud.matcher elas") from error
+        raise MissingDependencyError(
+            "pyelas", "elas", "point_cloud.matcher elas (GPL-3.0; built from source, see docs/file_formats.md)"
+        ) from error

@@ -78,6 +78,16 @@ def test_pixels_without_a_disparity_give_no_point(unknown: float) -> None:
     assert torch.equal(points.counts, (scene.detections.mask_left[:, :, 1::2] > 0.5).flatten(1).sum(1))
 
 
+def test_the_padding_of_a_smaller_frame_holds_no_points() -> None:
+    scene = measured_street()[1]
+    assert scene.frames.disparity is not None
+    filled = scene.frames.disparity.nan_to_num(nan=7.0)
+    frames = replace(scene.frames, disparity=filled, sizes=torch.tensor([[80, 70]]))
+    everywhere = replace(scene.detections, box_2d=torch.tensor([[0.0, 0.0, 159.0, 119.0]]).double().expand(2, 4))
+    wide = replace(ALL, pixels="box", max_distance_m=1e3, min_height_m=-99.0, max_height_m=99.0)
+    assert car_points(frames, everywhere, wide).counts.tolist() == [80 * 70] * 2
+
+
 def test_of_too_many_every_nth_is_kept() -> None:
     everything, some = points_of(), points_of(replace(ALL, max_points=100))
     assert torch.equal(some.counts, everything.counts)
