@@ -2,7 +2,7 @@
 
     python scripts/build_kernel_prior.py --out kernel_prior.safetensors [--num-cars 600 --num-codes 8]
 
-It is not bundled: 32 components of grids weigh 2 MB, and the results do not earn them (docs/results.md).
+It is not bundled: 32 components of grids weigh 3 MB, and its results are no better (docs/results.md).
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ def refined(prior: ShapePrior, args: argparse.Namespace, out: Path) -> tuple[Gro
 def table_of_figures(rows: Sequence[tuple[str, PriorFigures]]) -> str:
     """Markdown."""
     columns = "prior", "fit: new cars", "real meshes", "gradient", "turn: median, 95 %", "value", "derivatives"
-    lines = [" | ".join(columns), "|".join(["---"] * len(columns))]
+    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     for name, f in rows:
         cells = (
             name,
@@ -182,8 +182,8 @@ def table_of_figures(rows: Sequence[tuple[str, PriorFigures]]) -> str:
             f"{f.value_ms:.1f} ms",
             f"{f.derivatives_ms:.1f} ms",
         )
-        lines.append(" | ".join(cells))
-    return "\n".join(f"| {line} |" for line in lines)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def table_of_refinements(rows: Sequence[tuple[str, GroupSummary, float]]) -> str:
