@@ -1,0 +1,1 @@
+"""Parts of `train_through_refiner.py`: frames, networks, loss, training, evaluation, report."""
