@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers.problems import CONFIGS, begun_problem
@@ -15,7 +17,10 @@ from directshape_torch.energy.photometric_term import PhotometricTerm
 def test_sums_over_pixels_and_neighbours(config: str) -> None:
     """c = lambda / sum of neighbour weights; w of each pixel and neighbour; Huber's rho' and rho' / r by hand."""
     prior, scene = cached_street()
-    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections), CONFIGS[config])
+    # A weight that is not 1, so that it is seen where it belongs and where it does not.
+    photometric = replace(CONFIGS[config].photometric, weight=2.5)
+    settings = replace(CONFIGS[config], photometric=photometric)
+    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections), settings)
     term, (rows, J) = next(
         (t, r)
         for t, r in zip(problem.terms, rows_by_autograd(problem, state), strict=True)

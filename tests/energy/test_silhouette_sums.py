@@ -1,0 +1,40 @@
+"""Cost, gradient and matrices of the silhouette terms, summed one pixel at a time from autograd."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.problems import CONFIGS, begun_problem
+from helpers.synthetic_scene import cached_street, disturbed
+
+from directshape_torch.energy.autograd_jacobian import rows_by_autograd
+from directshape_torch.energy.silhouette_term import SilhouetteTerm
+
+
+@pytest.mark.parametrize("config", ["default", "paper"])
+def test_sums_over_the_pixels(config: str) -> None:
+    """c = lambda / number of pixels; g = c sum J, H = c sum J^T J / r, Fisher = sum J^T J."""
+    prior, scene = cached_street()
+    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections), CONFIGS[config])
+    projected = problem.project(state)
+    seen = 0
+    for term, (rows, J) in zip(problem.terms, rows_by_autograd(problem, state), strict=True):
+        if not isinstance(term, SilhouetteTerm):
+            continue
+        seen += 1
+        part = term.linearise(projected, with_fisher=True)
+        torch.testing.assert_close(part.cost, term.cost(projected), rtol=1e-12, atol=0)
+        for car in range(len(state.code)):
+            own = rows.object_index == car
+            c = term.config.weight / int(own.sum())
+            r = rows.value[own]
+            outer = J[own].T @ J[own]
+            weighted = (J[own] / r.clamp_min(term.config.residual_floor)[:, None]).T @ J[own]
+            torch.testing.assert_close(part.cost[car], c * r.sum(), rtol=1e-10, atol=0)
+            for found, expected in (
+                (part.gradient[car], c * J[own].sum(dim=0)),
+                (part.hessian[car], c * weighted),
+                (part.fisher[car], outer),
+            ):
+                torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9 * float(expected.abs().max()))
+    assert seen == 2
