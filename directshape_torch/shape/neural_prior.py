@@ -136,9 +136,10 @@ class NeuralShapePrior(nn.Module):
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """Height, width and length (B, 3), metres: a quadratic of the code, fitted to the training cars."""
         check_shape("code", code, ("B", self.num_codes))
-        by_code = torch.einsum("dkl,bl->bdk", self.dimensions_quadratic_hwl, code)
-        hwl = self.dimensions_mean_hwl + code @ self.dimensions_linear_hwl.T + (by_code @ code[..., None])[..., 0]
-        return DimensionsDerivative(hwl, self.dimensions_linear_hwl + 2 * by_code)
+        quadratic = self.dimensions_quadratic_hwl
+        by_code = torch.einsum("dkl,bl->bdk", quadratic + quadratic.transpose(1, 2), code)
+        hwl = self.dimensions_mean_hwl + code @ self.dimensions_linear_hwl.T + 0.5 * (by_code @ code[..., None])[..., 0]
+        return DimensionsDerivative(hwl, self.dimensions_linear_hwl + by_code)
 
     def save(self, path: Path | str) -> None:
         """Write a safetensors file, atomically."""

@@ -1,0 +1,89 @@
+"""The network prior: its formula by hand, its symmetry, and that its weights can be trained through the field."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from directshape_torch.errors import InputError
+from directshape_torch.shape.neural_prior import MIRROR_ROUNDING_M, NeuralShapePrior
+from directshape_torch.shape.pca_prior import PriorProvenance
+
+MADE = PriorProvenance("a test", "Apache-2.0", 1)
+ORIGIN = torch.tensor([-2.0, -2.0, -1.0], dtype=torch.float64)
+
+
+def small_prior(num_codes: int = 2) -> NeuralShapePrior:
+    return NeuralShapePrior([6, 5], num_codes, ORIGIN, (9, 6, 5), 0.5, MADE)
+
+
+def test_one_unit_by_hand() -> None:
+    prior = NeuralShapePrior([1, 1], 1, ORIGIN, (9, 6, 5), 0.5, MADE)
+    first, second, last = prior.coded_layers()
+    for parameter, value in (
+        (first.weight, [[0.5, 0.0, 1.0]]), (first.code_weight, [[0.2]]), (first.bias, [0.1]),
+        (second.weight, [[2.0]]), (second.code_weight, [[0.0]]), (second.bias, [-0.3]),
+        (last.weight, [[3.0]]), (last.code_weight, [[0.4]]), (last.bias, [0.05]),
+    ):  # fmt: skip
+        parameter.copy_(torch.tensor(value))
+    code = torch.tensor([[1.5]], dtype=torch.float64)
+    point = torch.tensor([[0.8, -1.0, 0.6]], dtype=torch.float64)
+    a = 0.5 * 0.8 + math.hypot(0.6, MIRROR_ROUNDING_M) + 0.2 * 1.5 + 0.1
+    b = 2.0 * math.sin(a) - 0.3
+    expected = 3.0 * b / (1 + math.exp(-b)) + 0.4 * 1.5 + 0.05
+    assert prior.bind(code).value(point, torch.tensor([0])).item() == pytest.approx(expected, abs=1e-7)
+
+
+def test_both_halves_of_a_car_are_the_same() -> None:
+    shape = NeuralShapePrior.load_bundled().double().bind(torch.ones(1, 8, dtype=torch.float64))
+    points = torch.rand(50, 3, dtype=torch.float64) - torch.tensor([0.5, 1.0, 0.5])
+    mirror = torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64)
+    index = torch.zeros(50, dtype=torch.long)
+    left, right = (shape.value_and_derivatives(p, index) for p in (points, points * mirror))
+    assert torch.equal(left.value, right.value)
+    torch.testing.assert_close(left.gradient, right.gradient * mirror)
+
+
+def test_dimensions_need_no_symmetric_matrix() -> None:
+    prior = small_prior()
+    prior.dimensions_quadratic_hwl[2] = torch.tensor([[0.1, 0.3], [0.0, 0.2]])
+    prior.dimensions_linear_hwl[2] = torch.tensor([0.5, -0.5])
+    at = prior.dimensions_and_derivative(torch.tensor([[1.0, 2.0]], dtype=torch.float64))
+    # 0.5 - 1 + 0.1 + 0.3 * 1 * 2 + 0.2 * 4, and its derivatives 0.5 + 0.2 + 0.6 and -0.5 + 0.3 + 0.8.
+    assert at.hwl[0, 2].item() == pytest.approx(1.0)
+    torch.testing.assert_close(at.J_hwl_code[0, 2], torch.tensor([1.3, 0.6], dtype=torch.float64))
+
+
+def test_points_beyond_one_part_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    prior = small_prior()
+    shape = prior.bind(torch.randn(3, 2, dtype=torch.float64))
+    points, index = torch.randn(40, 3, dtype=torch.float64), torch.arange(40) % 3
+    whole = shape.value_and_derivatives(points, index)
+    monkeypatch.setattr("directshape_torch.shape.neural_prior._CHUNK_POINTS", 7)
+    parts = shape.value_and_derivatives(points, index)
+    for name in ("value", "gradient", "J_value_code"):
+        torch.testing.assert_close(getattr(parts, name), getattr(whole, name))
+    torch.testing.assert_close(shape.value(points, index), whole.value)
+
+
+def test_weights_are_frozen_until_they_are_thawed() -> None:
+    prior = small_prior()
+    assert not any(p.requires_grad for p in prior.parameters())
+    prior.requires_grad_()
+    shape = prior.bind(prior.initial_code(1))
+    points, index = torch.zeros(1, 3, dtype=torch.float64), torch.tensor([0])
+    (shape.value(points, index).sum() + shape.value_and_derivatives(points, index).gradient.sum()).backward()
+    for name, parameter in prior.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+def test_wrong_settings_are_named() -> None:
+    with pytest.raises(InputError, match="layer_widths, num_codes: expected at least one each"):
+        NeuralShapePrior([], 2, ORIGIN, (9, 6, 5), 0.5, MADE)
+    with pytest.raises(InputError, match="grid_shape, spacing_m: expected two nodes"):
+        NeuralShapePrior([4], 2, ORIGIN, (9, 1, 5), 0.5, MADE)
+    with pytest.raises(InputError, match=r"code: expected shape \(B, 2\)"):
+        small_prior().bind(torch.zeros(1, 3, dtype=torch.float64))
