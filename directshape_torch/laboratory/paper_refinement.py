@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.term import ResidualRows, Term, TermLinearisation
 from directshape_torch.geometry import se3
 from directshape_torch.laboratory.paper_depth import PAPER, row_factors
-from directshape_torch.laboratory.regimes import REGIMES, seeded
+from directshape_torch.laboratory.regimes import REGIMES, DrawnStates, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.laboratory.steps import largest, median
 from directshape_torch.refiner import DirectShapeRefiner
@@ -24,6 +24,8 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import Stage
 from directshape_torch.status import Status
+
+CONTROL = "damped, control"
 
 # Costs that differ by less are the same minimum, found to different digits.
 _SAME_COST = 1e-3
@@ -71,7 +73,9 @@ class PaperRefinement:
     """Refinements of the same cars from the same starts with the exact and with the paper's depth derivative.
 
     Attributes:
-        solver: "damped" (default settings) or "undamped" (pure Gauss-Newton, every step accepted, as in the paper).
+        solver: "damped" (default settings) or "undamped" (pure Gauss-Newton, every step accepted, as in the paper);
+            `CONTROL` compares the exact derivative with itself under twice the initial damping: how far apart two ways
+            end that differ in nothing but their steps.
         cars: refined both ways.
         converged_exact, converged_paper: how many.
         iterations_exact, iterations_paper: mean per car.
@@ -99,33 +103,52 @@ def paper_refinements(
 ) -> list[PaperRefinement]:
     """Refine the cars of a scene from disturbed detections, with both derivatives and both solvers."""
     config = RefinerConfig()
-    undamped = replace(config.solver, initial_damping=0.0, accept_every_step=True)
+    undamped = replace(config, solver=replace(config.solver, initial_damping=0.0, accept_every_step=True))
+    twice = replace(config, solver=replace(config.solver, initial_damping=2 * config.solver.initial_damping))
+    regime = REGIMES["typical"]
+    drawn = regime.draw(scene, prior, num_states, seeded(seed, regime))
+    exact, paper, control, exact_undamped, paper_undamped = (
+        _refine(scene, prior, drawn, settings, with_paper)
+        for settings, with_paper in (
+            (config, False),
+            (config, True),
+            (twice, False),
+            (undamped, False),
+            (undamped, True),
+        )
+    )
     return [
-        _compare(scene, prior, num_states, seed, "damped", config),
-        _compare(scene, prior, num_states, seed, "undamped", replace(config, solver=undamped)),
+        _compare("damped", exact, paper),
+        _compare(CONTROL, exact, control),
+        _compare("undamped", exact_undamped, paper_undamped),
     ]
 
 
-def _compare(
-    scene: LaboratoryScene, prior: PCAShapePrior, num_states: int, seed: int, name: str, config: RefinerConfig
-) -> PaperRefinement:
-    regime = REGIMES["typical"]
-    drawn = regime.draw(scene, prior, num_states, seeded(seed, regime))
-    start = CarState(drawn.state.T_obj_cam, prior.initial_code(num_states))
-    minima: list[Minimum[CarState]] = []
-    costs = []
-    for with_paper in (False, True):
-        problem, initial = DirectShapeRefiner(prior, config).problem(scene.frame, drawn.detections)
-        if with_paper:
-            problem.terms = [_with_paper_depth(term) for term in problem.terms]
-        minima.append(minimise(problem, initial, config.solver, start))
-        costs.append(_final_cost(problem, initial, minima[-1].state))
-    exact, paper = minima
+class _Refined(NamedTuple):
+    minimum: Minimum[CarState]
+    cost: Tensor  # (B,) in the last stage begun at the input state: one and the same function for all ways
+
+
+def _refine(
+    scene: LaboratoryScene, prior: PCAShapePrior, drawn: DrawnStates, config: RefinerConfig, with_paper: bool
+) -> _Refined:
+    start = CarState(drawn.state.T_obj_cam, torch.zeros_like(drawn.state.code))
+    problem, initial = DirectShapeRefiner(prior, config).problem(scene.frame, drawn.detections)
+    if with_paper:
+        problem.terms = [_with_paper_depth(term) for term in problem.terms]
+    minimum = minimise(problem, initial, config.solver, start)
+    problem.begin_stage(problem.stages()[-1], initial)
+    return _Refined(minimum, problem.cost(minimum.state))
+
+
+def _compare(name: str, first: _Refined, second: _Refined) -> PaperRefinement:
+    exact, paper = first.minimum, second.minimum
+    costs = first.cost, second.cost
     difference = se3.log(paper.state.T_obj_cam @ se3.inverse(exact.state.T_obj_cam))
     metres, degrees = difference[:, :3].norm(dim=1), torch.rad2deg(difference[:, 3:].norm(dim=1))
     converged = [int((m.status == Status.converged.code).sum()) for m in (exact, paper)]
     return PaperRefinement(
-        name, num_states, converged[0], converged[1],
+        name, len(metres), converged[0], converged[1],
         float(exact.iterations.double().mean()), float(paper.iterations.double().mean()),
         int((costs[1] > costs[0] * (1 + _SAME_COST)).sum()), int((costs[1] < costs[0] * (1 - _SAME_COST)).sum()),
         median(metres), largest(metres), median(degrees), largest(degrees),
@@ -134,9 +157,3 @@ def _compare(
 
 def _with_paper_depth(term: Term) -> Term:
     return PaperDepthTerm(term) if isinstance(term, PhotometricTerm) else term
-
-
-def _final_cost(problem: CarProblem, initial: CarState, final: CarState) -> Tensor:
-    """Cost (B,) in the last stage begun at the input state: one and the same function for both ways."""
-    problem.begin_stage(problem.stages()[-1], initial)
-    return problem.cost(final)

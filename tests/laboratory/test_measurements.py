@@ -17,7 +17,7 @@ from directshape_torch.laboratory.paper_depth import (
     row_factors,
     scaled_linearisation,
 )
-from directshape_torch.laboratory.paper_refinement import paper_refinements
+from directshape_torch.laboratory.paper_refinement import CONTROL, paper_refinements
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.laboratory.single_precision import ALL_TERMS, cast, precision_loss
 from directshape_torch.laboratory.skip_rules import OFF_MASK, skip_costs
@@ -111,8 +111,10 @@ def test_skip_rules_are_counted(bench_of: BenchOf) -> None:
 
 def test_refinements_with_the_papers_derivative(scene: LaboratoryScene, prior: PCAShapePrior) -> None:
     """The same energy from the same starts: the two ways end near each other, and are not the same."""
-    damped, undamped = paper_refinements(scene, prior, 2)
-    assert (damped.solver, undamped.solver) == ("damped", "undamped")
+    damped, control, undamped = paper_refinements(scene, prior, 2)
+    assert (damped.solver, control.solver, undamped.solver) == ("damped", CONTROL, "undamped")
+    assert control.iterations_exact == damped.iterations_exact
+    assert 0 < control.apart_m < 0.2
     assert 1e-6 < damped.apart_m_median <= damped.apart_m < 0.2
     assert damped.iterations_exact > 1
     assert damped.cost_higher + damped.cost_lower <= damped.cars == 2
