@@ -8,7 +8,6 @@ differs: it depends on the code.
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import torch
@@ -27,14 +26,13 @@ class KernelPCAShapePrior(nn.Module):
     `c(code) = offset + linear code + sum_i weights_i exp(-|code - anchor_i|^2 / (2 width^2))`.
 
     Args:
-        subspace: linear prior of M components that holds the grids; its own code is c.
+        subspace: linear prior of M components that holds the grids; its own code is c, its provenance this prior's.
         anchors: codes of the N training cars, (N, K), standard deviations.
         weights: of the kernels, (N, M).
         linear: (M, K).
         offset: (M,).
         dimensions_basis_hwl: change of the dimensions by c, (3, M), metres.
-        kernel_width: in standard deviations of the code.
-        provenance: where the prior comes from.
+        kernel_width: (), in standard deviations of the code.
 
     Raises:
         InputError: shapes that do not fit together, or a width that is not positive.
@@ -54,6 +52,7 @@ class KernelPCAShapePrior(nn.Module):
     weights: Tensor
     linear: Tensor
     offset: Tensor
+    kernel_width: Tensor
 
     def __init__(
         self,
@@ -63,21 +62,22 @@ class KernelPCAShapePrior(nn.Module):
         weights: Tensor,
         linear: Tensor,
         offset: Tensor,
-        kernel_width: float,
+        kernel_width: Tensor,
     ) -> None:
         super().__init__()
         check_shape("anchors", anchors, ("N", "K"))
         check_shape("weights", weights, (len(anchors), subspace.num_codes))
         check_shape("linear", linear, (subspace.num_codes, anchors.shape[1]))
         check_shape("offset", offset, (subspace.num_codes,))
-        if not (math.isfinite(kernel_width) and kernel_width > 0):
+        check_shape("kernel_width", kernel_width, ())
+        if not bool(kernel_width.isfinite() & (kernel_width > 0)):
             raise InputError("kernel_width", "a positive number of standard deviations", f"{kernel_width}")
         self.subspace = subspace
         self.register_buffer("anchors", anchors)
         self.register_buffer("weights", weights)
         self.register_buffer("linear", linear)
         self.register_buffer("offset", offset)
-        self.kernel_width = float(kernel_width)
+        self.register_buffer("kernel_width", kernel_width)
 
     @property
     def provenance(self) -> PriorProvenance:
@@ -170,9 +170,8 @@ class KernelPCAShapePrior(nn.Module):
         scale = subspace.explained_variance_ratio.sqrt()
         anchors = _kernel_components(coordinates * scale, num_codes, feature_width)
         offset, linear, weights = _ridge_regression(anchors, coordinates, kernel_width, ridge)
-        fitted = cls(
-            subspace, anchors=anchors, weights=weights, linear=linear, offset=offset, kernel_width=kernel_width
-        )
+        width = anchors.new_tensor(kernel_width)
+        fitted = cls(subspace, anchors=anchors, weights=weights, linear=linear, offset=offset, kernel_width=width)
         return fitted.to(sdf_samples.dtype)
 
     def save(self, path: Path | str) -> None:
@@ -227,7 +226,7 @@ def _kernel_components(coordinates: Tensor, num_codes: int, feature_width: float
     return aligned
 
 
-def _gaussian(a: Tensor, b: Tensor, width: float) -> Tensor:
+def _gaussian(a: Tensor, b: Tensor, width: float | Tensor) -> Tensor:
     return torch.exp(-0.5 * torch.cdist(a, b) ** 2 / width**2)
 
 

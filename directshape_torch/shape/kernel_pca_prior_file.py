@@ -25,7 +25,6 @@ def write_kernel_prior(prior: KernelPCAShapePrior, path: Path) -> None:
     tensors |= {name: tensors[name].to(torch.float16) for name in _GRIDS}
     description = {
         "schema": SCHEMA,
-        "kernel_width": prior.kernel_width,
         "spacing_m": prior.spacing_m,
         "provenance": asdict(prior.provenance),
     }
@@ -45,7 +44,7 @@ def read_kernel_prior(path: Path) -> KernelPCAShapePrior:
             spacing_m=float(description["spacing_m"]), provenance=provenance, **_below(tensors, "subspace.")
         )
         own = {name: tensor for name, tensor in tensors.items() if "." not in name}
-        return KernelPCAShapePrior(subspace, kernel_width=float(description["kernel_width"]), **own)
+        return KernelPCAShapePrior(subspace, **own)
     except (InputError, KeyError, TypeError, ValueError) as problem:
         raise DataFormatError(path, f"not a valid kernel PCA prior: {problem!r}", cure=CURE) from problem
 

@@ -62,8 +62,9 @@ def test_wrong_settings_are_named() -> None:
     prior = kernel_prior()
     tensors = {name: getattr(prior, name) for name in ("anchors", "weights", "linear", "offset")}
     with pytest.raises(InputError, match="kernel_width: expected a positive number"):
-        KernelPCAShapePrior(prior.subspace, kernel_width=0.0, **tensors)
+        KernelPCAShapePrior(prior.subspace, kernel_width=torch.tensor(0.0), **tensors)
+    one = torch.tensor(1.0)
     with pytest.raises(InputError, match=r"linear: expected shape \(3, 2\)"):
-        KernelPCAShapePrior(prior.subspace, kernel_width=1.0, **{**tensors, "linear": prior.linear[:, :1]})
+        KernelPCAShapePrior(prior.subspace, **{**tensors, "kernel_width": one, "linear": prior.linear[:, :1]})
     with pytest.raises(InputError, match=r"code: expected shape \(B, 2\)"):
         prior.bind(torch.zeros(1, 3, dtype=torch.float64))
