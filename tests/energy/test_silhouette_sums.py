@@ -24,6 +24,7 @@ def test_sums_over_the_pixels(config: str) -> None:
         seen += 1
         part = term.linearise(projected, with_fisher=True)
         torch.testing.assert_close(part.cost, term.cost(projected), rtol=1e-12, atol=0)
+        assert torch.equal(term._rows(projected)[0].object_index, term.pixels.object_index)
         for car in range(len(state.code)):
             own = rows.object_index == car
             c = term.config.weight / int(own.sum())
