@@ -25,6 +25,8 @@ class Equivalent:
 _OF_ZERO = "the negative of zero is zero"
 _EITHER_SIGN = "a quaternion and its negative are the same rotation, and so3_log turns it to w >= 0"
 _BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its value nor its derivative gets anywhere"
+_FOR_SPEED = "a threshold that only saves work: what it leaves out is below the rounding of the sum"
+_THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEIGHT, dtype=self.zeta.dtype))"
 
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
@@ -32,6 +34,10 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("_by_rotation", "zeros[..., :3]", "(-zeros[..., :3])", _OF_ZERO),
     Equivalent("_by_rotation", "zeros[..., 3:]", "(-zeros[..., 3:])", _OF_ZERO),
     Equivalent("dimensions_prior", "no_twist", "(-no_twist)", _OF_ZERO),
+    *(
+        Equivalent("SilhouetteTerm._rows_product", _THRESHOLD, after, _FOR_SPEED)
+        for after in (f"(-({_THRESHOLD}))", f"({_THRESHOLD.removeprefix('self.zeta[:, None] * ')})")
+    ),
     Equivalent("_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     Equivalent(
         "_quaternion",

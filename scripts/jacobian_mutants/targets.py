@@ -62,7 +62,7 @@ TARGETS: dict[str, Target] = {
     ),
     "ray_depth": Target(
         "directshape_torch/shape/raycast.py",
-        ("ObjectRays.at", "attached_depth", "polished_depth", "_newton_step"),
+        ("ObjectRays.at", "attached_depth", "_newton_step"),
         ("tests/shape/test_raycast.py", "tests/residuals/test_photometric.py"),
     ),
     "state_chain": Target(
