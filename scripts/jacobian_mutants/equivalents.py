@@ -38,6 +38,9 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         Equivalent("SilhouetteTerm._rows_product", _THRESHOLD, after, _FOR_SPEED)
         for after in (f"(-({_THRESHOLD}))", f"({_THRESHOLD.removeprefix('self.zeta[:, None] * ')})")
     ),
+    Equivalent(
+        "ProjectedView.__init__", "moving_depths", "(-moving_depths)", "a flag, whose truth a sign leaves alone"
+    ),
     Equivalent("_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     Equivalent(
         "_quaternion",

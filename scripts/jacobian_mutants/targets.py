@@ -159,7 +159,7 @@ TARGETS: dict[str, Target] = {
     "rays_of_a_state": Target(
         "directshape_torch/energy/projected_state.py",
         ("ProjectedView.__init__",),
-        (f"{_COST}::test_g_is_the_gradient_of_the_reported_cost",),
+        ("tests/energy/test_rays_of_a_state.py", f"{_COST}::test_g_is_the_gradient_of_the_reported_cost"),
     ),
     "covariance": Target(
         "directshape_torch/covariance.py",
