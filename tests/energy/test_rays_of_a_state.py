@@ -18,4 +18,5 @@ def test_points_of_rays_are_transformed_points() -> None:
         points_cam = pixels.origin_cam + depth[:, None] * pixels.ray_cam
         expected = se3.transform(state.T_obj_cam[pixels.object_index], points_cam)
         torch.testing.assert_close(view.rays.at(depth), expected)
+        assert torch.equal(view.rays.object_index, pixels.object_index)
     assert problem.right.origin_cam.abs().max() > 0.5
