@@ -27,7 +27,6 @@ HIT = "hit or miss"
 GRAZING = "grazing limit"
 LOST = "right image border or occluder"
 HUBER = "Huber corner"
-RULES = (HIT, GRAZING, LOST, SATURATION, HUBER, TRILINEAR, BILINEAR)
 
 # A sample whose share in a row is smaller cannot move the row by what the bounds allow, kink or not. Rows shorter than
 # a millionth of the longest are judged by that millionth, their samples too.

@@ -166,7 +166,7 @@ REGIMES: Mapping[str, Regime] = {
         Regime("near_3m", "3 m away", _near),
         Regime("image_border", "cut in half by the left or right image border", _cut),
         Regime("grazing", "rays within 72 to 90 deg of the surface normal", _anywhere_placed, pixels="grazing"),
-        Regime("contour", "pixels on the soft contour, |zeta sdf| < 3", _anywhere_placed, pixels="contour"),
+        Regime("contour", "pixels on the soft contour, zeta sdf within 3", _anywhere_placed, pixels="contour"),
         Regime("identity_rotation", "rotation the identity, and 1e-7 rad off", _with_yaw(0.0, 1e-7)),
         Regime("near_pi_rotation", "rotation by pi, and 1e-7 and 1e-3 rad less",
                _with_yaw(math.pi, math.pi - 1e-7, math.pi - 1e-3)),

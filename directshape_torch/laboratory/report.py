@@ -13,7 +13,7 @@ from typing import Any
 
 from directshape_torch.io.atomic_files import write_bytes, write_text
 from directshape_torch.laboratory.comparison import BOUNDS, PAIRS, Comparison
-from directshape_torch.laboratory.paper_depth import PaperDepthError
+from directshape_torch.laboratory.paper_depth import PAPER, PaperDepthError
 from directshape_torch.laboratory.paper_refinement import PaperRefinement
 from directshape_torch.laboratory.plots import v_curves_png
 from directshape_torch.laboratory.regimes import REGIMES
@@ -204,16 +204,27 @@ def _skip_table(skips: Sequence[SkipCost]) -> str:
         steps = [s.step_share for s in own if not math.isnan(s.step_share)]
         rows.append([
             rule, term, f"{skipped} of {total} ({100 * skipped / max(total, 1):.1f} %)",
-            f"{100 * sorted(medians)[len(medians) // 2]:.2g} %" if medians else "not defined",
-            f"{100 * max(shares):.2g} %" if shares else "", f"{100 * max(steps):.2g} %" if steps else "",
+            _percent(sorted(medians)[len(medians) // 2]) if medians else "not defined",
+            _percent(max(shares)) if shares else "", _percent(max(steps)) if steps else "",
         ])  # fmt: skip
     header = ["rule", "term", "rows", "gradient removed, median", "largest", "step, of the trust region, largest"]
     return _table(header, rows)
 
 
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
+
+
 def _second_table(checks: Sequence[SecondDerivativeCheck]) -> str:
-    rows = [[c.name, c.regime, c.compared, f"{c.maximum:.1e}", f"{c.percentile_999:.1e}", c.excluded] for c in checks]
-    return _table(["second derivative", "regime", "entries", "max error", "99.9 %", "excluded (cell borders)"], rows)
+    """The worst regime of each; all are in the CSV file."""
+    rows = []
+    for name in dict.fromkeys(c.name for c in checks):
+        own = [c for c in checks if c.name == name]
+        worst = max(own, key=lambda c: c.maximum)
+        entries, excluded = sum(c.compared for c in own), sum(c.excluded for c in own)
+        rows.append([name, entries, f"{worst.maximum:.1e}", worst.regime, excluded])
+    header = ["second derivative", "entries", "largest error", "in", "excluded (cell borders)"]
+    return _table(header, rows)
 
 
 def _paper_table(errors: Sequence[PaperDepthError]) -> str:
@@ -222,13 +233,13 @@ def _paper_table(errors: Sequence[PaperDepthError]) -> str:
          f"{100 * e.gradient_error_median:.1f} %", f"{e.turned_deg_median:.2g} / {e.turned_deg:.2g} deg",
          f"{100 * e.step_m_median:.2g} / {100 * e.step_m:.2g} cm",
          f"{e.step_deg_median:.2g} / {e.step_deg:.2g} deg"]
-        for e in errors
+        for e in errors if e.variant == PAPER or e.regime == errors[0].regime
     ]  # fmt: skip
     header = [
         "what is approximated", "regime", "rays", "row error, median", "95 %", "gradient error, median",
         "step turns by (median / max)", "step moves by", "and turns the car by",
     ]  # fmt: skip
-    return _table(header, rows)
+    return _table(header, rows) + "\n\nBoth parts in every regime: paper_depth.csv." if rows else ""
 
 
 def _refinement_table(refinements: Sequence[PaperRefinement]) -> str:
