@@ -208,3 +208,44 @@ def test_float32_finds_the_same_surface() -> None:
     both = a.found & b.found
     assert both.sum() > 80
     assert (a.depth[both] - b.depth[both].double()).abs().quantile(0.99) < 1e-5
+
+
+def test_a_polished_depth_is_the_root_of_the_moved_surface() -> None:
+    """From the root of one sphere, Newton steps lead to that of a slightly larger one; misses are left alone."""
+    offset = torch.tensor([0.0, 0.3, 0.6, 2.0], dtype=torch.float64)
+    origin = torch.stack([offset, 0 * offset, 0 * offset - 8], dim=1)
+    forward = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64).expand(4, 3)
+    rays = ObjectRays(origin, forward, torch.zeros(4, dtype=torch.long))
+    inside = (0.8**2 - offset**2).clamp_min(0).sqrt()
+    before = raycast.Root((8 - inside) / 2, offset < 0.8)
+    sphere = _Sphere(torch.tensor(0.81, dtype=torch.float64))
+    expected = torch.where(before.found, (8 - (0.81**2 - offset**2).clamp_min(0).sqrt()) / 2, before.depth)
+    assert torch.equal(raycast.polished_depth(sphere, rays, before, 0), before.depth)
+    once = raycast.polished_depth(sphere, rays, before, 1)
+    torch.testing.assert_close(raycast.polished_depth(sphere, rays, before, 6), expected, rtol=0, atol=1e-14)
+    error = (once - expected).abs()[before.found]
+    assert (error < 0.05 * (before.depth - expected).abs()[before.found]).all()
+    assert error[2] > 1e-6
+
+
+def test_the_attached_point_of_closest_approach_is_the_detached_one_and_follows_the_surface() -> None:
+    rays = rays_at(targets(60, 1.3), ORIGIN)
+    marched = raycast.march(ELLIPSOID, rays, ELLIPSOID.bounds, 16)
+    plain = raycast.closest_approach_depth(marched)
+    crosses = marched.crosses_bounds
+
+    def attached(shift: Tensor) -> Tensor:
+        moved = ObjectRays(rays.origin_obj + shift, rays.direction_obj, rays.object_index)
+        return raycast.attached_closest_depth(ELLIPSOID, moved, ELLIPSOID.bounds, marched)[crosses]
+
+    zero = torch.zeros(3, dtype=torch.float64)
+    torch.testing.assert_close(attached(zero), plain[crosses], rtol=0, atol=1e-12)
+    J = torch.autograd.functional.jacobian(attached, zero)
+    step = 1e-6
+    for axis in range(3):
+        end = step * torch.eye(3, dtype=torch.float64)[axis]
+        numeric = (attached(end) - attached(-end)) / (2 * step)
+        # A ray that enters the bounds at an edge has a kink there.
+        agrees = (numeric - J[:, axis]).abs() < 1e-5
+        assert agrees.double().mean() > 0.95
+    assert J.abs().max() > 0.1
