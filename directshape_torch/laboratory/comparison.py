@@ -18,10 +18,9 @@ MAX_EXCLUDED_SHARE_TYPICAL = 0.02
 
 # Differences must be able to resolve a quarter of the bound that they are to decide.
 _RESOLUTION_SHARE = 0.25
-# A row is compared relative to its norm, but rows a millionth as long as the longest of their regime (a ray deep inside
-# the mask, a neighbour on a white wall) relative to that millionth: differences cannot see them, nor can any step.
-# Autograd can; its floor is for the product form, whose hand-derived sum leaves out samples below 1e-20 of zeta.
-FLAT_SHARE: Mapping[str, float] = {"analytic-autograd": 1e-8, "analytic-numeric": 1e-6, "autograd-numeric": 1e-6}
+# A row is compared relative to its norm, but rows shorter than a millionth of the longest of their regime (a ray deep
+# inside the mask, a neighbour on a white wall) relative to that millionth: rounding of their parts is all they are.
+FLAT_SHARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -105,8 +104,8 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
     moving = usable & (norm != 0)  # NaN among them: its errors are NaN and break the bounds
     finite = norm[moving & norm.isfinite()]
     longest = finite.max() if len(finite) else norm.new_ones(())
-    scale = {pair: norm.clamp_min(float(share * longest))[:, None] for pair, share in FLAT_SHARE.items()}
-    choice = choose(found, _RESOLUTION_SHARE * BOUNDS["analytic-numeric"] * scale["analytic-numeric"][:, 0])
+    scale = norm.clamp_min(float(FLAT_SHARE * longest))
+    choice = choose(found, _RESOLUTION_SHARE * BOUNDS["analytic-numeric"] * scale)
     numeric = choice.derivative
     judged = moving[:, None] & numeric.isfinite()
     excluded = {rule: int((e & moving[:, None]).sum()) for rule, e in choice.excluded.items()}
@@ -116,7 +115,7 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
         "autograd-numeric": (subject.autograd - numeric).abs(),
     }
     pairs = {
-        pair: (d / scale[pair])[moving[:, None].expand_as(d) if pair == "analytic-autograd" else judged]
+        pair: (d / scale[:, None])[moving[:, None].expand_as(d) if pair == "analytic-autograd" else judged]
         for pair, d in difference.items()
     }
     constant = usable & (norm == 0)
@@ -130,9 +129,9 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
         excluded={rule: n for rule, n in excluded.items() if n},
         skipped_rows=int((~usable).sum()),
         zero_rows=int(constant.sum()),
-        flat_rows=int((moving & (norm < scale["analytic-numeric"][:, 0])).sum()),
+        flat_rows=int((moving & (norm < scale)).sum()),
         errors={pair: _pair_error(e) for pair, e in pairs.items()},
-        curve=_curve(subject, found, moving, scale["analytic-numeric"]),
+        curve=_curve(subject, found, moving, scale[:, None]),
     )
 
 

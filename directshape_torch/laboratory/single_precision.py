@@ -100,7 +100,7 @@ def _row_errors(bench: Bench, low: Bench, names: Sequence[str]) -> tuple[int, in
         moving = both & (norm > 0)
         if not bool(moving.any()):
             continue
-        scale = norm.clamp_min(float(FLAT_SHARE["analytic-numeric"] * norm[moving].max()))[:, None]
+        scale = norm.clamp_min(float(FLAT_SHARE * norm[moving].max()))[:, None]
         rows += int(both.sum())
         analytic.append(((J_low.double() - high).abs() / scale)[moving].flatten())
         autograd.append(((J_autograd.double() - high).abs() / scale)[moving].flatten())
