@@ -137,7 +137,8 @@ class PointCloudConfig:
     """Point cloud from dense stereo, for the methods "geometric" (Engelmann et al., GCPR 2016) and "combined".
 
     Attributes:
-        weight: factor of the mean Huber norm of the signed distances, per square metre.
+        weight: factor of the mean Huber norm of the signed distances, per square metre, for "geometric".
+        combined_weight: the same for "combined": beside the images less is better.
         huber_m: corner of the Huber norm.
         matcher: disparity where the frames bring none: "sgbm" (OpenCV) or "elas" (optional package).
         pixels: points of the left instance "mask" where there is one, else of the 2D box; or always of the "box".
@@ -152,7 +153,8 @@ class PointCloudConfig:
         max_iterations: Gauss-Newton iterations of one half of a round, or of the joint refinement.
     """
 
-    weight: float = 30.0
+    weight: float = 300.0
+    combined_weight: float = 30.0
     huber_m: float = 0.1
     matcher: Literal["sgbm", "elas"] = "sgbm"
     pixels: Literal["mask", "box"] = "mask"

@@ -41,6 +41,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "photometric.lost_grey_levels": _POSITIVE,
     "photometric.min_ray_cosine": (0, 0.999),
     "point_cloud.weight": _NOT_NEGATIVE,
+    "point_cloud.combined_weight": _NOT_NEGATIVE,
     "point_cloud.huber_m": _POSITIVE,
     "point_cloud.min_height_m": (-100, 100),
     "point_cloud.max_height_m": (-100, 100),

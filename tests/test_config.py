@@ -10,6 +10,7 @@ import pytest
 
 from directshape_torch.config import (
     PhotometricConfig,
+    PointCloudConfig,
     PriorConfig,
     RefinerConfig,
     SamplingConfig,
@@ -73,6 +74,12 @@ def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) 
         ("solver.max_code=.inf", "solver.max_code: expected a number above 0, got inf"),
         ("priors.dimensions_sigma_m=[0.1, 0, 0.1]", "priors.dimensions_sigma_m: expected a number above 0"),
         ("sampling.max_pixels=50", "sampling.max_pixels: expected at least sampling.min_pixels = 400, got 50"),
+        (
+            "point_cloud.max_height_m=0",
+            "point_cloud.max_height_m: expected at least point_cloud.min_height_m = 0.1, got",
+        ),
+        ("point_cloud.huber_m=0", "point_cloud.huber_m: expected a number above 0, got 0.0"),
+        ("method=geometry", "method: expected one of direct, geometric, combined, got 'geometry'"),
         ("sampling.density=1.5", "sampling.density: expected a number above 0 and at most 1, got 1.5"),
     ],
 )
@@ -85,7 +92,7 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
 def test_every_number_has_a_range() -> None:
     groups = {
         "solver": SolverConfig, "silhouette": SilhouetteConfig, "photometric": PhotometricConfig,
-        "priors": PriorConfig, "sampling": SamplingConfig, "search": SearchConfig,
+        "priors": PriorConfig, "sampling": SamplingConfig, "search": SearchConfig, "point_cloud": PointCloudConfig,
     }  # fmt: skip
     for group, kind in groups.items():
         for field in dataclasses.fields(kind):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import PointCloudConfig, RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.direct_terms import prior_terms
 from directshape_torch.energy.point_cloud_term import point_cloud_term
@@ -22,7 +23,7 @@ def geometric_terms(config: RefinerConfig, prior: ShapePrior, cars: CarBatch, po
         cars: the B cars to refine.
         points: their stereo points.
     """
-    return _cloud(config, points) + prior_terms(config, prior, cars)
+    return _cloud(config.point_cloud, points) + prior_terms(config, prior, cars)
 
 
 def combined_terms(config: RefinerConfig, direct: Sequence[Term], points: PointSamples) -> list[Term]:
@@ -33,8 +34,9 @@ def combined_terms(config: RefinerConfig, direct: Sequence[Term], points: PointS
         direct: the terms of `direct_terms`, priors among them.
         points: stereo points of the same cars.
     """
-    return _cloud(config, points) + list(direct)
+    cloud = replace(config.point_cloud, weight=config.point_cloud.combined_weight)
+    return _cloud(cloud, points) + list(direct)
 
 
-def _cloud(config: RefinerConfig, points: PointSamples) -> list[Term]:
-    return [point_cloud_term(config.point_cloud, points)] if config.point_cloud.weight > 0 else []
+def _cloud(config: PointCloudConfig, points: PointSamples) -> list[Term]:
+    return [point_cloud_term(config, points)] if config.weight > 0 else []

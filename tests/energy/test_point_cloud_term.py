@@ -47,7 +47,20 @@ def test_methods_are_lists_of_terms() -> None:
     images = ["silhouette_left", "silhouette_right", "photometric"]
     assert names(GEOMETRIC) == ["point_cloud", *priors]
     assert names(COMBINED) == ["point_cloud", *images, *priors]
-    assert names(replace(COMBINED, point_cloud=replace(CLOUD, weight=0.0))) == names(DEFAULT) == [*images, *priors]
+    assert (
+        names(replace(COMBINED, point_cloud=replace(CLOUD, combined_weight=0.0)))
+        == names(DEFAULT)
+        == [*images, *priors]
+    )
+
+
+def test_each_method_has_its_own_weight() -> None:
+    config = replace(CLOUD, weight=7.0, combined_weight=3.0)
+    costs = []
+    for method in METHODS.values():
+        problem, state = case(replace(method, point_cloud=config))
+        costs.append(cloud_of(problem).cost(problem.project(state)))
+    torch.testing.assert_close(3.0 * costs[0], 7.0 * costs[1])
 
 
 @pytest.mark.parametrize("method", METHODS)
