@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from directshape_torch.energy.car_problem import CarProblem, sum_of
 from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.term import TermLinearisation
 
 
 def tangent_covariance(problem: CarProblem, state: CarState) -> Tensor:
@@ -15,8 +18,12 @@ def tangent_covariance(problem: CarProblem, state: CarState) -> Tensor:
     Silhouette pixels count with weight 1 (not the solver's 1/r), sums run over effective pixels (not means). It is
     uncalibrated: multiply by the s^2 fitted on data with ground truth.
     """
-    parts = problem.linearise_terms(state, with_fisher=True)
-    fisher = sum_of([part.fisher for part in parts])
+    return covariance_of(problem.linearise_terms(state, with_fisher=True))
+
+
+def covariance_of(linearisations: Sequence[TermLinearisation]) -> Tensor:
+    """`tangent_covariance` (B, D, D) from the linearisations of all terms, made with their Fisher information."""
+    fisher = sum_of([part.fisher for part in linearisations])
     finite = fisher.isfinite().all(-1).all(-1)
     identity = torch.eye(fisher.shape[-1], dtype=fisher.dtype, device=fisher.device)
     factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], fisher, identity))

@@ -11,6 +11,7 @@ from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedView
+from directshape_torch.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import BoundShape
 
@@ -25,33 +26,46 @@ class FitQuality:
         photometric_error_grey: (B,) mean absolute difference between the images over the pixels that count, in grey
             levels of 0..255, after matching the brightness.
         matched_share: (B,) share of the photometric pixel set that could be compared at the end.
+        evidence: (B, E) what is known of the refinement's course, columns `evidence.EVIDENCE_NAMES`.
     """
 
     mask_iou_left: Tensor
     mask_iou_right: Tensor
     photometric_error_grey: Tensor
     matched_share: Tensor
+    evidence: Tensor
 
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> FitQuality:
         """No figures for `count` cars."""
         nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
-        return cls(nan, nan, nan, nan)
+        return cls(nan, nan, nan, nan, nan[:, None].expand(-1, len(EVIDENCE_NAMES)))
 
     def spread(self, rows: Tensor, count: int) -> FitQuality:
         """The figures of some cars placed among `count` cars."""
-        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=rows.device)
-        return FitQuality(*(nan.index_copy(0, rows, getattr(self, f.name)) for f in fields(self)))
+
+        def place(values: Tensor) -> Tensor:
+            return values.new_full((count, *values.shape[1:]), torch.nan).index_copy(0, rows, values)
+
+        return FitQuality(*(place(getattr(self, f.name)) for f in fields(self)))
 
     def where(self, condition: Tensor) -> FitQuality:
         """The figures where the condition (B,) holds, NaN elsewhere."""
-        values = (getattr(self, f.name) for f in fields(self))
-        return FitQuality(*(torch.where(condition, x, torch.full_like(x, torch.nan)) for x in values))
+
+        def keep(values: Tensor) -> Tensor:
+            return torch.where(condition.view(-1, *[1] * (values.ndim - 1)), values, torch.full_like(values, torch.nan))
+
+        return FitQuality(*(keep(getattr(self, f.name)) for f in fields(self)))
 
 
 @torch.no_grad()
-def fit_quality(problem: CarProblem, state: CarState) -> FitQuality:
-    """Figures of B cars at a state of a problem whose last stage has begun."""
+def fit_quality(problem: CarProblem, course: Course) -> FitQuality:
+    """Figures of B cars at the end of a refinement whose last stage is the problem's present one."""
+    agreement = _agreement(problem, course.after)
+    return FitQuality(*agreement, evidence=evidence_of(problem, course, agreement))
+
+
+def _agreement(problem: CarProblem, state: CarState) -> Agreement:
     projected = problem.project(state)
     count = len(state.code)
     left = _mask_iou(projected.shape, projected.left, problem.left, count)
@@ -60,8 +74,8 @@ def fit_quality(problem: CarProblem, state: CarState) -> FitQuality:
     for term in problem.terms:
         if isinstance(term, PhotometricTerm):
             error, share = term.agreement(projected)
-            return FitQuality(left, right, error, share)
-    return FitQuality(left, right, nan, nan)
+            return Agreement(left, right, error, share)
+    return Agreement(left, right, nan, nan)
 
 
 def _mask_iou(shape: BoundShape, view: ProjectedView, pixels: PixelSamples, count: int) -> Tensor:

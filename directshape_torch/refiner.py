@@ -10,15 +10,17 @@ from torch import Tensor, nn
 
 from directshape_torch.backward import attached_state
 from directshape_torch.config import RefinerConfig
-from directshape_torch.covariance import covariance_xyz_yaw, tangent_covariance
+from directshape_torch.covariance import covariance_of, covariance_xyz_yaw
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.direct_terms import stacked_weights
 from directshape_torch.energy.method import method_terms
 from directshape_torch.errors import InputError
+from directshape_torch.evidence import Course
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
+from directshape_torch.observability import Observability, observability_of
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.pixel_sampling import MASK_THRESHOLD
 from directshape_torch.quality import FitQuality, fit_quality
@@ -193,7 +195,7 @@ class DirectShapeRefiner(nn.Module):
         with torch.no_grad():
             start = search_start(problem, initial, cars, self.config.search)
             minimum = minimise(problem, initial, self.config.solver, start, record)
-            outcome = _outcome_of(problem, initial, minimum)
+            outcome = _outcome_of(problem, initial, minimum, cars.detector_hwl)
         return replace(outcome, state=attached_state(problem, initial, start, minimum, self.config))
 
 
@@ -211,21 +213,34 @@ class _Outcome:
     covariance: Tensor
     covariance_xyz_yaw: Tensor
     quality: FitQuality
+    observability: Observability
 
 
-def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState]) -> _Outcome:
-    covariance = tangent_covariance(problem, minimum.state)
+def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], detector_hwl: Tensor) -> _Outcome:
+    linearisations = problem.linearise_terms(minimum.state, with_fisher=True)
+    covariance = covariance_of(linearisations)
+    course = Course(
+        before=initial,
+        after=minimum.state,
+        detector_hwl=detector_hwl,
+        cost_before=problem.term_costs(initial),
+        cost_after=problem.term_costs(minimum.state),
+        linearisations=linearisations,
+        covariance_xyz_yaw=covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
+        unsettled=minimum.status == Status.max_iterations.code,
+    )
     return _Outcome(
         minimum.state,
         minimum.status,
         minimum.iterations,
         minimum.cost_history,
         tuple(term.name for term in problem.terms),
-        problem.term_costs(initial),
-        problem.term_costs(minimum.state),
+        course.cost_before,
+        course.cost_after,
         covariance,
-        covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
-        fit_quality(problem, minimum.state),
+        course.covariance_xyz_yaw,
+        fit_quality(problem, course),
+        observability_of(problem.prior, minimum.state, problem.terms, linearisations),
     )
 
 
@@ -237,7 +252,8 @@ def _no_outcome(state: CarState, unknowns: int) -> _Outcome:
     xyz_yaw = nothing.reshape(0, 4, 4)
     quality = FitQuality.nothing(nothing, 0)
     empty = CarState(state.T_obj_cam[:0], state.code[:0])
-    return _Outcome(empty, none, none, nothing, (), nothing, nothing, square, xyz_yaw, quality)
+    unseen = Observability.nothing(nothing, 0)
+    return _Outcome(empty, none, none, nothing, (), nothing, nothing, square, xyz_yaw, quality, unseen)
 
 
 def _is_refined(status: Tensor) -> Tensor:
@@ -314,6 +330,7 @@ def _assemble(
         covariance_xyz_yaw=only_refined(spread(outcome.covariance_xyz_yaw)),
         cost_history=spread(outcome.cost_history),
         quality=outcome.quality.spread(rows, count).where(refined),
+        observability=outcome.observability.spread(rows, count).where(refined),
         input_dimensions_hwl=detections.dimensions_hwl,
         ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.observability import Observability
 from directshape_torch.quality import FitQuality
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
@@ -54,6 +55,7 @@ class RefinementResult:
         cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across
             stages, each of which begins when the slowest car of the batch has ended the one before.
         quality: agreement of each refined car with masks and images.
+        observability: what its view does not show; `observability.words()` says it in words.
         input_dimensions_hwl: (B, 3) of the detections, metres.
         ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
@@ -71,6 +73,7 @@ class RefinementResult:
     covariance_xyz_yaw: Tensor
     cost_history: Tensor
     quality: FitQuality
+    observability: Observability
     input_dimensions_hwl: Tensor
     ground_source: tuple[str, ...]
     t_cam_ref: Tensor

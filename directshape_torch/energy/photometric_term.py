@@ -175,6 +175,10 @@ class PhotometricTerm:
         share = fixed.segments.sum(usable.to(weight.dtype)) / count.clamp_min(1)
         return torch.where(total > 0, error / total.clamp_min(1), nothing), torch.where(count > 0, share, nothing)
 
+    def support(self) -> Tensor:
+        """Pixels (B,) of the stage's pixel set, float64."""
+        return self._require().segments.counts.to(torch.float64)
+
     def of_objects(self, keep: Tensor) -> PhotometricTerm:
         pixels = self.pixels.of_objects(keep)
         reduced = replace(self, cars=self.cars.of_objects(keep), pixels=pixels, fixed=None)

@@ -16,6 +16,7 @@ from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.observability import Observability
 from directshape_torch.quality import FitQuality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, StereoCamera
@@ -93,6 +94,7 @@ def result(statuses: list[Status]) -> RefinementResult:
         covariance_xyz_yaw=torch.eye(4).repeat(B, 1, 1),
         cost_history=torch.zeros(B, 3),
         quality=FitQuality.nothing(T_cam_obj, B),
+        observability=Observability.nothing(T_cam_obj, B),
         input_dimensions_hwl=torch.ones(B, 3, dtype=torch.float64),
         ground_source=("file",) * B,
         t_cam_ref=T_CAM_REF.expand(B, 3),

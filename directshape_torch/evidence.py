@@ -1,0 +1,196 @@
+"""What is known at run time of how a refinement went: a row of numbers for each car, for the model of trust to read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.energy.car_problem import CarProblem, sum_of
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
+
+EVIDENCE_NAMES = (
+    "log_depth",
+    "log_sigma_depth",
+    "log_sigma_side",
+    "log_sigma_yaw",
+    "moved_share",
+    "moved_depth",
+    "turned",
+    "log_moved_sigmas",
+    "length_change",
+    "mask_misfit_left",
+    "mask_misfit_right",
+    "log_photometric_error",
+    "unmatched_share",
+    "log_support",
+    "log_silhouette_cost",
+    "silhouette_decrease",
+    "photometric_decrease",
+    "relative_decrease",
+    "log_conflict",
+    "code_size",
+    "unsettled",
+)
+"""Columns of the evidence; `docs/results.md` says which of them the bundled model reads.
+
+`log_depth` metres over 20; `log_sigma_*` of the uncalibrated covariance, along and across the viewing ray in the ground
+plane (metres) and of the heading (radians); `moved_share` first-order share of the box that input and output do not
+have in common, seen from above; `moved_depth` of that along the viewing ray, metres; `turned` radians;
+`log_moved_sigmas` Mahalanobis length of the motion; `length_change` metres; `mask_misfit_*` one minus the overlap with
+the mask; `*_decrease` log of cost before over cost after; `log_conflict` share of the cost that photometry alone would
+still gain by a step; `code_size` root mean square; `unsettled` 1 where the iterations ran out.
+"""
+
+_TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Course:
+    """The course of a refinement of B cars, as far as the evidence needs it.
+
+    Attributes:
+        before, after: input and final state.
+        detector_hwl: (B, 3) metres, of the input.
+        cost_before, cost_after: (B, T) at the final stage.
+        linearisations: of the T terms at the final state.
+        covariance_xyz_yaw: (B, 4, 4), uncalibrated.
+        unsettled: (B,) bool, the iterations ran out.
+    """
+
+    before: CarState
+    after: CarState
+    detector_hwl: Tensor
+    cost_before: Tensor
+    cost_after: Tensor
+    linearisations: Sequence[TermLinearisation]
+    covariance_xyz_yaw: Tensor
+    unsettled: Tensor
+
+
+class Agreement(NamedTuple):
+    """Agreement of B cars with the images, (B,) each; see `FitQuality`."""
+
+    mask_iou_left: Tensor
+    mask_iou_right: Tensor
+    photometric_error_grey: Tensor
+    matched_share: Tensor
+
+
+def evidence_of(problem: CarProblem, course: Course, agreement: Agreement) -> Tensor:
+    """The evidence (B, E), float64, columns `EVIDENCE_NAMES`; NaN where a figure does not exist."""
+    columns = {**_motion(problem, course), **_agreement(problem, course, agreement), **_costs(problem, course)}
+    return torch.stack([columns[name].to(torch.float64) for name in EVIDENCE_NAMES], dim=1)
+
+
+def _motion(problem: CarProblem, course: Course) -> dict[str, Tensor]:
+    """How far the box moved, in metres, in shares of itself and in standard deviations."""
+    T_before, T_after = (se3.inverse(s.T_obj_cam).to(torch.float64) for s in (course.before, course.after))
+    hwl = problem.prior.dimensions_and_derivative(course.after.code).hwl.to(torch.float64)
+    shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
+    shift_obj = (T_after[:, :3, :3].mT @ shift_cam[..., None])[..., 0].abs()
+    turned = wrap_angle(rotation_y_from_pose(T_after) - rotation_y_from_pose(T_before))
+    change_hwl = (hwl - course.detector_hwl.to(torch.float64)).abs()
+    _, width, length = hwl.clamp_min(0.1).unbind(1)
+    share = shift_obj[:, 0] / length + shift_obj[:, 2] / width + turned.sin().abs() * length / (4 * width)
+    ray = _horizontal_ray(T_after)
+    along, across = (shift_cam * ray).sum(1), shift_cam[:, 0] * ray[:, 2] - shift_cam[:, 2] * ray[:, 0]
+    in_view = torch.stack([along, across, turned], dim=1)
+    covariance = _covariance_in_view(course.covariance_xyz_yaw, ray)
+    sigma = covariance.diagonal(dim1=1, dim2=2).clamp_min(_TINY**2).sqrt()
+    return {
+        "log_depth": (T_after[:, 2, 3].clamp_min(1.0) / 20).log(),
+        "log_sigma_depth": sigma[:, 0].log(),
+        "log_sigma_side": sigma[:, 1].log(),
+        "log_sigma_yaw": sigma[:, 2].log(),
+        "moved_share": share + 0.5 * (change_hwl[:, 2] / length + change_hwl[:, 1] / width),
+        "moved_depth": along.abs(),
+        "turned": turned.abs(),
+        "log_moved_sigmas": torch.log1p(_mahalanobis(in_view, covariance)),
+        "length_change": change_hwl[:, 2],
+        "code_size": course.after.code.square().mean(1).sqrt(),
+    }
+
+
+def _agreement(problem: CarProblem, course: Course, agreement: Agreement) -> dict[str, Tensor]:
+    """How well the images agree with the final state, and how many pixels say so."""
+    return {
+        "mask_misfit_left": 1 - agreement.mask_iou_left,
+        "mask_misfit_right": 1 - agreement.mask_iou_right,
+        "log_photometric_error": (agreement.photometric_error_grey.clamp_min(0.1) / 10).log(),
+        "unmatched_share": 1 - agreement.matched_share,
+        "log_support": torch.log1p(_support(problem.terms, course.unsettled)),
+        "unsettled": course.unsettled.to(torch.float64),
+    }
+
+
+def _costs(problem: CarProblem, course: Course) -> dict[str, Tensor]:
+    """What the terms paid before and after, and whether photometry pulls against the others at the end."""
+    names = [term.name for term in problem.terms]
+    silhouettes = [name.startswith("silhouette") for name in names]
+    photometric = [name == "photometric" for name in names]
+
+    def paid(costs: Tensor, chosen: list[bool]) -> Tensor:
+        return costs[:, torch.tensor(chosen, device=costs.device)].sum(1).clamp_min(_TINY).log()
+
+    before, after, everything = course.cost_before, course.cost_after, [True] * len(names)
+    return {
+        "log_silhouette_cost": paid(after, silhouettes),
+        "silhouette_decrease": paid(before, silhouettes) - paid(after, silhouettes),
+        "photometric_decrease": paid(before, photometric) - paid(after, photometric),
+        "relative_decrease": paid(before, everything) - paid(after, everything),
+        "log_conflict": _conflict(course, photometric),
+    }
+
+
+def _conflict(course: Course, photometric: list[bool]) -> Tensor:
+    """log(1 + 100 g_p^T H^-1 g_p / 2 / cost): what photometry alone asks for at the minimum of the sum."""
+    hessian = sum_of([part.hessian for part in course.linearisations])
+    pulls = [part.gradient for part, chosen in zip(course.linearisations, photometric, strict=True) if chosen]
+    if not pulls:
+        return torch.zeros_like(course.cost_after[:, 0])
+    pull = sum_of(pulls)
+    gain = 0.5 * _mahalanobis(pull, hessian).square()
+    return torch.log1p(100 * gain / course.cost_after.sum(1).clamp_min(_TINY))
+
+
+def _support(terms: Sequence[Term], like: Tensor) -> Tensor:
+    """Pixels (B,) of the photometric set."""
+    for term in terms:
+        if isinstance(term, PhotometricTerm):
+            return term.support()
+    return torch.zeros_like(like, dtype=torch.float64)
+
+
+def _horizontal_ray(T_cam_obj: Tensor) -> Tensor:
+    """Unit vectors (B, 3) of the viewing rays of the object origins, in the plane y = 0."""
+    ray = T_cam_obj[:, :3, 3] * T_cam_obj.new_tensor([1.0, 0.0, 1.0])
+    unit: Tensor = ray / ray.norm(dim=1, keepdim=True).clamp_min(_TINY)
+    return unit
+
+
+def _covariance_in_view(covariance_xyz_yaw: Tensor, ray: Tensor) -> Tensor:
+    """Covariance (B, 3, 3) along and across the viewing ray, and of the heading."""
+    J = ray.new_zeros(len(ray), 3, 4)
+    J[:, 0, :3] = ray
+    J[:, 1, 0], J[:, 1, 2] = ray[:, 2], -ray[:, 0]
+    J[:, 2, 3] = 1
+    return J @ covariance_xyz_yaw @ J.mT
+
+
+def _mahalanobis(vector: Tensor, matrix: Tensor) -> Tensor:
+    """sqrt(v^T M^-1 v) (B,) of vectors (B, n); NaN where M is not positive definite."""
+    finite = matrix.isfinite().all(-1).all(-1)
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], matrix, identity))
+    regular = finite & (info == 0)
+    factor = torch.where(regular[:, None, None], factor, identity)
+    white = torch.linalg.solve_triangular(factor, vector[..., None], upper=False)[..., 0]
+    return torch.where(regular, white.norm(dim=1), torch.full_like(white[:, 0], torch.nan))
