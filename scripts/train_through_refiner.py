@@ -10,7 +10,7 @@ the same correction as a constant for all cars, trained in the same way on the s
 Frames are dealt into folds by a seeded shuffle; each fold is judged by the training on the others, with the unchanged
 default settings. The training itself uses `fast.yaml` with 200 pixels a car and side and unrolls three iterations.
 Writes `summary.md`, `cars.csv`, `learning_curve.png` and the parameters of each fold as safetensors. The same seed
-gives the same bytes on one machine.
+gives the same parameters and figures on one machine.
 """
 
 from __future__ import annotations

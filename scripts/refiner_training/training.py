@@ -104,8 +104,9 @@ def train_step(
         if parameter.grad is not None:
             parameter.grad /= max(count, 1)
     norm = nn.utils.clip_grad_norm_(parameters, LARGEST_GRADIENT)
-    if count and bool(norm.isfinite()):
-        optimiser.step()
+    if not count or not bool(norm.isfinite()):
+        return losses.detach(), 0
+    optimiser.step()
     return losses.detach(), count
 
 
@@ -138,7 +139,8 @@ def train(
         for first in range(0, len(order), settings.frames_per_step):
             batch = joined([frames[k] for k in order[first : first + settings.frames_per_step]])
             step_losses, step_count = train_step(refiner, batch, corrector, optimiser)
-            schedule.step()
+            if step_count:
+                schedule.step()
             losses.append(step_losses)
             count += step_count
         total = sum(len(frame.counted) for frame in frames)

@@ -122,6 +122,17 @@ def test_a_car_without_gradient_is_counted_and_moves_nothing(script: SimpleNames
     assert all(bool((parameter == 0).all()) for parameter in corrector.parameters())
 
 
+def test_an_epoch_without_any_gradient_is_no_failure(script: SimpleNamespace, frames: list[object]) -> None:
+    strict = refiner("implicit")
+    strict.config = replace(strict.config, backward=BackwardConfig("implicit", max_remaining_step=1e-12))
+    corrector = network(script, "constant", "weights")
+    settings = script.training.TrainingSettings(epochs=1, rate=0.01, weight_decay=0.0, frames_per_step=1, seed=0)
+    (epoch,) = script.training.train(strict, corrector, frames[:1], [], settings)
+    assert (epoch.with_gradient, epoch.without_gradient) == (0, 1)
+    assert epoch.loss > 0
+    assert all(bool((parameter == 0).all()) for parameter in corrector.parameters())
+
+
 def test_seeds_repeat(script: SimpleNamespace, frames: list[object]) -> None:
     def trained(seed: int) -> dict[str, torch.Tensor]:
         corrector = network(script, "network", "weights", seed)
