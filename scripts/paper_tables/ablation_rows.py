@@ -1,0 +1,77 @@
+"""The rows of the ablation, as data: what differs from the default settings, and nothing else.
+
+A row with `start` other than "main" begins from other detections: "mono" (a detector of the data set with `mono` in its
+name) or "noise:S" (labels disturbed S times as much as stereo-like detections, see `simulated_detector`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from paper_tables.settings import DEFAULT, Settings
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row.
+
+    Attributes:
+        group: rows that belong together.
+        name: what differs.
+        settings: of the refinement.
+        start: the detections.
+    """
+
+    group: str
+    name: str
+    settings: Settings = DEFAULT
+    start: str = "main"
+
+
+_COARSE_POSE = "{contour_width_px: 2.0, image_level: 1, max_iterations: 10, unknowns: pose}"
+_FINE_POSE = "{contour_width_px: 0.5, image_level: 0, max_iterations: 12, unknowns: pose}"
+_NO_PRIORS = ("priors.shape_weight=0", "priors.height_weight=0", "priors.tilt_weight=0", "priors.dimensions_weight=0")
+_SAMPLINGS = {
+    "round one only": ("sampling.mode=round_one",),
+    "uniform": ("sampling.mode=uniform",),
+    "dense": ("sampling.mode=dense",),
+}
+
+
+def _points(number: int) -> Settings:
+    return Settings((f"sampling.min_pixels={number}", f"sampling.max_pixels={number}"))
+
+
+REFERENCE = Row("reference", "default settings")
+
+ROWS: tuple[Row, ...] = (
+    REFERENCE,
+    Row("stereo", "without the residual disparity field", Settings(with_field=False)),
+    Row("terms", "silhouette only", Settings(("photometric.weight=0",))),
+    Row("terms", "photometric only", Settings(("silhouette.weight=0",))),
+    Row("terms", "the paper's product silhouette", Settings(("silhouette.form=product",))),
+    Row("terms", "one brightness for both images", Settings(("photometric.gain=false",))),
+    Row("terms", "images and point cloud", Settings(("method=combined",))),
+    Row("priors", "no priors", Settings(_NO_PRIORS)),
+    Row("priors", "no shape prior", Settings(("priors.shape_weight=0",))),
+    Row("priors", "no prior on dimensions (the paper)", Settings(("priors.dimensions_weight=0",))),
+    Row("priors", "no ground", Settings(("priors.height_weight=0", "priors.tilt_weight=0"))),
+    Row("occlusion", "no occlusion handling", Settings(("sampling.occlusion=false",))),
+    Row("occlusion", "order by box bottoms (the paper)", Settings(("sampling.occlusion_order=box_bottom",))),
+    *(Row("sampling", name, Settings(overrides)) for name, overrides in _SAMPLINGS.items()),
+    *(Row("points a car", f"{number}", _points(number)) for number in (50, 100, 200, 400, 1000, 3000)),
+    Row("stages", "fine stage only", Settings((f"stages=[{_FINE_POSE.replace('pose', 'both')}]",))),
+    Row("shape", "mean shape, pose only", Settings((f"stages=[{_COARSE_POSE}, {_FINE_POSE}]",))),
+    *(Row("shape", f"K = {number}", Settings(prior=f"pca:{number}")) for number in (1, 2, 3, 5)),
+    Row("prior", "network (neural)", Settings(prior="neural")),
+    Row("prior", "built from real meshes, K = 5", Settings(prior="meshes")),
+    Row("masks", "degraded", Settings(masks="degraded")),
+    Row("masks", "left image only", Settings(masks="left")),
+    Row("masks", "2D boxes for masks", Settings(masks="boxes")),
+    *(Row("detector noise", f"{scale:g} times", start=f"noise:{scale:g}") for scale in (0.25, 0.5, 1, 2, 3, 4)),
+    Row("far start", "adaptive (default)", start="mono"),
+    *(Row("far start", name, Settings(overrides), "mono") for name, overrides in _SAMPLINGS.items()),
+    Row("far start", "silhouette only", Settings(("photometric.weight=0",)), "mono"),
+    Row("far start", "photometric only", Settings(("silhouette.weight=0",)), "mono"),
+    Row("far start", "fine stage only", Settings((f"stages=[{_FINE_POSE.replace('pose', 'both')}]",)), "mono"),
+)

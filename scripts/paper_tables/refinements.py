@@ -1,0 +1,173 @@
+"""Runs of the refiner, each in a folder of its own that a second call finds again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from directshape_torch.batch.content_hashes import hash_prior
+from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
+from directshape_torch.cli.refine import find_device
+from directshape_torch.config import load_config
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.atomic_files import write_json
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.refinement_files import shapes_path
+from directshape_torch.io.result_files import read_shapes
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.status import Status
+from paper_tables.data_sets import DataSet
+from paper_tables.mask_choices import masks_for
+from paper_tables.priors import prior_for
+from paper_tables.settings import Settings
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished refinement.
+
+    Attributes:
+        out: its folder, as `directshape refine` writes it.
+        before: folder of the detections that went in.
+        frame_ids: the frames asked for.
+        prior: the shapes.
+        seconds: by frame the processor time of the refiner, and its cars; frames of earlier calls included.
+    """
+
+    out: Path
+    before: Path
+    frame_ids: tuple[str, ...]
+    prior: ShapePrior
+    seconds: dict[str, tuple[float, int]]
+
+    @property
+    def mean_iterations(self) -> float:
+        """Gauss-Newton iterations a refined car; NaN without one."""
+        counts: list[int] = []
+        refined = {status.name for status in Status if status.is_refined}
+        for frame_id in self.frame_ids:
+            shapes = read_shapes(shapes_path(self.out, frame_id))
+            counts += [
+                int(n) for n, status in zip(shapes.iterations, shapes.statuses, strict=True) if status in refined
+            ]
+        return sum(counts) / len(counts) if counts else float("nan")
+
+    def time_ratio(self, reference: Run) -> float:
+        """Processor time a car over that of another run, on the frames that both have; NaN without any."""
+        common = sorted(set(self.seconds) & set(reference.seconds) & set(self.frame_ids))
+        mine, other = (_seconds_per_car([run.seconds[f] for f in common]) for run in (self, reference))
+        return mine / other if other > 0 else float("nan")
+
+
+@dataclass
+class Refinery:
+    """Makes runs, or finds them.
+
+    Attributes:
+        out: folder of everything that the tables write.
+        fields: residual disparity field by data set, or None.
+        meshes: folder of real car meshes, or None.
+        device: of the refiner.
+        used: folder of each run that was asked for, for the record.
+        runs: those of this call, by folder and frames.
+    """
+
+    out: Path
+    fields: dict[str, Path | None]
+    meshes: Path | None = None
+    device: str = "auto"
+    used: list[Path] = field(default_factory=list)
+    runs: dict[tuple[Path, tuple[str, ...]], Run] = field(default_factory=dict)
+
+    def run(self, data_set: DataSet, detections: Path, settings: Settings, frame_ids: Sequence[str]) -> Run:
+        """Refine the frames, those that an earlier call finished excepted.
+
+        Raises:
+            DirectShapeError: unusable settings or files; a folder whose files have changed since.
+        """
+        prior = prior_for(settings.prior, self.meshes, self.out / "priors")
+        refiner = DirectShapeRefiner(prior, load_config(settings.config, settings.overrides))
+        refiner = refiner.to(find_device(self.device))
+        dataset = KittiStereoDataset(
+            data_set.root,
+            detections,
+            masks_for(data_set, detections, settings.masks),
+            frames=frame_ids,
+            disparity_field=self._field(data_set, settings),
+        )
+        out = self._folder(data_set, detections, settings, dataset, refiner)
+        key = out, tuple(frame_ids)
+        if key not in self.runs:
+            self.used.append(out)
+            self.runs[key] = self._made(data_set, dataset, refiner, out)
+        return self.runs[key]
+
+    def _made(self, data_set: DataSet, dataset: KittiStereoDataset, refiner: DirectShapeRefiner, out: Path) -> Run:
+        with _measured(refiner, out / "processor_seconds.json") as seconds:
+            summary = refine_dataset(dataset, refiner, out)
+        for frame_id, reason in summary.failed.items():
+            print(f"{out.name}: frame {frame_id} failed: {reason}", file=sys.stderr)
+        done = tuple(frame_id for frame_id in dataset.frame_ids if frame_id not in summary.failed)
+        print(f"{data_set.name} {out.parent.name} {out.name}: {len(done)} frames", file=sys.stderr, flush=True)
+        known = {name: (entry[0], int(entry[1])) for name, entry in seconds.items()}
+        return Run(out, dataset.detections_dir, done, refiner.prior, known)
+
+    def _field(self, data_set: DataSet, settings: Settings) -> DisparityField | None:
+        path = self.fields.get(data_set.name) if settings.with_field else None
+        return None if path is None else DisparityField.load(path)
+
+    def _folder(
+        self,
+        data_set: DataSet,
+        detections: Path,
+        settings: Settings,
+        dataset: KittiStereoDataset,
+        refiner: DirectShapeRefiner,
+    ) -> Path:
+        """Other settings, prior, field or masks are another folder."""
+        manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
+        made_of = [manifest.package_version, manifest.config, manifest.sha256, settings.masks]
+        digest = hashlib.sha256(json.dumps(made_of, sort_keys=True, default=list).encode()).hexdigest()[:8]
+        return self.out / "runs" / data_set.name / detections.name / f"{settings.slug}-{digest}"
+
+
+@contextmanager
+def _measured(refiner: DirectShapeRefiner, path: Path) -> Iterator[dict[str, list[float]]]:
+    """Notes the processor time of each call of the refiner, which a busy machine changes less than the time of day.
+
+    Yields what is known of each frame, also from earlier calls; written to `path` at the end.
+    """
+    seconds: dict[str, list[float]] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    began = [0.0]
+
+    def before(_module: torch.nn.Module, _inputs: Any) -> None:
+        began[0] = time.process_time()
+
+    def after(_module: torch.nn.Module, inputs: Any, _result: Any) -> None:
+        frames, detections = inputs[:2]
+        (frame_id,) = frames.frame_ids
+        seconds[frame_id] = [time.process_time() - began[0], len(detections)]
+
+    handles = refiner.register_forward_pre_hook(before), refiner.register_forward_hook(after)
+    try:
+        yield seconds
+    finally:
+        for handle in handles:
+            handle.remove()
+        if seconds:
+            write_json(path, seconds)
+
+
+def _seconds_per_car(entries: Sequence[tuple[float, int]]) -> float:
+    cars = sum(count for _, count in entries)
+    return sum(seconds for seconds, _ in entries) / cars if cars else float("nan")

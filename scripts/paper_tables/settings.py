@@ -1,0 +1,59 @@
+"""How one row of a table is refined: everything a reader can change, as data."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+Masks = Literal["true", "left", "boxes", "degraded"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One way to refine.
+
+    Attributes:
+        overrides: `key=value`, as for `directshape refine --set`.
+        config: bundled settings that they change.
+        prior: "pca", "neural", "pca:K" (its first K components), "meshes" (built from real car meshes), or a file.
+        masks: "true" (the data set's own), "left" (those of the left images alone), "boxes" (the detector's 2D boxes,
+            filled) or "degraded".
+        with_field: use the residual disparity field where there is one.
+    """
+
+    overrides: tuple[str, ...] = ()
+    config: str = "default"
+    prior: str = "pca"
+    masks: Masks = "true"
+    with_field: bool = True
+
+    @property
+    def slug(self) -> str:
+        """A short name for folders, readable rather than unique.
+
+        Example:
+            >>> Settings(("silhouette.weight=0",), masks="degraded").slug
+            'default-silhouette.weight-0-degraded'
+        """
+        parts = [self.config, *self.overrides]
+        parts += [self.prior] if self.prior != "pca" else []
+        parts += [self.masks] if self.masks != "true" else []
+        parts += [] if self.with_field else ["no-field"]
+        return re.sub(r"[^\w.]+", "-", "-".join(parts)).strip("-")[:60]
+
+
+PAPER = Settings(config="paper")
+DEFAULT = Settings()
+FAST = Settings(config="fast")
+GEOMETRIC = Settings(("method=geometric",))
+COMBINED = Settings(("method=combined",))
+
+METHODS: dict[str, Settings] = {
+    "ours, `paper`": PAPER,
+    "ours, `fast`": FAST,
+    "ours, `default`": DEFAULT,
+    "geometric, SGBM": GEOMETRIC,
+    "combined": COMBINED,
+}
+"""The methods of the pose table, by the names they have there."""

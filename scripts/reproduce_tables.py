@@ -1,0 +1,133 @@
+"""The paper's experiments, one command each: pose, shape, ablation, detectors.
+
+    export DIRECTSHAPE_DATA=...                      # or --data ROOT, a full KITTI with detections and masks
+    python scripts/reproduce_tables.py pose          # AP before and after: ours, the geometric rival, both together
+    python scripts/reproduce_tables.py shape         # completeness, accuracy, F1 and RMSE over tau
+    python scripts/reproduce_tables.py ablation      # scripts/paper_tables/ablation_rows.py, row by row
+    python scripts/reproduce_tables.py detectors     # every detector, and counterparts of the paper's four
+
+Which folders a data set has: scripts/paper_tables/data_sets.py. Written to --out: NAME.md, NAME_*.csv, plots,
+NAME_manifest.json (options, seeds, versions, hashes of the runs), and under runs/ every refinement, as `directshape
+refine` writes it. Refinements are kept: a second call makes tables only, and one that was stopped goes on. They are
+told apart by settings, prior, stereo field and masks, not by the program's code: after a change of that, choose another
+--out. Try everything in a minute or two with --quick (two frames, one row of each group).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from paper_tables.ablation_table import make_ablation_table
+from paper_tables.data_sets import DataSet, find_data_sets
+from paper_tables.detector_table import make_detector_table
+from paper_tables.disparity_fields import field_file
+from paper_tables.experiment import Experiment
+from paper_tables.pose_table import make_pose_table
+from paper_tables.refinements import Refinery
+from paper_tables.report import Report
+from paper_tables.shape_table import make_shape_table
+
+from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+
+TABLES: dict[str, Callable[[Experiment], None]] = {
+    "pose": make_pose_table,
+    "shape": make_shape_table,
+    "ablation": make_ablation_table,
+    "detectors": make_detector_table,
+}
+
+
+def stereo_field(data_set: DataSet, choice: str, table: str, out: Path) -> Path | None:
+    """The residual disparity field that a table uses for a data set.
+
+    "auto" fits it: from disparity maps, but for shapes, which are judged by these, from LiDAR.
+    """
+    if choice == "none":
+        return None
+    if choice != "auto":
+        return Path(choice)
+    return field_file(data_set.root, "lidar" if table == "shape" else "disparity", out)
+
+
+def chosen_data_sets(args: argparse.Namespace) -> tuple[DataSet, ...]:
+    """The data sets that the options name.
+
+    Raises:
+        InputError: no data, or an unknown name.
+    """
+    root = args.data or os.environ.get("DIRECTSHAPE_DATA")
+    if not root:
+        raise InputError("--data", "a folder in KITTI's layout", "none", "or set DIRECTSHAPE_DATA")
+    found = find_data_sets(Path(root), args.masks)
+    unknown = sorted(set(args.sets or ()) - set(found))
+    if unknown:
+        raise InputError("--sets", f"names among {', '.join(found)}", ", ".join(unknown))
+    # Rendered scenes first, where the truth is exact.
+    chosen = [data_set for name, data_set in found.items() if not args.sets or name in args.sets]
+    return tuple(sorted(chosen, key=lambda data_set: not data_set.has_exact_truth))
+
+
+def run(args: argparse.Namespace) -> None:
+    """Make one experiment's tables."""
+    torch.set_num_threads(args.threads)
+    data_sets = chosen_data_sets(args)
+    fields = {d.name: stereo_field(d, args.stereo_bias, args.table, args.out / "fields") for d in data_sets}
+    root = Path(args.data or os.environ["DIRECTSHAPE_DATA"])
+    meshes = args.meshes or (root / "meshes" if (root / "meshes").is_dir() else None)
+    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
+    for name in ("data", "out", "masks", "meshes"):
+        # Results do not depend on where the files lie.
+        options.pop(name)
+    refinery = Refinery(args.out, fields, meshes, args.device)
+    experiment = Experiment(
+        data_sets=data_sets,
+        refinery=refinery,
+        report=Report(args.table, args.out, options),
+        frames=None if args.frames is None else tuple(frame.zfill(6) for frame in args.frames),
+        detectors=None if args.detections is None else tuple(args.detections),
+        bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
+        seed=args.seed,
+        quick=args.quick,
+    )
+    try:
+        TABLES[args.table](experiment)
+    finally:
+        experiment.report.write_record(refinery.used)
+    print(f"{args.out / args.table}.md")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line and run; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", choices=tuple(TABLES))
+    parser.add_argument("--data", type=Path, metavar="ROOT", help="default: DIRECTSHAPE_DATA")
+    parser.add_argument("--out", type=Path, default=Path("out/tables"), metavar="DIR", help="default: %(default)s")
+    parser.add_argument("--sets", nargs="+", metavar="NAME", help="data sets below ROOT; default all")
+    parser.add_argument("--detections", nargs="+", metavar="NAME", help="folders of detections/; default the table's")
+    parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
+    parser.add_argument("--masks", type=Path, metavar="DIR", help="instead of the data set's own")
+    parser.add_argument("--meshes", type=Path, metavar="DIR", help="real car meshes; default ROOT/meshes")
+    parser.add_argument(
+        "--stereo-bias", default="auto", metavar="FILE|auto|none", help="auto fits it, where all frames are of one rig"
+    )
+    parser.add_argument("--quick", action="store_true", help="two frames of each detector, one row of each group")
+    parser.add_argument("--seed", type=int, default=0, help="of simulated detections and intervals")
+    parser.add_argument("--draws", type=int, default=2000, help="of the intervals")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", default="auto")
+    try:
+        run(parser.parse_args(arguments))
+    except DirectShapeError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
