@@ -136,9 +136,9 @@ def _difference(
     if not common:
         return None
     _, index = np.unique([after[0][key].car for key in common], return_inverse=True)
-    values = [np.array([cars[key].after.bev_iou for key in common]) for cars in after]
+    default, row = (np.array([cars[key].after.bev_iou for key in common]) for cars in after)
     settings = experiment.bootstrap
-    return CarBootstrap(index, num_draws=settings.num_draws, seed=settings.seed).change(*values, weighted_mean)
+    return CarBootstrap(index, num_draws=settings.num_draws, seed=settings.seed).change(default, row, weighted_mean)
 
 
 def _after(entry: Judged) -> Estimate:
@@ -147,7 +147,7 @@ def _after(entry: Judged) -> Estimate:
 
 def _table(data_set: DataSet, main: Path, judged: list[Judged]) -> Table:
     title = f"{data_set.name}, detections `{main.name}`"
-    notes = (
+    notes: tuple[str, ...] = (
         "'against default': mean difference of the same cars from the same start, with its interval. 'reached': centre "
         f"within {CENTRE_LIMIT_M:g} m and heading within {YAW_LIMIT_DEG:g} degrees. 'time': processor time a car over "
         "that of the default settings.",

@@ -13,6 +13,8 @@ from paper_tables.refinements import Refinery, Run
 from paper_tables.report import Report
 from paper_tables.settings import DEFAULT, Settings
 
+QUICK_FRAMES = 2
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -50,7 +52,7 @@ class Experiment:
     def frames_of(self, data_set: DataSet, detections: Path) -> tuple[str, ...]:
         """Frames of a detector that this call is about."""
         frames = data_set.frames_of(detections, self.frames)
-        return frames[:2] if self.quick else frames
+        return frames[:QUICK_FRAMES] if self.quick else frames
 
     def run(self, data_set: DataSet, detections: Path, settings: Settings) -> Run:
         """The refinement of these frames."""

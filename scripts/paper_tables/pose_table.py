@@ -7,6 +7,7 @@ from typing import Any
 
 from directshape_torch.evaluation.comparison import Comparison
 from directshape_torch.evaluation.kitti_ap import KittiScores
+from directshape_torch.evaluation.kitti_curve import NUM_RECALL_POINTS
 from directshape_torch.visualize.precision_recall import RecallCurve, RecallPanel, write_recall_plot
 from paper_tables.average_precision import Average, ap_scores, long_rows, paper_columns, paper_row
 from paper_tables.data_sets import DataSet
@@ -56,8 +57,16 @@ def _ap_table(title: str, scores: dict[str, KittiScores], average: Average) -> T
     rows = tuple((method, *paper_row(s, average)) for method, s in scores.items())
     labels = [scores["input"].score("bev", 0.7, d).num_labels for d in ("easy", "moderate", "hard")]
     counts = f"Labels: {labels[0]} easy, {labels[1]} moderate, {labels[2]} hard."
-    few = f"{counts} With fewer than 41 labels not every recall point can be reached." if min(labels) < 41 else counts
-    return Table(title, ("", *paper_columns()), rows, (few,))
+    if min(labels) < NUM_RECALL_POINTS:
+        counts += f" With fewer than {NUM_RECALL_POINTS} labels not every recall point can be reached."
+    if not _are_ranked(scores["input"]):
+        counts += " All scores of these detections are equal: there is one point of the curve, and AP says little."
+    return Table(title, ("", *paper_columns()), rows, (counts,))
+
+
+def _are_ranked(scores: KittiScores) -> bool:
+    """Whether the detections differ in score, as far as the curves tell."""
+    return len({threshold for score in scores.scores for threshold in score.curve.thresholds.tolist()}) > 1
 
 
 def _box_table(title: str, comparisons: dict[str, Comparison]) -> Table:

@@ -12,7 +12,7 @@ from directshape_torch.evaluation.shape_error_scores import ShapeScores
 from directshape_torch.evaluation.shape_error_summary import METRICS, ShapeCurve
 from directshape_torch.visualize.shape_curves import TauCurve, TauPanel, write_tau_plot
 from paper_tables.data_sets import DataSet
-from paper_tables.experiment import Experiment
+from paper_tables.experiment import QUICK_FRAMES, Experiment
 from paper_tables.report import Table, few_cars_note
 from paper_tables.settings import METHODS
 
@@ -40,7 +40,8 @@ _OWN = ("stereo", "noisy_stereo")
 def _scores(experiment: Experiment, data_set: DataSet, detections: Path) -> dict[str, ShapeScores]:
     if data_set.truth is None:
         return {}
-    frames = [f for f in experiment.frames_of(data_set, detections) if _has_truth(data_set, f)]
+    with_truth = [f for f in data_set.frames_of(detections, experiment.frames) if _has_truth(data_set, f)]
+    frames = with_truth[:QUICK_FRAMES] if experiment.quick else with_truth
     if not frames:
         return {}
     scores = {}

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -135,7 +135,7 @@ def tuned_model(
         for _ in range(rounds):
             for knob, figure, low, high, rising in _KNOBS:
                 value = bisect(_figure_of(labels, model, knob, figure), getattr(wanted, figure), low, high, rising)
-                model = replace(model, **{knob: value})
+                model = _with_knob(model, knob, value)
             reached = average_precisions(labels, model)
             if best is None or miss(reached, wanted) < best[0]:
                 best = miss(reached, wanted), model, reached
@@ -150,8 +150,12 @@ _KNOBS = (
 )
 
 
+def _with_knob(model: NoiseModel, knob: str, value: float) -> NoiseModel:
+    return NoiseModel(**{**asdict(model), knob: value})
+
+
 def _figure_of(labels: Labels, model: NoiseModel, knob: str, figure: str) -> Callable[[float], float]:
-    return lambda value: float(getattr(average_precisions(labels, replace(model, **{knob: value})), figure))
+    return lambda value: float(getattr(average_precisions(labels, _with_knob(model, knob, value)), figure))
 
 
 def bisect(

@@ -1,0 +1,248 @@
+"""The experiments: rows are valid settings, tables come out of a tiny data set, runs are kept, simulated AP is hit."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from helpers.exact_disparity import exact_disparity
+from helpers.kitti_folder import CODE, write_data_set
+from helpers.synthetic_scene import TWO_CARS, street
+
+from directshape_torch.config import load_config
+from directshape_torch.io.disparity_files import write_disparity
+from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.text_files import Line
+from directshape_torch.refiner import DirectShapeRefiner
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    return importlib.import_module("reproduce_tables")
+
+
+@pytest.fixture
+def simulator(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    return importlib.import_module("paper_tables.simulated_detector")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A street in two frames, one of whose two cars is 25 px high; one detector named `data`, and true disparities."""
+    import torch
+
+    root = tmp_path_factory.mktemp("street")
+    frames = ("000000", "000001")
+    prior = write_data_set(root, frames)
+    scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=prior.mean.dtype))
+    for frame_id in frames:
+        path = root / "training" / "disp_occ_0" / f"{frame_id}.png"
+        write_disparity(path, exact_disparity(prior, scene)[0].numpy())
+    return root
+
+
+def _labels(num_frames: int = 20, cars_a_frame: int = 5) -> dict[str, list[KittiObject]]:
+    """Visible cars of one size, 8 to 40 m away."""
+    generator = np.random.default_rng(3)
+    labels = {}
+    for frame in range(num_frames):
+        lines = []
+        for car in range(cars_a_frame):
+            x, z, yaw = 8.0 * (car - 2), generator.uniform(8, 40), generator.uniform(-3, 3)
+            box = f"{100 + 200 * car} 100 {220 + 200 * car} 170"
+            lines.append(f"Car 0.00 0 0.0 {box} 1.5 1.7 4.2 {x:.2f} 1.65 {z:.2f} {yaw:.2f}")
+        labels[f"{frame:06d}"] = [parse_object("labels", Line(n, t, t)) for n, t in enumerate(lines, 1)]
+    return labels
+
+
+@pytest.mark.usefixtures("script")
+def test_every_row_is_a_valid_setting() -> None:
+    rows = importlib.import_module("paper_tables.ablation_rows").ROWS
+    methods = importlib.import_module("paper_tables.settings").METHODS
+    default = load_config()
+    assert len({(row.group, row.name) for row in rows}) == len(rows)
+    for settings in [*(row.settings for row in rows), *methods.values()]:
+        config = load_config(settings.config, settings.overrides)
+        # An override that changes nothing would make a row that says nothing.
+        assert (config != default) == bool(settings.overrides or settings.config != "default"), settings
+    assert sum(row.settings == replace(row.settings, overrides=()) for row in rows) > 5
+
+
+@pytest.mark.usefixtures("script")
+def test_rows_that_ask_for_nothing_new_are_told_apart_by_prior_masks_field_or_start() -> None:
+    rows = importlib.import_module("paper_tables.ablation_rows").ROWS
+    assert len({(row.settings, row.start) for row in rows}) == len(rows)
+
+
+@pytest.mark.usefixtures("script")
+def test_the_papers_table_is_complete() -> None:
+    rows = importlib.import_module("paper_tables.paper_rows").PAPER_ROWS
+    assert [row.detector for row in rows] == ["Mono3D", "Deep3DBox", "3DOP", "MLF"]
+    assert all(len(row.before) == len(row.after) == 12 for row in rows)
+    # The paper's refinement improves every figure of every detector.
+    assert all(b < a for row in rows for b, a in zip(row.before, row.after, strict=True))
+    wanted = rows[3].wanted
+    assert (wanted.bev_50, wanted.bev_70, wanted.box_50, wanted.box_70) == (36.73, 13.76, 29.48, 5.69)
+
+
+def test_no_noise_is_the_labels(simulator: ModuleType) -> None:
+    exact = simulator.NoiseModel(0.0, 0.0, 1.0)
+    labels = _labels(6)
+    for frame_id, lines in simulator.simulated_lines(labels, exact).items():
+        found = {line.split()[4]: [float(word) for word in line.split()[11:15]] for line in lines}
+        assert len(found) == 5
+        for label in labels[frame_id]:
+            truth = [*label.location_ref, label.rotation_y]
+            np.testing.assert_allclose(found[f"{label.box_2d[0]:.4f}"], truth, atol=1e-4)
+
+
+def test_noise_has_the_stated_size_and_does_not_depend_on_other_frames(simulator: ModuleType) -> None:
+    labels = _labels(80)
+    lines = simulator.simulated_lines(labels, simulator.NoiseModel(2.0, 3.0, 1.0, seed=4))
+    assert simulator.simulated_lines({"000007": labels["000007"]}, simulator.NoiseModel(2.0, 3.0, 1.0, 4)) == {
+        "000007": lines["000007"]
+    }
+    truth = {(f, f"{o.box_2d[0]:.4f}"): o for f, objects in labels.items() for o in objects}
+    pairs = [(truth[f, line.split()[4]], line.split()) for f, found in lines.items() for line in found]
+    height = np.array([float(words[12]) - o.location_ref[1] for o, words in pairs])
+    yaw = np.array([np.remainder(float(words[14]) - o.rotation_y + np.pi, 2 * np.pi) - np.pi for o, words in pairs])
+    along = []
+    for o, words in pairs:
+        ray = np.array([o.location_ref[0], o.location_ref[2]])
+        along.append(np.array([float(words[11]), float(words[13])]) @ ray / (ray @ ray) - 1)
+    # 400 cars: the standard deviation of a sample is known to 3.5 percent.
+    assert np.std(height) == pytest.approx(3 * simulator.VERTICAL_M, rel=0.15)
+    assert np.std(yaw) == pytest.approx(np.radians(2 * simulator.YAW_DEG), rel=0.15)
+    assert np.std(along) == pytest.approx(2 * simulator.DEPTH_SHARE, rel=0.15)
+
+
+def test_larger_models_find_less(simulator: ModuleType) -> None:
+    labels = _labels()
+    models = [simulator.NoiseModel(scale, 1.0, found) for scale, found in ((0.2, 1.0), (1.5, 1.0), (4.0, 1.0))]
+    bev = [simulator.average_precisions(labels, model).bev_70 for model in models]
+    assert bev[0] > bev[1] > bev[2]
+    assert simulator.average_precisions(labels, simulator.NoiseModel(0.2, 1.0, 0.4)).bev_50 < 50
+    few = simulator.simulated_lines(labels, simulator.NoiseModel(found_share=0.5))
+    assert 35 < sum(map(len, few.values())) < 65
+
+
+def test_the_wanted_average_precision_is_hit(simulator: ModuleType) -> None:
+    labels = _labels()
+    # What another seed reaches can be reached.
+    wanted = simulator.average_precisions(labels, simulator.NoiseModel(1.8, 2.0, 0.7, seed=11))
+    assert 5 < wanted.bev_70 < wanted.bev_50 < 90
+    model, reached = simulator.tuned_model(labels, wanted, seeds=(0, 1), rounds=2)
+    assert reached == simulator.average_precisions(labels, model)
+    assert simulator.miss(reached, wanted) < 4.0
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_pose_table_and_that_runs_are_kept(
+    script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = importlib.import_module("paper_tables.settings")
+    few = {"ours": settings.Settings(("stages=[{max_iterations: 2}]",)), "rival": settings.GEOMETRIC}
+    monkeypatch.setattr(importlib.import_module("paper_tables.pose_table"), "METHODS", few)
+    words = ["pose", "--data", str(data), "--out", str(tmp_path), "--draws", "20", "--stereo-bias", "none"]
+    assert script.main([*words, "--device", "cpu"]) == 0
+    text = (tmp_path / "pose.md").read_text(encoding="utf-8")
+    assert "| input |" in text
+    assert "| rival |" in text
+    assert "Few cars: 2 detections of 2 physical cars" in text
+    rows = _rows(tmp_path / "pose_ap.csv")
+    assert {row["after"] for row in rows} == {"input", "ours", "rival"}
+    assert {row["labels"] for row in rows if row["difficulty"] == "hard"} == {"2"}
+    assert (tmp_path / "plots" / f"pose_{data.name}_data_3d_0.7.png").read_bytes()[1:4] == b"PNG"
+    manifest = json.loads((tmp_path / "pose_manifest.json").read_text(encoding="utf-8"))
+    assert manifest["config"]["options"]["seed"] == 0
+    assert len(manifest["sha256"]) == 3  # the two methods, and the default, whose masks say which cars count
+
+    def refuse(*_arguments: object) -> None:
+        raise AssertionError("refined again")
+
+    monkeypatch.setattr(DirectShapeRefiner, "forward", refuse)
+    assert script.main([*words, "--device", "cpu"]) == 0
+    assert (tmp_path / "pose.md").read_text(encoding="utf-8") == text
+
+
+def test_shape_table(script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = importlib.import_module("paper_tables.settings")
+    few = {"ours": settings.Settings(("stages=[{max_iterations: 2}]",))}
+    monkeypatch.setattr(importlib.import_module("paper_tables.shape_table"), "METHODS", few)
+    words = ["shape", "--data", str(data), "--detections", "data", "--out", str(tmp_path), "--draws", "20"]
+    assert script.main([*words, "--stereo-bias", "none", "--quick", "--device", "cpu"]) == 0
+    text = (tmp_path / "shape.md").read_text(encoding="utf-8")
+    assert "segment surface, 2 cars" in text
+    rows = _rows(tmp_path / "shape_over_tau.csv")
+    assert len(rows) == 4 * 2 * 20
+    at_end = {row["after"]: float(row["value"]) for row in rows if row["metric"] == "f1" and row["tau_m"] == "1.0"}
+    assert at_end.keys() == {"mean shape, input pose", "ours"}
+    assert all(0 <= value <= 1 for value in at_end.values())
+
+
+def test_ablation_table(script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = importlib.import_module("paper_tables.ablation_table")
+    chosen = ("default settings", "2D boxes for masks", "left image only", "degraded", "K = 3", "1 times")
+    rows = tuple(row for row in table.ROWS if row.name in chosen)
+    monkeypatch.setitem(script.TABLES, "ablation", lambda experiment: table.make_ablation_table(experiment, rows))
+    words = ["ablation", "--data", str(data), "--detections", "data", "--out", str(tmp_path), "--draws", "20"]
+    assert script.main([*words, "--stereo-bias", "none", "--frames", "0", "--device", "cpu"]) == 0
+    found = {row["row"]: row for row in _rows(tmp_path / "ablation_rows.csv")}
+    # The street has no degraded masks: that row says nothing about it.
+    assert found.keys() == set(chosen) - {"degraded"}
+    assert found["default settings"]["difference"] == ""
+    reference = float(found["default settings"]["bev_iou"])
+    boxes = found["2D boxes for masks"]
+    assert float(boxes["difference"]) == pytest.approx(float(boxes["bev_iou"]) - reference)
+    assert float(found["default settings"]["time_ratio"]) == 1.0
+    assert (tmp_path / "plots" / f"ablation_{data.name}.png").is_file()
+
+
+def test_detector_table(script: ModuleType, data: Path, tmp_path: Path) -> None:
+    words = ["detectors", "--data", str(data), "--out", str(tmp_path), "--frames", "000001", "--draws", "20"]
+    assert script.main([*words, "--stereo-bias", "none", "--device", "cpu"]) == 0
+    text = (tmp_path / "detectors.md").read_text(encoding="utf-8")
+    assert f"| {data.name} | `data` | 1 | 1 (1) |" in text
+    assert f"| {data.name} `data`, refined |" in text
+    assert "Mono3D" not in text  # the street is not one of the rendered sets
+
+
+def test_wrong_input_names_the_cure(
+    script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("DIRECTSHAPE_DATA", raising=False)
+    assert script.main(["pose", "--out", str(tmp_path)]) == 2
+    assert "set DIRECTSHAPE_DATA" in capsys.readouterr().err
+    assert script.main(["pose", "--data", str(tmp_path), "--out", str(tmp_path)]) == 2
+    assert "detections/NAME/data" in capsys.readouterr().err
+    assert script.main(["pose", "--data", str(data), "--sets", "kitti", "--out", str(tmp_path)]) == 2
+    assert data.name in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("script")
+def test_the_development_data_is_found() -> None:
+    root = os.environ.get("DIRECTSHAPE_DATA")
+    if root is None:
+        pytest.skip("DIRECTSHAPE_DATA is not set")
+    found = importlib.import_module("paper_tables.data_sets").find_data_sets(Path(root))
+    assert set(found) == {"rendered", "kitti"}
+    assert found["rendered"].has_exact_truth
+    assert found["rendered"].masks_degraded is not None
+    tracks = found["kitti"].tracks
+    assert tracks is not None
+    assert len({identity.car for identity in tracks.identities.values()}) >= 3
