@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_problem import CarProblem
@@ -14,7 +15,12 @@ from directshape_torch.status import Status
 
 
 def attached_state(
-    problem: CarProblem, initial: CarState, start: CarState, minimum: Minimum[CarState], config: RefinerConfig
+    problem: CarProblem,
+    initial: CarState,
+    start: CarState,
+    minimum: Minimum[CarState],
+    config: RefinerConfig,
+    car_numbers: Tensor,
 ) -> CarState:
     """The states of a minimum, with the graph of the backward mode for every car that was refined.
 
@@ -24,6 +30,7 @@ def attached_state(
         start: where the iterations began; a search's choice counts as a constant motion of the input.
         minimum: of the problem.
         config: its `backward` says how.
+        car_numbers: (B,) the caller's numbers of the cars, for warnings.
     """
     if not torch.is_grad_enabled():
         return minimum.state
@@ -39,5 +46,5 @@ def attached_state(
     else:
         exact = backward.mode == "implicit"
         limit = backward.max_remaining_step
-        state = implicit_state(part, minimum, rows, exact=exact, max_remaining_step=limit)
+        state = implicit_state(part, minimum, rows, exact=exact, max_remaining_step=limit, names=car_numbers[rows])
     return put_rows(minimum.state, rows, state)

@@ -102,7 +102,8 @@ class DirectShapeRefiner(nn.Module):
     def _refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
-        input_state = CarState(se3.inverse(detections.T_cam_obj), self._initial_code(detections))
+        # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
+        input_state = CarState(se3.inverse(detections.T_cam_obj.detach()), self._initial_code(detections))
         points = self._points(frames, detections)
         observation, failure = self._observe(frames, detections, points)
         usable = failure < 0
@@ -196,7 +197,8 @@ class DirectShapeRefiner(nn.Module):
             start = search_start(problem, initial, cars, self.config.search)
             minimum = minimise(problem, initial, self.config.solver, start, record)
             outcome = _outcome_of(problem, initial, minimum, cars.detector_hwl)
-        return replace(outcome, state=attached_state(problem, initial, start, minimum, self.config))
+        state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)
+        return replace(outcome, state=state)
 
 
 @dataclass(frozen=True)

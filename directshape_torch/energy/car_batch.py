@@ -17,8 +17,7 @@ class CarBatch:
     Attributes:
         detection_row: (B,) row of each car among the detections of the call.
         frame_index: (B,) frame of each car.
-        focal_over_depth: (B,) focal length over INPUT depth, pixels per metre: zeta comes from the input depth for the
-            whole call, for a zeta that follows the state would let a car lower its cost by moving.
+        input_depth: (B,) metres.
         K_right: (B, 3, 3).
         T_right_cam: (B, 4, 4).
         K_left: (B, 3, 3).
@@ -29,7 +28,7 @@ class CarBatch:
 
     detection_row: Tensor
     frame_index: Tensor
-    focal_over_depth: Tensor
+    input_depth: Tensor
     K_left: Tensor
     K_right: Tensor
     T_right_cam: Tensor
@@ -40,11 +39,10 @@ class CarBatch:
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections) -> CarBatch:
         f = detections.frame_index
-        depth = detections.T_cam_obj[:, 2, 3]
         return cls(
             detection_row=torch.arange(len(f), device=f.device),
             frame_index=f,
-            focal_over_depth=frames.camera.K_left[f, 0, 0] / depth,
+            input_depth=detections.T_cam_obj[:, 2, 3],
             K_left=frames.camera.K_left[f],
             K_right=frames.camera.K_right[f],
             T_right_cam=frames.camera.T_right_cam[f],
@@ -52,6 +50,15 @@ class CarBatch:
             ground_offset=frames.ground.offset[f],
             detector_hwl=detections.dimensions_hwl,
         )
+
+    @property
+    def focal_over_depth(self) -> Tensor:
+        """Focal length over INPUT depth (B,), pixels per metre.
+
+        Zeta comes from the input depth for the whole call, for a zeta that follows the state would let a car lower its
+        cost by moving. Divided when asked for, after cars without a depth were left out: no NaN in gradients.
+        """
+        return self.K_left[:, 0, 0] / self.input_depth
 
     def of_objects(self, keep: Tensor) -> CarBatch:
         return replace(self, **{x.name: getattr(self, x.name)[keep] for x in fields(self)})

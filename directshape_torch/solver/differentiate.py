@@ -86,6 +86,7 @@ def implicit_state(
     *,
     exact: bool,
     max_remaining_step: float,
+    names: Tensor | None = None,
 ) -> StateT:
     """The states of some problems as functions of the problem, by the implicit function theorem at the final stage.
 
@@ -100,6 +101,7 @@ def implicit_state(
             second derivatives of the residuals: cheaper and biased.
         max_remaining_step: problems whose next Newton step would exceed this share of the trust region are not at a
             stationary point: no gradient, and a `NotStationaryWarning` that names them.
+        names: (R,) the numbers by which the warning names them; default `rows`.
 
     Returns:
         States of the R problems: the values of `minimum`; unknowns at a bound are constants.
@@ -116,7 +118,7 @@ def implicit_state(
     remaining = torch.linalg.lu_solve(factor, pivots, gradient.detach()[..., None])[..., 0]
     size = (remaining.abs() / problem.step_limits().to(remaining)).amax(dim=-1)
     stationary = (info == 0) & size.isfinite() & (size <= max_remaining_step)
-    _warn_of_the_others(stationary, rows)
+    _warn_of_the_others(stationary, rows if names is None else names)
     # The graph runs through the gradient alone; where it is not used the system is replaced, so that no NaN passes.
     safe = torch.where(stationary[:, None, None], J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
     gradient = torch.where(stationary[:, None], gradient, torch.zeros_like(gradient))
@@ -138,12 +140,13 @@ def _gradient_and_its_jacobian(
     return at, torch.stack(rows, dim=1)
 
 
-def _warn_of_the_others(stationary: Tensor, rows: Tensor) -> None:
-    others = rows[~stationary].tolist()
+def _warn_of_the_others(stationary: Tensor, names: Tensor) -> None:
+    others = names[~stationary].tolist()
     if others:
         warnings.warn(
             f"no implicit gradient for problems {_listed(others)}: their iterations ended away from a stationary "
-            "point (more iterations or a smaller cost_tolerance would help)",
+            "point (iterate longer with a smaller cost_tolerance; where they end on a kink of the energy, as on most "
+            "real images, only unrolled iterations have a gradient)",
             NotStationaryWarning,
             stacklevel=2,
         )
