@@ -230,6 +230,18 @@ class SearchConfig:
 
 
 @dataclass(frozen=True)
+class AcceptanceConfig:
+    """Which results are returned; the input stands in for the others (status not_trusted).
+
+    Attributes:
+        min_probability: of not being worse than the input by 0.05 of bird's-eye overlap, as far as the course of the
+            refinement tells (docs/results.md, "When to trust a result"); 0 returns every result.
+    """
+
+    min_probability: float = 0.0
+
+
+@dataclass(frozen=True)
 class RefinerConfig:
     """Everything `DirectShapeRefiner` can be told.
 
@@ -249,6 +261,7 @@ class RefinerConfig:
     priors: PriorConfig = field(default_factory=PriorConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
+    acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
     backward: BackwardConfig = field(default_factory=BackwardConfig)
 
     def __post_init__(self) -> None:

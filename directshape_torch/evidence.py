@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,16 +13,19 @@ from torch import Tensor
 from directshape_torch.energy.car_problem import CarProblem, sum_of
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.energy.prior_terms import PriorTerm
 from directshape_torch.energy.term import Term, TermLinearisation
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
+from directshape_torch.shape.shape_prior import DimensionsDerivative
 
 EVIDENCE_NAMES = (
     "log_depth",
     "log_sigma_depth",
     "log_sigma_side",
     "log_sigma_yaw",
-    "moved_share",
+    "log_expected_misfit",
+    "log_expected_gain",
     "moved_depth",
     "turned",
     "log_moved_sigmas",
@@ -32,6 +36,7 @@ EVIDENCE_NAMES = (
     "unmatched_share",
     "log_support",
     "log_silhouette_cost",
+    "log_prior_cost",
     "silhouette_decrease",
     "photometric_decrease",
     "relative_decrease",
@@ -42,14 +47,18 @@ EVIDENCE_NAMES = (
 """Columns of the evidence; `docs/results.md` says which of them the bundled model reads.
 
 `log_depth` metres over 20; `log_sigma_*` of the uncalibrated covariance, along and across the viewing ray in the ground
-plane (metres) and of the heading (radians); `moved_share` first-order share of the box that input and output do not
-have in common, seen from above; `moved_depth` of that along the viewing ray, metres; `turned` radians;
-`log_moved_sigmas` Mahalanobis length of the motion; `length_change` metres; `mask_misfit_*` one minus the overlap with
-the mask; `*_decrease` log of cost before over cost after; `log_conflict` share of the cost that photometry alone would
-still gain by a step; `code_size` root mean square; `unsettled` 1 where the iterations ran out.
+plane (metres) and of the heading (radians); `log_expected_misfit` the share of the box, seen from above, that these
+sigmas let one expect to be wrong, `log_expected_gain` by how much more it would be at the input; `moved_depth` motion
+along the viewing ray, metres; `turned` radians; `log_moved_sigmas` Mahalanobis length of the motion; `length_change`
+metres; `mask_misfit_*` one minus the overlap with the mask; `*_decrease` log of cost before over cost after;
+`log_conflict` share of the cost that photometry alone would still gain by a step; `code_size` root mean square;
+`unsettled` 1 where the iterations ran out.
 """
 
 _TINY = 1e-9
+# Round figures of the calibration: what the sigmas are short of, and the least errors of length, width and heading.
+_SIGMA_FACTOR = 2.0
+_SIGMA_FLOORS = (0.05, 0.04, 0.01, 0.1, 0.03)
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,7 @@ class Course:
         detector_hwl: (B, 3) metres, of the input.
         cost_before, cost_after: (B, T) at the final stage.
         linearisations: of the T terms at the final state.
+        covariance: (B, D, D) in the tangent of `retract`, uncalibrated.
         covariance_xyz_yaw: (B, 4, 4), uncalibrated.
         unsettled: (B,) bool, the iterations ran out.
     """
@@ -71,6 +81,7 @@ class Course:
     cost_before: Tensor
     cost_after: Tensor
     linearisations: Sequence[TermLinearisation]
+    covariance: Tensor
     covariance_xyz_yaw: Tensor
     unsettled: Tensor
 
@@ -93,13 +104,13 @@ def evidence_of(problem: CarProblem, course: Course, agreement: Agreement) -> Te
 def _motion(problem: CarProblem, course: Course) -> dict[str, Tensor]:
     """How far the box moved, in metres, in shares of itself and in standard deviations."""
     T_before, T_after = (se3.inverse(s.T_obj_cam).to(torch.float64) for s in (course.before, course.after))
-    hwl = problem.prior.dimensions_and_derivative(course.after.code).hwl.to(torch.float64)
+    dimensions = problem.prior.dimensions_and_derivative(course.after.code)
     shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
-    shift_obj = (T_after[:, :3, :3].mT @ shift_cam[..., None])[..., 0].abs()
     turned = wrap_angle(rotation_y_from_pose(T_after) - rotation_y_from_pose(T_before))
-    change_hwl = (hwl - course.detector_hwl.to(torch.float64)).abs()
-    _, width, length = hwl.clamp_min(0.1).unbind(1)
-    share = shift_obj[:, 0] / length + shift_obj[:, 2] / width + turned.sin().abs() * length / (4 * width)
+    change_hwl = dimensions.hwl.to(torch.float64) - course.detector_hwl.to(torch.float64)
+    shift_obj = (T_after[:, :3, :3].mT @ shift_cam[..., None])[..., 0]
+    motion = torch.stack([shift_obj[:, 0], shift_obj[:, 2], turned, change_hwl[:, 2], change_hwl[:, 1]], dim=1)
+    misfit, gain = _expected(motion, _footprint_sigmas(course, dimensions), dimensions.hwl.to(torch.float64))
     ray = _horizontal_ray(T_after)
     along, across = (shift_cam * ray).sum(1), shift_cam[:, 0] * ray[:, 2] - shift_cam[:, 2] * ray[:, 0]
     in_view = torch.stack([along, across, turned], dim=1)
@@ -110,13 +121,42 @@ def _motion(problem: CarProblem, course: Course) -> dict[str, Tensor]:
         "log_sigma_depth": sigma[:, 0].log(),
         "log_sigma_side": sigma[:, 1].log(),
         "log_sigma_yaw": sigma[:, 2].log(),
-        "moved_share": share + 0.5 * (change_hwl[:, 2] / length + change_hwl[:, 1] / width),
+        "log_expected_misfit": misfit.log(),
+        "log_expected_gain": (gain + 0.005).log(),
         "moved_depth": along.abs(),
         "turned": turned.abs(),
         "log_moved_sigmas": torch.log1p(_mahalanobis(in_view, covariance)),
-        "length_change": change_hwl[:, 2],
+        "length_change": change_hwl[:, 2].abs(),
         "code_size": course.after.code.square().mean(1).sqrt(),
     }
+
+
+def _footprint_sigmas(course: Course, dimensions: DimensionsDerivative) -> Tensor:
+    """Standard deviations (B, 5) along and across the car, of its heading, length and width, of the right size."""
+    J = dimensions.J_hwl_code[:, [2, 1]].to(torch.float64)
+    C = course.covariance
+    size_variance = (J @ C[:, 6:, 6:] @ J.mT).diagonal(dim1=1, dim2=2)
+    variance = torch.cat([C.diagonal(dim1=1, dim2=2)[:, [0, 2, 4]], size_variance], dim=1)
+    return (variance * _SIGMA_FACTOR**2 + variance.new_tensor(_SIGMA_FLOORS) ** 2).sqrt()
+
+
+def _expected(motion: Tensor, sigma: Tensor, hwl: Tensor) -> tuple[Tensor, Tensor]:
+    """Expected misfit (B,) of footprints whose errors are normal, and how much larger it is at the input.
+
+    Args:
+        motion: (B, 5) of the output against the input, along and across the car, of heading, length and width.
+        sigma: (B, 5) of the output.
+        hwl: (B, 3) metres.
+    """
+    _, width, length = hwl.clamp_min(0.1).unbind(1)
+    # IoU falls by twice the shift over the side, by the change of a side over itself, and by the corners cut in a turn.
+    turn = 0.5 * (length / width + width / length)
+    loss = torch.stack([2 / length, 2 / width, turn, 1 / length, 1 / width], dim=1)
+    # E|x| of x ~ N(0, sigma^2) and of N(motion, sigma^2).
+    at_output = sigma * math.sqrt(2 / math.pi)
+    ratio = motion / sigma
+    at_input = at_output * torch.exp(-0.5 * ratio**2) + motion * torch.erf(ratio / math.sqrt(2))
+    return (loss * at_output).sum(1), (loss * (at_input - at_output)).sum(1).clamp_min(0)
 
 
 def _agreement(problem: CarProblem, course: Course, agreement: Agreement) -> dict[str, Tensor]:
@@ -136,6 +176,7 @@ def _costs(problem: CarProblem, course: Course) -> dict[str, Tensor]:
     names = [term.name for term in problem.terms]
     silhouettes = [name.startswith("silhouette") for name in names]
     photometric = [name == "photometric" for name in names]
+    priors = [isinstance(term, PriorTerm) for term in problem.terms]
 
     def paid(costs: Tensor, chosen: list[bool]) -> Tensor:
         return costs[:, torch.tensor(chosen, device=costs.device)].sum(1).clamp_min(_TINY).log()
@@ -143,6 +184,7 @@ def _costs(problem: CarProblem, course: Course) -> dict[str, Tensor]:
     before, after, everything = course.cost_before, course.cost_after, [True] * len(names)
     return {
         "log_silhouette_cost": paid(after, silhouettes),
+        "log_prior_cost": paid(after, priors),
         "silhouette_decrease": paid(before, silhouettes) - paid(after, silhouettes),
         "photometric_decrease": paid(before, photometric) - paid(after, photometric),
         "relative_decrease": paid(before, everything) - paid(after, everything),

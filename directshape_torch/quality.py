@@ -14,6 +14,7 @@ from directshape_torch.energy.projected_state import ProjectedView
 from directshape_torch.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import BoundShape
+from directshape_torch.trust_model import bundled_trust_model
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,10 @@ class FitQuality:
             levels of 0..255, after matching the brightness.
         matched_share: (B,) share of the photometric pixel set that could be compared at the end.
         evidence: (B, E) what is known of the refinement's course, columns `evidence.EVIDENCE_NAMES`.
+        probability_better: (B,) calibrated probability that the refined box overlaps the true one more than the input
+            does, seen from above; NaN for the methods "geometric" and "combined".
+        probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Figures of cars whose status is
+            `not_trusted` speak of the refinement that was not returned.
     """
 
     mask_iou_left: Tensor
@@ -34,12 +39,14 @@ class FitQuality:
     photometric_error_grey: Tensor
     matched_share: Tensor
     evidence: Tensor
+    probability_better: Tensor
+    probability_not_worse: Tensor
 
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> FitQuality:
         """No figures for `count` cars."""
         nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
-        return cls(nan, nan, nan, nan, nan[:, None].expand(-1, len(EVIDENCE_NAMES)))
+        return cls(nan, nan, nan, nan, nan[:, None].expand(-1, len(EVIDENCE_NAMES)), nan, nan)
 
     def spread(self, rows: Tensor, count: int) -> FitQuality:
         """The figures of some cars placed among `count` cars."""
@@ -62,7 +69,19 @@ class FitQuality:
 def fit_quality(problem: CarProblem, course: Course) -> FitQuality:
     """Figures of B cars at the end of a refinement whose last stage is the problem's present one."""
     agreement = _agreement(problem, course.after)
-    return FitQuality(*agreement, evidence=evidence_of(problem, course, agreement))
+    evidence = evidence_of(problem, course, agreement)
+    better, not_worse = _probabilities(problem, evidence)
+    return FitQuality(*agreement, evidence, better, not_worse)
+
+
+def _probabilities(problem: CarProblem, evidence: Tensor) -> tuple[Tensor, Tensor]:
+    """Of a better and of a not worse box, (B,) each; the model knows the terms of the method "direct" alone."""
+    names = {term.name for term in problem.terms}
+    if not {"silhouette_left", "photometric"} <= names or "point_cloud" in names:
+        unknown = torch.full_like(evidence[:, 0], torch.nan)
+        return unknown, unknown
+    model = bundled_trust_model()
+    return model.better(evidence), model.not_worse(evidence)
 
 
 def _agreement(problem: CarProblem, state: CarState) -> Agreement:

@@ -30,6 +30,7 @@ from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum, minimise
+from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status
 from directshape_torch.stereo_matching.car_points import PointSamples, car_points
 from directshape_torch.stereo_matching.dense_disparity import with_disparity
@@ -68,8 +69,8 @@ class DirectShapeRefiner(nn.Module):
         """Refine every car of one or several frames.
 
         With `config.backward.mode` other than "none" pose and code of the result carry gradients to the masks, the
-        images, the prior's tensors, the term weights and the disparity that the frames bring, with "unroll" to the input
-        poses as well.
+        images, the prior's tensors, the term weights and the disparity that the frames bring, with "unroll" to the
+        input poses as well.
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
@@ -197,6 +198,8 @@ class DirectShapeRefiner(nn.Module):
             start = search_start(problem, initial, cars, self.config.search)
             minimum = minimise(problem, initial, self.config.solver, start, record)
             outcome = _outcome_of(problem, initial, minimum, cars.detector_hwl)
+            minimum = _without_distrusted(minimum, initial, outcome.quality, self.config.acceptance.min_probability)
+            outcome = replace(outcome, status=minimum.status)
         state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)
         return replace(outcome, state=state)
 
@@ -228,6 +231,7 @@ def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarStat
         cost_before=problem.term_costs(initial),
         cost_after=problem.term_costs(minimum.state),
         linearisations=linearisations,
+        covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
     )
@@ -244,6 +248,15 @@ def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarStat
         fit_quality(problem, course),
         observability_of(problem.prior, minimum.state, problem.terms, linearisations),
     )
+
+
+def _without_distrusted(
+    minimum: Minimum[CarState], initial: CarState, quality: FitQuality, min_probability: float
+) -> Minimum[CarState]:
+    """The input's state for cars whose result is too likely to be worse; unknown probabilities are no reason."""
+    distrusted = _is_refined(minimum.status) & (quality.probability_not_worse < min_probability)
+    status = torch.where(distrusted, torch.full_like(minimum.status, Status.not_trusted.code), minimum.status)
+    return replace(minimum, state=where_rows(distrusted, initial, minimum.state), status=status)
 
 
 def _no_outcome(state: CarState, unknowns: int) -> _Outcome:
@@ -331,7 +344,7 @@ def _assemble(
         covariance=only_refined(spread(outcome.covariance)),
         covariance_xyz_yaw=only_refined(spread(outcome.covariance_xyz_yaw)),
         cost_history=spread(outcome.cost_history),
-        quality=outcome.quality.spread(rows, count).where(refined),
+        quality=outcome.quality.spread(rows, count).where(refined | (status == Status.not_trusted.code)),
         observability=outcome.observability.spread(rows, count).where(refined),
         input_dimensions_hwl=detections.dimensions_hwl,
         ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),

@@ -15,6 +15,7 @@ from directshape_torch.quality import FitQuality
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
 from directshape_torch.status import Status
+from directshape_torch.trust_model import bundled_trust_model
 
 if TYPE_CHECKING:
     import trimesh
@@ -48,10 +49,11 @@ class RefinementResult:
         iterations: (B,) Gauss-Newton iterations.
         term_names: names of the T terms.
         cost_before, cost_after: (B, T) cost of each term for input and output, both at the final stage; NaN for cars
-            that were not refined at all.
+            that were not refined at all. Those of `not_trusted` cars are of the refinement that was not returned.
         covariance: (B, 6 + K, 6 + K) in the tangent `(v, omega, dcode)` of the object frame; uncalibrated (relative).
             NaN for cars that were not refined.
-        covariance_xyz_yaw: (B, 4, 4) of the object origin (x, y, z) in the reference frame and the heading.
+        covariance_xyz_yaw: (B, 4, 4) of the object origin (x, y, z) in the reference frame and the heading, relative
+            too; `sigma_xyz_yaw` is calibrated.
         cost_history: (B, n) cost after each iteration, NaN where a car took no part; not comparable across
             stages, each of which begins when the slowest car of the batch has ended the one before.
         quality: agreement of each refined car with masks and images.
@@ -122,6 +124,16 @@ class RefinementResult:
         dimensions = torch.where(refined, dimensions, self.input_dimensions_hwl)
         location = torch.where(refined, location, T_ref_obj[:, :3, 3])
         return KittiBoxes(dimensions, location, rotation_y, alpha_from_kitti(location, rotation_y))
+
+    @property
+    def sigma_xyz_yaw(self) -> Tensor:
+        """Calibrated standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
+
+        NaN for cars that were not refined. Calibrated with the default settings on rendered frames; what a rig's own
+        disparity error adds is not in them.
+        """
+        covariance = bundled_trust_model().calibrated_covariance(self.covariance_xyz_yaw, self.T_cam_obj[:, :3, 3])
+        return covariance.diagonal(dim1=1, dim2=2).sqrt()
 
     def mesh(self, index: int) -> trimesh.Trimesh:
         """Surface of one car in the left camera frame, metres, outward normals.

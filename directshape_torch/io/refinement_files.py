@@ -74,7 +74,7 @@ def refined_boxes(loaded: LoadedFrame, shapes: ShapeArrays, refined: Sequence[bo
 
 def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, rows: Tensor) -> ShapeArrays:
     """What `shapes/NNNNNN.npz` holds, for the given rows of a result."""
-    boxes = result.boxes()
+    boxes, words = result.boxes(), result.observability.words()
     statuses = [result.status[row] for row in rows.tolist()]
     lines = [loaded.input_objects[row].line_number for row in loaded.row_of_detection]
     return ShapeArrays(
@@ -101,6 +101,12 @@ def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: st
         mask_iou_right=_numpy(result.quality.mask_iou_right[rows]),
         photometric_errors_grey=_numpy(result.quality.photometric_error_grey[rows]),
         matched_shares=_numpy(result.quality.matched_share[rows]),
+        probabilities_better=_numpy(result.quality.probability_better[rows]),
+        probabilities_not_worse=_numpy(result.quality.probability_not_worse[rows]),
+        sigmas_ref=_numpy(result.sigma_xyz_yaw[rows]),
+        unseen=tuple(words[row] for row in rows.tolist()),
+        unseen_sigmas_m=_numpy(result.observability.sigmas_m[rows]),
+        unseen_directions=_numpy(result.observability.directions[rows]),
     )
 
 

@@ -104,6 +104,11 @@ class ShapeArrays:
         mask_iou_left, mask_iou_right: (B,) overlap of the projected shape with its masks; NaN where not refined.
         photometric_errors_grey: (B,) mean absolute difference of the images, grey levels of 0..255.
         matched_shares: (B,) share of the photometric pixels that could be compared.
+        probabilities_better, probabilities_not_worse: (B,) calibrated, see `FitQuality`.
+        sigmas_ref: (B, 4) calibrated standard deviations of (x, y, z, yaw) in `ref`, metres and radians.
+        unseen: (B,) text, the direction that the view shows least.
+        unseen_sigmas_m: (B, 7) standard deviations along the principal directions, falling, without priors.
+        unseen_directions: (B, 7, 7) these directions, rows; columns `observability.CAR_QUANTITIES`.
     """
 
     frame_id: str
@@ -129,6 +134,12 @@ class ShapeArrays:
     mask_iou_right: NDArray[np.floating[Any]]
     photometric_errors_grey: NDArray[np.floating[Any]]
     matched_shares: NDArray[np.floating[Any]]
+    probabilities_better: NDArray[np.floating[Any]]
+    probabilities_not_worse: NDArray[np.floating[Any]]
+    sigmas_ref: NDArray[np.floating[Any]]
+    unseen: tuple[str, ...]
+    unseen_sigmas_m: NDArray[np.floating[Any]]
+    unseen_directions: NDArray[np.floating[Any]]
 
     def __post_init__(self) -> None:
         B, T = len(self.input_lines), len(self.term_names)
@@ -153,6 +164,12 @@ class ShapeArrays:
             "mask_iou_right": (B,),
             "photometric_errors_grey": (B,),
             "matched_shares": (B,),
+            "probabilities_better": (B,),
+            "probabilities_not_worse": (B,),
+            "sigmas_ref": (B, 4),
+            "unseen": (B,),
+            "unseen_sigmas_m": (B, 7),
+            "unseen_directions": (B, 7, 7),
         }
         for name, shape in expected.items():
             got = np.shape(getattr(self, name))

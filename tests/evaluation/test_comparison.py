@@ -159,6 +159,12 @@ def _shapes(frame_id: str, lines: list[int], statuses: list[str]) -> ShapeArrays
         mask_iou_right=np.full(count, 0.9),
         photometric_errors_grey=np.full(count, 4.0),
         matched_shares=np.ones(count),
+        probabilities_better=np.full(count, 0.9),
+        probabilities_not_worse=np.full(count, 0.97),
+        sigmas_ref=np.full((count, 4), 0.1),
+        unseen=("",) * count,
+        unseen_sigmas_m=np.ones((count, 7)),
+        unseen_directions=np.ones((count, 7, 7)),
         **values,
     )
 

@@ -105,6 +105,12 @@ def shapes(num_cars: int) -> ShapeArrays:
         mask_iou_right=np.full(B, 0.9),
         photometric_errors_grey=np.full(B, 4.0),
         matched_shares=np.ones(B),
+        probabilities_better=np.full(B, 0.9),
+        probabilities_not_worse=np.full(B, 0.97),
+        sigmas_ref=random.random((B, 4)),
+        unseen=("rear view: length alone (sigma 0.20 m)", "", "")[:B],
+        unseen_sigmas_m=random.random((B, 7)),
+        unseen_directions=random.random((B, 7, 7)),
     )
 
 

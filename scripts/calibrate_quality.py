@@ -1,0 +1,170 @@
+"""Calibrates the figures of trust on refined cars with truth: probabilities, sigmas, and the acceptance policy.
+
+    R=$DIRECTSHAPE_DATA/rendered; K=$DIRECTSHAPE_DATA/kitti
+    directshape calibrate-stereo --data $K --from disparity --frames 007322 --out bias.json
+    python scripts/calibrate_quality.py --data $R --exact $R/detections/gt --masks $R/training/masks $R/masks_degraded
+        --seeds 0 1 2 --other $K --other-detections $K/detections/noisy_stereo --other-masks $K/training/masks
+        --stereo-bias bias.json --out out/trust --model directshape_torch/assets/trust_model.json
+
+Detections of three noise levels are drawn around exact ones and refined with each kind of masks, every result being
+returned. Outcome: did the bird's-eye overlap of the box with the label grow, and did it not fall by more than 0.05. Two
+logistic regressions read a few columns of `result.quality.evidence`; factors and floors bring the covariance into true
+units. Every figure of the report is of cars whose frame the fit has not seen (12 folds of frames); the model that is
+written is fitted to all of them. `--other` names real frames that are judged and never fitted. The refined cars are
+kept in OUT, so that a second call only fits.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from quality_calibration import columns
+from quality_calibration.fit import cross_validated, fit_head, fit_sigmas, in_view
+from quality_calibration.judgement import choose_threshold, is_worse, reliability
+from quality_calibration.noise import LEVELS
+from quality_calibration.observations import Array, Observations, observe_dataset, observe_noisy
+from quality_calibration.report import (
+    Judged,
+    coverage_table,
+    discrimination_table,
+    head_table,
+    plot_policy,
+    plot_reliability,
+    policy_table,
+    reliability_table,
+    sigma_line,
+)
+
+from directshape_torch.config import AcceptanceConfig, RefinerConfig
+from directshape_torch.errors import DirectShapeError
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.trust_model import TrustModel
+
+
+def refiner() -> DirectShapeRefiner:
+    """The default settings, every result returned."""
+    return DirectShapeRefiner(config=replace(RefinerConfig(), acceptance=AcceptanceConfig(min_probability=0.0)))
+
+
+def development_cars(args: argparse.Namespace) -> Observations:
+    """Refined cars of drawn detections, from OUT where they are there already."""
+    parts = []
+    for masks in args.masks:
+        kept = args.out / f"cars_{masks.name}_{'_'.join(map(str, args.seeds))}.npz"
+        if not kept.is_file():
+            dataset = KittiStereoDataset(args.data, args.exact, masks, frames=args.frames)
+            observe_noisy(dataset, refiner(), LEVELS, args.seeds, masks.name, _tell).save(kept)
+        parts.append(Observations.load(kept))
+    return Observations.joined(parts)
+
+
+def other_cars(args: argparse.Namespace) -> Observations:
+    """Refined cars of the real frames."""
+    kept = args.out / "cars_other.npz"
+    if not kept.is_file():
+        field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
+        dataset = KittiStereoDataset(args.other, args.other_detections, args.other_masks, disparity_field=field)
+        observe_dataset(dataset, refiner(), args.other.name).save(kept)
+    return Observations.load(kept)
+
+
+def fitted(cars: Observations, provenance: dict[str, object]) -> TrustModel:
+    """The model of some cars."""
+    scales = fit_sigmas(*in_view(cars))
+    better = fit_head(cars.evidence, cars.iou_after > cars.iou_before, columns.BETTER)
+    not_worse = fit_head(cars.evidence, ~is_worse(cars), columns.NOT_WORSE)
+    return TrustModel(better, not_worse, scales.factors, scales.floors, provenance)
+
+
+def predictions(model: TrustModel, cars: Observations) -> Array:
+    """Both probabilities and the four calibrated sigmas, (N, 6)."""
+    evidence = torch.from_numpy(cars.evidence)
+    _, raw = in_view(cars)
+    sigmas = np.sqrt((np.array(model.sigma_factors) * raw) ** 2 + np.array(model.sigma_floors) ** 2)
+    return np.column_stack([model.better(evidence).numpy(), model.not_worse(evidence).numpy(), sigmas])
+
+
+def judged(name: str, cars: Observations, predicted: Array) -> Judged:
+    """Cars with predictions (N, 6)."""
+    return Judged(name, cars, predicted[:, 0], predicted[:, 1], in_view(cars)[0], predicted[:, 2:])
+
+
+def run(args: argparse.Namespace) -> None:
+    """Refine, fit, judge and write."""
+    torch.set_num_threads(args.threads)
+    args.out.mkdir(parents=True, exist_ok=True)
+    cars = development_cars(args)
+    provenance: dict[str, object] = {
+        "made_by": "scripts/calibrate_quality.py",
+        "cars": len(cars),
+        "frames": len(set(cars.group.tolist())),
+        "sources": sorted(set(cars.source.tolist())),
+        "settings": "configs/default.yaml",
+        "worse_by": 0.05,
+    }
+    model = fitted(cars, provenance)
+    held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}), test))
+    everything = judged("rendered, all", cars, held_out)
+    chosen = choose_threshold(cars, everything.not_worse)
+    levels = np.array([source.partition(",")[0] for source in cars.source.tolist()])
+    groups = [everything.where(levels == level.name, f"rendered, {level.name}") for level in LEVELS]
+    real = [judged(args.other.name, other := other_cars(args), predictions(model, other))] if args.other else []
+    model.save(args.model or args.out / "trust_model.json")
+    report = "\n\n".join(
+        [
+            f"Lowest threshold below 2 % worse, all rendered cars: {chosen.threshold:.2f}",
+            head_table((("better", model.better), ("not worse", model.not_worse))),
+            discrimination_table([everything, *groups, *real]),
+            *(
+                reliability_table(f"{c.name}, {name}", reliability(p, y, c.observations.group, bins))
+                for c, bins in ((everything, 8), *((r, 3) for r in real))
+                for name, p, y in (("better", c.better, c.is_better), ("not worse", c.not_worse, c.is_not_worse))
+            ),
+            policy_table([everything, *groups, *real], sorted({0.0, 0.7, 0.8, 0.85, 0.9, 0.95, chosen.threshold})),
+            "Sigmas: " + sigma_line(fit_sigmas(*in_view(cars))),
+            coverage_table([everything, *groups, *real]),
+        ]
+    )
+    (args.out / "report.md").write_text(report + "\n", encoding="utf-8")
+    plot_reliability(args.out / "trust_reliability.png", [everything, *real], [8, *(3 for _ in real)])
+    plot_policy(args.out / "trust_policy.png", [everything, *groups, *real], chosen)
+    print(report)
+
+
+def _tell(message: str) -> None:
+    print(message, file=sys.stderr, flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line and run; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/")
+    parser.add_argument("--exact", type=Path, required=True, metavar="DIR", help="labels as result files")
+    parser.add_argument("--masks", type=Path, nargs="+", required=True, metavar="DIR")
+    parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--other", type=Path, metavar="ROOT", help="real frames, judged and never fitted")
+    parser.add_argument("--other-detections", type=Path, metavar="DIR")
+    parser.add_argument("--other-masks", type=Path, metavar="DIR")
+    parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="of the rig of --other")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--model", type=Path, metavar="FILE", help="default OUT/trust_model.json")
+    parser.add_argument("--threads", type=int, default=1)
+    try:
+        run(parser.parse_args(arguments))
+    except DirectShapeError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,153 @@
+"""Refined cars with truth: what was known of each at run time, and what became of its box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.rotated_iou import bev_iou
+from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
+from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections
+from quality_calibration.noise import NoiseLevel, noisy
+
+Array = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True)
+class Observations:
+    """N refined cars.
+
+    Attributes:
+        group: (N,) text, frame; cars of one group are never on both sides of a split.
+        source: (N,) text: detector and masks.
+        evidence: (N, E).
+        iou_before, iou_after: (N,) bird's-eye overlap of input and refined box with the label.
+        errors: (N, 4) refined minus true x, y, z (bottom centre, ref) and heading (modulo pi).
+        covariance: (N, 4, 4) of them, uncalibrated.
+        ray: (N, 2) x and z of the viewing ray's unit vector.
+    """
+
+    group: NDArray[np.str_]
+    source: NDArray[np.str_]
+    evidence: Array
+    iou_before: Array
+    iou_after: Array
+    errors: Array
+    covariance: Array
+    ray: Array
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+    def where(self, condition: NDArray[np.bool_]) -> Observations:
+        """Those for which the condition (N,) holds."""
+        return Observations(**{f.name: getattr(self, f.name)[condition] for f in fields(self)})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Observations]) -> Observations:
+        """All of several sets."""
+        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)})
+
+    def save(self, path: Path) -> None:
+        """Keep them for another fit; refining is what takes the time."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Observations:
+        """Those of `save`."""
+        with np.load(path, allow_pickle=False) as archive:
+            return cls(**{f.name: archive[f.name] for f in fields(cls)})
+
+
+def observe_noisy(
+    dataset: KittiStereoDataset,
+    refiner: DirectShapeRefiner,
+    levels: Sequence[NoiseLevel],
+    seeds: Sequence[int],
+    masks_name: str,
+    report: Callable[[str], None],
+) -> Observations:
+    """Refine the labelled cars of all frames from detections of several noise levels and seeds."""
+    parts = []
+    for number, frame_id in enumerate(dataset.frame_ids):
+        loaded = dataset.load(frame_id)
+        for seed in seeds:
+            for index, level in enumerate(levels):
+                draws = noisy(loaded.detections, level, seed=10_000 * seed + 100 * number + index)
+                parts += observe(loaded, draws, refiner, f"{level.name}, {masks_name}, seed {seed}")
+        report(f"{masks_name} masks: frame {frame_id} done")
+    return Observations.joined(parts)
+
+
+def observe_dataset(dataset: KittiStereoDataset, refiner: DirectShapeRefiner, source: str) -> Observations:
+    """Refine the detections of a data set as they are."""
+    frames: Iterable[LoadedFrame] = (dataset.load(frame_id) for frame_id in dataset.frame_ids)
+    return Observations.joined([part for f in frames for part in observe(f, f.detections, refiner, source)])
+
+
+def observe(
+    loaded: LoadedFrame, detections: Detections, refiner: DirectShapeRefiner, source: str
+) -> list[Observations]:
+    """The counted, refined cars of one frame, whose detections may have been replaced; none, or one set."""
+    result = refiner(loaded.frame, detections)
+    rows, labels = _counted(loaded, result)
+    if not len(rows):
+        return []
+    boxes_after, boxes_before = _after(result)[rows], _before(result, detections)[rows]
+    truth = torch.tensor([[*o.location_ref, *o.hwl, o.rotation_y] for o in labels], dtype=torch.float64)
+    errors = torch.cat([boxes_after[:, :3], boxes_after[:, 6:]], 1) - torch.cat([truth[:, :3], truth[:, 6:]], 1)
+    # A flip by half a turn is the detector's affair: the sigma of the heading does not speak of it.
+    errors[:, 3] = wrap_angle(2 * errors[:, 3]) / 2
+    ray = truth[:, [0, 2]] / truth[:, [0, 2]].norm(dim=1, keepdim=True)
+    columns = (
+        np.array([loaded.frame_id] * len(rows)),
+        np.array([source] * len(rows)),
+        result.quality.evidence[rows].numpy(),
+        _overlap(boxes_before, truth),
+        _overlap(boxes_after, truth),
+        errors.numpy(),
+        result.covariance_xyz_yaw[rows].numpy(),
+        ray.numpy(),
+    )
+    return [Observations(*columns)]
+
+
+def _counted(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[int], list[KittiObject]]:
+    objects = [loaded.input_objects[row] for row in loaded.row_of_detection]
+    assert loaded.labels is not None
+    refined, masked, counts = result.refined.tolist(), loaded.detections.has_mask_left.tolist(), CountedLabels()
+    pairs = [
+        (row, loaded.labels[partner])
+        for row, partner in enumerate(match_to_labels(objects, loaded.labels))
+        if partner >= 0 and refined[row] and masked[row] and counts.counts(loaded.labels[partner])
+    ]
+    return [row for row, _ in pairs], [label for _, label in pairs]
+
+
+def _after(result: RefinementResult) -> torch.Tensor:
+    """(B, 7) x, y, z, h, w, l, yaw."""
+    boxes = result.boxes()
+    return torch.cat([boxes.location_ref, boxes.dimensions_hwl, boxes.rotation_y[:, None]], 1).double()
+
+
+def _before(result: RefinementResult, detections: Detections) -> torch.Tensor:
+    location = detections.T_cam_obj[:, :3, 3] - result.t_cam_ref
+    yaw = rotation_y_from_pose(detections.T_cam_obj)
+    return torch.cat([location, detections.dimensions_hwl, yaw[:, None]], 1).double()
+
+
+def _overlap(boxes: torch.Tensor, truth: torch.Tensor) -> Array:
+    columns = [0, 2, 5, 4, 6]
+    return bev_iou(boxes[:, columns], truth[:, columns]).numpy()
