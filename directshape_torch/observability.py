@@ -38,7 +38,8 @@ class Observability:
     """What the images say of B cars without any prior, NaN where they were not refined.
 
     Attributes:
-        sigmas_m: (B, 7) standard deviations along the principal directions, the weakest direction first.
+        sigmas_m: (B, 7) standard deviations along the principal directions, the weakest direction first; in a result
+            scaled by the calibrated factor of the depth.
         directions: (B, 7, 7) unit vectors, row i that of sigma i, columns `CAR_QUANTITIES`.
         viewing_angle_rad: (B,) KITTI's alpha of the car, which says from where it is seen.
     """

@@ -34,6 +34,7 @@ from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status
 from directshape_torch.stereo_matching.car_points import PointSamples, car_points
 from directshape_torch.stereo_matching.dense_disparity import with_disparity
+from directshape_torch.trust_model import bundled_trust_model
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
 _MIN_DEPTH_M = 1.0
@@ -224,6 +225,7 @@ class _Outcome:
 def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], detector_hwl: Tensor) -> _Outcome:
     linearisations = problem.linearise_terms(minimum.state, with_fisher=True)
     covariance = covariance_of(linearisations)
+    unseen = observability_of(problem.prior, minimum.state, problem.terms, linearisations)
     course = Course(
         before=initial,
         after=minimum.state,
@@ -246,7 +248,8 @@ def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarStat
         covariance,
         course.covariance_xyz_yaw,
         fit_quality(problem, course),
-        observability_of(problem.prior, minimum.state, problem.terms, linearisations),
+        # The directions are mostly those of the depth, so its factor brings them to size.
+        unseen.scaled(bundled_trust_model().sigma_factors[0]),
     )
 
 

@@ -115,7 +115,8 @@ def run(args: argparse.Namespace) -> None:
     everything = judged("rendered, all", cars, held_out)
     chosen = choose_threshold(cars, everything.not_worse)
     levels = np.array([source.partition(",")[0] for source in cars.source.tolist()])
-    groups = [everything.where(levels == level.name, f"rendered, {level.name}") for level in LEVELS]
+    drawn = [level.name for level in LEVELS if (levels == level.name).any()]
+    groups = [everything.where(levels == name, f"rendered, {name}") for name in drawn]
     real = [judged(args.other.name, other := other_cars(args), predictions(model, other))] if args.other else []
     model.save(args.model or args.out / "trust_model.json")
     report = "\n\n".join(

@@ -1,0 +1,108 @@
+"""The evidence: its columns against sampling, against hand-made motions, and its blanks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import torch
+from helpers.problems import begun_problem
+from helpers.synthetic_scene import cached_street
+from torch import Tensor
+
+from directshape_torch import evidence
+from directshape_torch.covariance import covariance_of, covariance_xyz_yaw
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
+from directshape_torch.geometry import se3
+
+
+@cache
+def course_at_truth() -> tuple[CarProblem, Course]:
+    """Cars that begin and end at the same place, and cost half as much at the end."""
+    prior, scene = cached_street()
+    problem, state = begun_problem(prior, scene.frames, scene.detections)
+    parts = problem.linearise_terms(state, with_fisher=True)
+    costs, covariance = problem.term_costs(state), covariance_of(parts)
+    xyz_yaw = covariance_xyz_yaw(covariance, state.T_obj_cam)
+    hwl = prior.dimensions_and_derivative(state.code).hwl
+    settled = torch.tensor([False, True])
+    return problem, Course(state, state, hwl, 2 * costs, costs, parts, covariance, xyz_yaw, settled)
+
+
+def agreement(**changes: float) -> Agreement:
+    values = {"mask_iou_left": 0.9, "mask_iou_right": 0.8, "photometric_error_grey": 10.0, "matched_share": 1.0}
+    return Agreement(**{name: torch.full((2,), x, dtype=torch.float64) for name, x in (values | changes).items()})
+
+
+def columns(course: Course, agreed: Agreement | None = None) -> dict[str, Tensor]:
+    rows = evidence_of(course_at_truth()[0], course, agreement() if agreed is None else agreed)
+    assert rows.shape == (2, len(EVIDENCE_NAMES))
+    return dict(zip(EVIDENCE_NAMES, rows.unbind(1), strict=True))
+
+
+def test_a_car_that_did_not_move() -> None:
+    found = columns(course_at_truth()[1])
+    for name in ("moved_depth", "turned", "length_change", "log_moved_sigmas"):
+        torch.testing.assert_close(found[name], torch.zeros(2).double(), atol=1e-9, rtol=0)
+    for name in ("silhouette_decrease", "photometric_decrease", "relative_decrease"):
+        torch.testing.assert_close(found[name], torch.full((2,), math.log(2)).double())
+    torch.testing.assert_close(found["log_expected_gain"], torch.full((2,), math.log(0.005)).double())
+    torch.testing.assert_close(found["mask_misfit_right"], torch.full((2,), 0.2).double())
+    assert found["unsettled"].tolist() == [0, 1]
+    torch.testing.assert_close(found["log_photometric_error"], torch.zeros(2).double())
+
+
+def test_a_motion_along_the_ray_is_one_of_depth() -> None:
+    _, course = course_at_truth()
+    T = se3.inverse(course.after.T_obj_cam)
+    ray = T[:, :3, 3] * torch.tensor([1.0, 0.0, 1.0]).double()
+    T[:, :3, 3] -= 0.4 * ray / ray.norm(dim=1, keepdim=True)
+    moved = replace(course, before=CarState(se3.inverse(T), course.after.code))
+    found, still = columns(moved), columns(course)
+    torch.testing.assert_close(found["moved_depth"], torch.full((2,), 0.4).double())
+    assert (found["log_expected_gain"] > still["log_expected_gain"]).all()
+    torch.testing.assert_close(found["log_expected_misfit"], still["log_expected_misfit"])
+    # At least 0.4 m over the marginal sigma: the Mahalanobis length is no shorter than that of any projection.
+    assert (found["log_moved_sigmas"].expm1() >= 0.4 / found["log_sigma_depth"].exp() - 1e-6).all()
+
+
+def test_expectations_agree_with_sampling() -> None:
+    motion, sigma = (
+        torch.tensor([[0.3, -0.1, 0.05, 0.2, 0.0]]).double(),
+        torch.tensor([[0.1, 0.2, 0.03, 0.3, 0.1]]).double(),
+    )
+    hwl = torch.tensor([[1.5, 1.6, 4.0]]).double()
+    misfit, gain = evidence._expected(motion, sigma, hwl)
+    noise = sigma * torch.randn(400_000, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    loss = torch.tensor([2 / 4.0, 2 / 1.6, 0.5 * (4 / 1.6 + 1.6 / 4), 1 / 4.0, 1 / 1.6]).double()
+    at_output, at_input = ((noise + m).abs() @ loss for m in (0.0, motion))
+    torch.testing.assert_close(misfit[0], at_output.mean(), rtol=5e-3, atol=0)
+    torch.testing.assert_close(gain[0], (at_input - at_output).mean(), rtol=2e-2, atol=0)
+
+
+def test_conflict_is_what_photometry_alone_would_gain() -> None:
+    """With a unit matrix and a pull of length 0.2 at a cost of 1: log(1 + 100 * 0.02)."""
+    problem, course = course_at_truth()
+    identity, zero = torch.eye(9).double().expand(2, 9, 9), torch.zeros(2, 9, 9).double()
+    pull = torch.zeros(2, 9).double()
+    pull[:, 3] = 0.2
+    parts = [
+        part._replace(hessian=identity if term.name == "photometric" else zero, gradient=pull)
+        for term, part in zip(problem.terms, course.linearisations, strict=True)
+    ]
+    cost = torch.full_like(course.cost_after, 1 / course.cost_after.shape[1])
+    found = columns(replace(course, linearisations=parts, cost_after=cost))
+    torch.testing.assert_close(found["log_conflict"], torch.full((2,), math.log(3)).double())
+
+
+def test_what_does_not_exist_is_nan_and_touches_no_other_column() -> None:
+    _, course = course_at_truth()
+    blank = columns(course, agreement(mask_iou_right=math.nan))
+    assert blank["mask_misfit_right"].isnan().all()
+    assert all(x.isfinite().all() for name, x in blank.items() if name != "mask_misfit_right")
+    singular = columns(replace(course, covariance_xyz_yaw=torch.full((2, 4, 4), torch.nan).double()))
+    assert singular["log_moved_sigmas"].isnan().all()
+    assert singular["relative_decrease"].isfinite().all()
