@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 import torch
+from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape.shape_prior import BoundShape, DimensionsDerivative, SdfDerivatives, ShapePrior
@@ -67,15 +70,31 @@ def _check_attached(prior: ShapePrior) -> None:
     with torch.inference_mode(False), torch.enable_grad():
         code = prior.initial_code(1).clone().requires_grad_()
         point = prior.bounds_obj.mean(dim=0, keepdim=True).clone().requires_grad_()
-        value = prior.bind(code).value(point, torch.zeros(1, dtype=torch.long, device=point.device))
-        gradients = (
-            torch.autograd.grad(value.sum(), (point, code), allow_unused=True) if value.requires_grad else (None, None)
-        )
+        index = torch.zeros(1, dtype=torch.long, device=point.device)
+        _check_reaches("value", prior.bind(code).value(point, index), point, code)
+        at = prior.bind(code).value_and_derivatives(point, index)
+        _check_reaches("value_and_derivatives: value", at.value, point, code)
+        elsewhere = prior.bind(code + 1).value_and_derivatives(point + prior.spacing_m, index)
+    for field in ("gradient", "J_value_code"):
+        # Derivatives that are the same everywhere, of a linear field, need no graph.
+        derivative, other = getattr(at, field), getattr(elsewhere, field)
+        if not derivative.requires_grad and not torch.equal(derivative, other):
+            _refuse_detached(f"value_and_derivatives: {field}", "points and code")
+
+
+def _check_reaches(method: str, value: Tensor, point: Tensor, code: Tensor) -> None:
+    gradients: tuple[Tensor | None, ...] = (None, None)
+    if value.requires_grad:
+        gradients = torch.autograd.grad(value.sum(), (point, code), allow_unused=True)
     lost = [name for name, gradient in zip(("points", "code"), gradients, strict=True) if gradient is None]
     if lost:
-        raise InputError(
-            "prior.bind(code).value",
-            "a graph from points and code to the value, as jacobian='autograd' needs it",
-            f"none from {' and '.join(lost)}",
-            "compute it with differentiable operations, or use jacobian='analytic'",
-        )
+        _refuse_detached(method, " and ".join(lost))
+
+
+def _refuse_detached(method: str, lost: str) -> NoReturn:
+    raise InputError(
+        f"prior.bind(code).{method}",
+        "a graph from points and code to it, as jacobian='autograd' and the backward modes need it",
+        f"none from {lost}",
+        "compute it with differentiable operations, or use jacobian='analytic' and backward.mode='none'",
+    )

@@ -7,11 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
+from helpers.priors import KINDS, prior_of
 from helpers.problems import DEFAULT
 from torch import Tensor, nn
 
+from directshape_torch.config import BackwardConfig, RefinerConfig
 from directshape_torch.errors import InputError
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 
@@ -66,6 +69,20 @@ class Detached(Wrapped):
         return self.inner.bind(code.detach())
 
 
+class DetachedShape(GridShape):
+    def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
+        at = super().value_and_derivatives(points_obj, object_index)
+        return at._replace(gradient=at.gradient.detach())
+
+
+class DetachedGradient(Wrapped):
+    """Values with a graph, but a gradient without: second derivatives would be wrong without a word."""
+
+    def bind(self, code: Tensor) -> DetachedShape:
+        shape = self.inner.bind(code)
+        return DetachedShape(shape.values, shape.basis, shape.origin, shape.spacing_m)
+
+
 def test_a_wrapped_prior_without_fault_is_taken() -> None:
     DirectShapeRefiner(Wrapped(), AUTOGRAD)
 
@@ -88,6 +105,18 @@ def test_autograd_needs_a_graph_from_the_code() -> None:
     DirectShapeRefiner(Detached(), DEFAULT)
     with pytest.raises(InputError, match=r"expected a graph from points and code .* got none from code; compute it"):
         DirectShapeRefiner(Detached(), AUTOGRAD)
+
+
+@pytest.mark.parametrize("config", [AUTOGRAD, replace(DEFAULT, backward=BackwardConfig(mode="implicit"))])
+def test_derivatives_need_a_graph_too(config: RefinerConfig) -> None:
+    DirectShapeRefiner(DetachedGradient(), DEFAULT)
+    with pytest.raises(InputError, match=r"value_and_derivatives: gradient: expected a graph .* backward.mode='none'"):
+        DirectShapeRefiner(DetachedGradient(), config)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_ours_has_the_graphs(kind: str) -> None:
+    check_prior(prior_of(kind), by_autograd=True)
 
 
 def test_a_refiner_can_be_made_in_inference_mode() -> None:
