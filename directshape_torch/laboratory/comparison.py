@@ -107,7 +107,8 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
     scale = norm.clamp_min(float(FLAT_SHARE * longest))
     choice = choose(found, _RESOLUTION_SHARE * BOUNDS["analytic-numeric"] * scale)
     numeric = choice.derivative
-    judged = moving[:, None] & numeric.isfinite()
+    # Everything that no rule excludes is judged: a difference that is no number breaks its bound.
+    judged = moving[:, None] & ~torch.stack(list(choice.excluded.values())).any(dim=0)
     excluded = {rule: int((e & moving[:, None]).sum()) for rule, e in choice.excluded.items()}
     difference = {
         "analytic-autograd": (subject.analytic - subject.autograd).abs(),
@@ -119,13 +120,14 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
         for pair, d in difference.items()
     }
     constant = usable & (norm == 0)
-    pairs = _with_rows_that_should_be_constant(pairs, found, constant)
-    num_unknowns = subject.analytic.shape[1]
+    constant_errors, constant_excluded = _rows_that_should_be_constant(found, constant)
+    pairs = {p: e if p == "analytic-autograd" else torch.cat([e, constant_errors]) for p, e in pairs.items()}
+    excluded = {rule: n + constant_excluded.get(rule, 0) for rule, n in excluded.items()}
     return Comparison(
         name=subject.name,
         regime=regime,
-        entries=int(usable.sum()) * num_unknowns,
-        compared=int(judged.sum()) + int(constant.sum()) * num_unknowns,
+        entries=int(usable.sum()) * subject.analytic.shape[1],
+        compared=int(judged.sum()) + len(constant_errors),
         excluded={rule: n for rule, n in excluded.items() if n},
         skipped_rows=int((~usable).sum()),
         zero_rows=int(constant.sum()),
@@ -135,20 +137,22 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
     )
 
 
-def _with_rows_that_should_be_constant(
-    pairs: dict[str, Tensor], found: DifferenceSweep, constant: Tensor
-) -> dict[str, Tensor]:
+def _rows_that_should_be_constant(found: DifferenceSweep, constant: Tensor) -> tuple[Tensor, dict[str, int]]:
     """Rows whose Jacobians are zero have no norm to compare with: their differences must be rounding alone.
 
     Judged at the smallest stencil, where a kink is least likely; an entry beyond four times its rounding is an
     infinite relative error.
+
+    Returns:
+        The errors of the entries without a kink there, and the number of the others by rule.
     """
-    kink = torch.zeros_like(found.extrapolated[-1], dtype=torch.bool)
-    for crossed in found.crossed.values():
-        kink = kink | crossed[-1]
-    moves = (found.extrapolated[-1].abs() > 4 * found.rounding[-1]) & ~kink
-    error = torch.where(moves[constant], torch.inf, 0.0).flatten().to(found.value.dtype)
-    return {pair: e if pair == "analytic-autograd" else torch.cat([e, error]) for pair, e in pairs.items()}
+    judged = constant[:, None].expand_as(found.extrapolated[-1])
+    excluded = {}
+    for rule, crossed in found.crossed.items():
+        excluded[rule] = int((judged & crossed[-1]).sum())
+        judged = judged & ~crossed[-1]
+    still = found.extrapolated[-1].abs() <= 4 * found.rounding[-1]
+    return torch.where(still, 0.0, torch.inf)[judged].to(found.value.dtype), excluded
 
 
 def _pair_error(error: Tensor) -> PairError:

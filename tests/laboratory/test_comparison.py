@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.laboratory.comparison import Comparison, PairError, compare, quantile
+from directshape_torch.laboratory.differences import STEPS
 from directshape_torch.laboratory.subjects import Experiment, Subject, factor_experiment
 
 X = torch.linspace(-1.3, 1.7, 12, dtype=torch.float64)[:, None]
@@ -53,6 +54,28 @@ def test_a_row_that_both_jacobians_call_constant_must_not_move() -> None:
     (found,) = compare(Experiment((subject,), evaluate, units), "typical")
     assert found.zero_rows == 12
     assert found.errors["analytic-numeric"].maximum == math.inf
+
+
+@pytest.mark.parametrize("reach", [1e-2, 1e-4])
+def test_a_difference_that_is_no_number_breaks_the_bounds_and_is_not_left_out(reach: float) -> None:
+    def undefined_beyond(x: Tensor) -> Tensor:
+        return torch.where((x - X).abs() > reach, torch.nan, x)
+
+    undefined_steps = sum(step > reach for step in STEPS)
+    (found,) = compare(factor_experiment("f", undefined_beyond, X, torch.ones_like(X)[:, None]), "typical")
+    assert (found.compared, found.excluded) == (12, {})
+    assert bool(found.broken_bounds()) == (undefined_steps > 0)
+
+
+def test_kinks_of_constant_rows_are_counted() -> None:
+    def ramp(x: Tensor) -> Tensor:
+        return (x - X[:1]).clamp_min(0)
+
+    x = X[:1] - 1e-7
+    zero = torch.zeros(1, 1, 1, dtype=torch.float64)
+    (found,) = compare(factor_experiment("ramp", ramp, x, zero, lambda x: {"corner": (x[:, 0] > X[0]).long()}), "f")
+    assert (found.zero_rows, found.entries, found.compared, found.excluded) == (1, 1, 0, {"corner": 1})
+    assert found.broken_bounds() == []
 
 
 def test_unusable_rows_are_counted_and_not_judged() -> None:
