@@ -65,6 +65,30 @@ TARGETS: dict[str, Target] = {
         ("ObjectRays.at", "attached_depth", "_newton_step"),
         ("tests/shape/test_raycast.py", "tests/residuals/test_photometric.py"),
     ),
+    "neural_prior": Target(
+        "directshape_torch/shape/neural_prior.py",
+        (
+            "CodedLinear.shift",
+            "NeuralShapePrior.dimensions_and_derivative",
+            "NeuralShape._value",
+            "NeuralShape._value_and_derivatives",
+            "NeuralShape._split",
+            "NeuralShape._linear",
+            "_mirrored",
+            "_mirrored_slope",
+            "_safe_norm",
+        ),
+        ("tests/shape/test_neural_prior.py", "tests/shape/test_prior_protocol.py"),
+    ),
+    "kernel_pca_prior": Target(
+        "directshape_torch/shape/kernel_pca_prior.py",
+        (
+            "KernelPCAShapePrior.coefficients",
+            "KernelPCAShapePrior.dimensions_and_derivative",
+            "CurvedGridShape.value_and_derivatives",
+        ),
+        ("tests/shape/test_kernel_pca_prior.py", "tests/shape/test_prior_protocol.py"),
+    ),
     "state_chain": Target(
         "directshape_torch/residuals/state_chain.py", ("sdf_state_jacobian",), ("tests/residuals/test_state_chain.py",)
     ),

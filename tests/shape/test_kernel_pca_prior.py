@@ -32,6 +32,9 @@ def test_training_codes_are_white_and_their_expansion_is_as_written() -> None:
     torch.testing.assert_close(z.T.cov(), torch.eye(2, dtype=torch.float64), atol=1e-9, rtol=0)
     code = torch.tensor([[0.3, -0.8]], dtype=torch.float64)
     kernels = torch.exp(-((code - z) ** 2).sum(1) / (2 * prior.kernel_width**2))
+    # A fit to centred samples has next to no offset.
+    tensors = {name: getattr(prior, name) for name in ("anchors", "weights", "linear", "kernel_width")}
+    prior = KernelPCAShapePrior(prior.subspace, **tensors, offset=torch.arange(1.0, 4.0, dtype=torch.float64))
     expected = prior.offset + prior.linear @ code[0] + prior.weights.T @ kernels
     torch.testing.assert_close(prior.coefficients(code)[0][0], expected)
 
