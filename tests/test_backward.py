@@ -262,6 +262,23 @@ def test_a_misspelt_term_is_an_error_that_lists_the_names(inputs: Inputs) -> Non
         refiner(inputs.scene.frames, inputs.detections, {"height": torch.ones(7, dtype=torch.float64)})
 
 
+def test_wrong_weights_are_errors_and_one_that_is_no_number_is_a_matter_of_its_car(inputs: Inputs) -> None:
+    refiner = DirectShapeRefiner(inputs.prior, _mode("unroll", DEFAULT))
+    arguments = (inputs.scene.frames, inputs.detections)
+    with pytest.raises(InputError, match=r"term_weights\['height'\]: expected factors .*, got -0.5 for car 1"):
+        refiner(*arguments, {"height": torch.tensor([1.0, -0.5], dtype=torch.float64)})
+    with pytest.raises(InputError, match=r"term_weights\['height'\]: expected a tensor of shape \(2,\), got float"):
+        refiner(*arguments, {"height": 2.0})
+    weight = torch.tensor([torch.nan, 1.0], dtype=torch.float64, requires_grad=True)
+    result = refiner(*arguments, {"height": weight})
+    assert result.status[0].name == "non_finite"
+    assert result.refined.tolist() == [False, True]
+    torch.testing.assert_close(result.T_cam_obj[1], refiner(*arguments).T_cam_obj[1], rtol=0, atol=1e-12)
+    (gradient,) = torch.autograd.grad(_summary(result), weight)
+    assert gradient.isfinite().all()
+    assert gradient[1] != 0
+
+
 def test_memory_of_implicit_does_not_grow_with_the_iterations(inputs: Inputs) -> None:
     """Bytes that are saved for the backward pass, each storage once."""
 

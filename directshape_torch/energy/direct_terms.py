@@ -111,7 +111,7 @@ def stacked_weights(weights: Mapping[str, Tensor] | None, terms: Sequence[Term],
         code: (B, K), for number, dtype and device.
 
     Raises:
-        InputError: no such term (a misspelt name, or a term of weight zero), or a wrong shape.
+        InputError: no such term (a misspelt name, or a term of weight zero), no tensor, a wrong shape, or less than 0.
     """
     if weights is None:
         return None
@@ -119,6 +119,16 @@ def stacked_weights(weights: Mapping[str, Tensor] | None, terms: Sequence[Term],
     for name, weight in weights.items():
         if name not in names:
             raise InputError("term_weights", f"names among {', '.join(names)}", repr(name))
-        check_shape(f"term_weights[{name!r}]", weight, (len(code),))
+        _check_weight(f"term_weights[{name!r}]", weight, len(code))
     ones = code.new_ones(len(code))
     return torch.stack([weights[name].to(code) if name in weights else ones for name in names], dim=1)
+
+
+def _check_weight(name: str, weight: Tensor, num_cars: int) -> None:
+    if not isinstance(weight, Tensor):
+        raise InputError(name, f"a tensor of shape ({num_cars},)", type(weight).__name__, "one factor for each car")
+    check_shape(name, weight, (num_cars,))
+    negative = (weight < 0).nonzero()[:, 0].tolist()
+    if negative:
+        got = f"{float(weight[negative[0]]):.3g} for car {negative[0]}"
+        raise InputError(name, "factors of at least 0", got, "let a network predict their logarithm")
