@@ -94,6 +94,7 @@ def run(args: argparse.Namespace) -> None:
         bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
         seed=args.seed,
         quick=args.quick,
+        skipped_rows=tuple(args.skip_rows),
     )
     try:
         TABLES[args.table](experiment)
@@ -117,6 +118,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--stereo-bias", default="auto", metavar="FILE|auto|none", help="auto fits it, where all frames are of one rig"
     )
     parser.add_argument("--quick", action="store_true", help="two frames of each detector, one row of each group")
+    parser.add_argument(
+        "--skip-rows", nargs="+", default=[], metavar="NAME", help="rows of the ablation to leave out, such as dense"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of simulated detections and intervals")
     parser.add_argument("--draws", type=int, default=2000, help="of the intervals")
     parser.add_argument("--threads", type=int, default=1)

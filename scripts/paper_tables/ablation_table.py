@@ -80,6 +80,8 @@ def _judge_all(experiment: Experiment, data_set: DataSet, main: Path, rows: tupl
 
 def _why_not(experiment: Experiment, data_set: DataSet, row: Row) -> str:
     """Why a row says nothing about a data set; empty where it does."""
+    if row.name in experiment.skipped_rows:
+        return "by --skip-rows"
     if not row.settings.with_field and experiment.refinery.fields.get(data_set.name) is None:
         return "no residual disparity field"
     if row.settings.masks == "degraded" and data_set.masks_degraded is None:

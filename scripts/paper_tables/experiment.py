@@ -29,6 +29,7 @@ class Experiment:
         bootstrap: of the intervals.
         seed: of simulated detections.
         quick: a few frames and rows, to try everything.
+        skipped_rows: names of rows of the ablation to leave out.
     """
 
     data_sets: tuple[DataSet, ...]
@@ -39,6 +40,7 @@ class Experiment:
     bootstrap: BootstrapSettings
     seed: int
     quick: bool
+    skipped_rows: tuple[str, ...] = ()
 
     @property
     def plots(self) -> Path:
