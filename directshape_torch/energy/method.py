@@ -48,8 +48,8 @@ def method_stages(config: RefinerConfig) -> list[Stage]:
         return [Stage(s.contour_width_px, s.image_level, s.max_iterations, s.unknowns) for s in config.stages]
     # Contour and pyramid level mean nothing to a point cloud: the last stage's, for whoever draws or measures.
     last, cloud = config.stages[-1], config.point_cloud
-    pose, shape, both = (
+    pose_stage, shape_stage, joint_stage = (
         Stage(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns)
         for unknowns in ("pose", "shape", "both")
     )
-    return [pose, shape] * cloud.rounds if cloud.order == "alternating" else [both]
+    return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]

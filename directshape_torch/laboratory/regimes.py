@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
@@ -64,8 +64,8 @@ def _disturbed(state: CarState, generator: torch.Generator, metres: float, degre
     count, num_codes = state.code.shape
     delta = torch.randn(count, 6, generator=generator, dtype=torch.float64)
     delta = delta * torch.tensor([metres] * 3 + [math.radians(degrees)] * 3, dtype=torch.float64)
-    code = state.code + sigma * torch.randn(count, num_codes, generator=generator, dtype=torch.float64)
-    return CarState(se3.exp(delta) @ state.T_obj_cam, code.clamp(-3, 3))
+    change = sigma * torch.randn(count, num_codes, generator=generator, dtype=torch.float64)
+    return retract(state, torch.cat([delta, change], dim=1), max_code=3.0)
 
 
 def _cycled(detections: Detections, count: int) -> Detections:
