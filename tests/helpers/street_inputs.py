@@ -1,0 +1,91 @@
+"""A rendered street as a function of one number that enters wherever the refiner takes a gradient."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import BackwardConfig, RefinerConfig, StageConfig
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import cached_street, disturbed
+
+# Undamped steps settle where the gradient vanishes; accepting by the cost ends within the rounding of the cost.
+SETTLED = replace(
+    DEFAULT,
+    stages=(StageConfig(2.0, 1, 10), StageConfig(1.0, 0, 40)),
+    # What a stage fixes at its start, the state that the gain comes from among it, is constant for gradients alone.
+    photometric=replace(DEFAULT.photometric, gain=False),
+    solver=replace(DEFAULT.solver, cost_tolerance=0.0, step_tolerance=1e-9, accept_every_step=True, initial_damping=0),
+)
+
+
+class StreetInputs:
+    """Everything that can be differentiated by, moved along one seeded direction each by a scalar."""
+
+    def __init__(self) -> None:
+        self.prior, self.scene = cached_street()
+        self.detections = disturbed(self.scene.detections)
+        generator = torch.Generator().manual_seed(5)
+
+        def noise(like: Tensor) -> Tensor:
+            return torch.randn(like.shape, generator=generator, dtype=like.dtype)
+
+        # Clamped mask probabilities have no gradient.
+        self.mask = self.detections.mask_left.clamp(0.2, 0.8)
+        self.mask_direction = 0.1 * noise(self.mask)
+        self.image_direction = 0.02 * noise(self.scene.frames.images_right)
+        self.basis_direction = 0.05 * self.prior.basis.flip(-1)
+        self.mean_direction = 0.02 * torch.ones_like(self.prior.mean)
+
+    def refine(self, config: RefinerConfig, what: str = "nothing", by: Tensor | float = 0.0) -> RefinementResult:
+        frames, detections, weights = self.scene.frames, replace(self.detections, mask_left=self.mask), None
+        prior = self.prior
+        if what == "masks":
+            detections = replace(detections, mask_left=self.mask + by * self.mask_direction)
+        elif what == "images":
+            frames = replace(frames, images_right=frames.images_right + by * self.image_direction)
+        elif what == "weights":
+            weights = {"silhouette_left": torch.ones(len(detections), dtype=torch.float64) * (1 + by)}
+        elif what == "basis":
+            prior = _prior_with(basis=prior.basis + by * self.basis_direction)
+        elif what == "sigma":
+            sigma = 1 + by * torch.ones(prior.num_codes, dtype=torch.float64)
+            prior = _prior_with(basis=prior.basis * sigma, dimensions_basis_hwl=prior.dimensions_basis_hwl * sigma)
+        elif what == "mean":
+            prior = _prior_with(mean=prior.mean + by * self.mean_direction)
+        elif what == "dimensions":
+            detections = replace(detections, dimensions_hwl=detections.dimensions_hwl + by)
+        elif what == "pose":
+            shift = torch.zeros_like(detections.T_cam_obj)
+            shift[:, 0, 3] = 1.0
+            detections = replace(detections, T_cam_obj=detections.T_cam_obj + by * shift)
+        return DirectShapeRefiner(prior, config)(frames, detections, weights)
+
+
+def _prior_with(**tensors: Tensor) -> PCAShapePrior:
+    copy = ellipsoid_prior()
+    for name, tensor in tensors.items():
+        setattr(copy, name, tensor)
+    return copy
+
+
+def summary(result: RefinementResult) -> Tensor:
+    """One number that depends on position, heading and shape of every car."""
+    weight = torch.arange(1, result.code.shape[1] + 1, dtype=torch.float64)
+    return result.T_cam_obj[:, :3, 3].sum() + result.T_cam_obj[:, 0, 2].sum() + (result.code * weight).sum()
+
+
+def gradient_by(inputs: StreetInputs, config: RefinerConfig, what: str) -> float:
+    by = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(summary(inputs.refine(config, what, by)), by)
+    return float(gradient)
+
+
+def with_mode(mode: str, config: RefinerConfig = SETTLED, **settings: float) -> RefinerConfig:
+    return replace(config, backward=BackwardConfig(mode=mode, **{"unroll_iterations": 200, **settings}))  # type: ignore[arg-type]
