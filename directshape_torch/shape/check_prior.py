@@ -22,7 +22,7 @@ def check_prior(prior: ShapePrior, by_autograd: bool = False) -> None:
 
     Raises:
         InputError: members are missing, derivatives have other shapes than their definitions say, are not finite, or
-            (by autograd) do not reach points or code.
+            (by autograd) do not reach points or code, or come from inference mode.
 
     Example:
         >>> from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -67,6 +67,11 @@ def _check_derivatives(
 
 
 def _check_attached(prior: ShapePrior) -> None:
+    tensors = (*prior.named_buffers(), *prior.named_parameters())
+    unrecorded = [name for name, tensor in tensors if tensor.is_inference()]
+    if unrecorded:
+        got = f"{', '.join(unrecorded)} from inference mode"
+        raise InputError("prior", "tensors that autograd can record", got, "make it outside of torch.inference_mode()")
     with torch.inference_mode(False), torch.enable_grad():
         code = prior.initial_code(1).clone().requires_grad_()
         point = prior.bounds_obj.mean(dim=0, keepdim=True).clone().requires_grad_()

@@ -125,3 +125,10 @@ def test_a_refiner_can_be_made_in_inference_mode() -> None:
     prior = ellipsoid_prior()
     with torch.inference_mode():
         DirectShapeRefiner(prior, AUTOGRAD)
+
+
+def test_tensors_of_inference_mode_are_refused_where_a_graph_is_needed() -> None:
+    with torch.inference_mode():
+        prior = ellipsoid_prior()
+    with pytest.raises(InputError, match=r"prior: .* got mean, basis, .* make it outside of torch.inference_mode"):
+        DirectShapeRefiner(prior, AUTOGRAD)
