@@ -15,7 +15,9 @@ from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, hidden_pixels, occlusion_crops
-from directshape_torch.observation.pixel_sampling import SamplingSettings, region_boxes, select_pixels
+from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.observation.regions import region_boxes
+from directshape_torch.observation.sampling_settings import SamplingSettings
 from directshape_torch.scene import Detections, FrameBatch
 
 # Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.

@@ -14,22 +14,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.observation.gradient_thresholds import cell_thresholds, cells_of_regions
-from directshape_torch.observation.regions import MASK_THRESHOLD, region_boxes, region_pixels
-from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingMode, SamplingSettings
-
-__all__ = [
-    "DEFAULT_SETTINGS",
-    "MASK_THRESHOLD",
-    "PixelSelection",
-    "SamplingMode",
-    "SamplingSettings",
-    "cell_thresholds",
-    "cells_of_regions",
-    "region_boxes",
-    "region_pixels",
-    "sample_pixels",
-    "select_pixels",
-]
+from directshape_torch.observation.regions import region_pixels
+from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 
 _LOW_31_BITS = 2**31 - 1
 
