@@ -234,11 +234,14 @@ class AcceptanceConfig:
     """Which results are returned; the input stands in for the others (status not_trusted).
 
     Attributes:
-        min_probability: of not being worse than the input by 0.05 of bird's-eye overlap, as far as the course of the
-            refinement tells (docs/results.md, "When to trust a result"); 0 returns every result.
+        min_probability_better: of overlapping the true box more than the input does, seen from above, as far as the
+            course of the refinement tells (docs/results.md, "When to trust a result").
+        min_probability_not_worse: of not falling short of the input's overlap by more than 0.05. 0 and 0 return every
+            result.
     """
 
-    min_probability: float = 0.0
+    min_probability_better: float = 0.0
+    min_probability_not_worse: float = 0.8
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "sampling.min_usable_pixels": _NOT_NEGATIVE,
     "search.disparity_offsets_px": (-100, 100),
     "search.yaw_offsets_deg": (-360, 360),
-    "acceptance.min_probability": (0, 1),
+    "acceptance.min_probability_better": (0, 1),
+    "acceptance.min_probability_not_worse": (0, 1),
     "backward.unroll_iterations": (1, math.inf),
     "backward.max_remaining_step": _POSITIVE,
 }

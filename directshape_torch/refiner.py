@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.backward import attached_state
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import AcceptanceConfig, RefinerConfig
 from directshape_torch.covariance import covariance_of, covariance_xyz_yaw
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
@@ -22,7 +22,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
 from directshape_torch.observability import Observability, observability_of
 from directshape_torch.observation.packing import Observation, pack_pixels
-from directshape_torch.observation.pixel_sampling import MASK_THRESHOLD
+from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.quality import FitQuality, fit_quality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -199,7 +199,7 @@ class DirectShapeRefiner(nn.Module):
             start = search_start(problem, initial, cars, self.config.search)
             minimum = minimise(problem, initial, self.config.solver, start, record)
             outcome = _outcome_of(problem, initial, minimum, cars.detector_hwl)
-            minimum = _without_distrusted(minimum, initial, outcome.quality, self.config.acceptance.min_probability)
+            minimum = _without_distrusted(minimum, initial, outcome.quality, self.config.acceptance)
             outcome = replace(outcome, status=minimum.status)
         state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)
         return replace(outcome, state=state)
@@ -254,10 +254,12 @@ def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarStat
 
 
 def _without_distrusted(
-    minimum: Minimum[CarState], initial: CarState, quality: FitQuality, min_probability: float
+    minimum: Minimum[CarState], initial: CarState, quality: FitQuality, limits: AcceptanceConfig
 ) -> Minimum[CarState]:
     """The input's state for cars whose result is too likely to be worse; unknown probabilities are no reason."""
-    distrusted = _is_refined(minimum.status) & (quality.probability_not_worse < min_probability)
+    doubtful = quality.probability_better < limits.min_probability_better
+    risky = quality.probability_not_worse < limits.min_probability_not_worse
+    distrusted = _is_refined(minimum.status) & (doubtful | risky)
     status = torch.where(distrusted, torch.full_like(minimum.status, Status.not_trusted.code), minimum.status)
     return replace(minimum, state=where_rows(distrusted, initial, minimum.state), status=status)
 

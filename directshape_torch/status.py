@@ -18,8 +18,8 @@ class Status(enum.Enum):
     rejected_worse = "the result had a higher cost than the input, which is returned instead"
     too_few_points = "fewer stereo points on the car than point_cloud.min_points; it is far, hidden, or badly matched"
     not_trusted = (
-        "the result is less likely than acceptance.min_probability not to be worse than the input, which is returned "
-        "instead; check masks and calibration, or set acceptance.min_probability to 0 to have it all the same"
+        "the result is too likely to be worse than the input, which is returned instead; check masks and stereo "
+        "calibration, or set both probabilities of `acceptance` to 0 to have it all the same"
     )
 
     @property

@@ -19,7 +19,7 @@ from directshape_torch.status import Status
 
 
 def accepting(min_probability: float, config: RefinerConfig = DEFAULT) -> RefinerConfig:
-    return replace(config, acceptance=AcceptanceConfig(min_probability=min_probability))
+    return replace(config, acceptance=AcceptanceConfig(0.0, min_probability))
 
 
 def refine(config: RefinerConfig, detections: Detections) -> RefinementResult:
@@ -61,7 +61,7 @@ def test_a_threshold_between_two_cars_returns_the_input_of_one() -> None:
     # Why it is not trusted can be read off.
     assert torch.equal(result.quality.probability_not_worse, probability)
     assert result.sigma_xyz_yaw[less].isnan().all()
-    assert "acceptance.min_probability" in result.status[less].value
+    assert "`acceptance`" in result.status[less].value
 
 
 def test_zero_returns_everything_and_one_nothing() -> None:
@@ -70,6 +70,17 @@ def test_zero_returns_everything_and_one_nothing() -> None:
     nothing = refine(accepting(1.0), detections)
     assert nothing.status == [Status.not_trusted] * 2
     assert torch.equal(nothing.T_cam_obj, detections.T_cam_obj)
+
+
+def test_either_probability_refuses() -> None:
+    detections, before = trusting()
+    limit = float(before.quality.probability_better.mean())
+    result = refine(replace(DEFAULT, acceptance=AcceptanceConfig(limit, 0.0)), detections)
+    assert (
+        result.refined.tolist()
+        == (before.quality.probability_better >= limit).tolist()
+        in ([True, False], [False, True])
+    )
 
 
 @pytest.mark.parametrize("mode", ["unroll", "implicit"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,33 +77,48 @@ def _auc(probability: Array, outcome: NDArray[np.bool_]) -> float:
     return float(wins)
 
 
+class Thresholds(NamedTuple):
+    """Least probabilities of results that are returned."""
+
+    better: float
+    not_worse: float
+
+
 @dataclass(frozen=True)
 class PolicyOutcome:
-    """What a threshold does: shares of all cars, and the mean overlap of what is returned."""
+    """What a policy does: shares of all cars, and the mean overlap of what is returned."""
 
-    threshold: float
     kept: float
     worse: float
     iou: float
 
 
-def policy(observations: Observations, probability: Array, threshold: float) -> PolicyOutcome:
-    """Results below the threshold are replaced by the input."""
-    kept = probability >= threshold
+def is_kept(probabilities: Array, thresholds: Thresholds) -> NDArray[np.bool_]:
+    """Which results (N,) are returned; probabilities (N, 2) of a better and of a not worse one."""
+    return np.asarray((probabilities >= np.array(thresholds)).all(axis=1))
+
+
+def policy(observations: Observations, kept: NDArray[np.bool_]) -> PolicyOutcome:
+    """Results that are not kept (N,) are replaced by the input."""
     worse = kept & is_worse(observations)
     iou = np.where(kept, observations.iou_after, observations.iou_before)
-    return PolicyOutcome(threshold, float(kept.mean()), float(worse.mean()), float(iou.mean()))
+    return PolicyOutcome(float(kept.mean()), float(worse.mean()), float(iou.mean()))
+
+
+def choose_thresholds(observations: Observations, probabilities: Array, largest_worse: float = 0.02) -> Thresholds:
+    """Of all pairs in steps of 0.02 the one of highest mean overlap whose share of worse cars is below the bound."""
+    steps = [step / 50 for step in range(50)]
+    best, best_iou = Thresholds(1.0, 1.0), -np.inf
+    for thresholds in (Thresholds(b, n) for b in steps for n in steps):
+        outcome = policy(observations, is_kept(probabilities, thresholds))
+        if outcome.worse < largest_worse and outcome.iou > best_iou:
+            best, best_iou = thresholds, outcome.iou
+    return best
 
 
 def is_worse(observations: Observations) -> NDArray[np.bool_]:
     """Made worse by more than 0.05."""
     return np.asarray(observations.iou_after < observations.iou_before - WORSE_BY)
-
-
-def choose_threshold(observations: Observations, probability: Array, largest_worse: float = 0.02) -> PolicyOutcome:
-    """The lowest threshold in steps of 0.01 whose share of worse cars is below the bound."""
-    outcomes = [policy(observations, probability, t / 100) for t in range(101)]
-    return next(outcome for outcome in outcomes if outcome.worse < largest_worse or outcome.threshold == 1)
 
 
 def coverage(errors: Array, sigmas: Array) -> tuple[Array, Array]:

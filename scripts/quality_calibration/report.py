@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from directshape_torch.trust_model import LogisticHead
 from quality_calibration.fit import SigmaScales
 from quality_calibration.judgement import (
-    PolicyOutcome,
     ReliabilityBin,
+    Thresholds,
     coverage,
     discrimination,
+    is_kept,
     is_worse,
     policy,
     reliability,
@@ -42,6 +43,10 @@ class Judged:
     not_worse: Array
     errors: Array
     sigmas: Array
+
+    @property
+    def probabilities(self) -> Array:
+        return np.column_stack([self.better, self.not_worse])
 
     @property
     def is_better(self) -> NDArray[np.bool_]:
@@ -95,18 +100,19 @@ def reliability_table(name: str, bins: Sequence[ReliabilityBin]) -> str:
     return "\n".join(lines)
 
 
-def policy_table(cars: Sequence[Judged], thresholds: Sequence[float]) -> str:
+def policy_table(cars: Sequence[Judged], policies: Sequence[Thresholds]) -> str:
     """What thresholds cost and save."""
     lines = [
-        "| cars | `min_probability` | results kept | made worse by 0.05 | mean BEV IoU (input) |",
-        "|---|---|---|---|---|",
+        "| cars | better | not worse | results kept | made worse by 0.05 | mean BEV IoU (input) |",
+        "|---|---|---|---|---|---|",
     ]
     for c in cars:
-        for threshold in thresholds:
-            p = policy(c.observations, c.not_worse, threshold)
-            before = f" ({c.observations.iou_before.mean():.3f})" if threshold == thresholds[0] else ""
+        for thresholds in policies:
+            p = policy(c.observations, is_kept(c.probabilities, thresholds))
+            before = f" ({c.observations.iou_before.mean():.3f})" if thresholds == policies[0] else ""
             lines.append(
-                f"| {c.name} | {threshold:g} | {100 * p.kept:.1f} % | {100 * p.worse:.1f} % | {p.iou:.3f}{before} |"
+                f"| {c.name} | {thresholds.better:g} | {thresholds.not_worse:g} | {100 * p.kept:.1f} % | "
+                f"{100 * p.worse:.1f} % | {p.iou:.3f}{before} |"
             )
     return "\n".join(lines)
 
@@ -158,8 +164,8 @@ def plot_reliability(path: Path, cars: Sequence[Judged], bins: Sequence[int]) ->
     plt.close(figure)
 
 
-def plot_policy(path: Path, cars: Sequence[Judged], chosen: PolicyOutcome) -> None:
-    """Share made worse and mean overlap over the share of results that are kept."""
+def plot_policy(path: Path, cars: Sequence[Judged], chosen: Thresholds) -> None:
+    """Share made worse and mean overlap over the share of results that are kept, as both thresholds move together."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -167,11 +173,13 @@ def plot_policy(path: Path, cars: Sequence[Judged], chosen: PolicyOutcome) -> No
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
     for c in cars:
-        outcomes = [policy(c.observations, c.not_worse, t) for t in np.linspace(0, 1, 201)]
+        margin = (_logit(c.probabilities) - _logit(np.array(chosen))).min(axis=1)
+        limits = [-np.inf, *np.sort(margin), np.inf]
+        outcomes = [policy(c.observations, margin >= limit) for limit in limits]
         kept = [100 * p.kept for p in outcomes]
         (line,) = axes[0].plot(kept, [100 * p.worse for p in outcomes], label=f"{c.name} ({len(c.better)})")
         axes[1].plot(kept, [p.iou for p in outcomes], color=line.get_color())
-        there = policy(c.observations, c.not_worse, chosen.threshold)
+        there = policy(c.observations, margin >= 0)
         axes[0].plot(100 * there.kept, 100 * there.worse, "o", color=line.get_color())
         axes[1].plot(100 * there.kept, there.iou, "o", color=line.get_color())
     axes[0].axhline(2, color="0.7", linewidth=1)
@@ -180,3 +188,8 @@ def plot_policy(path: Path, cars: Sequence[Judged], chosen: PolicyOutcome) -> No
     axes[0].legend(fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _logit(probability: Array) -> Array:
+    clipped = np.clip(probability, 1e-6, 1 - 1e-6)
+    return np.asarray(np.log(clipped / (1 - clipped)))

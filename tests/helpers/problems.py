@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig, StageConfig
+from directshape_torch.config import AcceptanceConfig, RefinerConfig, StageConfig
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.projected_state import ProjectedState
@@ -24,6 +24,8 @@ DEFAULT = replace(
     # With 32 samples a ray that crosses opposite faces of the small grid never has one exactly on a plane of nodes.
     silhouette=replace(DEFAULT.silhouette, samples_per_ray=32),
     priors=replace(DEFAULT.priors, dimensions_weight=1.0),
+    # The model of trust knows full-size images of real cars; what the solver finds on toys is to be seen as it is.
+    acceptance=AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0),
 )
 PAPER = replace(
     DEFAULT,

@@ -101,10 +101,14 @@ def test_the_policy_by_hand(parts: dict[str, ModuleType]) -> None:
     probability, judgement = np.array([0.9, 0.3, 0.6, 0.5]), parts["judgement"]
     # 0.66 is less, but not by 0.05; at 0.55 the second and the fourth car keep their input.
     assert judgement.is_worse(cars).tolist() == [False, False, False, True]
-    outcome = judgement.policy(cars, probability, 0.55)
+    probabilities = np.column_stack([probability, np.ones(4)])
+    kept = judgement.is_kept(probabilities, judgement.Thresholds(0.55, 0.9))
+    assert kept.tolist() == [True, False, True, False]
+    outcome = judgement.policy(cars, kept)
     assert (outcome.kept, outcome.worse) == (0.5, 0.0)
     assert outcome.iou == pytest.approx((0.9 + 0.7 + 0.66 + 0.7) / 4)
-    assert judgement.choose_threshold(cars, probability).threshold == 0.51
+    # To lose the last car, the second must go as well; the third, a little worse, can go too.
+    assert judgement.choose_thresholds(cars, probabilities) == (0.62, 0.0)
 
 
 def test_drawn_detections_have_the_errors_of_their_level(parts: dict[str, ModuleType]) -> None:
