@@ -8,6 +8,7 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
+from directshape_torch.geometry import se3
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import put_rows, take_rows
@@ -27,7 +28,7 @@ def attached_state(
     Args:
         problem: made from inputs with graphs.
         initial: input states, with their graph.
-        start: where the iterations began; a search's choice counts as a constant motion of the input.
+        start: where the iterations began; what a search has chosen is a constant, how it moves a car is not.
         minimum: of the problem.
         config: its `backward` says how.
         car_numbers: (B,) the caller's numbers of the cars, for warnings.
@@ -40,11 +41,26 @@ def attached_state(
         return minimum.state
     part, backward = problem.compact(refined), config.backward
     if backward.mode == "unroll":
-        moved = start.T_obj_cam.detach() @ torch.linalg.inv(initial.T_obj_cam.detach()) @ initial.T_obj_cam
-        first = take_rows(CarState(moved, start.code), rows)
+        first = take_rows(_following(initial, start), rows)
         state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations)
     else:
         exact = backward.mode == "implicit"
         limit = backward.max_remaining_step
         state = implicit_state(part, minimum, rows, exact=exact, max_remaining_step=limit, names=car_numbers[rows])
     return put_rows(minimum.state, rows, state)
+
+
+def _following(initial: CarState, start: CarState) -> CarState:
+    """The state that a search made of the input, as a function of it: moved by a disparity and turned by an angle.
+
+    Both are constants. A disparity moves the origin along its viewing ray, `origin / (1 + a z)` with `a` the disparity
+    over focal length and baseline; an angle turns the car about itself.
+    """
+    origin, chosen = (se3.inverse(state.T_obj_cam)[:, :3, 3] for state in (initial, start))
+    here = origin.detach()
+    a = (here[:, 2] / chosen[:, 2].detach() - 1) / here[:, 2]
+    moved = origin / (1 + a * origin[:, 2])[:, None]
+    R_obj_cam = initial.T_obj_cam[:, :3, :3]
+    turn = (start.T_obj_cam[:, :3, :3] @ R_obj_cam.mT).detach()
+    R_moved = turn @ R_obj_cam
+    return CarState(se3.from_rotation_translation(R_moved, -(R_moved @ moved[..., None])[..., 0]), start.code)
