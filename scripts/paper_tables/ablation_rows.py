@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from paper_tables.settings import DEFAULT, Settings
+from paper_tables.settings import DEFAULT, TRUSTED, Settings
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,11 @@ def _points(number: int) -> Settings:
     return Settings((f"sampling.min_pixels={number}", f"sampling.max_pixels={number}"))
 
 
-REFERENCE = Row("reference", "default settings")
+REFERENCE = Row("reference", "default settings, every result")
 
 ROWS: tuple[Row, ...] = (
     REFERENCE,
+    Row("acceptance", "input where not trusted (the default)", TRUSTED),
     Row("stereo", "without the residual disparity field", Settings(with_field=False)),
     Row("terms", "silhouette only", Settings(("photometric.weight=0",))),
     Row("terms", "photometric only", Settings(("silhouette.weight=0",))),

@@ -96,7 +96,7 @@ class Refinery:
             DirectShapeError: unusable settings or files; a folder whose files have changed since.
         """
         prior = prior_for(settings.prior, self.meshes, self.out / "priors")
-        refiner = DirectShapeRefiner(prior, load_config(settings.config, settings.overrides))
+        refiner = DirectShapeRefiner(prior, load_config(settings.config, settings.all_overrides))
         refiner = refiner.to(find_device(self.device))
         dataset = KittiStereoDataset(
             data_set.root,

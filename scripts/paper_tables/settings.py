@@ -8,6 +8,8 @@ from typing import Literal
 
 Masks = Literal["true", "left", "boxes", "degraded"]
 
+_ACCEPT_ALL = ("acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0")
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -20,6 +22,8 @@ class Settings:
         masks: "true" (the data set's own), "left" (those of the left images alone), "boxes" (the detector's 2D boxes,
             filled) or "degraded".
         with_field: use the residual disparity field where there is one.
+        every_result: return every result, so that rows compare methods and not whom they trust; False leaves the
+            acceptance to the configuration, which may return the input instead.
     """
 
     overrides: tuple[str, ...] = ()
@@ -27,6 +31,12 @@ class Settings:
     prior: str = "pca"
     masks: Masks = "true"
     with_field: bool = True
+    every_result: bool = True
+
+    @property
+    def all_overrides(self) -> tuple[str, ...]:
+        """The overrides, with acceptance switched off where every result is wanted."""
+        return (*self.overrides, *(_ACCEPT_ALL if self.every_result else ()))
 
     @property
     def slug(self) -> str:
@@ -40,12 +50,14 @@ class Settings:
         parts += [self.prior] if self.prior != "pca" else []
         parts += [self.masks] if self.masks != "true" else []
         parts += [] if self.with_field else ["no-field"]
+        parts += [] if self.every_result else ["policy"]
         return re.sub(r"[^\w.]+", "-", "-".join(parts)).strip("-")[:60]
 
 
 PAPER = Settings(config="paper")
 DEFAULT = Settings()
 FAST = Settings(config="fast")
+TRUSTED = Settings(every_result=False)
 GEOMETRIC = Settings(("method=geometric",))
 COMBINED = Settings(("method=combined",))
 
@@ -53,6 +65,7 @@ METHODS: dict[str, Settings] = {
     "ours, `paper`": PAPER,
     "ours, `fast`": FAST,
     "ours, `default`": DEFAULT,
+    "the same, input where not trusted": TRUSTED,
     "geometric, SGBM": GEOMETRIC,
     "combined": COMBINED,
 }
