@@ -14,7 +14,7 @@ class Status(enum.Enum):
     too_few_pixels = "fewer usable pixels than the configured minimum; the car is tiny, cut off or hidden"
     behind_camera = "the initial box lies behind or at the camera, or upside down; check frame and units of the pose"
     singular = "the normal equations are singular; add a prior, more pixels, or damping"
-    non_finite = "the cost or its derivatives are not finite at the input; look for NaN in images, masks or pose"
+    non_finite = "the cost or its derivatives are not finite at the input; look for NaN in images, masks, pose, weights"
     rejected_worse = "the result had a higher cost than the input, which is returned instead"
     too_few_points = "fewer stereo points on the car than point_cloud.min_points; it is far, hidden, or badly matched"
     not_trusted = (
