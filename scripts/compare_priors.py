@@ -29,6 +29,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.config import load_config
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
 from directshape_torch.evaluation.comparison_summary import GroupSummary
@@ -155,7 +156,9 @@ def refined(prior: ShapePrior, args: argparse.Namespace, out: Path) -> tuple[Gro
     """
     dataset = KittiStereoDataset(args.data, args.detections, args.masks, frames=args.frames)
     start = time.process_time()
-    summary = refine_dataset(dataset, DirectShapeRefiner(prior), out)
+    # The model of trust was fitted to the bundled prior.
+    every_result = load_config(None, ["acceptance.min_probability_not_worse=0"])
+    summary = refine_dataset(dataset, DirectShapeRefiner(prior, every_result), out)
     spent_s = time.process_time() - start
     comparison = compare_results(
         args.data / "training" / "label_2",

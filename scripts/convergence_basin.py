@@ -195,9 +195,13 @@ def plot_png(table: NDArray[np.float64], positions_m: Sequence[float], yaws_deg:
     return content.getvalue()
 
 
+# Where the iterations end is asked, not what is made of it.
+EVERY_RESULT = "acceptance.min_probability_not_worse=0"
+
+
 def run(args: argparse.Namespace) -> None:
     """Refine all frames from all starts and write table, CSV and plot; partial results are written after each frame."""
-    refiner = DirectShapeRefiner(config=load_config(args.config, args.set)).to(args.device)
+    refiner = DirectShapeRefiner(config=load_config(args.config, [EVERY_RESULT, *args.set])).to(args.device)
     dataset = KittiStereoDataset(args.data, args.detections, args.masks, frames=args.frames)
     cells = [(position, yaw) for position in args.positions for yaw in args.yaws]
     trials: list[Trial] = []

@@ -5,12 +5,13 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
+from directshape_torch.config import AcceptanceConfig, RefinerConfig
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
@@ -79,7 +80,9 @@ def _typical(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator
 
 
 def _near_optimum(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
-    result = DirectShapeRefiner(prior)(scene.frame, scene.detections)
+    # Wherever the optimum lies, whether its box is to be trusted is another question.
+    every_result = replace(RefinerConfig(), acceptance=AcceptanceConfig(0.0, 0.0))
+    result = DirectShapeRefiner(prior, every_result)(scene.frame, scene.detections)
     rows = torch.arange(count) % len(scene.detections)
     refined = CarState(se3.inverse(result.T_cam_obj[rows]), result.code[rows])
     return DrawnStates(_cycled(scene.detections, count), _disturbed(refined, generator, 0.01, 0.1, 0.05))

@@ -27,7 +27,9 @@ BackwardMode = Literal["unroll", "implicit", "implicit_gauss_newton"]
 Kind = Literal["fixed", "constant", "network"]
 
 # Beside `fast.yaml`: fewer pixels while training. Costs are means over pixels, so weights keep their meaning.
-TRAINING_OVERRIDES = ("sampling.min_pixels=200", "sampling.max_pixels=200")
+# A result that is not returned has no gradient and says nothing of what a network has learnt.
+EVERY_RESULT = "acceptance.min_probability_not_worse=0"
+TRAINING_OVERRIDES = ("sampling.min_pixels=200", "sampling.max_pixels=200", EVERY_RESULT)
 UNROLLED_ITERATIONS = 3
 
 
@@ -91,8 +93,8 @@ def training_refiner(mode: BackwardMode) -> DirectShapeRefiner:
 
 
 def run_job(job: Job, options: Options, on_epoch: Callable[[], None] = lambda: None) -> Outcome:
-    """Train on the frames of the other folds and judge the held-out ones with the default settings."""
-    frames, refiner = load_frames(options), DirectShapeRefiner(config=load_config("default"))
+    """Train on the frames of the other folds and judge the others with the default settings, every result returned."""
+    frames, refiner = load_frames(options), DirectShapeRefiner(config=load_config("default", [EVERY_RESULT]))
     if job.kind == "fixed":
         return Outcome(job, tuple(refine_and_compare(refiner, None, frames)), (), {})
     fold_of = folds_of([frame.loaded.frame_id for frame in frames], options.folds, options.training.seed)
