@@ -11,6 +11,7 @@ from directshape_torch.errors import (
     ResumeError,
 )
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.observability import Observability
 from directshape_torch.quality import FitQuality
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
@@ -33,6 +34,7 @@ __all__ = [
     "KittiBoxes",
     "MeshError",
     "MissingDependencyError",
+    "Observability",
     "Occluders",
     "PCAShapePrior",
     "RefinementResult",
