@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from paper_tables.ablation_rows import ROWS
 from paper_tables.ablation_table import make_ablation_table
 from paper_tables.data_sets import DataSet, find_data_sets
 from paper_tables.detector_table import make_detector_table
@@ -95,6 +96,7 @@ def run(args: argparse.Namespace) -> None:
         seed=args.seed,
         quick=args.quick,
         skipped_rows=tuple(args.skip_rows),
+        only_groups=tuple(args.groups),
     )
     try:
         TABLES[args.table](experiment)
@@ -120,6 +122,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="two frames of each detector, one row of each group")
     parser.add_argument(
         "--skip-rows", nargs="+", default=[], metavar="NAME", help="rows of the ablation to leave out, such as dense"
+    )
+    parser.add_argument(
+        "--groups",
+        nargs="+",
+        default=[],
+        choices=sorted({row.group for row in ROWS}),
+        help="of the ablation; default all",
     )
     parser.add_argument("--seed", type=int, default=0, help="of simulated detections and intervals")
     parser.add_argument("--draws", type=int, default=2000, help="of the intervals")

@@ -38,6 +38,13 @@ _SAMPLINGS = {
 }
 
 
+_SEARCHES = {
+    "headings +-20 degrees": ("search.yaw_offsets_deg=[-20, 20]",),
+    "headings +-20 and 180 degrees": ("search.yaw_offsets_deg=[-20, 20, 180]",),
+    "disparities +-1 and +-2 px": ("search.disparity_offsets_px=[-2, -1, 1, 2]",),
+}
+
+
 def _points(number: int) -> Settings:
     return Settings((f"sampling.min_pixels={number}", f"sampling.max_pixels={number}"))
 
@@ -62,6 +69,7 @@ ROWS: tuple[Row, ...] = (
     *(Row("sampling", name, Settings(overrides)) for name, overrides in _SAMPLINGS.items()),
     *(Row("points a car", f"{number}", _points(number)) for number in (50, 100, 200, 400, 1000, 3000)),
     Row("stages", "fine stage only", Settings((f"stages=[{_FINE_POSE.replace('pose', 'both')}]",))),
+    *(Row("start states kept by cost", name, Settings(overrides)) for name, overrides in _SEARCHES.items()),
     Row("shape", "mean shape, pose only", Settings((f"stages=[{_COARSE_POSE}, {_FINE_POSE}]",))),
     *(Row("shape", f"K = {number}", Settings(prior=f"pca:{number}")) for number in (1, 2, 3, 5)),
     Row("prior", "network (neural)", Settings(prior="neural")),
@@ -74,5 +82,6 @@ ROWS: tuple[Row, ...] = (
     *(Row("far start", name, Settings(overrides), "mono") for name, overrides in _SAMPLINGS.items()),
     Row("far start", "silhouette only", Settings(("photometric.weight=0",)), "mono"),
     Row("far start", "photometric only", Settings(("silhouette.weight=0",)), "mono"),
+    *(Row("far start", f"start states: {name}", Settings(overrides), "mono") for name, overrides in _SEARCHES.items()),
     Row("far start", "fine stage only", Settings((f"stages=[{_FINE_POSE.replace('pose', 'both')}]",)), "mono"),
 )

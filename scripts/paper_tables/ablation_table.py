@@ -82,6 +82,8 @@ def _why_not(experiment: Experiment, data_set: DataSet, row: Row) -> str:
     """Why a row says nothing about a data set; empty where it does."""
     if row.name in experiment.skipped_rows:
         return "by --skip-rows"
+    if experiment.only_groups and row is not REFERENCE and row.group not in experiment.only_groups:
+        return "by --groups"
     if not row.settings.with_field and experiment.refinery.fields.get(data_set.name) is None:
         return "no residual disparity field"
     if row.settings.masks == "degraded" and data_set.masks_degraded is None:

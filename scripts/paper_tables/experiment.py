@@ -30,6 +30,7 @@ class Experiment:
         seed: of simulated detections.
         quick: a few frames and rows, to try everything.
         skipped_rows: names of rows of the ablation to leave out.
+        only_groups: the groups of the ablation to run beside the reference; empty for all.
     """
 
     data_sets: tuple[DataSet, ...]
@@ -41,6 +42,7 @@ class Experiment:
     seed: int
     quick: bool
     skipped_rows: tuple[str, ...] = ()
+    only_groups: tuple[str, ...] = ()
 
     @property
     def plots(self) -> Path:
