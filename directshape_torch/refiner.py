@@ -231,7 +231,7 @@ def _outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarStat
         after=minimum.state,
         detector_hwl=detector_hwl,
         cost_before=problem.term_costs(initial),
-        cost_after=problem.term_costs(minimum.state),
+        cost_after=torch.stack([part.cost for part in linearisations], dim=1),
         linearisations=linearisations,
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
