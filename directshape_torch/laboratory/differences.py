@@ -22,7 +22,8 @@ STEPS: tuple[float, ...] = tuple(8e-3 / STEP_RATIO**k for k in range(8))
 # Displacements so small that the function is linear along them, to many digits more than it has: what its value at the
 # centre lacks to the mean of both ends is rounding.
 _JITTER = 1e-11
-_NUM_JITTERS = 6
+# With few of them the largest is at times far below the rounding there is, and a stencil too fine is taken.
+_NUM_JITTERS = 16
 
 
 class Probe(NamedTuple):
