@@ -1,0 +1,78 @@
+"""Average precision as KITTI measures it: a slow reference, and known scores of real detectors."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.kitti_devkit import devkit_curves
+from helpers.kitti_lines import objects
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.evaluation.kitti_ap import evaluate_kitti
+from directshape_torch.io.kitti_labels import KittiObject
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> list[tuple[list[KittiObject], list[KittiObject]]]:
+    """Frames whose boxes crowd together, with equal scores and overlaps, and heights at the limits."""
+    heights, columns = st.sampled_from([24.0, 24.9, 25.0, 26.0, 39.9, 40.0, 41.0]), st.sampled_from([0, 2, 5, 8, 60])
+
+    def thing(kinds: tuple[str, ...], with_score: bool) -> str:
+        kind, u, x = draw(st.sampled_from(kinds)), draw(columns), draw(st.sampled_from([0.0, 0.2, 0.5, 0.6, 8.0]))
+        truncated, occluded = draw(st.sampled_from([0, 0.2, 0.4])), draw(st.sampled_from([0, 0, 1, 2]))
+        box_2d = f"{u} 0 {u + draw(st.sampled_from([60, 66]))} {draw(heights)}"
+        box_3d = f"{draw(st.sampled_from([1.5, 1.7]))} 2 4 {x} 1.6 20 0"
+        if kind == "DontCare":
+            truncated, occluded, box_3d = -1, -1, "-1 -1 -1 -1000 -1000 -1000 0"
+        text = f"{kind} {truncated} {occluded} {draw(st.sampled_from([-1.0, 0.0, 2.0]))} {box_2d} {box_3d}"
+        return f"{text} {draw(st.sampled_from([0.1, 0.3, 0.5, 0.9]))}" if with_score else text
+
+    frames = []
+    for _ in range(draw(st.integers(1, 4))):
+        labels = [thing(("Car", "Car", "Van", "Truck", "DontCare"), False) for _ in range(draw(st.integers(0, 5)))]
+        results = [thing(("Car", "Car", "Car", "Cyclist"), True) for _ in range(draw(st.integers(0, 6)))]
+        frames.append((objects(*labels), objects(*results)))
+    return frames
+
+
+@settings(max_examples=25)
+@given(scenes())
+def test_equals_the_devkit_taken_frame_by_frame(frames: list[tuple[list[KittiObject], list[KittiObject]]]) -> None:
+    labels = {str(k): frame[0] for k, frame in enumerate(frames)}
+    results = {str(k): frame[1] for k, frame in enumerate(frames)}
+    for score in evaluate_kitti(labels, results).scores:
+        expected, orientation = devkit_curves(frames, score.metric, score.minimum_iou, score.difficulty)
+        np.testing.assert_allclose(score.curve.precision, expected, atol=1e-12)
+        if score.metric == "2d":
+            np.testing.assert_allclose(score.curve.orientation, orientation, atol=1e-12)
+
+
+@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: KITTI labels needed")
+def test_agrees_with_known_scores_in_every_cell(tmp_path: Path) -> None:
+    """3769 frames, two detectors; the curves of the first at IoU 0.7 are the official evaluator's, six decimals."""
+    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti_eval"
+    known = json.loads((root / "expected.json").read_text())
+    labels = _extract(root / "label_2.zip", tmp_path) / "label_2"
+    for detector in ("frustum_pointnet", "pointgnn"):
+        results = _extract(root / known[detector]["results"], tmp_path / detector)
+        scores = evaluate_kitti(labels, results, split=root / "val.txt")
+        assert (scores.num_frames, scores.num_frames_without_results, len(scores.scores)) == (3769, 0, 18)
+        for score in scores.scores:
+            iou = str(score.minimum_iou)
+            cell = known[detector]["reimplementation"][score.metric][iou][score.difficulty]
+            assert score.num_labels == cell["n_gt"]
+            assert (score.ap_r11, score.ap_r40) == pytest.approx((cell["R11"], cell["R40"]), abs=1e-3)
+            curve = known["precision_curves"][detector][f"{score.metric}_{iou}_{score.difficulty}"]
+            np.testing.assert_allclose(score.curve.precision, curve, atol=1e-6)
+
+
+def _extract(archive: Path, folder: Path) -> Path:
+    with zipfile.ZipFile(archive) as file:
+        file.extractall(folder)
+    return folder

@@ -1,0 +1,45 @@
+"""Cars as lines of KITTI label and result files, each in a place of its own, and the scores of a frame of them."""
+
+from __future__ import annotations
+
+from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores, evaluate_kitti
+from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.text_files import Line
+
+
+def line(
+    slot: int = 0,
+    *,
+    kind: str = "Car",
+    width: float = 100,
+    height: float = 50,
+    shift: float = 0,
+    z: float = 20,
+    occluded: int = 0,
+    truncated: float = 0,
+    alpha: float = 0,
+    score: float | None = None,
+) -> str:
+    """A car 4 m x 2 m x 1.5 m in a place of its own (`slot`), in the image 300 px and on the road 10 m from the next.
+
+    `shift` moves the 3D box along its length.
+    """
+    box_2d = f"{300 * slot} 100 {300 * slot + width} {100 + height}"
+    text = f"{kind} {truncated} {occluded} {alpha} {box_2d} 1.5 2 4 {10 * slot + shift} 1.6 {z} 0"
+    return text if score is None else f"{text} {score}"
+
+
+def objects(*lines: str) -> list[KittiObject]:
+    return [parse_object("a file", Line(number, text, text)) for number, text in enumerate(lines, start=1)]
+
+
+def evaluate(labels: list[str], results: list[str], object_type: str = "Car") -> KittiScores:
+    """The scores of one frame."""
+    return evaluate_kitti({"0": objects(*labels)}, {"0": objects(*results)}, object_type=object_type)
+
+
+def precision(score: ApScore, count: int) -> list[float]:
+    """The first values of the curve; the rest must be 0, as beyond the last threshold."""
+    assert score.curve.precision.shape == (41,)
+    assert not score.curve.precision[count:].any()
+    return score.curve.precision[:count].tolist()
