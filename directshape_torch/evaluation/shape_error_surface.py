@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +14,9 @@ from torch import Tensor
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.shape_error import Points, ShapeError, shape_error
 from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
-from directshape_torch.io.image_files import read_file_bytes, read_single_channel
+from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.npz_files import read_npz
 from directshape_torch.scene import StereoCamera
 
 NUM_ESTIMATED_POINTS = 4000
@@ -183,13 +182,10 @@ def read_surface_points(path: Path) -> Points:
     Raises:
         DataFormatError: no such file or array, another shape, no points, or numbers that are not finite.
     """
-    # From memory: numpy leaves the file open when it turns out to be no archive.
-    content = io.BytesIO(read_file_bytes(path))
-    try:
-        with np.load(content, allow_pickle=False) as archive:
-            points = np.asarray(archive["points"])
-    except (ValueError, zipfile.BadZipFile, EOFError, AttributeError, TypeError, KeyError) as error:
-        raise DataFormatError(path, f"is no npz file with an array 'points' ({error})") from error
+    arrays = read_npz(path)
+    if "points" not in arrays:
+        raise DataFormatError(path, f"is no npz file with an array 'points', it has {sorted(arrays)}")
+    points = arrays["points"]
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise DataFormatError(path, f"expected 'points' of shape (N, 3), got {points.shape}")
     if points.dtype.kind != "f" or not np.isfinite(points).all():

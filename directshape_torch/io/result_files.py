@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +12,12 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io import atomic_files
-from directshape_torch.io.image_files import read_file_bytes
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.npz_files import read_npz
 
 SHAPES_SCHEMA_VERSION = 1
+
+Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,11 @@ def write_result_text(
     atomic_files.write_text(path, "".join(f"{line}\n" for line in lines))
 
 
+def _shape(*sizes: str | int) -> dict[str, tuple[str | int, ...]]:
+    """What a field of `ShapeArrays` must look like; letters as in its description."""
+    return {"shape": sizes}
+
+
 @dataclass(frozen=True)
 class ShapeArrays:
     """Content of `OUT/shapes/NNNNNN.npz` for the B refined lines of a frame; K codes, D = 6 + K, T terms.
@@ -114,67 +119,41 @@ class ShapeArrays:
     frame_id: str
     prior_sha256: str
     ground_source: str
-    input_lines: NDArray[np.int64]
-    T_cam_obj: NDArray[np.floating[Any]]
-    T_ref_obj: NDArray[np.floating[Any]]
-    boxes_hwl: NDArray[np.floating[Any]]
-    boxes_location_ref: NDArray[np.floating[Any]]
-    boxes_rotation_y: NDArray[np.floating[Any]]
-    codes: NDArray[np.floating[Any]]
-    covariances: NDArray[np.floating[Any]]
-    covariances_ref: NDArray[np.floating[Any]]
-    statuses: tuple[str, ...]
-    messages: tuple[str, ...]
+    input_lines: NDArray[np.int64] = field(metadata=_shape("B"))
+    T_cam_obj: Floats = field(metadata=_shape("B", 4, 4))
+    T_ref_obj: Floats = field(metadata=_shape("B", 4, 4))
+    boxes_hwl: Floats = field(metadata=_shape("B", 3))
+    boxes_location_ref: Floats = field(metadata=_shape("B", 3))
+    boxes_rotation_y: Floats = field(metadata=_shape("B"))
+    codes: Floats = field(metadata=_shape("B", "K"))
+    covariances: Floats = field(metadata=_shape("B", "D", "D"))
+    covariances_ref: Floats = field(metadata=_shape("B", 4, 4))
+    statuses: tuple[str, ...] = field(metadata=_shape("B"))
+    messages: tuple[str, ...] = field(metadata=_shape("B"))
     term_names: tuple[str, ...]
-    costs_before: NDArray[np.floating[Any]]
-    costs_after: NDArray[np.floating[Any]]
-    iterations: NDArray[np.int64]
-    has_mask_left: NDArray[np.bool_]
-    mask_iou_left: NDArray[np.floating[Any]]
-    mask_iou_right: NDArray[np.floating[Any]]
-    photometric_errors_grey: NDArray[np.floating[Any]]
-    matched_shares: NDArray[np.floating[Any]]
-    probabilities_better: NDArray[np.floating[Any]]
-    probabilities_not_worse: NDArray[np.floating[Any]]
-    sigmas_ref: NDArray[np.floating[Any]]
-    unseen: tuple[str, ...]
-    unseen_sigmas_m: NDArray[np.floating[Any]]
-    unseen_directions: NDArray[np.floating[Any]]
+    costs_before: Floats = field(metadata=_shape("B", "T"))
+    costs_after: Floats = field(metadata=_shape("B", "T"))
+    iterations: NDArray[np.int64] = field(metadata=_shape("B"))
+    has_mask_left: NDArray[np.bool_] = field(metadata=_shape("B"))
+    mask_iou_left: Floats = field(metadata=_shape("B"))
+    mask_iou_right: Floats = field(metadata=_shape("B"))
+    photometric_errors_grey: Floats = field(metadata=_shape("B"))
+    matched_shares: Floats = field(metadata=_shape("B"))
+    probabilities_better: Floats = field(metadata=_shape("B"))
+    probabilities_not_worse: Floats = field(metadata=_shape("B"))
+    sigmas_ref: Floats = field(metadata=_shape("B", 4))
+    unseen: tuple[str, ...] = field(metadata=_shape("B"))
+    unseen_sigmas_m: Floats = field(metadata=_shape("B", 7))
+    unseen_directions: Floats = field(metadata=_shape("B", 7, 7))
 
     def __post_init__(self) -> None:
-        B, T = len(self.input_lines), len(self.term_names)
-        K = self.codes.shape[-1]
-        expected = {
-            "input_lines": (B,),
-            "T_cam_obj": (B, 4, 4),
-            "T_ref_obj": (B, 4, 4),
-            "boxes_hwl": (B, 3),
-            "boxes_location_ref": (B, 3),
-            "boxes_rotation_y": (B,),
-            "codes": (B, K),
-            "covariances": (B, 6 + K, 6 + K),
-            "covariances_ref": (B, 4, 4),
-            "statuses": (B,),
-            "messages": (B,),
-            "costs_before": (B, T),
-            "costs_after": (B, T),
-            "iterations": (B,),
-            "has_mask_left": (B,),
-            "mask_iou_left": (B,),
-            "mask_iou_right": (B,),
-            "photometric_errors_grey": (B,),
-            "matched_shares": (B,),
-            "probabilities_better": (B,),
-            "probabilities_not_worse": (B,),
-            "sigmas_ref": (B, 4),
-            "unseen": (B,),
-            "unseen_sigmas_m": (B, 7),
-            "unseen_directions": (B, 7, 7),
-        }
-        for name, shape in expected.items():
-            got = np.shape(getattr(self, name))
-            if got != shape:
-                raise InputError(name, f"shape {shape}", f"{got}")
+        B, T, K = len(self.input_lines), len(self.term_names), self.codes.shape[-1]
+        sizes = {"B": B, "K": K, "D": 6 + K, "T": T}
+        for entry in fields(self):
+            shape = tuple(sizes.get(size, size) for size in entry.metadata.get("shape", ()))
+            got = np.shape(getattr(self, entry.name))
+            if shape and got != shape:
+                raise InputError(entry.name, f"shape {shape}", f"{got}")
 
 
 def write_shapes(path: Path | str, shapes: ShapeArrays) -> None:
@@ -192,7 +171,7 @@ def read_shapes(path: Path | str) -> ShapeArrays:
     Raises:
         DataFormatError: it is no such file, or of another schema version.
     """
-    arrays = _load_npz(path)
+    arrays = read_npz(path, cure="refine the frame again")
     version = arrays.pop("schema_version", None)
     if version is None or int(version) != SHAPES_SCHEMA_VERSION:
         raise DataFormatError(
@@ -204,16 +183,6 @@ def read_shapes(path: Path | str) -> ShapeArrays:
     if set(arrays) != names:
         raise DataFormatError(path, f"has the fields {sorted(arrays)}, expected {sorted(names)}")
     return ShapeArrays(**{name: _from_text(array) for name, array in arrays.items()})
-
-
-def _load_npz(path: Path | str) -> dict[str, NDArray[Any]]:
-    # From memory: numpy leaves the file open when it turns out to be no archive.
-    content = io.BytesIO(read_file_bytes(path))
-    try:
-        with np.load(content, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (ValueError, zipfile.BadZipFile, EOFError, AttributeError, TypeError) as error:
-        raise DataFormatError(path, f"is no readable npz file ({error})", cure="refine the frame again") from error
 
 
 def _from_text(array: NDArray[Any]) -> Any:

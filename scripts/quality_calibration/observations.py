@@ -16,6 +16,7 @@ from directshape_torch.evaluation.rotated_iou import bev_iou
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.npz_files import read_npz
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections
@@ -67,8 +68,8 @@ class Observations:
     @classmethod
     def load(cls, path: Path) -> Observations:
         """Those of `save`."""
-        with np.load(path, allow_pickle=False) as archive:
-            return cls(**{f.name: archive[f.name] for f in fields(cls)})
+        arrays = read_npz(path)
+        return cls(**{f.name: arrays[f.name] for f in fields(cls)})
 
 
 def observe_noisy(

@@ -187,7 +187,7 @@ def test_broken_files(tmp_path: Path) -> None:
     np.savez(tmp_path / "flat.npz", points=np.zeros((4, 2)))
     np.savez(tmp_path / "nan.npz", points=np.full((4, 3), np.nan))
     for name, text in (
-        ("text", "no npz file"),
+        ("text", "no readable npz file"),
         ("other", "'points'"),
         ("flat", r"shape \(N, 3\)"),
         ("nan", "not finite"),
