@@ -1,6 +1,7 @@
 """Joint 3D pose and shape refinement of cars from stereo images (DirectShape), in PyTorch."""
 
-from directshape_torch.config import RefinerConfig, load_config
+from directshape_torch.config import RefinerConfig
+from directshape_torch.config_files import load_config
 from directshape_torch.errors import (
     ConfigError,
     DataFormatError,

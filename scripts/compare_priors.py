@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.config import load_config
+from directshape_torch.config_files import load_config
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
 from directshape_torch.evaluation.comparison_summary import GroupSummary

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.config import load_config
+from directshape_torch.config_files import load_config
 from directshape_torch.errors import DirectShapeError, InputError, MissingDependencyError
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors

@@ -15,7 +15,8 @@ from typing import Any
 
 import yaml
 
-from directshape_torch.config import RefinerConfig, config_to_mapping
+from directshape_torch.config import RefinerConfig
+from directshape_torch.config_files import config_to_mapping
 
 TARGET = Path(__file__).parent.parent / "directshape_torch" / "assets" / "configs" / "default.yaml"
 HEADER = """\

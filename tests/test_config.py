@@ -17,10 +17,8 @@ from directshape_torch.config import (
     SearchConfig,
     SilhouetteConfig,
     SolverConfig,
-    config_from_mapping,
-    config_to_mapping,
-    load_config,
 )
+from directshape_torch.config_files import config_from_mapping, config_to_mapping, load_config
 from directshape_torch.config_ranges import _RANGES
 from directshape_torch.errors import ConfigError, DirectShapeError
 

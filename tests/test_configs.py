@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 import directshape_torch
-from directshape_torch.config import BUNDLED_CONFIGS, RefinerConfig, config_to_mapping, load_config
+from directshape_torch.config import RefinerConfig
+from directshape_torch.config_files import BUNDLED_CONFIGS, config_to_mapping, load_config
 from directshape_torch.errors import ConfigError
 
 ROOT = Path(__file__).parent.parent

@@ -15,7 +15,7 @@ from directshape_torch.batch.options import RefineOptions, RunObserver, SilentOb
 from directshape_torch.batch.run_record import RunRecord
 from directshape_torch.batch.run_summary import RunSummary, find_warnings
 from directshape_torch.batch.timing import RunTimings, write_timings
-from directshape_torch.config import config_to_mapping
+from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame

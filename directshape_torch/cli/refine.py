@@ -147,7 +147,7 @@ def make_refiner(config: str | None, overrides: list[str], prior: Path | str | N
         DataFormatError: a prior that cannot be used.
         InputError: no such device.
     """
-    from directshape_torch.config import load_config
+    from directshape_torch.config_files import load_config
     from directshape_torch.refiner import DirectShapeRefiner
     from directshape_torch.shape.load_prior import load_prior
 

@@ -39,7 +39,7 @@ def method_stages(config: RefinerConfig) -> list[Stage]:
     """The stages of `config.method`: rounds of its own for "geometric", else those of the configuration.
 
     Example:
-        >>> from directshape_torch.config import load_config
+        >>> from directshape_torch.config_files import load_config
         >>> stages = method_stages(load_config(None, ["method=geometric", "point_cloud.rounds=2"]))
         >>> [stage.unknowns for stage in stages]
         ['pose', 'shape', 'pose', 'shape']

@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from directshape_torch.config import BackwardConfig, load_config
+from directshape_torch.config import BackwardConfig
+from directshape_torch.config_files import load_config
 from directshape_torch.evaluation.comparison_summary import ComparedCar
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner

@@ -19,7 +19,8 @@ from directshape_torch.batch.options import RefineOptions, SilentObserver
 from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
 from directshape_torch.batch.run_record import RunRecord
 from directshape_torch.batch.run_summary import RunSummary
-from directshape_torch.config import RefinerConfig, load_config
+from directshape_torch.config import RefinerConfig
+from directshape_torch.config_files import load_config
 from directshape_torch.errors import DirectShapeError, InputError, ResumeError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset

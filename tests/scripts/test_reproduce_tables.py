@@ -16,7 +16,7 @@ from helpers.exact_disparity import exact_disparity
 from helpers.kitti_folder import CODE, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
 
-from directshape_torch.config import load_config
+from directshape_torch.config_files import load_config
 from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 from directshape_torch.io.text_files import Line
