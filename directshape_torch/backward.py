@@ -12,7 +12,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import put_rows, take_rows
-from directshape_torch.status import Status
+from directshape_torch.status import is_refined
 
 
 def attached_state(
@@ -35,7 +35,7 @@ def attached_state(
     """
     if not torch.is_grad_enabled():
         return minimum.state
-    refined = (minimum.status == Status.converged.code) | (minimum.status == Status.max_iterations.code)
+    refined = is_refined(minimum.status)
     rows = refined.nonzero()[:, 0]
     if not len(rows):
         return minimum.state

@@ -14,7 +14,7 @@ from directshape_torch.observability import Observability
 from directshape_torch.quality import FitQuality
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
-from directshape_torch.status import Status
+from directshape_torch.status import Status, is_refined
 from directshape_torch.trust_model import bundled_trust_model
 
 if TYPE_CHECKING:
@@ -92,8 +92,7 @@ class RefinementResult:
     @property
     def refined(self) -> Tensor:
         """(B,) bool: cars whose state is a refined one."""
-        codes = torch.tensor([s.code for s in Status if s.is_refined], device=self.status_code.device)
-        return torch.isin(self.status_code, codes)
+        return is_refined(self.status_code)
 
     @property
     def T_ref_obj(self) -> Tensor:

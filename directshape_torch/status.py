@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import enum
 
+import torch
+from torch import Tensor
+
 
 class Status(enum.Enum):
     """Outcome for one car. `converged` and `max_iterations` carry a refined state; all others the input's."""
@@ -39,3 +42,9 @@ class Status(enum.Enum):
 
 _BY_CODE = tuple(Status)
 _CODES = {status: code for code, status in enumerate(_BY_CODE)}
+_REFINED = [status.code for status in Status if status.is_refined]
+
+
+def is_refined(status_code: Tensor) -> Tensor:
+    """Which codes (B,) are of cars that carry a refined state."""
+    return torch.stack([status_code == code for code in _REFINED]).any(dim=0)

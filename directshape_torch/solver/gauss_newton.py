@@ -11,7 +11,7 @@ from torch import Tensor
 from directshape_torch.config import SolverConfig
 from directshape_torch.solver.damped_solve import damped_step, limit_step
 from directshape_torch.solver.problem import Linearisation, Problem, Stage, StateT, put_rows, take_rows, where_rows
-from directshape_torch.status import Status
+from directshape_torch.status import Status, is_refined
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def minimise(
             state, converged, failure, done = _run_stage(problem, stage, state, failure, config, log)
             iterations = iterations + done
         status = _final_status(problem, initial, state, converged, failure)
-        refined = (status == Status.converged.code) | (status == Status.max_iterations.code)
+        refined = is_refined(status)
         columns = torch.stack(history, dim=1) if history else torch.empty(num_problems, 0, device=device)
         final = where_rows(refined, state, initial)
         return Minimum(final, status, iterations, columns, tuple(starts), tuple(trajectory or ()))

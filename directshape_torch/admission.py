@@ -1,0 +1,90 @@
+"""Which cars can be refined at all, and whether the parts of a call fit together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.errors import InputError
+from directshape_torch.observation.packing import Observation
+from directshape_torch.observation.regions import MASK_THRESHOLD
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.status import Status
+from directshape_torch.stereo_matching.car_points import PointSamples
+
+# A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
+_MIN_DEPTH_M = 1.0
+
+
+def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
+    """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
+    for name, tensor in (("frames", frames.images_left), ("detections", detections.T_cam_obj)):
+        if tensor.dtype != prior.origin.dtype or tensor.device != prior.origin.device:
+            raise InputError(
+                name,
+                f"dtype {prior.origin.dtype} on {prior.origin.device}, like the refiner",
+                f"{tensor.dtype} on {tensor.device}",
+                "move them together with .to(device, dtype)",
+            )
+    if len(detections):
+        if detections.mask_left.shape[1:] != frames.images_left.shape[2:]:
+            raise InputError(
+                "detections.mask_left",
+                f"masks of the (padded) image size {tuple(frames.images_left.shape[2:])}",
+                f"{tuple(detections.mask_left.shape[1:])}",
+            )
+        lowest, highest = int(detections.frame_index.min()), int(detections.frame_index.max())
+        if lowest < 0 or highest >= len(frames):
+            raise InputError("detections.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
+
+
+def without_empty_masks(detections: Detections) -> Detections:
+    """A mask without any foreground counts as none: it would only say that there is no car."""
+    left, right = (_mask_areas(detections) > 0).unbind(dim=1)
+    return replace(detections, has_mask_left=left, has_mask_right=right)
+
+
+def refusals(
+    frames: FrameBatch, detections: Detections, pixels: Observation, points: PointSamples | None, config: RefinerConfig
+) -> Tensor:
+    """For each car the code (B,) of the status that forbids its refinement, or -1.
+
+    Args:
+        frames: F frames.
+        detections: B cars.
+        pixels: packed pixels of the cars.
+        points: their stereo points; None for methods without.
+        config: method and least numbers.
+    """
+    T = detections.T_cam_obj
+    finite = T.isfinite().all(-1).all(-1)
+    upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
+    in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
+    if config.method == "geometric" and points is not None:
+        lacking = [(points.counts < config.point_cloud.min_points, Status.too_few_points)]
+    else:
+        lacking = _lacking_pixels(detections, pixels, config.sampling.min_usable_pixels)
+    code = torch.full((len(detections),), -1, device=T.device)
+    # Later ones say more.
+    for condition, status in (*lacking, (~in_front, Status.behind_camera), (~finite, Status.non_finite)):
+        code = torch.where(condition, torch.full_like(code, status.code), code)
+    return code
+
+
+def _lacking_pixels(detections: Detections, pixels: Observation, least: int) -> list[tuple[Tensor, Status]]:
+    areas = _mask_areas(detections)
+    left, right = (torch.bincount(x.object_index, minlength=len(detections)) for x in (pixels.left, pixels.right))
+    # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
+    too_few = torch.minimum(left + right, areas.sum(dim=1)) < least
+    return [(too_few, Status.too_few_pixels), (~(areas > 0).any(dim=1), Status.no_mask)]
+
+
+def _mask_areas(detections: Detections) -> Tensor:
+    """Foreground pixels (B, 2) of the left and right masks, zero where absent; NaN counts, to be noticed later."""
+    masks = (detections.mask_left, detections.mask_right)
+    areas = torch.stack([(~(mask <= MASK_THRESHOLD)).flatten(1).sum(dim=1) for mask in masks], dim=1)
+    return areas * torch.stack([detections.has_mask_left, detections.has_mask_right], dim=1)

@@ -1,0 +1,143 @@
+"""What a minimisation says of its cars, and the result of a call that it becomes a part of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import AcceptanceConfig
+from directshape_torch.covariance import covariance_of, covariance_xyz_yaw
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.evidence import Course
+from directshape_torch.geometry import se3
+from directshape_torch.observability import Observability, observability_of
+from directshape_torch.quality import FitQuality, fit_quality
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.solver.problem import where_rows
+from directshape_torch.status import Status, is_refined
+from directshape_torch.trust_model import bundled_trust_model
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the minimisation says of the cars that could be refined."""
+
+    state: CarState
+    status: Tensor
+    iterations: Tensor
+    cost_history: Tensor
+    term_names: tuple[str, ...]
+    cost_before: Tensor
+    cost_after: Tensor
+    covariance: Tensor
+    covariance_xyz_yaw: Tensor
+    quality: FitQuality
+    observability: Observability
+
+    @classmethod
+    def nothing(cls, problem: CarProblem, like: CarState) -> Outcome:
+        """The outcome of no cars at all; `like` says dtype and device."""
+        empty = CarState(like.T_obj_cam[:0], like.code[:0])
+        nothing = empty.code.new_zeros(0, 0, dtype=torch.float64)
+        square = nothing.reshape(0, 6 + empty.code.shape[1], 6 + empty.code.shape[1])
+        none = torch.zeros(0, dtype=torch.long, device=nothing.device)
+        names = tuple(term.name for term in problem.terms)
+        costs = nothing.reshape(0, len(names))
+        xyz_yaw, quality, unseen = (
+            nothing.reshape(0, 4, 4),
+            FitQuality.nothing(nothing, 0),
+            Observability.nothing(nothing, 0),
+        )
+        return cls(empty, none, none, nothing, names, costs, costs, square, xyz_yaw, quality, unseen)
+
+
+def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], detector_hwl: Tensor) -> Outcome:
+    """Costs, covariance, quality and observability of the cars of a problem at its minimum."""
+    linearisations = problem.linearise_terms(minimum.state, with_fisher=True)
+    covariance = covariance_of(linearisations)
+    unseen = observability_of(problem.prior, minimum.state, problem.terms, linearisations)
+    course = Course(
+        before=initial,
+        after=minimum.state,
+        detector_hwl=detector_hwl,
+        cost_before=problem.term_costs(initial),
+        cost_after=torch.stack([part.cost for part in linearisations], dim=1),
+        linearisations=linearisations,
+        covariance=covariance,
+        covariance_xyz_yaw=covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
+        unsettled=minimum.status == Status.max_iterations.code,
+    )
+    return Outcome(
+        minimum.state,
+        minimum.status,
+        minimum.iterations,
+        minimum.cost_history,
+        tuple(term.name for term in problem.terms),
+        course.cost_before,
+        course.cost_after,
+        covariance,
+        course.covariance_xyz_yaw,
+        fit_quality(problem, course),
+        # The directions are mostly those of the depth, so its factor brings them to size.
+        unseen.scaled(bundled_trust_model().sigma_factors[0]),
+    )
+
+
+def without_distrusted(
+    minimum: Minimum[CarState], initial: CarState, quality: FitQuality, limits: AcceptanceConfig
+) -> Minimum[CarState]:
+    """The input's state for cars whose result is too likely to be worse; unknown probabilities are no reason."""
+    doubtful = quality.probability_better < limits.min_probability_better
+    risky = quality.probability_not_worse < limits.min_probability_not_worse
+    distrusted = is_refined(minimum.status) & (doubtful | risky)
+    status = torch.where(distrusted, torch.full_like(minimum.status, Status.not_trusted.code), minimum.status)
+    return replace(minimum, state=where_rows(distrusted, initial, minimum.state), status=status)
+
+
+def assemble(
+    prior: ShapePrior,
+    frames: FrameBatch,
+    detections: Detections,
+    state: CarState,
+    status: Tensor,
+    rows: Tensor,
+    outcome: Outcome,
+) -> RefinementResult:
+    """The result of a call whose cars `rows` were minimised; the others keep what they came with."""
+    count = len(detections)
+
+    def spread(part: Tensor) -> Tensor:
+        full = torch.full((count, *part.shape[1:]), torch.nan, dtype=torch.float64, device=status.device)
+        return full.index_copy(0, rows, part.to(torch.float64))
+
+    def only_refined(values: Tensor) -> Tensor:
+        return torch.where(refined[:, None, None], values, torch.full_like(values, torch.nan))
+
+    iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
+    refined = is_refined(status)
+    # The input pose is returned to the bit for cars that were not refined, not inverted twice.
+    T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), detections.T_cam_obj)
+    return RefinementResult(
+        T_cam_obj=T_cam_obj,
+        code=state.code,
+        status_code=status,
+        iterations=iterations,
+        term_names=outcome.term_names,
+        cost_before=spread(outcome.cost_before),
+        cost_after=spread(outcome.cost_after),
+        covariance=only_refined(spread(outcome.covariance)),
+        covariance_xyz_yaw=only_refined(spread(outcome.covariance_xyz_yaw)),
+        cost_history=spread(outcome.cost_history),
+        quality=outcome.quality.spread(rows, count).where(refined | (status == Status.not_trusted.code)),
+        observability=outcome.observability.spread(rows, count).where(refined),
+        input_dimensions_hwl=detections.dimensions_hwl,
+        ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),
+        t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
+        prior=prior,
+    )
