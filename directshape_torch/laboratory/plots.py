@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
-from directshape_torch.errors import MissingDependencyError
+from directshape_torch.io.figure_files import figure_png, new_figure
 from directshape_torch.laboratory.comparison import BOUNDS, Comparison
 
 _SMALLEST_SHOWN = 1e-16
@@ -22,16 +21,10 @@ def v_curves_png(name: str, comparisons: Sequence[Comparison]) -> bytes | None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError("matplotlib", "plot", "the plots of the laboratory") from error
     drawn = [(c.regime, c.curve) for c in comparisons if c.curve is not None]
     if not drawn:
         return None
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(11, 4.6, "the plots of the laboratory")
     plain, extrapolated = figure.subplots(1, 2, sharey=True)
     for k, (regime, curve) in enumerate(drawn):
         style = {"color": f"C{k % 10}", "linestyle": "-" if k < 10 else "--", "marker": "o", "markersize": 3}
@@ -46,9 +39,7 @@ def v_curves_png(name: str, comparisons: Sequence[Comparison]) -> bytes | None:
     plain.set_ylabel("error relative to the row's norm")
     extrapolated.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.suptitle(f"{name}: numeric differences against autograd (median; dotted: 99.9 %; grey: the bound)")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110)
-    return content.getvalue()
+    return figure_png(figure)
 
 
 def _shown(errors: Sequence[float]) -> list[float]:

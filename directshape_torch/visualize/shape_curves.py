@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import InputError, MissingDependencyError
-from directshape_torch.io import atomic_files
+from directshape_torch.visualize.panel_row import write_panel_row
 
 _PANEL_INCHES = 3.4
 
@@ -64,26 +62,7 @@ def write_tau_plot(path: Path | str, panels: Sequence[TauPanel], title: str) -> 
         >>> path.read_bytes()[1:4]
         b'PNG'
     """
-    if not panels:
-        raise InputError("panels", "at least one", "none")
-    try:
-        # No pyplot: it keeps figures and picks a window system.
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError("matplotlib", "plot", "plotting shape errors") from error
-    figure = Figure(figsize=(_PANEL_INCHES * len(panels), _PANEL_INCHES + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title)
-    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        _draw(axes, panel)
-    handles, names = axes.get_legend_handles_labels()
-    # Below the panels: the curves leave no corner of a panel free in all cases.
-    figure.legend(handles, names, loc="outside lower center", ncols=max(1, len(names)))
-    content = io.BytesIO()
-    # Without the software's version, so that equal curves give equal bytes.
-    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
-    atomic_files.write_bytes(path, content.getvalue())
+    write_panel_row(path, panels, _draw, title, _PANEL_INCHES, "plotting shape errors")
 
 
 def _draw(axes: Any, panel: TauPanel) -> None:

@@ -10,7 +10,7 @@ from dataclasses import astuple, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import MissingDependencyError
+from directshape_torch.io.figure_files import figure_png, new_figure
 from label_disparity.judgement import JudgedCar
 from label_disparity.measurement import spread
 
@@ -114,13 +114,7 @@ def scatter_png(cars: Sequence[JudgedCar]) -> bytes:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError("matplotlib", "plot", "the scatter plot") from error
-    figure = Figure(figsize=(10, 5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(10, 5, "the scatter plot")
     titles = {"centre_px": "depth of the refined centre", "side_px": "refined visible side"}
     for axes, (name, title) in zip(figure.subplots(1, 2), titles.items(), strict=True):
         for group, members in _plot_groups(cars):
@@ -132,9 +126,7 @@ def scatter_png(cars: Sequence[JudgedCar]) -> bytes:
         axes.set_ylabel("refined minus label [px]")
         axes.set_title(title)
         axes.legend(fontsize="small")
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=100)
-    return content.getvalue()
+    return figure_png(figure)
 
 
 def _plot_groups(cars: Sequence[JudgedCar]) -> list[tuple[str, list[JudgedCar]]]:

@@ -8,10 +8,10 @@ from typing import Any
 from directshape_torch.evaluation.comparison import Comparison
 from directshape_torch.evaluation.kitti_ap import KittiScores
 from directshape_torch.evaluation.kitti_curve import NUM_RECALL_POINTS
+from directshape_torch.visualize.precision_recall import RecallCurve, RecallPanel, write_recall_plot
 from paper_tables.average_precision import Average, ap_scores, long_rows, paper_columns, paper_row
 from paper_tables.data_sets import DataSet
 from paper_tables.experiment import Experiment
-from paper_tables.plots import write_precision_plot
 from paper_tables.report import Table, few_cars_note, interval
 from paper_tables.settings import METHODS
 
@@ -98,10 +98,15 @@ def _cell(key: str, estimate: Any) -> str:
 
 def _plot(path: Path, name: str, scores: dict[str, KittiScores], iou: float) -> None:
     """As the paper's figure: a panel for each difficulty, a line for each method."""
-    panels = {
-        f"{difficulty}, 3D IoU > {iou}": {
-            method: s.score("3d", iou, difficulty).curve.precision for method, s in scores.items()
-        }
+    panels = [
+        RecallPanel(
+            f"{difficulty}, 3D IoU > {iou}",
+            "precision",
+            tuple(
+                RecallCurve(method.replace("`", ""), s.score("3d", iou, difficulty).curve.precision)
+                for method, s in scores.items()
+            ),
+        )
         for difficulty in ("easy", "moderate", "hard")
-    }
-    write_precision_plot(path, panels, name)
+    ]
+    write_recall_plot(path, panels, name)

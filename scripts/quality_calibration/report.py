@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from directshape_torch.io.atomic_files import write_bytes
+from directshape_torch.io.figure_files import figure_png, new_figure
 from directshape_torch.trust_model import LogisticHead
 from quality_calibration.fit import SigmaScales
 from quality_calibration.judgement import (
@@ -141,12 +143,8 @@ def sigma_line(scales: SigmaScales) -> str:
 
 def plot_reliability(path: Path, cars: Sequence[Judged], bins: Sequence[int]) -> None:
     """Predicted against observed for both heads, 95 % intervals over frames."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(9, 4.4), layout="constrained")
+    figure = new_figure(9, 4.4, "the reliability diagram")
+    axes = figure.subplots(1, 2)
     heads = (("better than the input", "better", "is_better"), ("not worse by 0.05", "not_worse", "is_not_worse"))
     for axis, (title, probability, outcome) in zip(axes, heads, strict=True):
         axis.plot([0, 1], [0, 1], color="0.7", linewidth=1)
@@ -160,18 +158,13 @@ def plot_reliability(path: Path, cars: Sequence[Judged], bins: Sequence[int]) ->
     axes[0].set(xlim=(0, 1.02), ylim=(0, 1.02))
     axes[1].set(xlim=(0.5, 1.02), ylim=(0.5, 1.02))
     axes[0].legend(loc="upper left", fontsize=8)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    write_bytes(path, figure_png(figure))
 
 
 def plot_policy(path: Path, cars: Sequence[Judged], chosen: Thresholds) -> None:
     """Share made worse and mean overlap over the share of results that are kept, as both thresholds move together."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.8), layout="constrained")
+    figure = new_figure(9, 3.8, "the picture of the policy")
+    axes = figure.subplots(1, 2)
     for c in cars:
         margin = (_logit(c.probabilities) - _logit(np.array(chosen))).min(axis=1)
         limits = [-np.inf, *np.sort(margin), np.inf]
@@ -186,8 +179,7 @@ def plot_policy(path: Path, cars: Sequence[Judged], chosen: Thresholds) -> None:
     axes[0].set(xlabel="results kept, %", ylabel="made worse by 0.05, % of all cars")
     axes[1].set(xlabel="results kept, %", ylabel="mean BEV IoU of what is returned")
     axes[0].legend(fontsize=8)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    write_bytes(path, figure_png(figure))
 
 
 def _logit(probability: Array) -> Array:

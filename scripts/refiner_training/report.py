@@ -7,8 +7,8 @@ import io
 import math
 from collections.abc import Sequence
 
-from directshape_torch.errors import MissingDependencyError
 from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+from directshape_torch.io.figure_files import figure_png, new_figure
 from refiner_training.evaluation import Variant, table_row
 from refiner_training.jobs import Kind, Options, Outcome, folds_of
 from refiner_training.networks import TERMS
@@ -122,13 +122,7 @@ def learning_curve_png(outcomes: Sequence[Outcome]) -> bytes:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError("matplotlib", "plot", "the learning curves") from error
-    figure = Figure(figsize=(9, 4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9, 4, "the learning curves")
     both = figure.subplots(1, 2, sharey=True)
     kinds: tuple[Kind, Kind] = ("constant", "network")
     for axes, kind in zip(both, kinds, strict=True):
@@ -142,6 +136,4 @@ def learning_curve_png(outcomes: Sequence[Outcome]) -> bytes:
         axes.set_xlabel("epoch")
         axes.legend(fontsize="small")
     both[0].set_ylabel("mean loss per car")
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()
+    return figure_png(figure)
