@@ -30,12 +30,15 @@ from directshape_torch.residuals.photometric import (
     photometric_residual,
     surface_slope,
 )
+from directshape_torch.residuals.photometric_profile import disparity_residuals
 from directshape_torch.shape.raycast import attached_depth
 from directshape_torch.solver.normal_equations import Segments
 from directshape_torch.solver.problem import Stage
 
 # Matching brightness is for exposure and gain, which differ by a few percent; more is a wrong pose.
 _GAIN_BOUNDS = (0.8, 1.25)
+# Of a profile at once: 8 MB in single precision.
+_PROFILE_RESIDUALS = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,23 @@ class _Fixed(NamedTuple):
     neighbour_weight: Tensor  # (Q, N) zero for neighbours that the mask says are not on the car
     images: GreyPair
     segments: Segments
+
+
+class _ResidualInputs(NamedTuple):
+    """Arguments of `photometric_residual`, in its order."""
+
+    image_right: Tensor
+    sizes: Tensor
+    level_scale: float
+    frame_index: Tensor
+    intensity_left: Tensor
+    rays_left: Tensor
+    depth: Tensor
+    K_right: Tensor
+    T_right_cam: Tensor
+    bias_px: Tensor | None
+    vertical_px: Tensor | None
+    centre: int
 
 
 @dataclass(frozen=True)
@@ -146,7 +166,7 @@ class PhotometricTerm:
         at = projected.shape.value_and_derivatives(points, rays.object_index)
         depth = depth_state_jacobian(points, at, rays.direction_obj, self.config.min_ray_cosine)
         residual = self._residual(root.depth)
-        return depth, residual, self._is_usable(root.found & ~depth.grazing, residual)
+        return depth, residual, self._is_usable(root.found & ~depth.grazing, residual.inside, residual.uv_right)
 
     def _norm_and_weight(self, residual: Tensor, usable: Tensor) -> tuple[robust.RobustValue, Tensor]:
         """Robust norm and weight (Q, N) of each neighbourhood pixel, zero where it is not usable."""
@@ -174,6 +194,27 @@ class PhotometricTerm:
         count = fixed.segments.counts.to(torch.float64)
         share = fixed.segments.sum(usable.to(weight.dtype)) / count.clamp_min(1)
         return torch.where(total > 0, error / total.clamp_min(1), nothing), torch.where(count > 0, share, nothing)
+
+    @torch.no_grad()
+    def profile(self, projected: ProjectedState, offsets_px: Tensor) -> Tensor:
+        """Costs (B, n) as if the visible surface had other disparities, by offsets (n,); NaN for cars without pixels.
+
+        The hits are those of the state, moved along their rays, so that only the warp is evaluated for each offset. At
+        offset 0 it is `cost`.
+        """
+        fixed = self._require()
+        depth, on_surface = self._surface(projected)
+        # A few offsets at a time where the pixels are dense, so that memory stays that of the other evaluations.
+        at_once = max(1, _PROFILE_RESIDUALS // max(1, fixed.intensity_left.numel()))
+        parts = [self._costs_at(depth, on_surface, part) for part in torch.split(offsets_px.to(depth), at_once)]
+        costs = fixed.segments.sum(torch.cat(parts).mT) * self._weight()[:, None]
+        return costs.masked_fill((fixed.segments.counts == 0)[:, None], torch.nan)
+
+    def _costs_at(self, depth: Tensor, on_surface: Tensor, offsets_px: Tensor) -> Tensor:
+        """Weighted Huber norms (n, Q) at offsets (n,) of the disparity."""
+        moved = disparity_residuals(*self._residual_inputs(depth), offsets_px)
+        usable = self._is_usable(on_surface, moved.inside, moved.uv_right)
+        return self._weighted_cost(self._norm(moved.residual).rho, usable)
 
     def support(self) -> Tensor:
         """Pixels (B,) of the stage's pixel set, float64."""
@@ -210,10 +251,10 @@ class PhotometricTerm:
         return self.config.weight / fixed.segments.sum(fixed.neighbour_weight.sum(dim=1)).clamp_min(1)
 
     def _weighted_cost(self, rho: Tensor, usable: Tensor) -> Tensor:
-        """Cost (Q,) of each pixel of the set from the norms (Q, N) of its neighbourhood."""
+        """Cost (..., Q) of each pixel of the set from the norms (..., Q, N) of its neighbourhood."""
         fixed = self._require()
-        rho = torch.where(usable[:, None], rho, self._lost_cost())
-        return (rho * fixed.neighbour_weight).sum(dim=1) * fixed.gradient_weight
+        rho = torch.where(usable[..., None], rho, self._lost_cost())
+        return (rho * fixed.neighbour_weight).sum(dim=-1) * fixed.gradient_weight
 
     def _norm(self, residual: Tensor) -> robust.RobustValue:
         if self.config.truncated:
@@ -262,9 +303,12 @@ class PhotometricTerm:
         return gain.clamp(*_GAIN_BOUNDS).to(fixed.intensity_left.dtype)
 
     def _residual(self, depth: Tensor) -> PhotometricResidual:
+        return photometric_residual(*self._residual_inputs(depth))
+
+    def _residual_inputs(self, depth: Tensor) -> _ResidualInputs:
         fixed = self._require()
         cars = self.cars
-        return photometric_residual(
+        return _ResidualInputs(
             fixed.images.right,
             fixed.images.sizes,
             fixed.images.scale,
@@ -279,22 +323,26 @@ class PhotometricTerm:
             DSO_PATTERN.index((0, 0)),
         )
 
-    def _is_usable(self, on_surface: Tensor, residual: PhotometricResidual) -> Tensor:
-        usable = on_surface & residual.inside
+    def _is_usable(self, on_surface: Tensor, inside: Tensor, uv_right: Tensor) -> Tensor:
+        """Which pixels (..., Q) of the set are on the surface, inside the right image and not hidden there."""
+        usable = on_surface & inside
         if self.hidden_right is None:
             return usable
         crop = self.cars.detection_row[self._require().object_index]
-        return usable & ~self.hidden_right.at(crop, residual.uv_right.detach())
+        return usable & ~self.hidden_right.at(crop, uv_right.detach())
 
     def _usable_and_residual(
         self, projected: ProjectedState, attached: bool = False
     ) -> tuple[Tensor, PhotometricResidual]:
+        depth, on_surface = self._surface(projected, attached)
+        residual = self._residual(depth)
+        return self._is_usable(on_surface, residual.inside, residual.uv_right), residual
+
+    def _surface(self, projected: ProjectedState, attached: bool = False) -> tuple[Tensor, Tensor]:
+        """Depth (Q,) of the surface under each pixel of the set, and where (Q,) there is one that is not grazing."""
         rays, root = projected.left.surface(self._require().pixel_index)
         depth = root.depth.detach()
         at = projected.shape.value_and_derivatives(rays.at(depth).detach(), rays.object_index)
         _, grazing = surface_slope(at.gradient.detach(), rays.direction_obj.detach(), self.config.min_ray_cosine)
         on_surface = root.found & ~grazing
-        if attached:
-            depth = attached_depth(projected.shape, rays, depth, on_surface)
-        residual = self._residual(depth)
-        return self._is_usable(on_surface, residual), residual
+        return attached_depth(projected.shape, rays, depth, on_surface) if attached else depth, on_surface
