@@ -24,6 +24,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from command_line import run_command
 from numpy.typing import NDArray
 from quality_calibration import columns
 from quality_calibration.fit import cross_validated, fit_head, fit_sigmas, in_view
@@ -43,7 +44,6 @@ from quality_calibration.report import (
 )
 
 from directshape_torch.config import AcceptanceConfig, RefinerConfig
-from directshape_torch.errors import DirectShapeError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
@@ -181,12 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--model", type=Path, metavar="FILE", help="default OUT/trust_model.json")
     parser.add_argument("--threads", type=int, default=1)
-    try:
-        run(parser.parse_args(arguments))
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":

@@ -21,8 +21,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from command_line import run_command
 
-from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.paper_depth import PaperDepthError, paper_depth_errors
 from directshape_torch.laboratory.paper_refinement import paper_refinements
@@ -97,11 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="measure the paper's approximate depth derivative too",
     )  # fmt: skip
     torch.set_num_threads(1)  # the operations are small, and threads would spin
-    try:
-        return run(parser.parse_args(arguments))
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":

@@ -24,13 +24,13 @@ from pathlib import Path
 
 import torch
 from build_bundled_prior import GRID, sample_grid
+from command_line import run_command
 from judge_prior import ordinary_cars, true_sdf
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.config_files import load_config
-from directshape_torch.errors import DirectShapeError
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
 from directshape_torch.evaluation.comparison_summary import GroupSummary
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -250,12 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
     parser.add_argument("--out", type=Path, default=Path("out/priors"), metavar="DIR")
     parser.add_argument("--threads", type=int, default=1)
-    try:
-        run(parser.parse_args(arguments))
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":

@@ -20,15 +20,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from command_line import run_command
 from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.config_files import load_config
-from directshape_torch.errors import DirectShapeError, InputError, MissingDependencyError
+from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.io.atomic_files import write_bytes, write_text
+from directshape_torch.io.figure_files import figure_png, new_figure
 from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
@@ -173,13 +175,7 @@ def plot_png(table: NDArray[np.float64], positions_m: Sequence[float], yaws_deg:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError("matplotlib", "plot", "the plot of the convergence basin") from error
-    figure = Figure(figsize=(6, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(6, 4.5, "the plot of the convergence basin")
     axes = figure.add_subplot()
     picture = axes.imshow(100 * table, origin="lower", vmin=0, vmax=100, cmap="viridis", aspect="auto")
     axes.set_xticks(range(len(yaws_deg)), [f"{yaw:g}" for yaw in yaws_deg])
@@ -190,9 +186,7 @@ def plot_png(table: NDArray[np.float64], positions_m: Sequence[float], yaws_deg:
     for (i, j), share in np.ndenumerate(table):
         axes.text(j, i, f"{100 * share:.0f}", ha="center", va="center", color="black" if share > 0.6 else "white")
     figure.colorbar(picture)
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()
+    return figure_png(figure)
 
 
 # Where the iterations end is asked, not what is made of it.
@@ -232,12 +226,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--yaws", type=float, nargs="+", default=YAW_ERRORS_DEG, metavar="DEG")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu")
-    try:
-        run(parser.parse_args(arguments))
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":

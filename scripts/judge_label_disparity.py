@@ -30,11 +30,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from command_line import run_command
 from label_disparity.judgement import Measured, judge
 from label_disparity.measurement import Frame, measure_side, read_frame
 from label_disparity.report import csv_text, report, scatter_png
 
-from directshape_torch.errors import DirectShapeError
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.atomic_files import write_bytes, write_text
@@ -74,8 +74,23 @@ def measure_cars(args: argparse.Namespace) -> tuple[list[Measured], int]:
     return measured, num_unmeasured
 
 
+def run(args: argparse.Namespace) -> int:
+    """Measure, print and write; 1 where no car could be measured."""
+    measured, num_unmeasured = measure_cars(args)
+    cars = judge(measured)
+    if not cars:
+        print(f"no car could be measured ({num_unmeasured} have too few patches)", file=sys.stderr)
+        return 1
+    print(report(cars, num_unmeasured), end="")
+    if args.csv is not None:
+        write_text(args.csv, csv_text(cars))
+    if args.plot is not None:
+        write_bytes(args.plot, scatter_png(cars))
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, print and write; returns the exit code."""
+    """Parse the command line and run; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/")
     parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field that the refinement used; default none")
@@ -85,22 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--min-depth", type=float, default=NEAREST_M, metavar="M", help="of the label (default 15)")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each car")
     parser.add_argument("--plot", type=Path, metavar="PNG", help="draw the errors over the disagreement")
-    args = parser.parse_args(arguments)
-    try:
-        measured, num_unmeasured = measure_cars(args)
-        cars = judge(measured)
-        if not cars:
-            print(f"no car could be measured ({num_unmeasured} have too few patches)", file=sys.stderr)
-            return 1
-        print(report(cars, num_unmeasured), end="")
-        if args.csv is not None:
-            write_text(args.csv, csv_text(cars))
-        if args.plot is not None:
-            write_bytes(args.plot, scatter_png(cars))
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,14 @@ the other by its boxes alone, so no table is needed. Writes the JSON that `direc
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from command_line import run_command
 
-from directshape_torch.errors import DataFormatError, DirectShapeError
+from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, write_tracks
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, read_objects
 from directshape_torch.io.text_files import Line, read_lines
@@ -98,25 +98,24 @@ def link_drive(object_dir: Path, tracking_dir: Path) -> dict[tuple[str, int], Ca
     return identities
 
 
+def run(args: argparse.Namespace) -> None:
+    """Link, write and report."""
+    identities: dict[tuple[str, int], CarIdentity] = {}
+    for folder in args.tracking:
+        found = link_drive(args.object, folder)
+        frames, cars = {frame for frame, _ in found}, {identity.car for identity in found.values()}
+        print(f"{folder}: {len(found)} labels of {len(cars)} objects in {len(frames)} object frames")
+        identities |= found
+    write_tracks(args.out, CarTracks(identities))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Link, write and report; returns the exit code."""
+    """Parse the command line and run; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--object", type=Path, required=True, metavar="DIR", help="ROOT/training of the object set")
     parser.add_argument("--tracking", type=Path, required=True, nargs="+", metavar="DIR", help="sequence folders")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON to write")
-    args = parser.parse_args(arguments)
-    identities: dict[tuple[str, int], CarIdentity] = {}
-    try:
-        for folder in args.tracking:
-            found = link_drive(args.object, folder)
-            frames, cars = {frame for frame, _ in found}, {identity.car for identity in found.values()}
-            print(f"{folder}: {len(found)} labels of {len(cars)} objects in {len(frames)} object frames")
-            identities |= found
-        write_tracks(args.out, CarTracks(identities))
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":

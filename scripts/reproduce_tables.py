@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
+from command_line import run_command
 from paper_tables.ablation_rows import ROWS
 from paper_tables.ablation_table import make_ablation_table
 from paper_tables.data_sets import DataSet, find_data_sets
@@ -33,7 +33,7 @@ from paper_tables.refinements import Refinery
 from paper_tables.report import Report
 from paper_tables.shape_table import make_shape_table
 
-from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.evaluation.comparison_summary import BootstrapSettings
 
 TABLES: dict[str, Callable[[Experiment], None]] = {
@@ -134,12 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, default=2000, help="of the intervals")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="auto")
-    try:
-        run(parser.parse_args(arguments))
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(parser, run, arguments)
 
 
 if __name__ == "__main__":

@@ -16,17 +16,16 @@ gives the same parameters and figures on one machine.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from command_line import run_command
 from refiner_training.jobs import Job, Options, Outcome, run_jobs
 from refiner_training.report import csv_text, learning_curve_png, markdown
 from refiner_training.training import TrainingSettings
 
-from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.atomic_files import write_bytes, write_text
 from directshape_torch.shape.tensor_file import write_tensors
 
@@ -35,14 +34,8 @@ SCHEMA = "directshape_torch.trained_correction/1"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; returns the exit code."""
-    args = _parser().parse_args(arguments)
     torch.set_num_threads(1)
-    try:
-        run(_options(args), args.out, args.processes)
-    except DirectShapeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command(_parser(), lambda args: run(_options(args), args.out, args.processes), arguments)
 
 
 def run(options: Options, out: Path, processes: int) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from pathlib import Path
 
+import build_kernel_prior as script
 import pytest
 
 from directshape_torch.refiner import DirectShapeRefiner
@@ -13,8 +13,7 @@ from directshape_torch.shape.load_prior import load_prior
 
 
 def test_a_prior_of_five_cars(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
-    script, out = importlib.import_module("build_kernel_prior"), tmp_path / "prior.safetensors"
+    out = tmp_path / "prior.safetensors"
     words = ["--num-cars", "5", "--num-codes", "2", "--num-components", "3", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", ["build_kernel_prior", *words])
     script.main()

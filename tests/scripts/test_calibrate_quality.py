@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
-from types import ModuleType
 
+import calibrate_quality
 import numpy as np
 import pytest
 import torch
 from helpers.synthetic_scene import cached_street
+from quality_calibration import fit, judgement, noise, observations
 
 from directshape_torch.evidence import EVIDENCE_NAMES
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.trust_model import load_trust_model
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
-PARTS = ("fit", "judgement", "noise", "observations", "report")
 
-
-@pytest.fixture
-def parts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    names = {part: f"quality_calibration.{part}" for part in PARTS} | {"main": "calibrate_quality"}
-    return {part: importlib.import_module(name) for part, name in names.items()}
-
-
-def simulated(parts: dict[str, ModuleType], count: int = 6000, frames: int = 24):
+def simulated(count: int = 6000, frames: int = 24):
     """Cars whose overlap falls with probability sigmoid(-(2 - 1.5 x)), x the first column; errors of known scales."""
     rng = np.random.default_rng(3)
     evidence = rng.standard_normal((count, len(EVIDENCE_NAMES)))
@@ -37,7 +27,7 @@ def simulated(parts: dict[str, ModuleType], count: int = 6000, frames: int = 24)
     # Straight ahead: x lies across the ray, z along it.
     for position, column in enumerate((2, 0, 1, 3)):
         covariance[:, column, column] = raw[:, position] ** 2
-    return parts["observations"].Observations(
+    return observations.Observations(
         group=np.array([f"{i % frames:06d}" for i in range(count)]),
         source=np.array(["stereo, simulated"] * count),
         evidence=evidence,
@@ -52,37 +42,37 @@ def simulated(parts: dict[str, ModuleType], count: int = 6000, frames: int = 24)
 FACTORS, FLOORS = np.array([2.0, 1.5, 1.0, 1.0]), np.array([0.05, 0.1, 0.03, 0.02])
 
 
-def test_the_weights_are_recovered(parts: dict[str, ModuleType]) -> None:
-    cars = simulated(parts)
-    head = parts["fit"].fit_head(cars.evidence, ~parts["judgement"].is_worse(cars), EVIDENCE_NAMES[:2])
+def test_the_weights_are_recovered() -> None:
+    cars = simulated()
+    head = fit.fit_head(cars.evidence, ~judgement.is_worse(cars), EVIDENCE_NAMES[:2])
     assert head.weights[0] == pytest.approx(-1.5, abs=0.12)
     assert head.weights[1] == pytest.approx(0.0, abs=0.12)
     assert head.bias == pytest.approx(2.0, abs=0.12)
 
 
-def test_factors_and_floors_of_the_sigmas_are_recovered(parts: dict[str, ModuleType]) -> None:
-    errors, raw = parts["fit"].in_view(simulated(parts))
-    scales = parts["fit"].fit_sigmas(errors, raw)
+def test_factors_and_floors_of_the_sigmas_are_recovered() -> None:
+    errors, raw = fit.in_view(simulated())
+    scales = fit.fit_sigmas(errors, raw)
     np.testing.assert_allclose(scales.factors, FACTORS, rtol=0.15)
     np.testing.assert_allclose(scales.floors, FLOORS, rtol=0.25)
-    one, two = parts["judgement"].coverage(errors, scales(raw))
+    one, two = judgement.coverage(errors, scales(raw))
     np.testing.assert_allclose(one, 0.683, atol=0.02)
     np.testing.assert_allclose(two, 0.954, atol=0.02)
 
 
-def test_no_prediction_has_seen_its_frame(parts: dict[str, ModuleType]) -> None:
-    cars = simulated(parts, 240)
+def test_no_prediction_has_seen_its_frame() -> None:
+    cars = simulated(240)
 
     def seen(train, test):
         assert not set(train.group.tolist()) & set(test.group.tolist())
         return np.full((len(test), 1), len(train), dtype=float)
 
-    predictions = parts["fit"].cross_validated(cars, seen)
+    predictions = fit.cross_validated(cars, seen)
     assert np.unique(predictions).tolist() == [220.0]
 
 
-def test_true_probabilities_are_found_reliable_and_false_ones_are_not(parts: dict[str, ModuleType]) -> None:
-    cars, judgement = simulated(parts), parts["judgement"]
+def test_true_probabilities_are_found_reliable_and_false_ones_are_not() -> None:
+    cars = simulated()
     truth = 1 / (1 + np.exp(-(2 - 1.5 * cars.evidence[:, 0])))
     outcome = ~judgement.is_worse(cars)
     bins = judgement.reliability(truth, outcome, cars.group, 8)
@@ -95,10 +85,10 @@ def test_true_probabilities_are_found_reliable_and_false_ones_are_not(parts: dic
     assert (fair.auc > 0.75, constant.auc) == (True, 0.5)
 
 
-def test_the_policy_by_hand(parts: dict[str, ModuleType]) -> None:
-    cars = simulated(parts, 4)
+def test_the_policy_by_hand() -> None:
+    cars = simulated(4)
     cars = type(cars)(**{**vars(cars), "iou_before": np.full(4, 0.7), "iou_after": np.array([0.9, 0.8, 0.66, 0.5])})
-    probability, judgement = np.array([0.9, 0.3, 0.6, 0.5]), parts["judgement"]
+    probability = np.array([0.9, 0.3, 0.6, 0.5])
     # 0.66 is less, but not by 0.05; at 0.55 the second and the fourth car keep their input.
     assert judgement.is_worse(cars).tolist() == [False, False, False, True]
     probabilities = np.column_stack([probability, np.ones(4)])
@@ -111,10 +101,10 @@ def test_the_policy_by_hand(parts: dict[str, ModuleType]) -> None:
     assert judgement.choose_thresholds(cars, probabilities) == (0.62, 0.0)
 
 
-def test_drawn_detections_have_the_errors_of_their_level(parts: dict[str, ModuleType]) -> None:
+def test_drawn_detections_have_the_errors_of_their_level() -> None:
     _, scene = cached_street()
-    level, detections = parts["noise"].LEVELS[1], scene.detections
-    draws = [parts["noise"].noisy(detections, level, seed) for seed in range(400)]
+    level, detections = noise.LEVELS[1], scene.detections
+    draws = [noise.noisy(detections, level, seed) for seed in range(400)]
     first = torch.stack([d.T_cam_obj[0] for d in draws])
     exact = detections.T_cam_obj[0]
     distance = float(exact[[0, 2], 3].norm())
@@ -122,16 +112,16 @@ def test_drawn_detections_have_the_errors_of_their_level(parts: dict[str, Module
     assert float(along.std()) == pytest.approx(level.depth_share * distance, rel=0.15)
     yaw = rotation_y_from_pose(first) - rotation_y_from_pose(exact[None])
     assert float(torch.rad2deg(yaw).std()) == pytest.approx(level.yaw_deg, rel=0.15)
-    assert torch.equal(draws[7].T_cam_obj, parts["noise"].noisy(detections, level, 7).T_cam_obj)
+    assert torch.equal(draws[7].T_cam_obj, noise.noisy(detections, level, 7).T_cam_obj)
     assert all(torch.equal(d.box_2d, detections.box_2d) for d in draws[:3])
 
 
-def test_cars_that_are_kept_make_model_report_and_pictures(parts: dict[str, ModuleType], tmp_path: Path) -> None:
-    simulated(parts, 480).save(tmp_path / "out" / "cars_masks_0.npz")
-    simulated(parts, 48).save(tmp_path / "out" / "cars_other.npz")
+def test_cars_that_are_kept_make_model_report_and_pictures(tmp_path: Path) -> None:
+    simulated(480).save(tmp_path / "out" / "cars_masks_0.npz")
+    simulated(48).save(tmp_path / "out" / "cars_other.npz")
     arguments = ["--data", ".", "--exact", ".", "--masks", "masks", "--seeds", "0", "--other", "kitti", "--out"]
     model = tmp_path / "model.json"
-    assert parts["main"].main([*arguments, str(tmp_path / "out"), "--model", str(model)]) == 0
+    assert calibrate_quality.main([*arguments, str(tmp_path / "out"), "--model", str(model)]) == 0
     assert load_trust_model(model).provenance["cars"] == 480
     report = (tmp_path / "out" / "report.md").read_text()
     assert "| rendered, all | 480 | better |" in report

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
+import check_gradients as script
 import pytest
 import torch
 
@@ -17,19 +15,7 @@ from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
 from directshape_torch.laboratory.study import StudyPlan, run_study
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
-_SCRIPT = Path(__file__).parents[2] / "scripts" / "check_gradients.py"
 _QUICK = ["--states", "1", "--pixels", "4", "--regime", "far_80m", "--no-second", "--no-paper-depth"]
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("check_gradients", _SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +24,7 @@ def _small_prior(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(PCAShapePrior, "load_bundled", lambda: small)
 
 
-def test_tables_and_files(script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     assert script.main([*_QUICK, "--term", "shape", "warp", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
@@ -54,7 +40,7 @@ def test_tables_and_files(script: ModuleType, tmp_path: Path, capsys: pytest.Cap
 
 
 def test_a_wrong_jacobian_makes_the_exit_code_one(
-    script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     right = PriorTerm.jacobian
     monkeypatch.setattr(PriorTerm, "jacobian", lambda self, projected: -right(self, projected))
@@ -68,7 +54,7 @@ def test_a_wrong_jacobian_makes_the_exit_code_one(
     (["--states", "0"], "--states: expected at least 1"),
     (["--data", "nowhere"], "nowhere/detections: holds no folder"),
 ])  # fmt: skip
-def test_wrong_use(script: ModuleType, capsys: pytest.CaptureFixture[str], option: list[str], message: str) -> None:
+def test_wrong_use(capsys: pytest.CaptureFixture[str], option: list[str], message: str) -> None:
     assert script.main(option) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")

@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-from pathlib import Path
-from types import ModuleType
 
-import pytest
+import compare_priors as script
 import torch
 from helpers.ellipsoids import Ellipsoid, ellipsoid_prior
 from torch import Tensor
-
-SCRIPTS = Path(__file__).parents[2] / "scripts"
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    return importlib.import_module("compare_priors")
 
 
 class Balls:
@@ -30,14 +19,14 @@ class Balls:
         return Ellipsoid.sphere(0.5)
 
 
-def test_the_code_is_fitted_exactly_to_a_shape_of_the_family(script: ModuleType) -> None:
+def test_the_code_is_fitted_exactly_to_a_shape_of_the_family() -> None:
     prior = ellipsoid_prior()
     points = prior.bounds_obj[0] + torch.rand(400, 3, dtype=torch.float64) * prior.bounds_obj.diff(dim=0)
     truth = prior.bind(torch.tensor([[1.5, -1.0, 0.5]]).double()).value(points, torch.zeros(400, dtype=torch.long))
     assert script.fit_error_cm(prior, points, truth) < 1e-3
 
 
-def test_normals_of_a_ball_turn_by_step_over_radius(script: ModuleType) -> None:
+def test_normals_of_a_ball_turn_by_step_over_radius() -> None:
     generator, index = torch.Generator().manual_seed(0), torch.zeros(200, dtype=torch.long)
     ball, prior = Ellipsoid.sphere(0.5), Balls()
     surface = script.surface_points(ball, prior, index, generator)
@@ -49,5 +38,5 @@ def test_normals_of_a_ball_turn_by_step_over_radius(script: ModuleType) -> None:
     torch.testing.assert_close(turns, torch.full_like(turns, expected))
 
 
-def test_the_best_time_is_the_least(script: ModuleType) -> None:
+def test_the_best_time_is_the_least() -> None:
     assert 0 <= script.best_ms(lambda: None, repeats=3) < 50

@@ -1,32 +1,16 @@
 """The start errors of the convergence experiment are what they claim, and successes are counted right."""
 
-import importlib.util
 import math
-import sys
-from pathlib import Path
-from types import ModuleType
 
+import convergence_basin as script
 import numpy as np
 import pytest
 import torch
 
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose, wrap_angle
 
-_SCRIPT = Path(__file__).parents[2] / "scripts" / "convergence_basin.py"
 
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("convergence_basin", _SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_start_is_off_by_exactly_the_stated_error(script: ModuleType):
+def test_start_is_off_by_exactly_the_stated_error():
     place = torch.tensor([[1.0, 1.6, 20.0], [-4.0, 1.5, 9.0]], dtype=torch.float64)
     truth = pose_from_kitti(place, torch.tensor([0.3, 3.1], dtype=torch.float64))
     direction = torch.tensor([0.0, math.pi / 2], dtype=torch.float64)
@@ -38,7 +22,7 @@ def test_start_is_off_by_exactly_the_stated_error(script: ModuleType):
     torch.testing.assert_close(torch.rad2deg(turn), torch.tensor([10.0, -10.0], dtype=torch.float64))
 
 
-def test_successes_are_counted_per_cell(script: ModuleType):
+def test_successes_are_counted_per_cell():
     def trial(position: float, yaw: float, centre: float, heading: float) -> object:
         return script.Trial("000001", 1, position, yaw, centre, heading, "converged")
 
@@ -55,7 +39,7 @@ def test_successes_are_counted_per_cell(script: ModuleType):
     assert script.csv_text(trials).splitlines()[1] == "000001,1,0.1,2.0,0.2000,3.000,1,converged"
 
 
-def test_plot_is_a_png(script: ModuleType):
+def test_plot_is_a_png():
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     content = script.plot_png(np.array([[1.0, 0.5], [0.2, 0.0]]), [0.1, 0.5], [2.0, 5.0])
     assert content.startswith(b"\x89PNG")

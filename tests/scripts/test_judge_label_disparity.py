@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import csv
 import math
-import sys
 from pathlib import Path
 
+import judge_label_disparity as script
 import numpy as np
 import pytest
 import torch
+from label_disparity import judgement, measurement, report
 
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.atomic_files import write_png
-
-_SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-if str(_SCRIPTS) not in sys.path:
-    sys.path.insert(0, str(_SCRIPTS))
-
-import judge_label_disparity as script  # noqa: E402
-from label_disparity import judgement, measurement, report  # noqa: E402
 
 SIZE = (400, 160)
 FOCAL_PX, BASELINE_M = 600.0, 0.5

@@ -1,34 +1,19 @@
 """Object frames are found in a tracking sequence by their boxes."""
 
-import importlib.util
 import os
-import sys
 from pathlib import Path
-from types import ModuleType
 
+import link_kitti_tracks as script
 import pytest
 
 from directshape_torch.evaluation.car_identity import CarIdentity, read_tracks
-
-_SCRIPT = Path(__file__).parents[2] / "scripts" / "link_kitti_tracks.py"
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("link_kitti_tracks", _SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def _tracking_line(frame: int, track: int, x: float, z: float) -> str:
     return f"{frame} {track} Car 0 0 0.1 10 10 60 40 1.516012 1.628068 3.941835 {x} 1.900249 {z} -1.538772"
 
 
-def test_frames_and_cars_are_found(tmp_path: Path, script: ModuleType):
+def test_frames_and_cars_are_found(tmp_path: Path):
     sequence, training = tmp_path / "0042", tmp_path / "training"
     sequence.mkdir()
     (training / "label_2").mkdir(parents=True)
@@ -48,14 +33,14 @@ def test_frames_and_cars_are_found(tmp_path: Path, script: ModuleType):
     }
 
 
-def test_a_damaged_file_is_named(tmp_path: Path, script: ModuleType, capsys: pytest.CaptureFixture[str]):
+def test_a_damaged_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "label_02.txt").write_text("Car 0 0\n")
     assert script.main(["--object", str(tmp_path), "--tracking", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
     assert "label_02.txt, line 1: does not start with a frame number" in capsys.readouterr().err
 
 
 @pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: KITTI frames needed")
-def test_far_drive(script: ModuleType):
+def test_far_drive():
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
     identities = script.link_drive(root / "training", root / "tracking" / "0005")
     assert len({frame for frame, _ in identities}) == 15

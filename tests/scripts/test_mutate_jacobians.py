@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import mutate_jacobians
 import pytest
+from jacobian_mutants.equivalents import EQUIVALENTS, reason_for
+from jacobian_mutants.mutants import Mutant, mutants_of
+from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError
+from jacobian_mutants.targets import TARGETS, Target
 
 _ROOT = Path(__file__).resolve().parents[2]
-if str(_ROOT / "scripts") not in sys.path:
-    sys.path.insert(0, str(_ROOT / "scripts"))
-
-import mutate_jacobians  # noqa: E402
-from jacobian_mutants.equivalents import EQUIVALENTS, reason_for  # noqa: E402
-from jacobian_mutants.mutants import Mutant, mutants_of  # noqa: E402
-from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError  # noqa: E402
-from jacobian_mutants.targets import TARGETS, Target  # noqa: E402
 
 
 def changes(body: str) -> set[tuple[str, str, str]]:

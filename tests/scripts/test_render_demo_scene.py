@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from demo_scene import camera, car_surfaces, frame_files, labels, layout, sensor, surfaces
 
 from directshape_torch.scene import StereoCamera
-
-_SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-if str(_SCRIPTS) not in sys.path:
-    sys.path.insert(0, str(_SCRIPTS))
-
-from demo_scene import camera, car_surfaces, frame_files, labels, layout, sensor, surfaces  # noqa: E402
 
 # pycocotools' decode predates numpy 2's protocol.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")

@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
+import reproduce_tables as script
 from helpers.exact_disparity import exact_disparity
 from helpers.kitti_folder import CODE, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
+from paper_tables import ablation_rows, ablation_table, data_sets, paper_rows, pose_table, settings, shape_table
+from paper_tables import simulated_detector as simulator
 
 from directshape_torch.config_files import load_config
 from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 from directshape_torch.io.text_files import Line
 from directshape_torch.refiner import DirectShapeRefiner
-
-SCRIPTS = Path(__file__).parents[2] / "scripts"
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    return importlib.import_module("reproduce_tables")
-
-
-@pytest.fixture
-def simulator(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    return importlib.import_module("paper_tables.simulated_detector")
 
 
 @pytest.fixture(scope="module")
@@ -66,29 +53,25 @@ def _labels(num_frames: int = 20, cars_a_frame: int = 5) -> dict[str, list[Kitti
     return labels
 
 
-@pytest.mark.usefixtures("script")
 def test_every_row_is_a_valid_setting() -> None:
-    rows = importlib.import_module("paper_tables.ablation_rows").ROWS
-    methods = importlib.import_module("paper_tables.settings").METHODS
+    rows = ablation_rows.ROWS
     default = load_config()
     assert len({(row.group, row.name) for row in rows}) == len(rows)
-    for settings in [*(row.settings for row in rows), *methods.values()]:
-        load_config(settings.config, settings.all_overrides)
-        config = load_config(settings.config, settings.overrides)
+    for row_settings in [*(row.settings for row in rows), *settings.METHODS.values()]:
+        load_config(row_settings.config, row_settings.all_overrides)
+        config = load_config(row_settings.config, row_settings.overrides)
         # An override that changes nothing would make a row that says nothing.
-        assert (config != default) == bool(settings.overrides or settings.config != "default"), settings
+        assert (config != default) == bool(row_settings.overrides or row_settings.config != "default"), row_settings
     assert sum(row.settings == replace(row.settings, overrides=()) for row in rows) > 5
 
 
-@pytest.mark.usefixtures("script")
 def test_rows_that_ask_for_nothing_new_are_told_apart_by_prior_masks_field_or_start() -> None:
-    rows = importlib.import_module("paper_tables.ablation_rows").ROWS
+    rows = ablation_rows.ROWS
     assert len({(row.settings, row.start) for row in rows}) == len(rows)
 
 
-@pytest.mark.usefixtures("script")
 def test_the_papers_table_is_complete() -> None:
-    rows = importlib.import_module("paper_tables.paper_rows").PAPER_ROWS
+    rows = paper_rows.PAPER_ROWS
     assert [row.detector for row in rows] == ["Mono3D", "Deep3DBox", "3DOP", "MLF"]
     assert all(len(row.before) == len(row.after) == 12 for row in rows)
     # The paper's refinement improves every figure of every detector.
@@ -97,7 +80,7 @@ def test_the_papers_table_is_complete() -> None:
     assert (wanted.bev_50, wanted.bev_70, wanted.box_50, wanted.box_70) == (36.73, 13.76, 29.48, 5.69)
 
 
-def test_no_noise_is_the_labels(simulator: ModuleType) -> None:
+def test_no_noise_is_the_labels() -> None:
     exact = simulator.NoiseModel(0.0, 0.0, 1.0)
     labels = _labels(6)
     for frame_id, lines in simulator.simulated_lines(labels, exact).items():
@@ -108,7 +91,7 @@ def test_no_noise_is_the_labels(simulator: ModuleType) -> None:
             np.testing.assert_allclose(found[f"{label.box_2d[0]:.4f}"], truth, atol=1e-4)
 
 
-def test_noise_has_the_stated_size_and_does_not_depend_on_other_frames(simulator: ModuleType) -> None:
+def test_noise_has_the_stated_size_and_does_not_depend_on_other_frames() -> None:
     labels = _labels(80)
     lines = simulator.simulated_lines(labels, simulator.NoiseModel(2.0, 3.0, 1.0, seed=4))
     assert simulator.simulated_lines({"000007": labels["000007"]}, simulator.NoiseModel(2.0, 3.0, 1.0, 4)) == {
@@ -128,7 +111,7 @@ def test_noise_has_the_stated_size_and_does_not_depend_on_other_frames(simulator
     assert np.std(along) == pytest.approx(2 * simulator.DEPTH_SHARE, rel=0.15)
 
 
-def test_larger_models_find_less(simulator: ModuleType) -> None:
+def test_larger_models_find_less() -> None:
     labels = _labels()
     models = [simulator.NoiseModel(scale, 1.0, found) for scale, found in ((0.2, 1.0), (1.5, 1.0), (4.0, 1.0))]
     bev = [simulator.average_precisions(labels, model).bev_70 for model in models]
@@ -138,7 +121,7 @@ def test_larger_models_find_less(simulator: ModuleType) -> None:
     assert 35 < sum(map(len, few.values())) < 65
 
 
-def test_the_wanted_average_precision_is_hit(simulator: ModuleType) -> None:
+def test_the_wanted_average_precision_is_hit() -> None:
     labels = _labels()
     # What another seed reaches can be reached.
     wanted = simulator.average_precisions(labels, simulator.NoiseModel(1.8, 2.0, 0.7, seed=11))
@@ -153,12 +136,9 @@ def _rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_pose_table_and_that_runs_are_kept(
-    script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = importlib.import_module("paper_tables.settings")
+def test_pose_table_and_that_runs_are_kept(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = {"ours": settings.Settings(("stages=[{max_iterations: 2}]",)), "rival": settings.GEOMETRIC}
-    monkeypatch.setattr(importlib.import_module("paper_tables.pose_table"), "METHODS", few)
+    monkeypatch.setattr(pose_table, "METHODS", few)
     words = ["pose", "--data", str(data), "--out", str(tmp_path), "--draws", "20", "--stereo-bias", "none"]
     assert script.main([*words, "--device", "cpu"]) == 0
     text = (tmp_path / "pose.md").read_text(encoding="utf-8")
@@ -181,10 +161,9 @@ def test_pose_table_and_that_runs_are_kept(
     assert (tmp_path / "pose.md").read_text(encoding="utf-8") == text
 
 
-def test_shape_table(script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = importlib.import_module("paper_tables.settings")
+def test_shape_table(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = {"ours": settings.Settings(("stages=[{max_iterations: 2}]",))}
-    monkeypatch.setattr(importlib.import_module("paper_tables.shape_table"), "METHODS", few)
+    monkeypatch.setattr(shape_table, "METHODS", few)
     words = ["shape", "--data", str(data), "--detections", "data", "--out", str(tmp_path), "--draws", "20"]
     assert script.main([*words, "--stereo-bias", "none", "--quick", "--device", "cpu"]) == 0
     text = (tmp_path / "shape.md").read_text(encoding="utf-8")
@@ -196,11 +175,12 @@ def test_shape_table(script: ModuleType, data: Path, tmp_path: Path, monkeypatch
     assert all(0 <= value <= 1 for value in at_end.values())
 
 
-def test_ablation_table(script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    table = importlib.import_module("paper_tables.ablation_table")
+def test_ablation_table(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = ("default settings, every result", "2D boxes for masks", "left image only", "degraded", "K = 3", "1 times")
-    rows = tuple(row for row in table.ROWS if row.name in chosen)
-    monkeypatch.setitem(script.TABLES, "ablation", lambda experiment: table.make_ablation_table(experiment, rows))
+    rows = tuple(row for row in ablation_table.ROWS if row.name in chosen)
+    monkeypatch.setitem(
+        script.TABLES, "ablation", lambda experiment: ablation_table.make_ablation_table(experiment, rows)
+    )
     words = ["ablation", "--data", str(data), "--detections", "data", "--out", str(tmp_path), "--draws", "20"]
     assert (
         script.main([*words, "--stereo-bias", "none", "--frames", "0", "--device", "cpu", "--skip-rows", "K = 3"]) == 0
@@ -216,7 +196,7 @@ def test_ablation_table(script: ModuleType, data: Path, tmp_path: Path, monkeypa
     assert (tmp_path / "plots" / f"ablation_{data.name}.png").is_file()
 
 
-def test_detector_table(script: ModuleType, data: Path, tmp_path: Path) -> None:
+def test_detector_table(data: Path, tmp_path: Path) -> None:
     words = ["detectors", "--data", str(data), "--out", str(tmp_path), "--frames", "000001", "--draws", "20"]
     assert script.main([*words, "--stereo-bias", "none", "--device", "cpu"]) == 0
     text = (tmp_path / "detectors.md").read_text(encoding="utf-8")
@@ -226,7 +206,7 @@ def test_detector_table(script: ModuleType, data: Path, tmp_path: Path) -> None:
 
 
 def test_wrong_input_names_the_cure(
-    script: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("DIRECTSHAPE_DATA", raising=False)
     assert script.main(["pose", "--out", str(tmp_path)]) == 2
@@ -237,12 +217,11 @@ def test_wrong_input_names_the_cure(
     assert data.name in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("script")
 def test_the_development_data_is_found() -> None:
     root = os.environ.get("DIRECTSHAPE_DATA")
     if root is None:
         pytest.skip("DIRECTSHAPE_DATA is not set")
-    found = importlib.import_module("paper_tables.data_sets").find_data_sets(Path(root))
+    found = data_sets.find_data_sets(Path(root))
     assert set(found) == {"rendered", "kitti"}
     assert found["rendered"].has_exact_truth
     assert found["rendered"].masks_degraded is not None

@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
+import train_neural_prior as script
 
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PriorProvenance
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
 MADE = PriorProvenance("a test", "Apache-2.0", 20)
 
 
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    return importlib.import_module("train_neural_prior")
-
-
-def small_prior(script: ModuleType) -> NeuralShapePrior:
+def small_prior() -> NeuralShapePrior:
     origin = torch.tensor(script.GRID.origin, dtype=torch.float64)
     return NeuralShapePrior([8, 8], 2, origin, script.GRID.shape, script.GRID.spacing_m, MADE)
 
 
-def test_whitening_changes_codes_but_no_shape(script: ModuleType) -> None:
-    prior = small_prior(script)
+def test_whitening_changes_codes_but_no_shape() -> None:
+    prior = small_prior()
     code = torch.randn(50, 2, dtype=torch.float64) @ torch.tensor([[2.0, 0.3], [0.0, 0.7]]).double() + 0.4
     points, index = torch.rand(50, 3, dtype=torch.float64), torch.arange(50)
     before = prior.bind(code).value(points, index)
@@ -39,8 +31,8 @@ def test_whitening_changes_codes_but_no_shape(script: ModuleType) -> None:
     torch.testing.assert_close(prior.bind(white).value(points, index), before)
 
 
-def test_dimensions_that_are_quadratic_in_the_code_are_found(script: ModuleType) -> None:
-    prior = small_prior(script)
+def test_dimensions_that_are_quadratic_in_the_code_are_found() -> None:
+    prior = small_prior()
     code = torch.randn(20, 2, dtype=torch.float64)
     axes = [
         torch.arange(n) * script.GRID.spacing_m + o for n, o in zip(script.GRID.shape, script.GRID.origin, strict=True)
@@ -58,9 +50,7 @@ def test_dimensions_that_are_quadratic_in_the_code_are_found(script: ModuleType)
     torch.testing.assert_close(at.J_hwl_code[0, 2, 0], torch.tensor(0.2, dtype=torch.float64), atol=1e-6, rtol=0)
 
 
-def test_training_lowers_the_error_and_repeats_to_the_byte(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_lowers_the_error_and_repeats_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(script, "NEAR_POINTS", 300)
     monkeypatch.setattr(script, "FAR_POINTS", 100)
     files = [tmp_path / "first.safetensors", tmp_path / "second.safetensors"]
