@@ -36,8 +36,8 @@ def ordinary_cars(meshes: Path) -> dict[str, Path]:
 
 
 def true_sdf(file: Path, grid: GridSpec) -> NDArray[np.float32]:
-    axes = {"forward_axis": "+z", "up_axis": "+y"} if file.suffix == ".glb" else {}
-    options = MeshOptions(**axes)
+    """Signed distances of a mesh at the nodes of a grid, (nx, ny, nz), metres."""
+    options = MeshOptions(forward_axis="+z", up_axis="+y") if file.suffix == ".glb" else MeshOptions()
     return mesh_to_sdf(load_mesh_obj(file, options), grid, options, file.name)
 
 
@@ -51,6 +51,7 @@ def fit_error_cm(prior: PCAShapePrior, sdf: Tensor, num_codes: int) -> tuple[flo
 
 
 def main() -> None:
+    """Judge the prior and print a line for each mesh."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--prior", type=Path, help="npz file; the bundled prior if left out")
     parser.add_argument("--codes", type=int, nargs="*", default=[0, 1, 2, 3, 5, 8, 10])
@@ -60,8 +61,9 @@ def main() -> None:
         parser.error("set DIRECTSHAPE_DATA to the folder that holds meshes/")
     prior = PCAShapePrior.load(args.prior) if args.prior else PCAShapePrior.load_bundled()
     counts = [k for k in args.codes if k <= prior.num_codes]
-    lower = prior.origin.tolist()
-    grid = GridSpec((lower[0], lower[1], lower[2]), prior.spacing_m, tuple(prior.mean.shape))
+    x, y, z = prior.origin.tolist()
+    nx, ny, nz = prior.mean.shape
+    grid = GridSpec((x, y, z), prior.spacing_m, (nx, ny, nz))
     print(f"{'mean |error| within 7 cm, cm':32s}" + "".join(f"   K={k:<3d}" for k in counts) + "  |code|")
     table = []
     for name, file in ordinary_cars(Path(root) / "meshes").items():
