@@ -168,7 +168,9 @@ def find_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
         torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
+    # PyTorch has no exception of its own for this: RuntimeError for an unknown name or number, AssertionError for a
+    # backend it was compiled without, ImportError for one that a package must bring. Its reason goes into the message.
+    except (RuntimeError, AssertionError, ImportError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError("--device", "a device of this machine", f"{name!r} ({reason})", "try cpu") from error
     return device
