@@ -161,7 +161,14 @@ def test_threads_are_those_asked_for(source: Path, tmp_path: Path, capsys: pytes
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("gpu7", "Expected one of cpu"), ("cuda:99", "CUDA"), ("hpu", "hpu"), ("vulkan", "Vulkan"), ("", "not be empty")],
+    [
+        ("gpu7", "Invalid device string"),
+        ("gpu", "Expected one of cpu"),
+        ("cuda:99", "CUDA"),
+        ("hpu", "hpu"),
+        ("vulkan", "Vulkan"),
+        ("", "not be empty"),
+    ],
 )
 def test_a_device_that_is_not_there_is_refused_with_pytorchs_reason(name: str, reason: str) -> None:
     with pytest.raises(InputError, match=rf"--device: expected a device of this machine, got '{name}' \(.*{reason}"):
