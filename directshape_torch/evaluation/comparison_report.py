@@ -9,7 +9,6 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.evaluation.bootstrap import Estimate
 from directshape_torch.evaluation.comparison import Comparison
 from directshape_torch.evaluation.comparison_summary import (
     METRICS,
@@ -19,6 +18,7 @@ from directshape_torch.evaluation.comparison_summary import (
     GroupSummary,
     Metric,
 )
+from directshape_torch.evaluation.text_table import align, number, with_interval
 from directshape_torch.io import atomic_files
 
 COMPARISON_SCHEMA_VERSION = 1
@@ -89,9 +89,9 @@ def _overall_table(group: GroupSummary) -> str:
     for metric in METRICS:
         summary = group.metrics[metric.key]
         estimates = (summary.before, summary.after, summary.change)
-        rows.append([metric.label, *(_with_interval(metric.unit, e, sign=e is summary.change) for e in estimates)])
-    rows.append([f"BEV IoU worse by {WORSE_BY_BEV_IOU}", "", _with_interval("%", group.worse_share), ""])
-    return _align(rows)
+        rows.append([metric.label, *(with_interval(metric.unit, e, sign=e is summary.change) for e in estimates)])
+    rows.append([f"BEV IoU worse by {WORSE_BY_BEV_IOU}", "", with_interval("%", group.worse_share), ""])
+    return align(rows)
 
 
 def _group_table(groups: Sequence[GroupSummary]) -> str:
@@ -101,34 +101,12 @@ def _group_table(groups: Sequence[GroupSummary]) -> str:
     rows = [["group", "n", "cars", *(metric.label for metric in metrics), "worse"]]
     for group in groups:
         figures = [_before_after(metric, group) for metric in metrics]
-        worse = "" if group.worse_share is None else _number("%", group.worse_share.value)
+        worse = "" if group.worse_share is None else number("%", group.worse_share.value)
         rows.append([group.name, str(group.num_detections), str(group.num_cars), *figures, worse])
-    return _align(rows)
+    return align(rows)
 
 
 def _before_after(metric: Metric, group: GroupSummary) -> str:
     summary = group.metrics[metric.key]
-    before, after = (_number(metric.unit, e.value) for e in (summary.before, summary.after))
+    before, after = (number(metric.unit, e.value) for e in (summary.before, summary.after))
     return f"{before.split(' ')[0]} -> {after}"
-
-
-def _with_interval(unit: str, estimate: Estimate, sign: bool = False) -> str:
-    value = _number(unit, estimate.value, sign)
-    if estimate.low is None or estimate.high is None:
-        return value
-    low, high = (_number(unit, bound, sign).split(" ")[0] for bound in (estimate.low, estimate.high))
-    return f"{value} [{low}, {high}]"
-
-
-def _number(unit: str, value: float, sign: bool = False) -> str:
-    if unit == "%":
-        return f"{100 * value:{'+' if sign else ''}.1f} %"
-    digits = 2 if unit == "deg" else 3
-    return f"{value:{'+' if sign else ''}.{digits}f}" + (f" {unit}" if unit else "")
-
-
-def _align(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(lines)

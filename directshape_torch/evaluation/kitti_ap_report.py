@@ -10,6 +10,7 @@ from typing import Any
 from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores
 from directshape_torch.evaluation.kitti_curve import NUM_RECALL_POINTS
 from directshape_torch.evaluation.kitti_difficulty import DIFFICULTIES
+from directshape_torch.evaluation.text_table import align
 from directshape_torch.io import atomic_files
 
 KITTI_SCORES_SCHEMA_VERSION = 1
@@ -107,7 +108,7 @@ def _table(scores: Sequence[ApScore], prefix: str, figures: dict[str, str]) -> s
         cells = {s.difficulty: s for s in scores if (s.metric, s.minimum_iou) == (metric, minimum_iou)}
         values = [f"{getattr(cells[d.name], field):.2f}" for field in figures.values() for d in DIFFICULTIES]
         rows.append([_NAMES[metric], str(minimum_iou), *values])
-    return _align(rows)
+    return align(rows)
 
 
 def _distance_table(scores: KittiScores) -> str:
@@ -124,15 +125,8 @@ def _distance_table(scores: KittiScores) -> str:
         name = f"{part.low_m:.0f}-{part.high_m:.0f} m" if math.isfinite(part.high_m) else f"over {part.low_m:.0f} m"
         moderate = _moderate(part.scores)
         rows.append([name, str(moderate[0].num_labels), *(f"{s.ap_r40:.2f} ({s.ap_area:.2f})" for s in moderate)])
-    return "AP_R40 (area under the curve), in percent\n" + _align(rows)
+    return "AP_R40 (area under the curve), in percent\n" + align(rows)
 
 
 def _moderate(scores: Sequence[ApScore]) -> list[ApScore]:
     return [score for score in scores if score.difficulty == _DISTANCE_DIFFICULTY]
-
-
-def _align(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(lines)

@@ -11,10 +11,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.evaluation.bootstrap import Estimate
 from directshape_torch.evaluation.shape_error import TAUS_M
 from directshape_torch.evaluation.shape_error_scores import EvaluatedCar, ShapeScores
 from directshape_torch.evaluation.shape_error_summary import METRICS, ShapeCurve, SurfaceSummary
+from directshape_torch.evaluation.text_table import align, number, with_interval
 from directshape_torch.io import atomic_files
 
 SHAPE_SCORES_SCHEMA_VERSION = 1
@@ -129,6 +129,7 @@ def _surface_heading(surface: SurfaceSummary) -> str:
 
 def _curve_table(curve: ShapeCurve) -> str:
     limited = curve.sampling_limit is not None
+    unit = "m" if curve.metric == "rmse_m" else "%"
     rows = [[TITLES[curve.metric], "n", "before", "after", "change", *(["sampling limit"] if limited else [])]]
     for k, tau in enumerate(curve.taus_m):
         if not any(math.isclose(tau, printed) for printed in PRINTED_TAUS_M) and curve.taus_m == TAUS_M:
@@ -137,31 +138,9 @@ def _curve_table(curve: ShapeCurve) -> str:
         estimates = ["-"] * 3
         if summary is not None:
             estimates = [
-                _with_interval(curve.metric, estimate, sign=estimate is summary.change)
+                with_interval(unit, estimate, sign=estimate is summary.change)
                 for estimate in (summary.before, summary.after, summary.change)
             ]
-        limit = [_number(curve.metric, curve.sampling_limit[k])] if curve.sampling_limit is not None else []
+        limit = [number(unit, curve.sampling_limit[k])] if curve.sampling_limit is not None else []
         rows.append([f"tau {tau:.2f} m", str(curve.num_rows[k]), *estimates, *limit])
-    return _align(rows)
-
-
-def _with_interval(metric: str, estimate: Estimate, sign: bool) -> str:
-    value = _number(metric, estimate.value, sign)
-    if estimate.low is None or estimate.high is None:
-        return value
-    low, high = (_number(metric, bound, sign).split(" ")[0] for bound in (estimate.low, estimate.high))
-    return f"{value} [{low}, {high}]"
-
-
-def _number(metric: str, value: float, sign: bool = False) -> str:
-    if not math.isfinite(value):
-        return "-"
-    plus = "+" if sign else ""
-    return f"{value:{plus}.3f} m" if metric == "rmse_m" else f"{100 * value:{plus}.1f} %"
-
-
-def _align(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(lines)
+    return align(rows)

@@ -1,0 +1,58 @@
+"""Tables of figures as text: aligned columns, units, and intervals behind their figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from directshape_torch.evaluation.bootstrap import Estimate
+
+
+def align(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of equally many cells as lines with aligned columns, the first ruled off as the heading.
+
+    Example:
+        >>> print(align([["metric", "value"], ["F1", "0.5"]]))
+        metric  value
+        ------  -----
+        F1      0.5
+    """
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines)
+
+
+def number(unit: str, value: float, sign: bool = False) -> str:
+    """A figure with its unit: shares ("%") in percent, degrees ("deg") with two digits, all else with three.
+
+    Args:
+        unit: "%", "deg", "m", or "" for none.
+        value: a share for "%"; what is not finite is a dash.
+        sign: whether a positive figure has a plus.
+
+    Example:
+        >>> number("%", 0.125), number("m", 0.5, sign=True), number("", 0.75), number("m", math.nan)
+        ('12.5 %', '+0.500 m', '0.750', '-')
+    """
+    if not math.isfinite(value):
+        return "-"
+    plus = "+" if sign else ""
+    if unit == "%":
+        return f"{100 * value:{plus}.1f} %"
+    digits = 2 if unit == "deg" else 3
+    return f"{value:{plus}.{digits}f}" + (f" {unit}" if unit else "")
+
+
+def with_interval(unit: str, estimate: Estimate, sign: bool = False) -> str:
+    """An estimate as `number` writes it, and its interval in brackets where it has one.
+
+    Example:
+        >>> with_interval("%", Estimate(0.5, 0.25, 0.75))
+        '50.0 % [25.0, 75.0]'
+    """
+    value = number(unit, estimate.value, sign)
+    if estimate.low is None or estimate.high is None:
+        return value
+    low, high = (number(unit, bound, sign).split(" ")[0] for bound in (estimate.low, estimate.high))
+    return f"{value} [{low}, {high}]"
