@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from directshape_torch.cli.judging_options import add_frame_choice, add_interval_options, bootstrap_settings
+
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
@@ -25,15 +27,11 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="KITTI labels, NNNNNN.txt")
     for name, what in (("before", "result files that went in"), ("after", "result files that came out")):
         parser.add_argument(f"--{name}", type=Path, required=True, metavar="DIR", help=f"{what} (or DIR/data)")
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all of --before")
-    chosen.add_argument("--frames", nargs="+", metavar="ID", help="frame ids")
-    parser.add_argument("--tracks", type=Path, metavar="FILE", help="JSON: which labels show the same physical car")
+    add_frame_choice(parser, "all of --before")
     parser.add_argument("--shapes", type=Path, metavar="DIR", help="OUT/shapes: count only cars that had a mask")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all groups")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each detection")
-    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
-    parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
+    add_interval_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -49,7 +47,6 @@ def run(args: argparse.Namespace) -> int:
         write_comparison_csv,
         write_comparison_json,
     )
-    from directshape_torch.evaluation.comparison_summary import BootstrapSettings
 
     comparison = compare_results(
         args.labels,
@@ -59,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         frames=args.frames,
         tracks=args.tracks,
         keep_line=None if args.shapes is None else lines_with_left_mask(args.shapes),
-        bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
+        bootstrap=bootstrap_settings(args),
     )
     print(format_comparison(comparison), end="")
     if args.json is not None:

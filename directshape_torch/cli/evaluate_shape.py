@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from directshape_torch.cli.judging_options import add_frame_choice, add_interval_options, bootstrap_settings
+
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
@@ -38,13 +40,9 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--masks", type=Path, metavar="DIR", help="with disparity: which pixels belong to a car")
     parser.add_argument("--labels", type=Path, metavar="DIR", help="default: ROOT/training/label_2")
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all that have truth")
-    chosen.add_argument("--frames", nargs="+", metavar="ID", help="frame ids")
-    parser.add_argument("--tracks", type=Path, metavar="FILE", help="JSON: which labels show the same physical car")
+    add_frame_choice(parser, "all that have truth")
     parser.add_argument("--prior", metavar="FILE|NAME", help="the shape prior of the refinement (default: pca)")
-    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
-    parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
+    add_interval_options(parser)
 
 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
@@ -60,7 +58,6 @@ def run(args: argparse.Namespace) -> int:
         DirectShapeError: for the main program to show.
     """
     from directshape_torch.batch.content_hashes import hash_prior
-    from directshape_torch.evaluation.comparison_summary import BootstrapSettings
     from directshape_torch.evaluation.shape_error_cars import evaluate_shapes
     from directshape_torch.evaluation.shape_error_report import (
         format_shape_scores,
@@ -82,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         split=args.split,
         tracks=args.tracks,
         prior_sha256=hash_prior(prior),
-        bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
+        bootstrap=bootstrap_settings(args),
     )
     print(format_shape_scores(scores), end="")
     if args.json is not None:

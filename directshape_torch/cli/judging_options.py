@@ -1,0 +1,31 @@
+"""Options that all commands share which judge cars against labels."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+
+
+def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
+    """`--split` or `--frames`; `default` says which frames count without them."""
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--split", type=Path, metavar="FILE", help=f"one frame id a line; default: {default}")
+    chosen.add_argument("--frames", nargs="+", metavar="ID", help="frame ids")
+
+
+def add_interval_options(parser: argparse.ArgumentParser) -> None:
+    """`--tracks`, `--seed` and `--draws` of intervals over physical cars."""
+    parser.add_argument("--tracks", type=Path, metavar="FILE", help="JSON: which labels show the same physical car")
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
+    parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
+
+
+def bootstrap_settings(args: argparse.Namespace) -> BootstrapSettings:
+    """What `--seed` and `--draws` ask for."""
+    from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+
+    return BootstrapSettings(num_draws=args.draws, seed=args.seed)
