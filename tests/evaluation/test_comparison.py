@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.shape_arrays import shape_arrays
 
 from directshape_torch.cli import compare
 from directshape_torch.errors import DataFormatError, InputError
@@ -127,45 +128,12 @@ def test_without_tracks_it_says_so(folders: tuple[Path, Path, Path]):
 
 
 def _shapes(frame_id: str, lines: list[int], statuses: list[str]) -> ShapeArrays:
-    count = len(lines)
-    eye = np.tile(np.eye(4), (count, 1, 1))
-    values = {
-        "T_cam_obj": eye,
-        "T_ref_obj": eye,
-        "covariances_ref": eye,
-        "covariances": np.tile(np.eye(7), (count, 1, 1)),
-    }
-    values |= {
-        "boxes_hwl": np.ones((count, 3)),
-        "boxes_location_ref": np.ones((count, 3)),
-        "codes": np.zeros((count, 1)),
-    }
-    values |= {
-        "boxes_rotation_y": np.zeros(count),
-        "costs_before": np.zeros((count, 0)),
-        "costs_after": np.zeros((count, 0)),
-    }
-    return ShapeArrays(
+    return shape_arrays(
+        len(lines),
         frame_id=frame_id,
-        prior_sha256="",
-        ground_source="file",
         input_lines=np.array(lines, dtype=np.int64),
         statuses=tuple(statuses),
-        messages=("",) * count,
-        term_names=(),
-        iterations=np.zeros(count, dtype=np.int64),
         has_mask_left=np.array([status != "no_mask" for status in statuses]),
-        mask_iou_left=np.full(count, 0.9),
-        mask_iou_right=np.full(count, 0.9),
-        photometric_errors_grey=np.full(count, 4.0),
-        matched_shares=np.ones(count),
-        probabilities_better=np.full(count, 0.9),
-        probabilities_not_worse=np.full(count, 0.97),
-        sigmas_ref=np.full((count, 4), 0.1),
-        unseen=("",) * count,
-        unseen_sigmas_m=np.ones((count, 7)),
-        unseen_directions=np.ones((count, 7, 7)),
-        **values,
     )
 
 

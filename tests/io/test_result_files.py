@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.shape_arrays import shape_arrays
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.atomic_files import write_npz
@@ -78,45 +79,9 @@ def test_wrong_refinements_leave_no_file(tmp_path: Path) -> None:
     assert not (tmp_path / "out.txt").exists()
 
 
-def shapes(num_cars: int) -> ShapeArrays:
-    random = np.random.default_rng(num_cars)
-    B, K, T = num_cars, 5, 2
-    return ShapeArrays(
-        frame_id="000107",
-        prior_sha256="ab" * 32,
-        ground_source="file",
-        input_lines=np.arange(B, dtype=np.int64) + 1,
-        T_cam_obj=random.random((B, 4, 4)),
-        T_ref_obj=random.random((B, 4, 4)),
-        boxes_hwl=random.random((B, 3)),
-        boxes_location_ref=random.random((B, 3)),
-        boxes_rotation_y=random.random(B),
-        codes=random.random((B, K)).astype(np.float32),
-        covariances=np.full((B, 6 + K, 6 + K), np.nan),
-        covariances_ref=random.random((B, 4, 4)),
-        statuses=("converged", "no_mask", "max_iterations")[:B],
-        messages=("", "no mask in either image", "")[:B],
-        term_names=("silhouette", "shape prior"),
-        costs_before=random.random((B, T)),
-        costs_after=random.random((B, T)),
-        iterations=np.full(B, 7, dtype=np.int64),
-        has_mask_left=np.ones(B, dtype=bool),
-        mask_iou_left=np.full(B, 0.9),
-        mask_iou_right=np.full(B, 0.9),
-        photometric_errors_grey=np.full(B, 4.0),
-        matched_shares=np.ones(B),
-        probabilities_better=np.full(B, 0.9),
-        probabilities_not_worse=np.full(B, 0.97),
-        sigmas_ref=random.random((B, 4)),
-        unseen=("rear view: length alone (sigma 0.20 m)", "", "")[:B],
-        unseen_sigmas_m=random.random((B, 7)),
-        unseen_directions=random.random((B, 7, 7)),
-    )
-
-
 @pytest.mark.parametrize("num_cars", [0, 1, 3])
 def test_shapes_round_trip_and_equal_bytes(tmp_path: Path, num_cars: int) -> None:
-    written = shapes(num_cars)
+    written = shape_arrays(num_cars)
     write_shapes(tmp_path / "a.npz", written)
     write_shapes(tmp_path / "b.npz", written)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
@@ -134,9 +99,9 @@ def test_shapes_round_trip_and_equal_bytes(tmp_path: Path, num_cars: int) -> Non
 
 def test_shapes_of_wrong_size() -> None:
     with pytest.raises(InputError, match=r"covariances: expected shape \(3, 11, 11\), got \(3, 5, 5\)"):
-        dataclasses.replace(shapes(3), covariances=np.zeros((3, 5, 5)))
+        dataclasses.replace(shape_arrays(3), covariances=np.zeros((3, 5, 5)))
     with pytest.raises(InputError, match=r"statuses: expected shape \(3,\), got \(2,\)"):
-        dataclasses.replace(shapes(3), statuses=("converged", "no_mask"))
+        dataclasses.replace(shape_arrays(3), statuses=("converged", "no_mask"))
 
 
 def test_files_that_are_no_shapes(tmp_path: Path) -> None:
@@ -163,7 +128,7 @@ def test_files_that_are_no_shapes(tmp_path: Path) -> None:
 
 def test_truncated_shapes(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
-    write_shapes(path, shapes(2))
+    write_shapes(path, shape_arrays(2))
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(DataFormatError, match="is no readable npz file"):
         read_shapes(path)
