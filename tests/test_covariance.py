@@ -9,7 +9,7 @@ from helpers.derivatives import central_differences, moved, tangent_of
 from helpers.problems import DEFAULT, begun_problem
 from helpers.synthetic_scene import cached_street
 
-from directshape_torch.covariance import covariance_xyz_yaw, tangent_covariance
+from directshape_torch.covariance import covariance_xyz_yaw, shared_disparity_covariance, tangent_covariance
 from directshape_torch.energy.car_problem import sum_of
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
@@ -78,3 +78,15 @@ def test_singular_and_broken_systems_give_nan() -> None:
     covariance = tangent_covariance(problem, CarState(far, state.code))
     assert covariance[0].isnan().all()
     assert tangent_covariance(problem, CarState(far * torch.nan, state.code)).isnan().all()
+
+
+def test_an_error_that_all_pixels_share_moves_the_car_along_its_ray_by_the_depth_that_it_feigns() -> None:
+    location = torch.tensor([-6.0, 1.6, 30.0]).double()
+    T_obj_cam = se3.inverse(pose_from_kitti(location, torch.tensor(0.8).double()))[None]
+    focal_baseline, sigma_px = 721.5 * 0.54, 0.1
+    shared = shared_disparity_covariance(T_obj_cam, torch.tensor([focal_baseline]).double(), sigma_px, 9)
+    disparity = focal_baseline / location[2]
+    feigned = location * (focal_baseline / (disparity - 1e-4) / location[2] - 1) / 1e-4 * sigma_px
+    expected = torch.zeros(4, 4).double()
+    expected[:3, :3] = torch.outer(feigned, feigned)
+    torch.testing.assert_close(covariance_xyz_yaw(shared, T_obj_cam)[0], expected, rtol=1e-4, atol=1e-12)
