@@ -174,6 +174,14 @@ class PriorConfig:
         dimensions_weight: on the difference between the shape's dimensions and the detector's, in units of
             dimensions_sigma_m; 0 switches it off (the paper).
         dimensions_sigma_m: standard deviation of the detector's height, width and length.
+        pose_weight: on the difference between the pose and the detector's, in units of the detector's standard
+            deviations: those of the detections where they have some, else those below; without either it does nothing.
+        pose_sigma_along_share, pose_sigma_along_m: standard deviation of the detector's position along the viewing ray
+            on the ground, as a share of the distance and in metres (both: the root of the sum of squares); 0 for not
+            known, as in the next three.
+        pose_sigma_across_m: across the viewing ray, on the ground.
+        pose_sigma_vertical_m: along the camera's y axis.
+        pose_sigma_yaw_deg: of the heading.
     """
 
     shape_weight: float = 0.15
@@ -182,6 +190,12 @@ class PriorConfig:
     tilt_form: Literal["normal", "cosine"] = "normal"
     dimensions_weight: float = 0.5
     dimensions_sigma_m: tuple[float, float, float] = (0.1, 0.1, 0.4)
+    pose_weight: float = 0.3
+    pose_sigma_along_share: float = 0.0
+    pose_sigma_along_m: float = 0.0
+    pose_sigma_across_m: float = 0.0
+    pose_sigma_vertical_m: float = 0.0
+    pose_sigma_yaw_deg: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -257,6 +257,12 @@ class Detections(_TensorRecord):
         mask_left, mask_right: (B, H, W) foreground probability in [0, 1], floating point or bool.
         has_mask_left, has_mask_right: (B,) bool; a mask that is absent is never read.
         occluders: other instances that may hide the cars, or None.
+        pose_sigma: (B, 4) standard deviations of the detector's own error: along the viewing ray of the object origin
+            (in the plane of the camera's x and z axes), across it in that plane, along the camera's y axis (metres),
+            and of the heading (radians). Infinity where not known. None: the settings' (`priors.pose_sigma_*`), if any.
+
+    Raises:
+        InputError: wrong shapes, a rotation that is none, or a standard deviation that is not above 0.
     """
 
     frame_index: Tensor
@@ -269,6 +275,7 @@ class Detections(_TensorRecord):
     has_mask_left: Tensor
     has_mask_right: Tensor
     occluders: Occluders | None = None
+    pose_sigma: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("frame_index", self.frame_index, ("B",))
@@ -282,6 +289,9 @@ class Detections(_TensorRecord):
         check_shape("mask_right", self.mask_right, tuple(self.mask_left.shape))
         check_shape("has_mask_left", self.has_mask_left, (count,))
         check_shape("has_mask_right", self.has_mask_right, (count,))
+        if self.pose_sigma is not None:
+            check_shape("pose_sigma", self.pose_sigma, (count, 4))
+            _check_above_zero("pose_sigma", self.pose_sigma)
 
     def __len__(self) -> int:
         return len(self.frame_index)
@@ -302,6 +312,14 @@ def _check_rotation(
             f"R = {rotation[row].tolist()} in row {row}",
             "leave scale out of the transform, and build it from a rotation matrix",
         )
+
+
+def _check_above_zero(name: str, sigma: Tensor) -> None:
+    wrong = (~(sigma.detach() > 0)).nonzero().tolist()
+    if wrong:
+        row, column = wrong[0]
+        got = f"{float(sigma[row, column]):g} in row {row}"
+        raise InputError(name, "standard deviations above 0", got, "give infinity for what the detector does not know")
 
 
 def _check_at_most_one(name: str, images: Tensor) -> None:

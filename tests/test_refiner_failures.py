@@ -288,5 +288,5 @@ def _at_depth(T_cam_obj: Tensor, depth_m: float) -> Tensor:
 
 
 def joined_cars(parts: list[Detections]) -> Detections:
-    names = [f.name for f in fields(Detections) if f.name != "occluders"]
+    names = [f.name for f in fields(Detections) if f.name not in ("occluders", "pose_sigma")]
     return Detections(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})

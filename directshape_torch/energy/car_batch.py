@@ -24,6 +24,8 @@ class CarBatch:
         ground_normal_cam: (B, 3).
         ground_offset: (B,).
         detector_hwl: (B, 3).
+        detector_T_cam_obj: (B, 4, 4) input pose.
+        detector_pose_sigma: (B, 4) its standard deviations, see `Detections`, or None.
     """
 
     detection_row: Tensor
@@ -35,6 +37,8 @@ class CarBatch:
     ground_normal_cam: Tensor
     ground_offset: Tensor
     detector_hwl: Tensor
+    detector_T_cam_obj: Tensor
+    detector_pose_sigma: Tensor | None
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections) -> CarBatch:
@@ -49,6 +53,8 @@ class CarBatch:
             ground_normal_cam=frames.ground.normal[f],
             ground_offset=frames.ground.offset[f],
             detector_hwl=detections.dimensions_hwl,
+            detector_T_cam_obj=detections.T_cam_obj,
+            detector_pose_sigma=detections.pose_sigma,
         )
 
     @property
@@ -61,4 +67,5 @@ class CarBatch:
         return self.K_left[:, 0, 0] / self.input_depth
 
     def of_objects(self, keep: Tensor) -> CarBatch:
-        return replace(self, **{x.name: getattr(self, x.name)[keep] for x in fields(self)})
+        known = {x.name: getattr(self, x.name) for x in fields(self) if getattr(self, x.name) is not None}
+        return replace(self, **{name: values[keep] for name, values in known.items()})

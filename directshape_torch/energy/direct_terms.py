@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from directshape_torch.checks import check_shape
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import PriorConfig, RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.photometric_term import GreyPair, PhotometricTerm
 from directshape_torch.energy.prior_terms import PriorTerm
@@ -22,6 +23,7 @@ from directshape_torch.residuals.priors import (
     PriorResidual,
     dimensions_prior,
     height_prior,
+    pose_prior,
     shape_prior,
     tilt_prior_cosine,
     tilt_prior_normal,
@@ -58,7 +60,7 @@ def direct_terms(
 
 
 def prior_terms(config: RefinerConfig, prior: ShapePrior, cars: CarBatch) -> list[Term]:
-    """Shape, height, tilt and dimensions, those of weight zero left out."""
+    """Shape, height, tilt, dimensions, and pose where its sigma is known; those of weight zero left out."""
     p = config.priors
 
     def shape(_: CarBatch, at: ProjectedState) -> PriorResidual:
@@ -77,13 +79,39 @@ def prior_terms(config: RefinerConfig, prior: ShapePrior, cars: CarBatch) -> lis
         sigma = torch.tensor(p.dimensions_sigma_m, dtype=code.dtype, device=code.device)
         return dimensions_prior(prior.dimensions_and_derivative(code), cars.detector_hwl, sigma)
 
+    def pose(cars: CarBatch, at: ProjectedState) -> PriorResidual:
+        sigma = detector_pose_sigma(p, cars)
+        return pose_prior(at.state.T_obj_cam, cars.detector_T_cam_obj, sigma, at.state.code.shape[1])
+
     all_terms = [
         PriorTerm("shape", p.shape_weight, cars, shape),
         PriorTerm("height", p.height_weight, cars, height),
         PriorTerm("tilt", p.tilt_weight, cars, tilt),
         PriorTerm("dimensions", p.dimensions_weight, cars, dimensions),
     ]
+    if cars.detector_pose_sigma is not None or any(_pose_sigmas(p)):
+        all_terms.append(PriorTerm("pose", p.pose_weight, cars, pose))
     return [term for term in all_terms if term.weight > 0]
+
+
+def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
+    """Standard deviations (B, 4) of the input poses, see `Detections.pose_sigma`; infinite where nobody knows them."""
+    if cars.detector_pose_sigma is not None:
+        return cars.detector_pose_sigma
+    along_share, *constant = _pose_sigmas(config)
+    origin = cars.detector_T_cam_obj[:, :3, 3]
+    sigma = origin.new_tensor([s if s > 0 else math.inf for s in constant]).repeat(len(origin), 1)
+    if along_share > 0:
+        # constant[0], for infinity stands for nothing known here.
+        distance = torch.hypot(origin[:, 0], origin[:, 2])
+        sigma[:, 0] = torch.sqrt((along_share * distance) ** 2 + constant[0] ** 2)
+    return sigma
+
+
+def _pose_sigmas(p: PriorConfig) -> tuple[float, float, float, float, float]:
+    """Along the ray as a share of the distance, then metres, metres, metres and radians; 0 for not known."""
+    metres = p.pose_sigma_along_m, p.pose_sigma_across_m, p.pose_sigma_vertical_m
+    return p.pose_sigma_along_share, *metres, math.radians(p.pose_sigma_yaw_deg)
 
 
 def _photometric_term(

@@ -1,4 +1,4 @@
-"""Prior terms: `lambda r^2 / 2` for shape, height, tilt and the detector's dimensions."""
+"""Prior terms: `lambda r^2 / 2` for shape, height, tilt, and the detector's dimensions and pose."""
 
 from __future__ import annotations
 

@@ -99,7 +99,17 @@ def _detections(parts: Sequence[Detections], size_hw: tuple[int, int]) -> Detect
         mask_left=_padded([part.mask_left for part in parts], size_hw),
         mask_right=_padded([part.mask_right for part in parts], size_hw),
         occluders=_occluders(occluders, size_hw),
+        pose_sigma=_pose_sigmas(parts),
         **rows,
+    )
+
+
+def _pose_sigmas(parts: Sequence[Detections]) -> Tensor | None:
+    """Those of all frames, infinite for the frames without."""
+    if all(part.pose_sigma is None for part in parts):
+        return None
+    return torch.cat(
+        [p.T_cam_obj.new_full((len(p), 4), torch.inf) if p.pose_sigma is None else p.pose_sigma for p in parts]
     )
 
 

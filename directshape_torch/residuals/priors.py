@@ -1,4 +1,4 @@
-"""Priors: shape code, height above the ground, tilt against the ground, agreement with the detector's dimensions.
+"""Priors: shape code, height above the ground, tilt against the ground, the detector's dimensions and pose.
 
 Each returns its residual and the Jacobian by the state `(v, omega, dcode)`, rows (B, R, 6 + K).
 """
@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.geometry import se3
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 
 
@@ -105,3 +106,53 @@ def dimensions_prior(
     J_residual_code = shape.J_hwl_code / sigma_hwl[:, None]
     no_twist = J_residual_code.new_zeros(*J_residual_code.shape[:2], 6)
     return PriorResidual((shape.hwl - detector_hwl) / sigma_hwl, torch.cat([no_twist, J_residual_code], dim=-1))
+
+
+def pose_prior(
+    T_obj_cam: Tensor,  # (B, 4, 4)
+    detector_T_cam_obj: Tensor,  # (B, 4, 4) input pose
+    sigma: Tensor,  # (B, 4) along the viewing ray, across it, vertically (metres), heading (radians); infinite: no part
+    num_codes: int,
+) -> PriorResidual:
+    """Object origin and heading against the detector's, in the detector's standard deviations (not in the paper).
+
+    The axes are those of the detector's viewing ray, so they stay while the car moves; the heading is the angle about
+    the camera's y axis from the detector's x axis to the car's, in (-pi, pi].
+
+    Example:
+        >>> T_cam_obj = torch.eye(4)[None].clone()
+        >>> T_cam_obj[:, 2, 3] = 10.0
+        >>> nearer = T_cam_obj.clone()
+        >>> nearer[:, 2, 3] = 9.0
+        >>> pose_prior(se3.inverse(nearer), T_cam_obj, torch.tensor([[0.5, 1.0, 1.0, 0.1]]), 0).residual
+        tensor([[-2.,  0.,  0.,  0.]])
+    """
+    T_cam_obj = se3.inverse(T_obj_cam)
+    R_cam_obj, axes = T_cam_obj[:, :3, :3], viewing_axes(detector_T_cam_obj[:, :3, 3])
+    moved = (axes @ (T_cam_obj[:, :3, 3:] - detector_T_cam_obj[:, :3, 3:]))[..., 0]
+    x_axis, x_detector = R_cam_obj[:, [0, 2], 0], detector_T_cam_obj[:, [0, 2], 0]
+    sine = x_axis[:, 0] * x_detector[:, 1] - x_axis[:, 1] * x_detector[:, 0]
+    turned = torch.atan2(sine, (x_axis * x_detector).sum(-1))
+    # The x axis h moves by R_cam_obj (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], its angle atan2(-h_z, h_x) by
+    # (h_z dh_x - h_x dh_z) / |h|^2.
+    dh_y, dh_z = R_cam_obj[:, [0, 2], 2], -R_cam_obj[:, [0, 2], 1]
+    by_y, by_z = (x_axis[:, 1] * dh[:, 0] - x_axis[:, 0] * dh[:, 1] for dh in (dh_y, dh_z))
+    J_yaw_omega = torch.stack([torch.zeros_like(by_y), by_y, by_z], dim=-1) / (x_axis * x_axis).sum(-1, keepdim=True)
+    J = T_obj_cam.new_zeros(len(T_obj_cam), 4, 6 + num_codes)
+    J[:, :3, :3] = -axes @ R_cam_obj
+    J[:, 3, 3:6] = J_yaw_omega
+    return PriorResidual(torch.cat([moved, turned[:, None]], dim=-1) / sigma, J / sigma[..., None])
+
+
+def viewing_axes(origin_cam: Tensor) -> Tensor:
+    """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down.
+
+    Example:
+        >>> viewing_axes(torch.tensor([[0.0, 1.6, 10.0]]))[0, 0]
+        tensor([0., 0., 1.])
+    """
+    x, z = origin_cam[:, 0], origin_cam[:, 2]
+    distance = torch.sqrt(x * x + z * z)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    rows = (x / distance, zero, z / distance, z / distance, zero, -x / distance, zero, one, zero)
+    return torch.stack(rows, dim=-1).view(-1, 3, 3)

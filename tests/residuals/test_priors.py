@@ -18,9 +18,11 @@ from directshape_torch.residuals.priors import (
     PriorResidual,
     dimensions_prior,
     height_prior,
+    pose_prior,
     shape_prior,
     tilt_prior_cosine,
     tilt_prior_normal,
+    viewing_axes,
 )
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 
@@ -58,8 +60,17 @@ def _dimensions(state: CarState) -> PriorResidual:
     return dimensions_prior(_linear_dimensions(state.code), detector, SIGMA_HWL)
 
 
+POSE_SIGMA = torch.tensor([0.8, 0.5, 0.4, 0.07], dtype=torch.float64)
+
+
+def _pose(state: CarState) -> PriorResidual:
+    detector = pose_from_kitti(torch.tensor([2.3, 1.7, 14.0]).double(), torch.tensor(-2.8).double())
+    count = len(state.code)
+    return pose_prior(state.T_obj_cam, detector.expand(count, 4, 4), POSE_SIGMA.expand(count, 4), NUM_CODES)
+
+
 PRIORS: dict[str, Callable[[CarState], PriorResidual]] = {
-    "shape": _shape, "height": _height, "tilt": _tilt, "cosine": _cosine, "dimensions": _dimensions,
+    "shape": _shape, "height": _height, "tilt": _tilt, "cosine": _cosine, "dimensions": _dimensions, "pose": _pose,
 }  # fmt: skip
 
 
@@ -156,6 +167,42 @@ def test_dimensions_by_hand() -> None:
     detector = torch.tensor([[1.4, 1.6, 4.0]], dtype=torch.float64)
     residual = dimensions_prior(_linear_dimensions(code), detector, SIGMA_HWL).residual
     torch.testing.assert_close(residual[0, 0], torch.tensor(1.8, dtype=torch.float64))
+
+
+def vector(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def _kitti_pose(x: float, y: float, z: float, rotation_y: float) -> Tensor:
+    return pose_from_kitti(vector(x, y, z), vector(rotation_y)[0])[None]
+
+
+def test_pose_by_hand() -> None:
+    """The detector sees the car along (0.6, 0, 0.8); it went 1 m on along the ray, 0.5 m to the right, 0.2 m up."""
+    detector = _kitti_pose(12.0, 1.6, 16.0, 0.3)
+    car = _kitti_pose(12.0 + 0.6 + 0.5 * 0.8, 1.4, 16.0 + 0.8 - 0.5 * 0.6, 0.1)
+    sigma = torch.tensor([[0.5, 0.25, 0.1, 0.04]], dtype=torch.float64)
+    residual = pose_prior(se3.inverse(car), detector, sigma, 0).residual
+    torch.testing.assert_close(residual, torch.tensor([[2.0, 2.0, -2.0, -5.0]], dtype=torch.float64))
+    torch.testing.assert_close(viewing_axes(detector[:, :3, 3])[0, 0], vector(0.6, 0.0, 0.8))
+
+
+@pytest.mark.parametrize("before", [-3.1, -1.0, 0.0, 1.6, 3.1])
+@pytest.mark.parametrize("turn", [-3.0, -1.7, -0.1, 0.0, 0.1, 1.5, 3.0])
+def test_heading_against_the_detector_s_knows_no_border_at_pi(before: float, turn: float) -> None:
+    after = math.remainder(before + turn, math.tau)
+    detector, car = _kitti_pose(1.0, 1.6, 9.0, before), _kitti_pose(1.0, 1.6, 9.0, after)
+    result = pose_prior(se3.inverse(car), detector, torch.ones(1, 4).double(), 0)
+    torch.testing.assert_close(result.residual, vector(0, 0, 0, turn)[None], atol=1e-12, rtol=0)
+    # A turn of the camera's frame by omega_y about the object's own y is one of the object by -omega_y.
+    torch.testing.assert_close(result.J_residual_state[0, 3], vector(0, 0, 0, 0, -1, 0))
+
+
+def test_what_the_detector_does_not_know_pulls_at_nothing() -> None:
+    sigma = torch.tensor([[0.5, math.inf, math.inf, math.inf]], dtype=torch.float64)
+    result = pose_prior(se3.inverse(_kitti_pose(3.0, 1.0, 11.0, 0.5)), _kitti_pose(0.0, 1.6, 10.0, 0.3), sigma, 2)
+    torch.testing.assert_close(result.residual, torch.tensor([[2.0, 0.0, 0.0, 0.0]], dtype=torch.float64))
+    assert (result.J_residual_state[0, 1:] == 0).all()
 
 
 def test_moving_the_whole_scene_changes_no_prior() -> None:
