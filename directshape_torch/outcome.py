@@ -9,6 +9,7 @@ from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.covariance import covariance_of, covariance_xyz_yaw
+from directshape_torch.disparity_profile import DisparityProfile, disparity_profile
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.evidence import Course
@@ -39,6 +40,7 @@ class Outcome:
     covariance_xyz_yaw: Tensor
     quality: FitQuality
     observability: Observability
+    profile: DisparityProfile
 
     @classmethod
     def nothing(cls, problem: CarProblem, like: CarState) -> Outcome:
@@ -49,12 +51,9 @@ class Outcome:
         none = torch.zeros(0, dtype=torch.long, device=nothing.device)
         names = tuple(term.name for term in problem.terms)
         costs = nothing.reshape(0, len(names))
-        xyz_yaw, quality, unseen = (
-            nothing.reshape(0, 4, 4),
-            FitQuality.nothing(nothing, 0),
-            Observability.nothing(nothing, 0),
-        )
-        return cls(empty, none, none, nothing, names, costs, costs, square, xyz_yaw, quality, unseen)
+        quality, unseen = FitQuality.nothing(nothing, 0), Observability.nothing(nothing, 0)
+        profile, xyz_yaw = DisparityProfile.nothing(nothing, 0), nothing.reshape(0, 4, 4)
+        return cls(empty, none, none, nothing, names, costs, costs, square, xyz_yaw, quality, unseen, profile)
 
 
 def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], detector_hwl: Tensor) -> Outcome:
@@ -86,6 +85,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         fit_quality(problem, course),
         # The directions are mostly those of the depth, so its factor brings them to size.
         unseen.scaled(bundled_trust_model().sigma_factors[0]),
+        disparity_profile(problem, initial, minimum.state),
     )
 
 
@@ -136,6 +136,7 @@ def assemble(
         cost_history=spread(outcome.cost_history),
         quality=outcome.quality.spread(rows, count).where(refined | (status == Status.not_trusted.code)),
         observability=outcome.observability.spread(rows, count).where(refined),
+        profile=outcome.profile.spread(rows, count).where(refined | (status == Status.not_trusted.code)),
         input_dimensions_hwl=detections.dimensions_hwl,
         ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],

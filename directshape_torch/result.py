@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from directshape_torch.disparity_profile import DisparityProfile
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.observability import Observability
@@ -58,6 +59,8 @@ class RefinementResult:
             stages, each of which begins when the slowest car of the batch has ended the one before.
         quality: agreement of each refined car with masks and images.
         observability: what its view does not show; `observability.words()` says it in words.
+        profile: photometric cost over the disparity at input and end; of `not_trusted` cars at the end that was not
+            returned.
         input_dimensions_hwl: (B, 3) of the detections, metres.
         ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
@@ -76,6 +79,7 @@ class RefinementResult:
     cost_history: Tensor
     quality: FitQuality
     observability: Observability
+    profile: DisparityProfile
     input_dimensions_hwl: Tensor
     ground_source: tuple[str, ...]
     t_cam_ref: Tensor

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from directshape_torch.disparity_profile import DisparityProfile
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.frame_detections import MatchingSummary
@@ -95,6 +96,7 @@ def result(statuses: list[Status]) -> RefinementResult:
         cost_history=torch.zeros(B, 3),
         quality=FitQuality.nothing(T_cam_obj, B),
         observability=Observability.nothing(T_cam_obj, B),
+        profile=DisparityProfile.nothing(T_cam_obj, B),
         input_dimensions_hwl=torch.ones(B, 3, dtype=torch.float64),
         ground_source=("file",) * B,
         t_cam_ref=T_CAM_REF.expand(B, 3),

@@ -1,0 +1,196 @@
+"""The photometric cost of a car over offsets of its disparity: is its state in the right valley, and is there another?
+
+The hits of a state are moved along their rays together, as if the whole visible surface had another disparity; shape
+and contour stay. One curve at the input and one at the end, with the same pixels, say how far the images pull each of
+them, how sharply, and whether a repeated texture offers a second place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.errors import InputError
+
+# Two minima nearer than this are one with a dent.
+_APART_PX = 0.75
+# A rise on the way that is a smaller share of the lowest cost is noise and no ridge.
+_RIDGE_SHARE = 0.02
+# A second minimum less than this factor above the first could be the true one.
+AMBIGUOUS_BELOW = 1.25
+
+
+class ProfileFigures(NamedTuple):
+    """What one curve says of each of B cars; NaN and False where there is no curve.
+
+    Attributes:
+        offset_px: (B,) of the lowest cost, by the parabola through its neighbours; at an end of the range the end.
+        sigma_px: (B,) standard deviation of that offset, from the curvature there and the cost that is left; infinite
+            where the curve is flat, or falls to an end.
+        distinctness: (B,) cost of the best other minimum, at least 0.75 px away, over the lowest; infinite without one.
+        in_basin: (B,) bool: from the state downhill one comes to the lowest cost.
+        ambiguous: (B,) bool: the other minimum is nearly as low.
+    """
+
+    offset_px: Tensor
+    sigma_px: Tensor
+    distinctness: Tensor
+    in_basin: Tensor
+    ambiguous: Tensor
+
+
+@dataclass(frozen=True)
+class DisparityProfile:
+    """Photometric cost of B cars over n offsets of their disparity, with the pixels of the final stage.
+
+    Attributes:
+        offsets_px: (n,) evenly spaced, full-resolution pixels; a positive one is nearer.
+        cost_before, cost_after: (B, n) cost at the input and at the end, of the photometric term without the factors of
+            single cars; NaN for cars without pixels, or that were not refined.
+        num_pixels: (B,) of the curves.
+    """
+
+    offsets_px: Tensor
+    cost_before: Tensor
+    cost_after: Tensor
+    num_pixels: Tensor
+
+    @classmethod
+    def nothing(cls, like: Tensor, count: int) -> DisparityProfile:
+        """Of `count` cars of which nothing is known."""
+        offsets = profile_offsets().to(like.device)
+        nan = torch.full((count, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)
+        return cls(offsets, nan, nan, nan[:, 0])
+
+    def spread(self, rows: Tensor, count: int) -> DisparityProfile:
+        """Some cars placed among `count` cars."""
+
+        def place(values: Tensor) -> Tensor:
+            return values.new_full((count, *values.shape[1:]), torch.nan).index_copy(0, rows, values)
+
+        return replace(self, **{f.name: place(getattr(self, f.name)) for f in fields(self)[1:]})
+
+    def where(self, condition: Tensor) -> DisparityProfile:
+        """What is known where the condition (B,) holds, NaN elsewhere."""
+
+        def keep(values: Tensor) -> Tensor:
+            return torch.where(condition.view(-1, *[1] * (values.ndim - 1)), values, torch.full_like(values, torch.nan))
+
+        return replace(self, **{f.name: keep(getattr(self, f.name)) for f in fields(self)[1:]})
+
+    @property
+    def before(self) -> ProfileFigures:
+        """Figures of the curve at the input."""
+        return profile_figures(self.offsets_px, self.cost_before, self.num_pixels)
+
+    @property
+    def after(self) -> ProfileFigures:
+        """Figures of the curve at the end; a good fit has its minimum near 0 and no other that is as low."""
+        return profile_figures(self.offsets_px, self.cost_after, self.num_pixels)
+
+
+def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
+    """Offsets (n,) from minus to plus the range, 0 in the middle, float64.
+
+    Raises:
+        InputError: no positive range and step, or a range below two steps.
+
+    Example:
+        >>> profile_offsets(1.0, 0.5)
+        tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
+    """
+    if not (step_px > 0 and range_px >= 2 * step_px):
+        raise InputError("range_px, step_px", "a positive step and at least two of them", f"{range_px}, {step_px}")
+    steps = int(range_px / step_px + 1e-9)
+    return step_px * torch.arange(-steps, steps + 1, dtype=torch.float64)
+
+
+@torch.no_grad()
+def disparity_profile(
+    problem: CarProblem, before: CarState, after: CarState, offsets_px: Tensor | None = None
+) -> DisparityProfile:
+    """The curves of B cars at two states, in the present stage of their problem.
+
+    Args:
+        problem: whose last stage has begun.
+        before, after: input and end.
+        offsets_px: (n,) evenly spaced, 0 among them; default -3 to 3 px in steps of 0.25.
+    """
+    offsets = profile_offsets().to(after.code.device) if offsets_px is None else offsets_px
+    for term in problem.terms:
+        if isinstance(term, PhotometricTerm):
+            curves = [term.profile(problem.project(state), offsets) for state in (before, after)]
+            return DisparityProfile(offsets, curves[0], curves[1], term.support())
+    nan = after.code.new_full((len(after.code), len(offsets)), torch.nan, dtype=torch.float64)
+    return DisparityProfile(offsets, nan, nan, nan[:, 0])
+
+
+def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:
+    """Figures of curves.
+
+    Args:
+        offsets_px: (n,) evenly spaced, 0 among them.
+        cost: (B, n).
+        num_pixels: (B,) whose mean the cost is.
+
+    Example:
+        >>> offsets = profile_offsets()
+        >>> figures = profile_figures(offsets, 2 + (offsets - 0.4)[None] ** 2, torch.tensor([100.0]))
+        >>> figures.offset_px, figures.sigma_px, figures.in_basin
+        (tensor([0.4000], dtype=torch.float64), tensor([0.1414], dtype=torch.float64), tensor([True]))
+    """
+    known = cost.isfinite().all(dim=1)
+    cost = torch.where(known[:, None], cost, 0.0)
+    best = cost.argmin(dim=1)
+    lowest = cost.gather(1, best[:, None])[:, 0]
+    offset, sigma = _vertex(offsets_px, cost, best, num_pixels)
+    distinctness = _other_minimum(offsets_px, cost, best) / lowest
+    nan = torch.full_like(lowest, torch.nan)
+    offset, sigma, distinctness = (torch.where(known, x, nan) for x in (offset, sigma, distinctness))
+    in_basin = known & _is_downhill(offsets_px, cost, best, _RIDGE_SHARE * lowest)
+    return ProfileFigures(offset, sigma, distinctness, in_basin, known & (distinctness < AMBIGUOUS_BELOW))
+
+
+def _vertex(offsets_px: Tensor, cost: Tensor, best: Tensor, num_pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Offset (B,) and its standard deviation (B,), by the parabola through the lowest cost and its neighbours.
+
+    With a mean squared residual of twice the cost, `sigma^2 = 2 cost / (curvature num_pixels)`.
+    """
+    inner = best.clamp(1, cost.shape[1] - 2)
+    left, here, right = (cost.gather(1, (inner + i)[:, None])[:, 0] for i in (-1, 0, 1))
+    step = offsets_px[1] - offsets_px[0]
+    curvature = (left - 2 * here + right) / step**2
+    is_valley = (inner == best) & (curvature > 0)
+    safe = torch.where(is_valley, curvature, torch.ones_like(curvature))
+    shift = torch.where(is_valley, (left - right) / (2 * step * safe), torch.zeros_like(here))
+    lowest = (here - 0.5 * safe * shift**2).clamp_min(0)
+    sigma = (2 * lowest / (safe * num_pixels.clamp_min(1))).sqrt()
+    return offsets_px[best] + shift, torch.where(is_valley, sigma, torch.full_like(sigma, torch.inf))
+
+
+def _other_minimum(offsets_px: Tensor, cost: Tensor, best: Tensor) -> Tensor:
+    """Lowest local minimum (B,) that is not the lowest one; one at an end counts, infinite where there is none."""
+    padded = torch.nn.functional.pad(cost, (1, 1), value=torch.inf)
+    is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
+    is_apart = (offsets_px - offsets_px[best][:, None]).abs() > _APART_PX - 1e-6
+    return torch.where(is_minimum & is_apart, cost, torch.inf).amin(dim=1)
+
+
+def _is_downhill(offsets_px: Tensor, cost: Tensor, best: Tensor, tolerance: Tensor) -> Tensor:
+    """Whether (B,) the cost falls all the way from offset 0 to the lowest one, but for rises within the tolerance."""
+    start = int(offsets_px.abs().argmin())
+    index = torch.arange(len(offsets_px), device=cost.device)
+    low, high = best.clamp_max(start)[:, None], best.clamp_min(start)[:, None]
+    # Towards the lowest one: to the right where that lies on the right.
+    on_way = torch.where((index >= low) & (index <= high), cost, torch.inf)
+    rightwards = torch.where(on_way.isinf(), -torch.inf, on_way - on_way.cummin(dim=1).values)
+    flipped = on_way.flip(1)
+    leftwards = torch.where(flipped.isinf(), -torch.inf, flipped - flipped.cummin(dim=1).values)
+    rise = torch.where(best >= start, rightwards.amax(dim=1), leftwards.amax(dim=1))
+    return rise <= tolerance

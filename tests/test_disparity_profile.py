@@ -1,0 +1,224 @@
+"""Disparity profiles: known disparities, repeated texture, a rigidly moved car, and curves drawn by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT, begun_problem
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, cached_street, disturbed, select, street
+from torch import Tensor
+
+from directshape_torch.disparity_profile import (
+    DisparityProfile,
+    disparity_profile,
+    profile_figures,
+    profile_offsets,
+)
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.stereo import warp_to_right
+from directshape_torch.initial_search import move_by_disparity
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import FrameBatch
+
+OFFSETS = profile_offsets()
+
+
+@cache
+def far_street() -> Street:
+    """Two cars at 60 and 72 m before a very long lens: 19 and 16 px of disparity, 1 px over a whole car."""
+    place = [(-2.0, CAMERA_HEIGHT_M, 60.0), (2.2, CAMERA_HEIGHT_M, 72.0)]
+    return street(ellipsoid_prior(), place, [-1.4, 0.3], size_wh=(280, 200), focal_px=2200.0)
+
+
+def begun(frames: FrameBatch, scene: Street) -> tuple[CarProblem, CarState]:
+    # Without a gain: it would be estimated at a state that the shifted images make wrong.
+    config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, gain=False))
+    return begun_problem(ellipsoid_prior(), frames, scene.detections, config)
+
+
+def photometric_of(problem: CarProblem) -> PhotometricTerm:
+    return next(term for term in problem.terms if isinstance(term, PhotometricTerm))
+
+
+@pytest.mark.parametrize("shift_px", [-2, 0, 1])
+def test_the_minimum_is_where_the_right_image_was_moved_to(shift_px: int) -> None:
+    """Columns moved by k to the left are k px more of disparity, for every pixel of every car."""
+    scene = far_street()
+    frames = replace(scene.frames, images_right=scene.frames.images_right.roll(-shift_px, dims=-1))
+    problem, state = begun(frames, scene)
+    profile = disparity_profile(problem, state, state)
+    torch.testing.assert_close(profile.after.offset_px, torch.full((2,), float(shift_px)).double(), atol=0.05, rtol=0)
+    assert torch.equal(profile.cost_before, profile.cost_after)
+    assert profile.after.in_basin.all()
+    assert not profile.after.ambiguous.any()
+    assert (profile.after.sigma_px < 0.1).all()
+
+
+def test_a_car_that_begins_too_far_away_is_pulled_nearer() -> None:
+    scene = far_street()
+    problem, truth = begun(scene.frames, scene)
+    focal_baseline = torch.full((2,), 2200 * 0.53, dtype=torch.float64)
+    start = move_by_disparity(truth, focal_baseline, -1.5)
+    found = disparity_profile(problem, start, truth)
+    torch.testing.assert_close(found.before.offset_px, torch.full((2,), 1.5).double(), atol=0.15, rtol=0)
+    torch.testing.assert_close(found.after.offset_px, torch.zeros(2).double(), atol=0.05, rtol=0)
+
+
+def test_the_term_at_rigidly_moved_states_agrees() -> None:
+    """The slow way: a car moved along its ray and marched anew; of a far car all surface moves by one disparity."""
+    scene = far_street()
+    # Without the rim, which a car further away leaves: 2 px of disparity are 10 % of its size.
+    inner = 1 - torch.nn.functional.max_pool2d(1 - scene.detections.mask_left[:, None], 9, 1, 4)[:, 0]
+    scene = replace(scene, detections=replace(scene.detections, mask_left=inner))
+    problem, state = begun(scene.frames, scene)
+    profile = disparity_profile(problem, state, state)
+    term = photometric_of(problem)
+    assert term.fixed is not None
+    depth = problem.project(state).left.surface(term.fixed.pixel_index)[1].depth
+    for car, origin_depth in enumerate((60.0, 72.0)):
+        # The side that is seen is nearer than the origin, so that its disparity changes by more.
+        nearer = float(origin_depth / depth[term.fixed.object_index == car].mean()) ** 2
+        for offset in (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0):
+            moved = move_by_disparity(state, torch.full((2,), 2200 * 0.53).double(), offset / nearer)
+            slow = term.cost(problem.project(moved))[car]
+            fast = profile.cost_after[car, int(offset / 0.25) + 12]
+            torch.testing.assert_close(fast, slow, rtol=0.04, atol=1e-6)
+
+
+def _zigzag(u: Tensor) -> Tensor:
+    """Period 4 px, so that its samples at whole pixels hold all of it."""
+    return 100 + 40 * ((u - 4 * (u / 4).round()).abs() - 1)
+
+
+def test_repeated_texture_is_ambiguous() -> None:
+    """Stripes of 4 px, the car between two of them: minima at -2 and 2 px, equally low."""
+    scene = far_street()
+    problem, state = begun(scene.frames, scene)
+    term, projected = photometric_of(problem), problem.project(state)
+    fixed = term.fixed
+    assert fixed is not None
+    _, root = projected.left.surface(fixed.pixel_index)
+    K, T = (x[fixed.object_index][:, None] for x in (term.cars.K_right, term.cars.T_right_cam))
+    uv = warp_to_right(fixed.rays_left, root.depth[:, None], K, T).uv_right
+    right = _zigzag(torch.arange(280).double()).expand_as(fixed.images.right)
+    striped = fixed._replace(intensity_left=_zigzag(uv[..., 0] + 2), images=replace(fixed.images, right=right))
+    problem.terms = [replace(t, fixed=striped) if t is term else t for t in problem.terms]  # type: ignore[type-var]
+    figures = disparity_profile(problem, state, state).after
+    assert figures.ambiguous.all()
+    torch.testing.assert_close(figures.offset_px.abs(), torch.full((2,), 2.0).double(), atol=0.1, rtol=0)
+    assert (figures.distinctness < 1.2).all()
+
+
+def _figures(cost: Tensor, pixels: float = 100.0) -> dict[str, float]:
+    found = profile_figures(OFFSETS, cost[None], torch.tensor([pixels]).double())
+    return {name: float(value[0]) for name, value in found._asdict().items()}
+
+
+def test_a_parabola_by_hand() -> None:
+    """2 + 3 (x - 0.6)^2: curvature 6, sigma^2 = 2 * 2 / (6 * 100)."""
+    found = _figures(2 + 3 * (OFFSETS - 0.6) ** 2)
+    assert found["offset_px"] == pytest.approx(0.6)
+    assert found["sigma_px"] == pytest.approx(math.sqrt(4 / 600))
+    assert found["distinctness"] == math.inf
+    assert (found["in_basin"], found["ambiguous"]) == (1, 0)
+
+
+def test_two_valleys_by_hand() -> None:
+    """Depth 4 at 0 and depth 1 at 2 px, with a ridge between: another basin; 4 / 1 apart, and 1.1 / 1."""
+    valleys = torch.minimum(4 + 10 * OFFSETS**2, 1 + 10 * (OFFSETS - 2) ** 2)
+    found = _figures(valleys)
+    assert found["offset_px"] == pytest.approx(2.0)
+    assert found["distinctness"] == pytest.approx(4.0)
+    assert (found["in_basin"], found["ambiguous"]) == (0, 0)
+    mirrored = _figures(valleys.flip(0))
+    assert (mirrored["offset_px"], mirrored["in_basin"]) == (pytest.approx(-2.0), 0)
+    close = _figures(torch.minimum(1 + 10 * OFFSETS**2, 1.1 + 10 * (OFFSETS - 2) ** 2))
+    assert close["distinctness"] == pytest.approx(1.1)
+    assert (close["in_basin"], close["ambiguous"]) == (1, 1)
+
+
+def test_a_dent_beside_the_minimum_is_no_other_minimum_and_a_ripple_no_ridge() -> None:
+    dented = 5 + OFFSETS**2
+    dented[OFFSETS == 0.5] = 5.02
+    assert _figures(dented)["distinctness"] == math.inf
+    rippled = 5 + (OFFSETS - 2) ** 2
+    rippled[OFFSETS == 1.0] += 0.6
+    assert _figures(rippled)["in_basin"] == 1
+    rippled[OFFSETS == 1.0] += 0.3
+    assert _figures(rippled)["in_basin"] == 0
+
+
+def test_a_curve_that_falls_to_its_end_has_no_width() -> None:
+    found = _figures(10 - OFFSETS)
+    assert (found["offset_px"], found["sigma_px"], found["in_basin"]) == (3.0, math.inf, 1)
+    flat = _figures(torch.full_like(OFFSETS, 7.0))
+    assert (flat["sigma_px"], flat["distinctness"], flat["ambiguous"]) == (math.inf, 1.0, 1)
+
+
+def test_no_curve_says_nothing() -> None:
+    found = profile_figures(OFFSETS, torch.full((1, 25), torch.nan).double(), torch.tensor([0.0]).double())
+    for figure in (found.offset_px, found.sigma_px, found.distinctness):
+        assert figure.isnan().all()
+    assert not (found.in_basin | found.ambiguous).any()
+
+
+def test_in_a_result_each_car_has_its_own_curve_and_cars_that_were_not_refined_have_none() -> None:
+    prior, scene = cached_street()
+    detections = disturbed(scene.detections)
+    refiner = DirectShapeRefiner(prior, replace(DEFAULT, sampling=replace(DEFAULT.sampling, occlusion=False)))
+    together = refiner(scene.frames, detections).profile
+    for row in range(2):
+        alone = refiner(scene.frames, select(detections, torch.tensor([row]))).profile
+        torch.testing.assert_close(together.cost_after[row], alone.cost_after[0], rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(together.cost_before[row], alone.cost_before[0], rtol=1e-6, atol=1e-6)
+    maskless = replace(
+        detections, has_mask_left=torch.tensor([True, False]), has_mask_right=torch.tensor([True, False])
+    )
+    found = refiner(scene.frames, maskless).profile
+    assert found.cost_after[0].isfinite().all()
+    for figure in (found.cost_before, found.cost_after, found.num_pixels):
+        assert figure[1].isnan().all()
+    geometric = disparity_profile(*_without_photometry())
+    assert geometric.cost_after.isnan().all()
+
+
+def _without_photometry() -> tuple[CarProblem, CarState, CarState]:
+    problem, state = begun(far_street().frames, far_street())
+    problem.terms = [term for term in problem.terms if term.name != "photometric"]
+    return problem, state, state
+
+
+def test_no_cars_and_other_offsets() -> None:
+    prior, scene = cached_street()
+    none = DirectShapeRefiner(prior, DEFAULT)(scene.frames, select(scene.detections, torch.zeros(0, dtype=torch.long)))
+    assert none.profile.cost_after.shape == (0, 25)
+    assert none.profile.after.offset_px.shape == (0,)
+    problem, state = begun(far_street().frames, far_street())
+    fine = disparity_profile(problem, state, state, profile_offsets(1.0, 0.1))
+    assert fine.cost_after.shape == (2, 21)
+    coarse = disparity_profile(problem, state, state)
+    torch.testing.assert_close(fine.cost_after[:, [0, 10, 20]], coarse.cost_after[:, [8, 12, 16]])
+
+
+@pytest.mark.parametrize(("range_px", "step_px"), [(1.0, 0.0), (1.0, 0.8), (-1.0, 0.25)])
+def test_offsets_that_make_no_curve_are_refused(range_px: float, step_px: float) -> None:
+    with pytest.raises(InputError, match="at least two"):
+        profile_offsets(range_px, step_px)
+
+
+def test_placing_and_blanking() -> None:
+    values = torch.tensor([[3.0, 1.0, 2.0]]).double()
+    some = DisparityProfile(torch.tensor([-1.0, 0.0, 1.0]).double(), values, 2 * values, torch.tensor([9.0]).double())
+    placed = some.spread(torch.tensor([1]), 2)
+    assert placed.cost_after[1].tolist() == [6, 2, 4]
+    assert placed.cost_before[0].isnan().all()
+    assert placed.num_pixels[0].isnan()
+    assert placed.where(torch.tensor([True, False])).cost_after.isnan().all()
