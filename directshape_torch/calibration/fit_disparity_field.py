@@ -28,7 +28,7 @@ _SHRINK = 0.93
 _PATCH_SCALE_PX = 0.15
 _SMALLEST_NUMBER = 50
 # Standard deviation expected of a coefficient by its degree, pixels: what keeps the fit tame where data is thin.
-_COEFFICIENT_SIGMA_PX = (5.0, 2.0, 1.0, 0.5, 0.5)
+COEFFICIENT_SIGMA_PX = (5.0, 2.0, 1.0, 0.5, 0.5)
 _LARGEST_HULL = 24
 
 
@@ -90,13 +90,26 @@ def fit_disparity_field(
             str(len(observations)),
             "give more frames, or check that calibration and ground truth belong to the images",
         )
-    basis = polynomial_basis(observations.uv_left, size_wh)
     balance = _balance(observations.uv_left, size_wh)
-    coefficients = _robust_ridge(basis, observations.bias_px, balance)
+    coefficients = _robust_ridge(polynomial_basis(observations.uv_left, size_wh), observations.bias_px, balance)
+    return build_field(coefficients, observations, size_wh, camera, source, frame_ids)
+
+
+def build_field(
+    coefficients: Tensor,  # (10,) pixels
+    observations: DisparityObservations,
+    size_wh: tuple[int, int],
+    camera: StereoCamera,
+    source: str,
+    frame_ids: tuple[str, ...] = (),
+) -> FieldFit:
+    """A field of given coefficients; rows, hull and statistics from the observations (arguments as above)."""
+    basis = polynomial_basis(observations.uv_left, size_wh)
     before, after = observations.bias_px, observations.bias_px - basis @ coefficients
     statistics = FitStatistics(
         len(observations), *_median_and_mad(before), *_median_and_mad(after), _uncovered(observations.uv_left, size_wh)
     )
+    balance = _balance(observations.uv_left, size_wh)
     field = DisparityField(
         coefficients=coefficients,
         vertical_coefficients=_robust_ridge(basis, observations.vertical_px, balance),
@@ -123,7 +136,7 @@ def _robust_ridge(
 ) -> Tensor:  # (10,)
     """Tukey's biweight from a start that is the median alone; its scale shrinks from the residuals' spread to the
     accuracy of the patches, because the outliers are one-sided."""
-    sigma = torch.tensor([_COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=basis.dtype)
+    sigma = torch.tensor([COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=basis.dtype)
     coefficients = torch.zeros_like(sigma)
     coefficients[0] = bias_px.median()
     scale = torch.zeros_like(sigma[0])

@@ -9,13 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from directshape_torch.calibration.disparity_observations import DisparityObservations
     from directshape_torch.calibration.fit_disparity_field import FitStatistics
     from directshape_torch.calibration.kitti_observations import RigFrame, TruthSource
+    from directshape_torch.geometry.disparity_field import DisparityField
 
 _DESCRIPTION = """Fit the residual disparity field of a stereo rig, measured minus true disparity as a smooth function
 of the left pixel, and write it to a JSON file for 'directshape refine --stereo-bias'. True disparities come from
 disparity maps (training/disp_noc_0 or disp_occ_0), LiDAR scans (training/velodyne), or, much weaker, 3D box labels
-(training/label_2)."""
+(training/label_2). Without any truth, '--from motion' takes consecutive frames of a moving car (ROOT/image_02, image_03
+and calib.txt, a sequence of KITTI's tracking benchmark) and the height of the camera above the road."""
+
+_NO_TRUTH = "motion"
 
 
 # argparse's own type for this argument is private, hence the generic `_SubParsersAction` in quotes.
@@ -25,14 +30,25 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "calibrate-stereo", help="fit the residual disparity field of a stereo rig", description=_DESCRIPTION
     )
     parser.add_argument(
-        "--data", type=Path, required=True, metavar="ROOT", help="folder with training/ in KITTI's layout"
+        "--data",
+        type=Path,
+        required=True,
+        metavar="ROOT",
+        help="folder with training/ in KITTI's layout; motion: see above",
     )
     parser.add_argument(
         "--from",
         dest="source",
-        choices=("disparity", "lidar", "labels"),
+        choices=("disparity", "lidar", "labels", _NO_TRUTH),
         required=True,
-        help="where the truth comes from",
+        help="where the truth comes from; motion: nowhere",
+    )
+    parser.add_argument(
+        "--camera-height",
+        type=float,
+        default=1.65,
+        metavar="M",
+        help="above the road, for --from motion; 0 where it is not known (default: 1.65)",
     )
     parser.add_argument("--frames", nargs="+", metavar="ID", help="frame ids; default all that have such a file")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json", help="field to write")
@@ -46,12 +62,12 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         DirectShapeError: a missing or damaged file, frames of several rigs, or too few observations.
     """
+    if args.source == _NO_TRUTH:
+        return _run_without_truth(args)
     # Imported here so that `directshape --help` does not wait for torch.
     from directshape_torch.calibration.disparity_observations import concatenate
     from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
     from directshape_torch.calibration.kitti_observations import check_one_rig
-    from directshape_torch.io.atomic_files import write_png
-    from directshape_torch.visualize.disparity_field_picture import draw_disparity_field
 
     frames = _observe(args.data, args.source, args.frames)
     if not frames:
@@ -61,13 +77,41 @@ def run(args: argparse.Namespace) -> int:
     observations = concatenate([frame.observations for frame in frames])
     names = tuple(frame.frame_id for frame in frames)
     fit = fit_disparity_field(observations, frames[0].size_wh, frames[0].camera, args.source, names)
+    print(report(fit.statistics, args.source, len(frames)))
+    _write(args, fit.field, observations)
+    return 0
+
+
+def _run_without_truth(args: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from directshape_torch.calibration.observe_motion import observe_motion
+    from directshape_torch.calibration.self_calibration import self_calibrate
+    from directshape_torch.calibration.stereo_sequence import open_sequence
+    from directshape_torch.errors import InputError
+
+    if not 0 <= args.camera_height < 10:
+        raise InputError("--camera-height", "metres between 0 (not known) and 10", str(args.camera_height))
+    sequence = open_sequence(args.data, args.frames)
+    shown = tqdm(sequence.frame_ids, desc="frames", unit="frame", disable=not sys.stderr.isatty())
+    constraints, size_wh = observe_motion(sequence, args.camera_height or None, shown)
+    calibrated = self_calibrate(constraints, size_wh, sequence.camera, sequence.frame_ids)
+    print(report(calibrated.fit.statistics, args.source, len(sequence.frame_ids)))
+    sigma = calibrated.sigma(calibrated.observations.uv_left)
+    print(f"standard deviation of the field at its data: {float(sigma.median()):.3f} px, model errors not included")
+    _write(args, calibrated.fit.field, calibrated.observations)
+    return 0
+
+
+def _write(args: argparse.Namespace, field: DisparityField, observations: DisparityObservations) -> None:
+    from directshape_torch.io.atomic_files import write_png
+    from directshape_torch.visualize.disparity_field_picture import draw_disparity_field
+
     picture = args.picture or args.out.with_suffix(".png")
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    fit.field.save(args.out)
-    write_png(picture, draw_disparity_field(fit.field, observations.uv_left, observations.bias_px))
-    print(report(fit.statistics, args.source, len(frames)))
+    field.save(args.out)
+    write_png(picture, draw_disparity_field(field, observations.uv_left, observations.bias_px))
     print(f"wrote {args.out} and {picture}")
-    return 0
 
 
 def _observe(root: Path, source: TruthSource, wanted: list[str] | None) -> list[RigFrame]:
@@ -87,10 +131,11 @@ def _observe(root: Path, source: TruthSource, wanted: list[str] | None) -> list[
     return frames
 
 
-def report(statistics: FitStatistics, source: TruthSource, num_frames: int) -> str:
+def report(statistics: FitStatistics, source: str, num_frames: int) -> str:
     """What was fitted, how well, and where the image is not covered, as text."""
+    truth = "depth from motion and road" if source == _NO_TRUTH else f"truth from {source}"
     lines = [
-        f"{statistics.num_points} points of {num_frames} frame(s), truth from {source}",
+        f"{statistics.num_points} points of {num_frames} frame(s), {truth}",
         "measured - true disparity [px]     median     MAD",
         f"  before                         {statistics.median_before_px:+8.3f} {statistics.mad_before_px:7.3f}",
         f"  after                          {statistics.median_after_px:+8.3f} {statistics.mad_after_px:7.3f}",

@@ -1,0 +1,116 @@
+"""The road as a constraint on the field: a plane at a known height, its slope and roll unknown in every frame.
+
+With `a = -normal / height` (so that `a . x_cam = 1` on the road), inverse depth is `a . ray_cam`, hence disparity is an
+affine function of the pixel: `d = f b (a_x (u - c_u) / f + a_y (v - c_v) / f + a_z)`. Pitch (a_z) and roll (a_x) are
+free, so a constant in the field and its slope along u are NOT seen: any of them is a road that lies otherwise. The
+known height fixes `|a|`, with it the slope along v; and everything of higher degree bends the plane, which is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from directshape_torch.calibration.disparity_observations import DisparityObservations
+from directshape_torch.calibration.field_constraint import (
+    PATCH_SIGMA_PX,
+    Linearisation,
+    information_share,
+    tukey_weight,
+)
+from directshape_torch.calibration.road_pixels import RoadPixels
+from directshape_torch.geometry.disparity_field import polynomial_basis
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.scene import StereoCamera
+from directshape_torch.stereo_matching.points import disparity_of_depth
+
+# Roads are even to about this share of the camera's height, and so is the disparity on them.
+_UNEVENNESS = 0.01
+# A car bounces on its springs, and its road is no plane: this much, metres, in every frame.
+_HEIGHT_SIGMA_M = 0.02
+
+
+@dataclass(frozen=True)
+class RoadConstraint:
+    """The road of one frame; own unknowns: `inverse_plane` (3,)."""
+
+    pixels: RoadPixels
+    camera: StereoCamera
+    size_wh: tuple[int, int]
+    height_m: float
+    inverse_plane: Tensor
+    degrees_of_freedom: int = 1
+
+    @classmethod
+    def of(cls, pixels: RoadPixels, camera: StereoCamera, size_wh: tuple[int, int], height_m: float) -> RoadConstraint:
+        """With the plane found in the raw points as start."""
+        return cls(pixels, camera, size_wh, height_m, pixels.inverse_plane)
+
+    def linearise(self, coefficients: Tensor, scale: float) -> Linearisation:
+        """See `FieldConstraint`."""
+        predicted, _, J_disparity_plane = self._predict()
+        basis = polynomial_basis(self.pixels.uv_left, self.size_wh)
+        sigma = self._sigma()
+        residual = (predicted[:, 0] + basis @ coefficients - self.pixels.disparity) / sigma
+        J = torch.cat([J_disparity_plane, basis], dim=1) / sigma[:, None]
+        weight = tukey_weight(residual, scale)
+        share = information_share(weight, scale)
+        H = share * J.T @ (weight[:, None] * J)
+        g = share * J.T @ (weight * residual)
+        height = 1 / self.inverse_plane.norm()
+        J_height = torch.zeros_like(g)
+        J_height[:3] = -self.inverse_plane * height**3 / _HEIGHT_SIGMA_M
+        height_residual = (height - self.height_m) / _HEIGHT_SIGMA_M
+        return Linearisation(H + torch.outer(J_height, J_height), g + J_height * height_residual, residual.abs())
+
+    def moved(self, own_step: Tensor) -> Self:
+        """See `FieldConstraint`."""
+        return replace(self, inverse_plane=self.inverse_plane + own_step)
+
+    def observations(self, coefficients: Tensor, scale: float) -> DisparityObservations:
+        """See `FieldConstraint`."""
+        predicted, depth, _ = self._predict()
+        bias = self.pixels.disparity - predicted[:, 0]
+        basis = polynomial_basis(self.pixels.uv_left, self.size_wh)
+        kept = tukey_weight((bias - basis @ coefficients) / self._sigma(), scale) > 0
+        vertical = predicted[:, 1] - self.pixels.row_shift
+        return DisparityObservations(self.pixels.uv_left[kept], bias[kept], vertical[kept], depth[kept])
+
+    def _predict(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Displacement (P, 2), depth (P,), J_disparity_plane (P, 3)."""
+        K_left, K_right, T_right_cam = (
+            t[0].double() for t in (self.camera.K_left, self.camera.K_right, self.camera.T_right_cam)
+        )
+        rays_cam = rays_from_pixels(self.pixels.uv_left, K_left)
+        inverse_depth = (rays_cam @ self.inverse_plane).clamp_min(1e-4)
+        displacement = disparity_of_depth(self.pixels.uv_left, 1 / inverse_depth, K_left, K_right, T_right_cam)
+        slope = disparity_slope(self.pixels.uv_left, inverse_depth, K_left, K_right, T_right_cam)
+        return displacement, 1 / inverse_depth, slope[:, None] * rays_cam
+
+    def _sigma(self) -> Tensor:
+        return (PATCH_SIGMA_PX**2 + (_UNEVENNESS * self.pixels.disparity) ** 2).sqrt()
+
+
+def disparity_slope(
+    uv_left: Tensor,  # (P, 2) pixels
+    inverse_depth: Tensor,  # (P,) 1/m
+    K_left: Tensor,  # (3, 3)
+    K_right: Tensor,  # (3, 3)
+    T_right_cam: Tensor,  # (4, 4)
+) -> Tensor:  # (P,)
+    """Derivative of the true disparity by the inverse depth, pixels x metres.
+
+    Example:
+        >>> K, T = torch.tensor([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), torch.eye(4)
+        >>> T[0, 3] = -0.5
+        >>> disparity_slope(torch.tensor([[600.0, 180.0]]), torch.tensor([0.1]), K, K, T)
+        tensor([350.])
+    """
+    a = rays_from_pixels(uv_left, K_left) @ (K_right @ T_right_cam[:3, :3]).T
+    b = K_right @ T_right_cam[:3, 3]
+    homogeneous = a + inverse_depth[:, None] * b
+    u_right = homogeneous[:, 0] / homogeneous[:, 2]
+    return -(b[0] - u_right * b[2]) / homogeneous[:, 2]

@@ -1,0 +1,169 @@
+"""Motion and road give back a field that was put into them; a road alone, or a car that stands, is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch.calibration.field_constraint import FieldConstraint, Linearisation
+from directshape_torch.calibration.motion_constraint import MotionConstraint
+from directshape_torch.calibration.motion_tracks import TrackedFeatures
+from directshape_torch.calibration.road_constraint import RoadConstraint
+from directshape_torch.calibration.road_pixels import RoadPixels
+from directshape_torch.calibration.self_calibration import self_calibrate
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import polynomial_basis
+from directshape_torch.geometry.pinhole import project, rays_from_pixels
+from directshape_torch.geometry.se3 import exp
+from directshape_torch.scene import StereoCamera
+from directshape_torch.stereo_matching.points import disparity_of_depth
+
+SIZE = (1242, 375)
+HEIGHT_M = 1.65
+TRUE = torch.tensor([-0.4, -0.2, 0.3, -1.0, 0.1, 0.1, 0.3, 0.1, -0.1, -0.3], dtype=torch.float64)
+
+
+def camera() -> StereoCamera:
+    P = torch.tensor([[720.0, 0, 610, 0], [0, 720, 173, 0], [0, 0, 1, 0]], dtype=torch.float64)
+    P_right = P.clone()
+    P_right[0, 3], P_right[1, 3] = -720 * 0.53, 2.0
+    return StereoCamera.from_projections(P[None], P_right[None])
+
+
+def measured(uv: Tensor, depth: Tensor, generator: torch.Generator, noise_px: float) -> tuple[Tensor, Tensor]:
+    """Disparity with the field and noise on it, and the row shift of the geometry less 0.2 px."""
+    rig = camera()
+    displacement = disparity_of_depth(uv, depth, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
+    noise = noise_px * torch.randn(len(uv), generator=generator, dtype=torch.float64)
+    return displacement[:, 0] + polynomial_basis(uv, SIZE) @ TRUE + noise, displacement[:, 1] - 0.2
+
+
+def random_pixels(count: int, generator: torch.Generator) -> Tensor:
+    return torch.rand(count, 2, generator=generator, dtype=torch.float64) * torch.tensor(SIZE)
+
+
+def motion(seed: int, way_m: float = 2.0, moving_share: float = 0.0, noise_px: float = 0.1) -> MotionConstraint:
+    """Points 5 to 60 m away, the camera driving ahead and turning a little; some points move by themselves."""
+    generator, rig = torch.Generator().manual_seed(seed), camera()
+    uv = random_pixels(500, generator)
+    depth = 5 + 55 * torch.rand(500, generator=generator, dtype=torch.float64)
+    disparity, row_shift = measured(uv, depth, generator, noise_px)
+    T_later_cam = exp(torch.tensor([0.02, 0.01, -way_m, 0.002, 0.01 * (seed % 3 - 1), 0.001], dtype=torch.float64))
+    own_motion = (torch.rand(500, generator=generator) < moving_share)[:, None] * torch.tensor([0.0, 0.0, 1.5])
+    points = depth[:, None] * rays_from_pixels(uv, rig.K_left[0]) + own_motion
+    uv_later = project(points @ T_later_cam[:3, :3].T + T_later_cam[:3, 3], rig.K_left[0])
+    uv_later = uv_later + noise_px * torch.randn(500, 2, generator=generator, dtype=torch.float64)
+    # The rough motion is that of raw disparities: a few per cent too long.
+    start = exp(torch.tensor([0.0, 0.0, -0.02 * way_m, 0.001, 0.0, 0.0], dtype=torch.float64)) @ T_later_cam
+    return MotionConstraint.of(TrackedFeatures(uv, disparity, row_shift, uv_later, start), rig, SIZE)
+
+
+def road(seed: int, noise_px: float = 0.1, pitch: float = 0.0) -> RoadConstraint:
+    """A road that leans by a degree or two, seen from 4 to 30 m."""
+    generator, rig = torch.Generator().manual_seed(seed), camera()
+    normal = torch.tensor([0.01 * (seed % 3), -1.0, 0.01 * (seed % 2) + pitch], dtype=torch.float64)
+    plane = -normal / normal.norm() / HEIGHT_M
+    uv = random_pixels(3000, generator)
+    depth = 1 / (rays_from_pixels(uv, rig.K_left[0]) @ plane)
+    ahead = (depth > 4) & (depth < 30)
+    disparity, row_shift = measured(uv[ahead], depth[ahead], generator, noise_px)
+    start = plane * torch.tensor([1.0, 1.02, 1.0]) + torch.tensor([0.0, 0.0, 0.004])
+    return RoadConstraint.of(RoadPixels(uv[ahead], disparity, row_shift, start), rig, SIZE, HEIGHT_M)
+
+
+def grid() -> Tensor:
+    u, v = torch.meshgrid(torch.linspace(40, 1200, 12), torch.linspace(20, 360, 8), indexing="xy")
+    return torch.stack([u, v], dim=-1).reshape(-1, 2).double()
+
+
+def largest_error(constraints: list[FieldConstraint]) -> float:
+    field = self_calibrate(constraints, SIZE, camera()).fit.field
+    return float((field.bias(grid()) - polynomial_basis(grid(), SIZE) @ TRUE).abs().max())
+
+
+def test_motion_and_road_find_the_field_beside_things_that_move() -> None:
+    constraints = [*(motion(k, moving_share=0.2) for k in range(6)), *(road(k) for k in range(4))]
+    result = self_calibrate(constraints, SIZE, camera(), ("000000", "000001"))
+    error = result.fit.field.bias(grid()) - polynomial_basis(grid(), SIZE) @ TRUE
+    assert float(error.abs().max()) < 0.1
+    assert float(error.square().mean().sqrt()) < 0.03
+    assert float(result.sigma(grid()).median()) < 0.1
+    rows = result.fit.field.vertical(grid())
+    torch.testing.assert_close(rows, torch.full_like(rows, 0.2), atol=0.01, rtol=0)
+    assert result.fit.field.provenance["source"] == "motion"
+    assert result.fit.field.provenance["frames"] == "000000 000001"
+
+
+def test_a_wrong_height_tilts_the_field_only_where_motion_is_weak() -> None:
+    """Without noise the field is exact; a road that is taken for 5 cm lower pulls, but motion resists."""
+    exact: list[FieldConstraint] = [*(motion(k, noise_px=0.0) for k in range(6)), road(0, noise_px=0.0)]
+    assert largest_error(exact) < 0.02
+    wrong = replace(road(0, noise_px=0.0), height_m=HEIGHT_M + 0.05)
+    assert largest_error([*exact[:-1], wrong]) < 0.5
+
+
+def test_a_road_alone_does_not_determine_a_field() -> None:
+    with pytest.raises(InputError, match="no constant, no slope"):
+        self_calibrate([road(k) for k in range(10)], SIZE, camera())
+
+
+def test_a_road_does_not_see_pitch_but_height_and_bends() -> None:
+    """The information about the constant is nothing, about v and u^2 it is much, once the plane is eliminated."""
+    seen = replace(road(1), inverse_plane=road(1).inverse_plane - torch.tensor([0.0, 0.012, 0.004]))
+    H, _ = seen.linearise(TRUE, 2.0).of_field()
+    constant, slope_u, slope_v, bend_u = (float(H[k, k]) for k in range(4))
+    assert constant < 1e-3 * slope_v
+    assert slope_u < 1e-3 * bend_u
+    # 2 cm of 1.65 m are 1.2 % of the 60 px of disparity between the horizon and the lower edge.
+    assert 0.3 / 0.73**2 < slope_v < 1.2 / 0.73**2
+    assert bend_u > 1
+
+
+def test_a_car_that_stands_is_refused() -> None:
+    with pytest.raises(InputError, match="drives past still things"):
+        self_calibrate([motion(k, way_m=0.0) for k in range(4)], SIZE, camera())
+    with pytest.raises(InputError, match="followed from frame to frame"):
+        self_calibrate([], SIZE, camera())
+
+
+@pytest.mark.parametrize("constraint", [motion(1), road(1, pitch=0.01)], ids=["motion", "road"])
+def test_gradient_is_that_of_the_robust_cost(constraint: MotionConstraint | RoadConstraint) -> None:
+    """Central differences of Tukey's cost over the coefficients and the constraint's own unknowns."""
+    coefficients, scale = 0.9 * TRUE, 3.0
+    linear = constraint.linearise(coefficients, scale)
+    num_own = len(linear.g) - len(TRUE)
+    numeric = torch.zeros_like(linear.g)
+    for k in range(len(linear.g)):
+        values = []
+        for sign in (1.0, -1.0):
+            delta = torch.zeros_like(linear.g)
+            delta[k] = sign * 1e-5
+            moved = constraint.moved(delta[:num_own])
+            values.append(cost(moved.linearise(coefficients + delta[num_own:], scale), scale))
+        numeric[k] = (values[0] - values[1]) / 2e-5
+    weight_sum = float(tukey(linear.distances, scale).sum())
+    numeric = numeric * min(1.0, 60 / weight_sum) / scale**2
+    if isinstance(constraint, RoadConstraint):
+        numeric = numeric + height_gradient(constraint)
+    torch.testing.assert_close(linear.g, numeric, rtol=2e-4, atol=2e-4 * float(numeric.abs().max()))
+
+
+def tukey(distances: Tensor, scale: float) -> Tensor:
+    return (1 - (distances / (4.685 * scale)) ** 2).clamp_min(0) ** 2
+
+
+def cost(linear: Linearisation, scale: float) -> float:
+    """Sum of Tukey's rho, whose derivative is r (1 - (r / c)^2)^2."""
+    c = 4.685 * scale
+    inside = (1 - (linear.distances / c) ** 2).clamp_min(0) ** 3
+    return float((c**2 / 6 * (1 - inside)).sum())
+
+
+def height_gradient(constraint: RoadConstraint) -> Tensor:
+    plane = constraint.inverse_plane.clone().requires_grad_(True)
+    (0.5 * ((1 / plane.norm() - HEIGHT_M) / 0.02) ** 2).backward()
+    assert plane.grad is not None
+    return torch.cat([plane.grad, torch.zeros(len(TRUE), dtype=torch.float64)])
