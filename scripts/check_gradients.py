@@ -1,6 +1,6 @@
 """The Jacobian laboratory: every derivative of the energy three ways, in named regimes, with real image content.
 
-Every term (both silhouettes in both forms, photometric, shape, height, tilt in both forms, dimensions) and every
+Every term (both silhouettes in both forms, photometric, shape, height, tilt in both forms, dimensions, pose) and every
 factor of the chain has its hand-derived Jacobian compared with autograd and with central differences (Richardson
 extrapolation over a sweep of steps). Entries whose difference stencil contains a kink of the function are excluded by
 a stated rule and counted. Exit code 1 when a bound is broken: analytic against autograd 1e-9, against numeric 1e-6,

@@ -25,7 +25,7 @@ from directshape_torch.solver.problem import Stage
 
 TERM_NAMES = (
     "silhouette_left", "silhouette_right", "silhouette_left_product", "silhouette_right_product", "photometric",
-    "shape", "height", "tilt_normal", "tilt_cosine", "dimensions",
+    "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
 )  # fmt: skip
 
 # Brackets shrink superlinearly: more iterations than float64 can use; Newton's steps from there are quadratic.
@@ -34,6 +34,8 @@ _NEWTON_STEPS = 5
 _CELLS_TO_CHOOSE_FROM = 3000
 _CONTOUR = 3.0
 _GRAZING_COSINE = 0.3
+# Of a stereo detector: without any the pose prior would not be there to be examined.
+_POSE_SIGMAS = {"along_share": 0.02, "across_m": 0.1, "vertical_m": 0.05, "yaw_deg": 4.0}
 
 
 class _RememberedView(ProjectedView):
@@ -56,7 +58,7 @@ class Bench:
 
     Attributes:
         regime: they were drawn from.
-        problem: of these cars, its terms those of the default settings, the regime's stage begun.
+        problem: of these cars, its terms those of the default settings and the pose prior, the regime's stage begun.
         terms: by the laboratory's names, the forms of the paper among them.
         state: of the B cars.
         projected: at that state, with roots as precise as the dtype allows.
@@ -101,7 +103,7 @@ class Bench:
         config: RefinerConfig | None = None,
     ) -> Bench:
         """Draw states and choose their pixels."""
-        config = RefinerConfig() if config is None else config
+        config = _with_pose_prior(RefinerConfig() if config is None else config)
         generator = seeded(seed, regime)
         drawn = regime.draw(scene, prior, num_states, generator)
         cells = pixels_per_car if regime.pixels == "sampled" else _CELLS_TO_CHOOSE_FROM
@@ -130,6 +132,11 @@ class Bench:
         projected = problem.project(drawn.state, root_iterations=ROOT_ITERATIONS)
         projected.left, projected.right = _RememberedView(projected.left), _RememberedView(projected.right)
         return cls(regime, problem, _named(problem, other), drawn.state, projected, cars)
+
+
+def _with_pose_prior(config: RefinerConfig) -> RefinerConfig:
+    sigmas = {f"pose_sigma_{name}": value for name, value in _POSE_SIGMAS.items()}
+    return replace(config, priors=replace(config.priors, **sigmas))
 
 
 def _named(problem: CarProblem, paper: CarProblem) -> dict[str, Term]:

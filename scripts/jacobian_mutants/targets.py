@@ -117,7 +117,16 @@ TARGETS: dict[str, Target] = {
     ),
     "priors": Target(
         "directshape_torch/residuals/priors.py",
-        ("shape_prior", "height_prior", "tilt_prior_normal", "tilt_prior_cosine", "_by_rotation", "dimensions_prior"),
+        (
+            "shape_prior",
+            "height_prior",
+            "tilt_prior_normal",
+            "tilt_prior_cosine",
+            "_by_rotation",
+            "dimensions_prior",
+            "pose_prior",
+            "viewing_axes",
+        ),
         ("tests/residuals/test_priors.py",),
     ),
     "robust": Target(
