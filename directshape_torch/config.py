@@ -190,7 +190,7 @@ class PriorConfig:
     tilt_form: Literal["normal", "cosine"] = "normal"
     dimensions_weight: float = 0.5
     dimensions_sigma_m: tuple[float, float, float] = (0.1, 0.1, 0.4)
-    pose_weight: float = 0.3
+    pose_weight: float = 0.2
     pose_sigma_along_share: float = 0.0
     pose_sigma_along_m: float = 0.0
     pose_sigma_across_m: float = 0.0

@@ -50,6 +50,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "point_cloud.max_points": (1, math.inf),
     "point_cloud.rounds": (1, 1000),
     "point_cloud.max_iterations": (1, math.inf),
+    "rig.disparity_sigma_px": _NOT_NEGATIVE,
     "priors.shape_weight": _NOT_NEGATIVE,
     "priors.height_weight": _NOT_NEGATIVE,
     "priors.tilt_weight": _NOT_NEGATIVE,

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
-from directshape_torch.covariance import covariance_of, covariance_xyz_yaw
+from directshape_torch.covariance import covariance_of, covariance_xyz_yaw, shared_disparity_covariance
 from directshape_torch.disparity_profile import DisparityProfile, disparity_profile
+from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.evidence import Course
@@ -56,15 +57,15 @@ class Outcome:
         return cls(empty, none, none, nothing, names, costs, costs, square, xyz_yaw, quality, unseen, profile)
 
 
-def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], detector_hwl: Tensor) -> Outcome:
+def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch) -> Outcome:
     """Costs, covariance, quality and observability of the cars of a problem at its minimum."""
     linearisations = problem.linearise_terms(minimum.state, with_fisher=True)
-    covariance = covariance_of(linearisations)
+    covariance = covariance_of(linearisations) + _rig_covariance(problem, minimum.state, cars)
     unseen = observability_of(problem.prior, minimum.state, problem.terms, linearisations)
     course = Course(
         before=initial,
         after=minimum.state,
-        detector_hwl=detector_hwl,
+        detector_hwl=cars.detector_hwl,
         cost_before=problem.term_costs(initial),
         cost_after=torch.stack([part.cost for part in linearisations], dim=1),
         linearisations=linearisations,
@@ -87,6 +88,12 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         unseen.scaled(bundled_trust_model().sigma_factors[0]),
         disparity_profile(problem, initial, minimum.state),
     )
+
+
+def _rig_covariance(problem: CarProblem, state: CarState, cars: CarBatch) -> Tensor:
+    """Covariance (B, D, D) of the rig's own error, in the units that the calibration of depth brings to size."""
+    sigma_px = problem.config.rig.disparity_sigma_px / bundled_trust_model().sigma_factors[0]
+    return shared_disparity_covariance(state.T_obj_cam, cars.focal_baseline, sigma_px, 6 + state.code.shape[1])
 
 
 def without_distrusted(

@@ -153,7 +153,7 @@ class DirectShapeRefiner(nn.Module):
         with torch.no_grad():
             start = search_start(problem, initial, cars, self.config.search)
             minimum = minimise(problem, initial, self.config.solver, start, record)
-            outcome = outcome_of(problem, initial, minimum, cars.detector_hwl)
+            outcome = outcome_of(problem, initial, minimum, cars)
             minimum = without_distrusted(minimum, initial, outcome.quality, self.config.acceptance)
             outcome = replace(outcome, status=minimum.status)
         state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)

@@ -66,6 +66,11 @@ class CarBatch:
         """
         return self.K_left[:, 0, 0] / self.input_depth
 
+    @property
+    def focal_baseline(self) -> Tensor:
+        """Focal length times baseline (B,), pixel metres: disparity is this over depth."""
+        return -self.K_left[:, 0, 0] * self.T_right_cam[:, 0, 3]
+
     def of_objects(self, keep: Tensor) -> CarBatch:
         known = {x.name: getattr(self, x.name) for x in fields(self) if getattr(self, x.name) is not None}
         return replace(self, **{name: values[keep] for name, values in known.items()})

@@ -45,6 +45,12 @@ _SEARCHES = {
 }
 
 
+def _pose_sigmas(along_share: float, across_m: float, vertical_m: float, yaw_deg: float) -> Settings:
+    """The detector's pose as a prior, with these standard deviations."""
+    sigmas = {"along_share": along_share, "across_m": across_m, "vertical_m": vertical_m, "yaw_deg": yaw_deg}
+    return Settings(tuple(f"priors.pose_sigma_{name}={value:g}" for name, value in sigmas.items()))
+
+
 def _points(number: int) -> Settings:
     return Settings((f"sampling.min_pixels={number}", f"sampling.max_pixels={number}"))
 
@@ -64,6 +70,7 @@ ROWS: tuple[Row, ...] = (
     Row("priors", "no shape prior", Settings(("priors.shape_weight=0",))),
     Row("priors", "no prior on dimensions (the paper)", Settings(("priors.dimensions_weight=0",))),
     Row("priors", "no ground", Settings(("priors.height_weight=0", "priors.tilt_weight=0"))),
+    Row("priors", "the detector's pose and its sigmas", _pose_sigmas(0.02, 0.1, 0.05, 4.0)),
     Row("occlusion", "no occlusion handling", Settings(("sampling.occlusion=false",))),
     Row("occlusion", "order by box bottoms (the paper)", Settings(("sampling.occlusion_order=box_bottom",))),
     *(Row("sampling", name, Settings(overrides)) for name, overrides in _SAMPLINGS.items()),
@@ -78,7 +85,10 @@ ROWS: tuple[Row, ...] = (
     Row("masks", "left image only", Settings(masks="left")),
     Row("masks", "2D boxes for masks", Settings(masks="boxes")),
     *(Row("detector noise", f"{scale:g} times", start=f"noise:{scale:g}") for scale in (0.25, 0.5, 1, 2, 3, 4)),
+    # As that noise is drawn, a fourth of a stereo detector's: see `simulated_detector`.
+    Row("detector noise", "0.25 times, and its sigmas", _pose_sigmas(0.00625, 0.03, 0.0125, 1.25), "noise:0.25"),
     Row("far start", "adaptive (default)", start="mono"),
+    Row("far start", "the detector's pose and its sigmas", _pose_sigmas(0.05, 0.25, 0.06, 9.0), "mono"),
     *(Row("far start", name, Settings(overrides), "mono") for name, overrides in _SAMPLINGS.items()),
     Row("far start", "silhouette only", Settings(("photometric.weight=0",)), "mono"),
     Row("far start", "photometric only", Settings(("silhouette.weight=0",)), "mono"),
