@@ -59,6 +59,19 @@ class SolverConfig:
 
 
 @dataclass(frozen=True)
+class RigConfig:
+    """What is known beforehand of the stereo rig.
+
+    Attributes:
+        disparity_sigma_px: standard deviation of the rig's disparity about its calibration, the same for all pixels of
+            a car, so that no residual shows it; it enters covariance, sigmas and probabilities, not the estimate. 0 for
+            a perfect rig; about 0.1 where a residual disparity field was fitted, 0.5 and more where none was.
+    """
+
+    disparity_sigma_px: float = 0.0
+
+
+@dataclass(frozen=True)
 class BackwardConfig:
     """Gradients through the refinement, for training in front of it.
 
@@ -271,6 +284,7 @@ class RefinerConfig:
     priors: PriorConfig = field(default_factory=PriorConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
+    rig: RigConfig = field(default_factory=RigConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
     backward: BackwardConfig = field(default_factory=BackwardConfig)
 
