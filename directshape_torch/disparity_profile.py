@@ -45,6 +45,13 @@ class ProfileFigures(NamedTuple):
     ambiguous: Tensor
 
 
+class CostPair(NamedTuple):
+    """Costs (B,) on the two curves."""
+
+    before: Tensor
+    after: Tensor
+
+
 @dataclass(frozen=True)
 class DisparityProfile:
     """Photometric cost of B cars over n offsets of their disparity, with the pixels of the final stage.
@@ -83,6 +90,21 @@ class DisparityProfile:
             return torch.where(condition.view(-1, *[1] * (values.ndim - 1)), values, torch.full_like(values, torch.nan))
 
         return replace(self, **{f.name: keep(getattr(self, f.name)) for f in fields(self)[1:]})
+
+    @property
+    def range_px(self) -> float:
+        """The largest offset."""
+        return float(self.offsets_px[-1])
+
+    @property
+    def lowest(self) -> CostPair:
+        """The least cost of each curve; NaN where there is none."""
+        return CostPair(self.cost_before.amin(dim=1), self.cost_after.amin(dim=1))
+
+    def cost_at(self, offset_px: float) -> CostPair:
+        """Costs at the sample next to an offset."""
+        column = int((self.offsets_px - offset_px).abs().argmin())
+        return CostPair(self.cost_before[:, column], self.cost_after[:, column])
 
     @property
     def before(self) -> ProfileFigures:

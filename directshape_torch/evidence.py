@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.disparity_profile import DisparityProfile
 from directshape_torch.energy.car_problem import CarProblem, sum_of
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
@@ -43,6 +44,12 @@ EVIDENCE_NAMES = (
     "log_conflict",
     "code_size",
     "unsettled",
+    "log_profile_sigma",
+    "log_profile_offset",
+    "log_profile_contrast",
+    "profile_offset_before",
+    "log_profile_fall_before",
+    "outside_basin",
 )
 """Columns of the evidence; `docs/results.md` says which of them the bundled model reads.
 
@@ -52,7 +59,10 @@ sigmas let one expect to be wrong, `log_expected_gain` by how much more it would
 along the viewing ray, metres; `turned` radians; `log_moved_sigmas` Mahalanobis length of the motion; `length_change`
 metres; `mask_misfit_*` one minus the overlap with the mask; `*_decrease` log of cost before over cost after;
 `log_conflict` share of the cost that photometry alone would still gain by a step; `code_size` root mean square;
-`unsettled` 1 where the iterations ran out.
+`unsettled` 1 where the iterations ran out. Of the disparity profile at the end: `log_profile_sigma` and
+`log_profile_offset` of its minimum, pixels, `log_profile_contrast`, how much more a pixel of disparity to the better
+side costs, `outside_basin` 1 where a ridge lies between the state and the minimum. Of the one at the input:
+`profile_offset_before` of its minimum, pixels, and `log_profile_fall_before`, cost there over that at the minimum.
 """
 
 _TINY = 1e-9
@@ -73,6 +83,7 @@ class Course:
         covariance: (B, D, D) in the tangent of `retract`, uncalibrated.
         covariance_xyz_yaw: (B, 4, 4), uncalibrated.
         unsettled: (B,) bool, the iterations ran out.
+        profile: photometric cost over the disparity.
     """
 
     before: CarState
@@ -84,6 +95,7 @@ class Course:
     covariance: Tensor
     covariance_xyz_yaw: Tensor
     unsettled: Tensor
+    profile: DisparityProfile
 
 
 class Agreement(NamedTuple):
@@ -97,7 +109,12 @@ class Agreement(NamedTuple):
 
 def evidence_of(problem: CarProblem, course: Course, agreement: Agreement) -> Tensor:
     """The evidence (B, E), float64, columns `EVIDENCE_NAMES`; NaN where a figure does not exist."""
-    columns = {**_motion(problem, course), **_agreement(problem, course, agreement), **_costs(problem, course)}
+    columns = {
+        **_motion(problem, course),
+        **_agreement(problem, course, agreement),
+        **_costs(problem, course),
+        **_profile(course.profile),
+    }
     return torch.stack([columns[name].to(torch.float64) for name in EVIDENCE_NAMES], dim=1)
 
 
@@ -189,6 +206,22 @@ def _costs(problem: CarProblem, course: Course) -> dict[str, Tensor]:
         "photometric_decrease": paid(before, photometric) - paid(after, photometric),
         "relative_decrease": paid(before, everything) - paid(after, everything),
         "log_conflict": _conflict(course, photometric),
+    }
+
+
+def _profile(profile: DisparityProfile) -> dict[str, Tensor]:
+    """How sharply the images know the disparity at the end, and how far they pulled the input."""
+    before, after = profile.before, profile.after
+    here, lowest = profile.cost_at(0.0), profile.lowest
+    sides = torch.minimum(*(cost.after for cost in (profile.cost_at(-1.0), profile.cost_at(1.0))))
+    return {
+        # A flat curve has no width: no offset of its range is any worse.
+        "log_profile_sigma": after.sigma_px.clamp_max(profile.range_px).log(),
+        "log_profile_offset": (after.offset_px.abs() + 0.05).log(),
+        "log_profile_contrast": (sides / lowest.after).log(),
+        "profile_offset_before": before.offset_px.abs(),
+        "log_profile_fall_before": (here.before / lowest.before).log(),
+        "outside_basin": torch.where(after.offset_px.isnan(), after.offset_px, (~after.in_basin).to(torch.float64)),
     }
 
 

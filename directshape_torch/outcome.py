@@ -72,6 +72,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
+        profile=disparity_profile(problem, initial, minimum.state),
     )
     return Outcome(
         minimum.state,
@@ -86,7 +87,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         fit_quality(problem, course),
         # The directions are mostly those of the depth, so its factor brings them to size.
         unseen.scaled(bundled_trust_model().sigma_factors[0]),
-        disparity_profile(problem, initial, minimum.state),
+        course.profile,
     )
 
 

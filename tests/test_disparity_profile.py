@@ -39,9 +39,7 @@ def far_street() -> Street:
 
 
 def begun(frames: FrameBatch, scene: Street) -> tuple[CarProblem, CarState]:
-    # Without a gain: it would be estimated at a state that the shifted images make wrong.
-    config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, gain=False))
-    return begun_problem(ellipsoid_prior(), frames, scene.detections, config)
+    return begun_problem(ellipsoid_prior(), frames, scene.detections)
 
 
 def photometric_of(problem: CarProblem) -> PhotometricTerm:

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from functools import cache
 
+import pytest
 import torch
 from helpers.problems import begun_problem
 from helpers.synthetic_scene import cached_street
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from directshape_torch import evidence
 from directshape_torch.covariance import covariance_of, covariance_xyz_yaw
+from directshape_torch.disparity_profile import DisparityProfile, disparity_profile, profile_offsets
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
@@ -29,7 +31,8 @@ def course_at_truth() -> tuple[CarProblem, Course]:
     xyz_yaw = covariance_xyz_yaw(covariance, state.T_obj_cam)
     hwl = prior.dimensions_and_derivative(state.code).hwl
     settled = torch.tensor([False, True])
-    return problem, Course(state, state, hwl, 2 * costs, costs, parts, covariance, xyz_yaw, settled)
+    profile = disparity_profile(problem, state, state)
+    return problem, Course(state, state, hwl, 2 * costs, costs, parts, covariance, xyz_yaw, settled, profile)
 
 
 def agreement(**changes: float) -> Agreement:
@@ -106,3 +109,31 @@ def test_what_does_not_exist_is_nan_and_touches_no_other_column() -> None:
     singular = columns(replace(course, covariance_xyz_yaw=torch.full((2, 4, 4), torch.nan).double()))
     assert singular["log_moved_sigmas"].isnan().all()
     assert singular["relative_decrease"].isfinite().all()
+
+
+def test_the_profile_by_hand() -> None:
+    """At the input 2 + (x - 2)^2, at the end 3 + 6 (x - 0.25)^2 of 100 pixels; the second car has no curve."""
+    _, course = course_at_truth()
+    x = profile_offsets()
+    before, after = (torch.stack([c, c * math.nan]) for c in (2 + (x - 2) ** 2, 3 + 6 * (x - 0.25) ** 2))
+    pixels = torch.full((2,), 100.0, dtype=torch.float64)
+    found = columns(replace(course, profile=DisparityProfile(x, before, after, pixels)))
+    expected = {
+        "log_profile_sigma": math.log(math.sqrt(6 / 1200)),
+        "log_profile_offset": math.log(0.3),
+        "log_profile_contrast": math.log((3 + 6 * 0.75**2) / 3),
+        "profile_offset_before": 2.0,
+        "log_profile_fall_before": math.log(3),
+        "outside_basin": 0.0,
+    }
+    for name, value in expected.items():
+        assert float(found[name][0]) == pytest.approx(value), name
+        assert math.isnan(found[name][1])
+
+
+def test_a_flat_profile_is_as_wide_as_its_range() -> None:
+    _, course = course_at_truth()
+    flat = torch.full((2, 25), 4.0, dtype=torch.float64)
+    found = columns(replace(course, profile=replace(course.profile, cost_before=flat, cost_after=flat)))
+    assert float(found["log_profile_sigma"][0]) == pytest.approx(math.log(3))
+    assert found["log_profile_contrast"].tolist() == [0, 0]
