@@ -50,14 +50,21 @@ def test_without_standard_deviations_there_is_no_such_term() -> None:
 
 
 def test_the_settings_say_the_same_as_the_detections() -> None:
-    origin = _start().T_cam_obj[:, :3, 3]
-    along = 0.02 * torch.hypot(origin[:, 0], origin[:, 2])
+    prior, scene = cached_street()
+    start = _start()
+    along = 0.02 * start.T_cam_obj[:, [0, 2], 3].norm(dim=1)
     rest = torch.tensor([0.1, math.inf, math.radians(4.0)], dtype=torch.float64).expand(2, 3)
-    given = _refined(_start(torch.cat([along[:, None], rest], dim=1)))
+    given = _start(torch.cat([along[:, None], rest], dim=1))
     settings = _with_sigmas(along_share=0.02, across_m=0.1, yaw_deg=4.0)
-    assert given.term_names[-1] == "pose"
-    torch.testing.assert_close(_refined(_start(), settings).T_cam_obj, given.T_cam_obj, rtol=0, atol=1e-9)
-    assert (given.T_cam_obj - _refined(_start()).T_cam_obj).abs().max() > 1e-3
+    away = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64).expand(2, 9)
+    costs = []
+    for detections, config in ((given, _with_sigmas()), (start, settings)):
+        problem, state = begun_problem(prior, scene.frames, detections, config)
+        assert problem.terms[-1].name == "pose"
+        costs.append(problem.term_costs(moved(state, away))[:, -1])
+    torch.testing.assert_close(costs[0], costs[1], rtol=1e-12, atol=0)
+    assert costs[0].min() > 1
+    assert (_refined(start, settings).T_cam_obj - _refined(start).T_cam_obj).abs().max() > 1e-3
 
 
 def test_the_detections_own_standard_deviations_come_first_and_shares_add_to_metres() -> None:
