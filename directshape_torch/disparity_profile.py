@@ -16,7 +16,13 @@ from torch import Tensor
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.errors import InputError
+from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.solver.normal_equations import Segments
+
+MAX_PIXELS = 100
+"""Pixels of each car that a curve is made of by default: enough for its shape at a third of the time."""
 
 # Two minima nearer than this are one with a dent.
 _APART_PX = 0.75
@@ -135,7 +141,11 @@ def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
 
 @torch.no_grad()
 def disparity_profile(
-    problem: CarProblem, before: CarState, after: CarState, offsets_px: Tensor | None = None
+    problem: CarProblem,
+    before: CarState,
+    after: CarState,
+    offsets_px: Tensor | None = None,
+    max_pixels: int = MAX_PIXELS,
 ) -> DisparityProfile:
     """The curves of B cars at two states, in the present stage of their problem.
 
@@ -143,14 +153,44 @@ def disparity_profile(
         problem: whose last stage has begun.
         before, after: input and end.
         offsets_px: (n,) evenly spaced, 0 among them; default -3 to 3 px in steps of 0.25.
+        max_pixels: of each car; of more, every second, third, ...
     """
     offsets = profile_offsets().to(after.code.device) if offsets_px is None else offsets_px
     for term in problem.terms:
         if isinstance(term, PhotometricTerm):
-            curves = [term.profile(problem.project(state), offsets) for state in (before, after)]
-            return DisparityProfile(offsets, curves[0], curves[1], term.support())
+            few = _thinned(term, max_pixels)
+            curves = [few.profile(_projected(problem, few.pixels, state), offsets) for state in (before, after)]
+            return DisparityProfile(offsets, curves[0], curves[1], few.support())
     nan = after.code.new_full((len(after.code), len(offsets)), torch.nan, dtype=torch.float64)
     return DisparityProfile(offsets, nan, nan, nan[:, 0])
+
+
+def _thinned(term: PhotometricTerm, max_pixels: int) -> PhotometricTerm:
+    """The term with at most so many pixels of each car, and with no pixels beside those of its set."""
+    fixed = term.fixed
+    if fixed is None:
+        raise RuntimeError("the photometric term has no pixel set before a stage begins: call begin_stage first")
+    counts = fixed.segments.counts
+    first = torch.cumsum(counts, 0) - counts
+    rank = torch.arange(len(fixed.object_index), device=counts.device) - first[fixed.object_index]
+    stride = (counts + max_pixels - 1) // max_pixels
+    chosen = (rank % stride[fixed.object_index].clamp_min(1) == 0).nonzero()[:, 0]
+    object_index = fixed.object_index[chosen]
+    few = fixed._replace(
+        pixel_index=torch.arange(len(chosen), device=counts.device),
+        object_index=object_index,
+        intensity_left=fixed.intensity_left[chosen],
+        rays_left=fixed.rays_left[chosen],
+        gradient_weight=fixed.gradient_weight[chosen],
+        neighbour_weight=fixed.neighbour_weight[chosen],
+        segments=Segments.from_sorted_index(object_index, len(counts)),
+    )
+    return replace(term, pixels=term.pixels.select(fixed.pixel_index[chosen]), fixed=few)
+
+
+def _projected(problem: CarProblem, pixels: PixelSamples, state: CarState) -> ProjectedState:
+    """The rays of these pixels alone; the term does not look at the right ones."""
+    return ProjectedState(problem.prior, state, pixels, pixels, problem.config.silhouette.samples_per_ray)
 
 
 def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:

@@ -220,3 +220,22 @@ def test_placing_and_blanking() -> None:
     assert placed.cost_before[0].isnan().all()
     assert placed.num_pixels[0].isnan()
     assert placed.where(torch.tensor([True, False])).cost_after.isnan().all()
+
+
+def test_all_pixels_are_the_terms_own_and_few_are_much_the_same() -> None:
+    problem, state = begun(far_street().frames, far_street())
+    term = photometric_of(problem)
+    every = disparity_profile(problem, state, state, max_pixels=10**6)
+    torch.testing.assert_close(every.cost_after, term.profile(problem.project(state), OFFSETS), rtol=1e-12, atol=0)
+    assert torch.equal(every.num_pixels, term.support())
+    few = disparity_profile(problem, state, state, max_pixels=60)
+    assert (few.num_pixels <= 60).all()
+    assert (few.num_pixels > 30).all()
+    torch.testing.assert_close(few.after.offset_px, every.after.offset_px, rtol=0, atol=0.05)
+
+
+def test_before_a_stage_there_is_no_curve() -> None:
+    scene = far_street()
+    problem, state = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).problem(scene.frames, scene.detections)
+    with pytest.raises(RuntimeError, match="begin_stage"):
+        disparity_profile(problem, state, state)
