@@ -61,8 +61,8 @@ class DirectShapeRefiner(nn.Module):
         """Refine every car of one or several frames.
 
         With `config.backward.mode` other than "none" pose and code of the result carry gradients to the masks, the
-        images, the prior's tensors, the term weights and the disparity that the frames bring, with "unroll" to the
-        input poses as well.
+        images, the prior's tensors, the term weights, the disparity that the frames bring and the detector's standard
+        deviations, with "unroll" or where those are given to the input poses as well.
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
