@@ -21,6 +21,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -44,6 +45,7 @@ from quality_calibration.report import (
 )
 
 from directshape_torch.config import AcceptanceConfig, RefinerConfig
+from directshape_torch.evidence import EVIDENCE_NAMES
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
@@ -83,11 +85,21 @@ def other_cars(args: argparse.Namespace) -> Observations:
     return Observations.load(kept)
 
 
-def fitted(cars: Observations, provenance: dict[str, object]) -> TrustModel:
+class HeadColumns(NamedTuple):
+    """The columns of evidence that the two heads read."""
+
+    better: tuple[str, ...] = columns.BETTER
+    not_worse: tuple[str, ...] = columns.NOT_WORSE
+
+
+DEFAULT_COLUMNS = HeadColumns()
+
+
+def fitted(cars: Observations, provenance: dict[str, object], read: HeadColumns = DEFAULT_COLUMNS) -> TrustModel:
     """The model of some cars."""
     scales = fit_sigmas(*in_view(cars))
-    better = fit_head(cars.evidence, cars.iou_after > cars.iou_before, columns.BETTER)
-    not_worse = fit_head(cars.evidence, ~is_worse(cars), columns.NOT_WORSE)
+    better = fit_head(cars.evidence, cars.iou_after > cars.iou_before, read.better)
+    not_worse = fit_head(cars.evidence, ~is_worse(cars), read.not_worse)
     return TrustModel(better, not_worse, scales.factors, scales.floors, provenance)
 
 
@@ -117,8 +129,9 @@ def run(args: argparse.Namespace) -> None:
         "settings": "configs/default.yaml",
         "worse_by": 0.05,
     }
-    model = fitted(cars, provenance)
-    held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}), test))
+    read = HeadColumns(tuple(args.better), tuple(args.not_worse))
+    model = fitted(cars, provenance, read)
+    held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}, read), test))
     everything = judged("rendered, all", cars, held_out)
     levels = np.array([source.partition(",")[0] for source in cars.source.tolist()])
     drawn = [level.name for level in LEVELS if (levels == level.name).any()]
@@ -180,6 +193,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="of the rig of --other")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--model", type=Path, metavar="FILE", help="default OUT/trust_model.json")
+    head = {"nargs": "+", "choices": EVIDENCE_NAMES, "metavar": "COLUMN"}
+    parser.add_argument("--better", default=columns.BETTER, help="evidence for it; default the bundled model's", **head)
+    parser.add_argument("--not-worse", default=columns.NOT_WORSE, help="the same", **head)
     parser.add_argument("--threads", type=int, default=1)
     return run_command(parser, run, arguments)
 

@@ -128,3 +128,11 @@ def test_cars_that_are_kept_make_model_report_and_pictures(tmp_path: Path) -> No
     assert "| kitti | 48 | not worse |" in report
     for name in ("trust_reliability.png", "trust_policy.png"):
         assert (tmp_path / "out" / name).stat().st_size > 5000
+
+
+def test_heads_read_the_columns_that_are_named() -> None:
+    read = calibrate_quality.HeadColumns(("log_profile_sigma", "turned"), ("outside_basin",))
+    model = calibrate_quality.fitted(simulated(600), {}, read)
+    assert model.better.columns == ("log_profile_sigma", "turned")
+    assert model.not_worse.columns == ("outside_basin",)
+    assert calibrate_quality.fitted(simulated(600), {}).better.columns == calibrate_quality.columns.BETTER
