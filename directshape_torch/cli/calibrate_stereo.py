@@ -53,6 +53,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--frames", nargs="+", metavar="ID", help="frame ids; default all that have such a file")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json", help="field to write")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="picture of the fit; default beside --out")
+    parser.add_argument(
+        "--against", nargs="+", type=Path, default=[], metavar="FILE.json", help="print the difference to other fields"
+    )
     parser.set_defaults(run=run)
 
 
@@ -104,6 +107,8 @@ def _run_without_truth(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace, field: DisparityField, observations: DisparityObservations) -> None:
+    from directshape_torch.calibration.compare_fields import compare_fields
+    from directshape_torch.geometry.disparity_field import DisparityField
     from directshape_torch.io.atomic_files import write_png
     from directshape_torch.visualize.disparity_field_picture import draw_disparity_field
 
@@ -112,6 +117,8 @@ def _write(args: argparse.Namespace, field: DisparityField, observations: Dispar
     field.save(args.out)
     write_png(picture, draw_disparity_field(field, observations.uv_left, observations.bias_px))
     print(f"wrote {args.out} and {picture}")
+    for path in args.against:
+        print(f"less {path}, where both have data: {compare_fields(field, DisparityField.load(path))}")
 
 
 def _observe(root: Path, source: TruthSource, wanted: list[str] | None) -> list[RigFrame]:

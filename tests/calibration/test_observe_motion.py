@@ -1,0 +1,117 @@
+"""From images to a field: a textured wall that comes nearer, read from a folder as the command does."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.calibration.motion_constraint import MotionConstraint
+from directshape_torch.calibration.observe_motion import observe_motion
+from directshape_torch.calibration.stereo_sequence import open_sequence
+from directshape_torch.cli import calibrate_stereo
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.atomic_files import write_png
+
+SIZE = (320, 160)
+FOCAL_PX, BASELINE_M, BIAS_PX = 300.0, 0.5, -0.4
+DEPTHS_M = (12.0, 11.0, 10.0)
+
+
+def texture(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Grey levels of a wall: waves of many directions, 10 to 40 px long in the image."""
+    generator = np.random.default_rng(0)
+    grey = np.full(x_m.shape, 128.0)
+    for angle, wave_m, phase in zip(
+        generator.uniform(0, np.pi, 24), generator.uniform(0.35, 1.4, 24), generator.uniform(0, 6, 24), strict=True
+    ):
+        grey += 12 * np.sin(2 * np.pi * (x_m * np.cos(angle) + y_m * np.sin(angle)) / wave_m + phase)
+    return np.repeat(grey.clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def write_sequence(root: Path) -> None:
+    """A left camera that drives towards a wall, and a right one whose disparity is off by `BIAS_PX`."""
+    u, v = np.meshgrid(np.arange(float(SIZE[0])), np.arange(float(SIZE[1])))
+    for number, depth in enumerate(DEPTHS_M):
+        y_m = (v - 80) * depth / FOCAL_PX
+        left = texture((u - 160) * depth / FOCAL_PX, y_m)
+        right = texture((u + BIAS_PX - 160) * depth / FOCAL_PX + BASELINE_M, y_m)
+        for folder, image in (("image_02", left), ("image_03", right)):
+            write_png(root / folder / f"{number:06d}.png", image)
+    P = f"{FOCAL_PX} 0 160 {{}} 0 {FOCAL_PX} 80 0 0 0 1 0"
+    (root / "calib.txt").write_text(f"P2: {P.format(0)}\nP3: {P.format(-FOCAL_PX * BASELINE_M)}\n")
+
+
+def test_a_wall_is_followed_to_where_it_is(tmp_path: Path) -> None:
+    """Three frames give steps 1, 2 and 1; the wall's pixels move away from the centre by the ratio of its depths."""
+    write_sequence(tmp_path)
+    constraints, size_wh = observe_motion(open_sequence(tmp_path), height_m=1.65)
+    assert size_wh == SIZE
+    tracks = [c.tracks for c in constraints if isinstance(c, MotionConstraint)]
+    assert len(tracks) == len(constraints) == 3
+    for track, ratio in zip(tracks, (12 / 11, 12 / 10, 11 / 10), strict=True):
+        assert len(track.uv_left) > 100
+        centre = torch.tensor([160.0, 80.0])
+        error = track.uv_later - (centre + ratio * (track.uv_left - centre))
+        # Windows move but do not grow with the wall, so single points err; they must not err all to one side.
+        assert float(error.norm(dim=1).median()) < 0.4
+        assert float(error.median(dim=0).values.abs().max()) < 0.05
+    true = FOCAL_PX * BASELINE_M / 12.0
+    assert float((tracks[0].disparity - true).median()) == pytest.approx(BIAS_PX, abs=0.05)
+
+
+def calibrate(root: Path, out: Path, *more: str) -> int:
+    parser = argparse.ArgumentParser()
+    calibrate_stereo.add_parser(parser.add_subparsers())
+    arguments = ["calibrate-stereo", "--data", str(root), "--from", "motion", "--out", str(out), *more]
+    args = parser.parse_args(arguments)
+    return int(args.run(args))
+
+
+def test_command_refuses_what_is_no_sequence(tmp_path: Path) -> None:
+    with pytest.raises(DataFormatError, match="image_02"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+    write_sequence(tmp_path)
+    with pytest.raises(InputError, match="000009"):
+        calibrate(tmp_path, tmp_path / "bias.json", "--frames", "000000", "000009")
+    with pytest.raises(InputError, match="at least two"):
+        calibrate(tmp_path, tmp_path / "bias.json", "--frames", "000000")
+    with pytest.raises(InputError, match="camera-height"):
+        calibrate(tmp_path, tmp_path / "bias.json", "--camera-height", "-1")
+    right = tmp_path / "image_03" / "000001.png"
+    right.write_bytes(right.read_bytes()[:500])
+    with pytest.raises(DataFormatError, match="000001"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+
+
+def test_one_wall_cannot_tell_bias_from_way(tmp_path: Path) -> None:
+    """All points at one depth: any constant bias is another length of the way, and the command says so."""
+    write_sequence(tmp_path)
+    with pytest.raises(InputError, match="determine the field"):
+        calibrate(tmp_path, tmp_path / "bias.json", "--camera-height", "0")
+
+
+@pytest.mark.skipif(
+    "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
+)
+def test_five_real_frames_come_near_the_field_of_ground_truth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
+    out = tmp_path / "bias.json"
+    assert calibrate(root / "tracking" / "0005", out, "--frames", *(f"{k:06d}" for k in range(5))) == 0
+    assert calibrate(root / "tracking" / "0005", out, "--frames", "000000", "000001", "--against", str(out)) == 0
+    printed = capsys.readouterr().out
+    assert "depth from motion and road" in printed
+    assert "where both have data: mean" in printed
+    field = DisparityField.load(out)
+    left, middle, right = field.bias(torch.tensor([[60.0, 180.0], [620.0, 180.0], [1180.0, 150.0]]).double()).tolist()
+    assert -2.3 < left < -1.0
+    assert -0.8 < middle < -0.2
+    assert -2.3 < right < -1.0
