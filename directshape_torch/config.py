@@ -125,7 +125,11 @@ class PhotometricConfig:
         truncated: residuals beyond lost_grey_levels (reflections, wrong matches) cost no more than a lost pixel.
         pixel_set: "hit" (the paper) or "hit_and_mask" (hit and p_fg > 0.5).
         min_ray_cosine: rays closer to the surface's tangent are grazing and lost.
-        gain: match the brightness of the two images, by one factor per car, at the start of each stage.
+        brightness: how that of the two images is matched, car by car at the start of each stage: "gain" (a factor),
+            "affine" (a factor and an offset, for cameras of different black level or contrast) or "none" (the paper).
+        patch: residuals of a neighbourhood of eight pixels as they are ("plain", the paper), without its brightness
+            ("zero_mean") or without its brightness and contrast ("normalised"), wherever in the image they change.
+        contrast_floor_grey_levels: standard deviation that a neighbourhood has at least for "normalised".
     """
 
     weight: float = 1.0
@@ -135,7 +139,9 @@ class PhotometricConfig:
     truncated: bool = False
     pixel_set: Literal["hit", "hit_and_mask"] = "hit_and_mask"
     min_ray_cosine: float = 0.1
-    gain: bool = True
+    brightness: Literal["none", "gain", "affine"] = "gain"
+    patch: Literal["plain", "zero_mean", "normalised"] = "plain"
+    contrast_floor_grey_levels: float = 5.0
 
 
 @dataclass(frozen=True)

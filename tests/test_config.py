@@ -47,7 +47,7 @@ def test_an_unknown_key_names_the_nearest(mapping: dict[str, Any], nearest: str)
         ({"silhouette": {"weight": True}}, "silhouette.weight: expected float, got True"),
         ({"silhouette": {"samples_per_ray": 3.5}}, "silhouette.samples_per_ray: expected int, got 3.5"),
         ({"silhouette": {"form": "sum"}}, "silhouette.form: expected one of closest_approach, product, got 'sum'"),
-        ({"photometric": {"gain": 1}}, "photometric.gain: expected bool, got 1"),
+        ({"photometric": {"truncated": 1}}, "photometric.truncated: expected bool, got 1"),
         ({"stages": {"a": 1}}, "stages: expected a list, got {'a': 1}"),
         ({"priors": {"dimensions_sigma_m": [0.1, 0.2]}}, "priors.dimensions_sigma_m: expected 3 entries"),
         ({"search": {"yaw_offsets_deg": ["x"]}}, "search.yaw_offsets_deg[0]: expected a number"),
@@ -112,10 +112,10 @@ def test_numbers_that_yaml_reads_as_text() -> None:
 
 def test_files_and_overrides(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
-    path.write_text("silhouette: {weight: 5}\nphotometric: {gain: false}\n", encoding="utf-8")
+    path.write_text("silhouette: {weight: 5}\nphotometric: {brightness: none}\n", encoding="utf-8")
     config = load_config(path, ["silhouette.weight=6"])
     assert config.silhouette.weight == 6
-    assert not config.photometric.gain
+    assert config.photometric.brightness == "none"
     path.write_text("", encoding="utf-8")
     assert load_config(path) == RefinerConfig()
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig
+from directshape_torch.energy.brightness import matched_brightness
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.term import ResidualRows, TermLinearisation
@@ -30,13 +31,12 @@ from directshape_torch.residuals.photometric import (
     photometric_residual,
     surface_slope,
 )
+from directshape_torch.residuals.photometric_patch import PatchForm, patch_derivative, patch_residual
 from directshape_torch.residuals.photometric_profile import disparity_residuals
 from directshape_torch.shape.raycast import attached_depth
 from directshape_torch.solver.normal_equations import Segments
 from directshape_torch.solver.problem import Stage
 
-# Matching brightness is for exposure and gain, which differ by a few percent; more is a wrong pose.
-_GAIN_BOUNDS = (0.8, 1.25)
 # Of a profile at once: 8 MB in single precision.
 _PROFILE_RESIDUALS = 2_000_000
 
@@ -60,7 +60,7 @@ class _Fixed(NamedTuple):
 
     pixel_index: Tensor  # (Q,) rows of the packed left pixels, ascending
     object_index: Tensor  # (Q,)
-    intensity_left: Tensor  # (Q, N) brought to the brightness of the right image
+    intensity_left: Tensor  # (Q, N) brought to the brightness of the right image, as far as the settings say
     rays_left: Tensor  # (Q, N, 3)
     gradient_weight: Tensor  # (Q,)
     neighbour_weight: Tensor  # (Q, N) zero for neighbours that the mask says are not on the car
@@ -107,12 +107,13 @@ class PhotometricTerm:
         if self.config.pixel_set == "hit_and_mask":
             candidates = candidates[self.pixels.foreground > 0.5]
         trial = replace(self, fixed=self._fix(candidates, images))
-        usable, residual = trial._usable_and_residual(projected)
+        depth, on_surface = trial._surface(projected)
+        plain = photometric_residual(*trial._residual_inputs(depth))
+        usable = trial._is_usable(on_surface, plain.inside, plain.uv_right)
         fixed = self._fix(candidates[usable], images)
-        if self.config.gain:
-            gain = self._gain(fixed, residual.residual[usable] + trial._require().intensity_left[usable])
-            fixed = fixed._replace(intensity_left=fixed.intensity_left * gain[fixed.object_index, None])
-        return replace(self, fixed=fixed)
+        left, right = fixed.intensity_left, (plain.residual + trial._require().intensity_left)[usable]
+        matched = matched_brightness(self.config.brightness, left, right, fixed.neighbour_weight, fixed.segments)
+        return replace(self, fixed=fixed._replace(intensity_left=matched))
 
     def cost(self, projected: ProjectedState) -> Tensor:
         fixed = self._require()
@@ -214,7 +215,7 @@ class PhotometricTerm:
         """Weighted Huber norms (n, Q) at offsets (n,) of the disparity."""
         moved = disparity_residuals(*self._residual_inputs(depth), offsets_px)
         usable = self._is_usable(on_surface, moved.inside, moved.uv_right)
-        return self._weighted_cost(self._norm(moved.residual).rho, usable)
+        return self._weighted_cost(self._norm(patch_residual(*self._patch_inputs(moved.residual))).rho, usable)
 
     def support(self) -> Tensor:
         """Pixels (B,) of the stage's pixel set, float64."""
@@ -295,15 +296,17 @@ class PhotometricTerm:
         on_car = self.mask_left[self.cars.detection_row[object_index][:, None], v, u] > 0.5
         return (inside & on_car).to(uv.dtype)
 
-    def _gain(self, fixed: _Fixed, intensity_right: Tensor) -> Tensor:
-        """Brightness (B,) of the right image relative to the left one, over each car's pixel set."""
-        left = fixed.segments.sum((fixed.neighbour_weight * fixed.intensity_left).sum(dim=1))
-        right = fixed.segments.sum((fixed.neighbour_weight * intensity_right).sum(dim=1))
-        gain = torch.where(left > 0, right / torch.where(left > 0, left, torch.ones_like(left)), torch.ones_like(left))
-        return gain.clamp(*_GAIN_BOUNDS).to(fixed.intensity_left.dtype)
-
     def _residual(self, depth: Tensor) -> PhotometricResidual:
-        return photometric_residual(*self._residual_inputs(depth))
+        plain = photometric_residual(*self._residual_inputs(depth))
+        patches = self._patch_inputs(plain.residual)
+        J_residual_depth = patch_derivative(plain.J_residual_depth, *patches)
+        return plain._replace(residual=patch_residual(*patches), J_residual_depth=J_residual_depth)
+
+    def _patch_inputs(self, residual: Tensor) -> tuple[Tensor, Tensor, Tensor, PatchForm, float]:
+        """Arguments of `patch_residual`, in its order."""
+        fixed, config = self._require(), self.config
+        form, floor = config.patch, config.contrast_floor_grey_levels
+        return residual, fixed.intensity_left, fixed.neighbour_weight, form, floor
 
     def _residual_inputs(self, depth: Tensor) -> _ResidualInputs:
         fixed = self._require()

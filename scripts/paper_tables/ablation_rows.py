@@ -64,7 +64,7 @@ ROWS: tuple[Row, ...] = (
     Row("terms", "silhouette only", Settings(("photometric.weight=0",))),
     Row("terms", "photometric only", Settings(("silhouette.weight=0",))),
     Row("terms", "the paper's product silhouette", Settings(("silhouette.form=product",))),
-    Row("terms", "one brightness for both images", Settings(("photometric.gain=false",))),
+    Row("terms", "one brightness for both images", Settings(("photometric.brightness=none",))),
     Row("terms", "images and point cloud", Settings(("method=combined",))),
     Row("priors", "no priors", Settings(_NO_PRIORS)),
     Row("priors", "no shape prior", Settings(("priors.shape_weight=0",))),

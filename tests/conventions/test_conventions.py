@@ -303,7 +303,7 @@ def test_23_residuals_are_predicted_minus_observed() -> None:
     assert height_prior(T, vector(0, -1, 0)[None], vector(1.65), 0).residual > 0
     prior, scene = cached_street()
     darker_left = replace(scene.frames, images_left=scene.frames.images_left - 0.1)
-    config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, gain=False))
+    config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, brightness="none"))
     problem, state = begun_problem(prior, darker_left, scene.detections, config)
     term = next(t for t in problem.terms if isinstance(t, PhotometricTerm))
     _, residual = term._usable_and_residual(problem.project(CarState(state.T_obj_cam, scene.code)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -212,3 +212,27 @@ def test_gain_brings_the_left_image_to_the_brightness_of_the_right_one() -> None
     assert fixed is not None
     u, v = term.pixels.uv[fixed.pixel_index].long().unbind(1)
     torch.testing.assert_close(fixed.intensity_left[:, 4], level[0, v, u])
+
+
+@pytest.mark.parametrize("change", ["darker", "flatter"])
+def test_forms_that_do_not_see_a_change_of_the_right_image_have_the_same_gradient(change: str) -> None:
+    """20 grey levels darker, or 0.9 of the contrast about 100: the paper's residuals see both, the others not."""
+    prior, scene = cached_street()
+    grey = 255 * scene.frames.images_right
+    changed = grey - 20 if change == "darker" else 0.9 * grey + 10
+    assert 0 <= float(changed.min()) <= float(changed.max()) <= 255
+    frames = replace(scene.frames, images_right=changed / 255)
+
+    def off_by(**photometric: Any) -> float:
+        settings = replace(DEFAULT, photometric=replace(DEFAULT.photometric, **{"brightness": "none", **photometric}))
+        g = []
+        for each in (scene.frames, frames):
+            problem, state = begun_problem(prior, each, disturbed(scene.detections, 0.05, 0.02), settings)
+            g.append(_photometric(problem).linearise(problem.project(state)).gradient)
+        return float((g[1] - g[0]).norm() / g[0].norm())
+
+    assert off_by() > 0.1
+    # Residuals after the match are those of the right image, so its contrast is a factor of them, squared in g.
+    assert off_by(brightness="affine") < (1e-6 if change == "darker" else 0.2)
+    assert off_by(patch="normalised", contrast_floor_grey_levels=0.1) < 1e-2
+    assert (off_by(patch="zero_mean") < 1e-9) is (change == "darker")

@@ -36,7 +36,7 @@ def two_cars() -> Street:
     return cached_street()[1]
 
 
-@pytest.mark.parametrize("config", ["default", "truncated", "paper"])
+@pytest.mark.parametrize("config", ["default", "truncated", "paper", "normalised"])
 def test_at_no_offset_it_is_the_cost(config: str) -> None:
     problem, state = begun(two_cars().frames, disturbed(two_cars().detections), config)
     projected, term = problem.project(state), photometric_of(problem)

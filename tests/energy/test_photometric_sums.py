@@ -13,7 +13,7 @@ from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.photometric_term import PhotometricTerm
 
 
-@pytest.mark.parametrize("config", ["default", "truncated"])
+@pytest.mark.parametrize("config", ["default", "truncated", "normalised"])
 def test_sums_over_pixels_and_neighbours(config: str) -> None:
     """c = lambda / sum of neighbour weights; w of each pixel and neighbour; Huber's rho' and rho' / r by hand."""
     prior, scene = cached_street()

@@ -30,12 +30,13 @@ DEFAULT = replace(
 PAPER = replace(
     DEFAULT,
     silhouette=replace(DEFAULT.silhouette, form="product"),
-    photometric=replace(DEFAULT.photometric, pixel_set="hit", gain=False, truncated=False),
+    photometric=replace(DEFAULT.photometric, pixel_set="hit", brightness="none", truncated=False),
     priors=replace(DEFAULT.priors, tilt_form="cosine", tilt_weight=1e7, dimensions_weight=0.0),
     sampling=replace(DEFAULT.sampling, occlusion_order="box_bottom"),
 )
 TRUNCATED = replace(DEFAULT, photometric=replace(DEFAULT.photometric, truncated=True, lost_grey_levels=20.0))
-CONFIGS = {"default": DEFAULT, "paper": PAPER, "truncated": TRUNCATED}
+NORMALISED = replace(DEFAULT, photometric=replace(DEFAULT.photometric, patch="normalised", brightness="affine"))
+CONFIGS = {"default": DEFAULT, "paper": PAPER, "truncated": TRUNCATED, "normalised": NORMALISED}
 
 
 def begun_problem(
