@@ -22,7 +22,9 @@ def search_start(problem: CarProblem, initial: CarState, cars: CarBatch, config:
     problem.begin_stage(problem.stages()[0], initial)
     best, best_cost = initial, problem.cost(initial)
     for offset_px in config.disparity_offsets_px:
-        best, best_cost = _keep_cheaper(problem, best, best_cost, move_by_disparity(initial, cars.focal_baseline, offset_px))
+        best, best_cost = _keep_cheaper(
+            problem, best, best_cost, move_by_disparity(initial, cars.focal_baseline, offset_px)
+        )
     base = best
     for offset_deg in config.yaw_offsets_deg:
         best, best_cost = _keep_cheaper(problem, best, best_cost, turn(base, math.radians(offset_deg)))

@@ -46,7 +46,7 @@ class LogisticHead:
         chosen = evidence[:, [EVIDENCE_NAMES.index(name) for name in self.columns]]
         new = chosen.new_tensor
         standard = ((chosen - new(self.means)) / new(self.scales)).clamp(-_KNOWN_SIGMAS, _KNOWN_SIGMAS)
-        # A product and a sum rather than a matrix product, and an exponential rather than PyTorch's sigmoid, which rounds
+        # A product and a sum rather than a matrix product, an exponential rather than PyTorch's sigmoid, which rounds
         # another way at the end of a batch: equal bits whatever its size.
         log_odds = self.bias + (torch.nan_to_num(standard, nan=0.0) * new(self.weights)).sum(dim=1)
         return 1 / (1 + torch.exp(-log_odds))
