@@ -4,7 +4,8 @@
     directshape calibrate-stereo --data $K --from disparity --frames 007322 --out bias.json
     python scripts/calibrate_quality.py --data $R --exact $R/detections/gt --masks $R/training/masks $R/masks_degraded
         --seeds 0 1 2 --other $K --other-detections $K/detections/noisy_stereo --other-masks $K/training/masks
-        --stereo-bias bias.json --out out/trust --model directshape_torch/assets/trust_model.json
+        --stereo-bias bias.json --other-disparity-sigma-px 0 0.1
+        --out out/trust --model directshape_torch/assets/trust_model.json
 
 Detections of three noise levels are drawn around exact ones and refined with each kind of masks, every result being
 returned. Outcome: did the bird's-eye overlap of the box with the label grow, and did it not fall by more than 0.05. Two
@@ -44,7 +45,7 @@ from quality_calibration.report import (
     sigma_line,
 )
 
-from directshape_torch.config import AcceptanceConfig, RefinerConfig
+from directshape_torch.config import AcceptanceConfig, RefinerConfig, RigConfig
 from directshape_torch.evidence import EVIDENCE_NAMES
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -58,9 +59,9 @@ USUAL_LEVELS = ("stereo", "mono")
 STRICT = Thresholds(0.8, 0.9)
 
 
-def refiner() -> DirectShapeRefiner:
-    """The default settings, every result returned."""
-    return DirectShapeRefiner(config=replace(RefinerConfig(), acceptance=EVERYTHING))
+def refiner(disparity_sigma_px: float = 0.0) -> DirectShapeRefiner:
+    """The default settings, every result returned, for a rig that is off by so much."""
+    return DirectShapeRefiner(config=replace(RefinerConfig(), acceptance=EVERYTHING, rig=RigConfig(disparity_sigma_px)))
 
 
 def development_cars(args: argparse.Namespace) -> Observations:
@@ -75,13 +76,13 @@ def development_cars(args: argparse.Namespace) -> Observations:
     return Observations.joined(parts)
 
 
-def other_cars(args: argparse.Namespace) -> Observations:
-    """Refined cars of the real frames."""
-    kept = args.out / "cars_other.npz"
+def other_cars(args: argparse.Namespace, disparity_sigma_px: float) -> Observations:
+    """Refined cars of the real frames, judged as those of a rig that is off by so much."""
+    kept = args.out / f"cars_other_{disparity_sigma_px:g}px.npz"
     if not kept.is_file():
         field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
         dataset = KittiStereoDataset(args.other, args.other_detections, args.other_masks, disparity_field=field)
-        observe_dataset(dataset, refiner(), args.other.name).save(kept)
+        observe_dataset(dataset, refiner(disparity_sigma_px), args.other.name).save(kept)
     return Observations.load(kept)
 
 
@@ -116,6 +117,16 @@ def judged(name: str, cars: Observations, predicted: Array) -> Judged:
     return Judged(name, cars, predicted[:, 0], predicted[:, 1], in_view(cars)[0], predicted[:, 2:])
 
 
+def judged_others(args: argparse.Namespace, model: TrustModel) -> list[Judged]:
+    """The real frames, once for each disparity error that the rig may be known to have."""
+    entries = []
+    for sigma_px in args.other_disparity_sigma_px:
+        cars = other_cars(args, sigma_px)
+        name = args.other.name + (f", rig off by {sigma_px:g} px" if sigma_px else "")
+        entries.append(judged(name, cars, predictions(model, cars)))
+    return entries
+
+
 def run(args: argparse.Namespace) -> None:
     """Refine, fit, judge and write."""
     torch.set_num_threads(args.threads)
@@ -139,7 +150,7 @@ def run(args: argparse.Namespace) -> None:
     usual = everything.where(np.isin(levels, USUAL_LEVELS), " and ".join(USUAL_LEVELS))
     chosen = choose_thresholds(usual.observations, usual.probabilities)
     nested = policy(usual.observations, kept_by_nested_choice(usual))
-    real = [judged(args.other.name, other := other_cars(args), predictions(model, other))] if args.other else []
+    real = judged_others(args, model) if args.other else []
     model.save(args.model or args.out / "trust_model.json")
     report = "\n\n".join(
         [
@@ -191,6 +202,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--other-detections", type=Path, metavar="DIR")
     parser.add_argument("--other-masks", type=Path, metavar="DIR")
     parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="of the rig of --other")
+    parser.add_argument(
+        "--other-disparity-sigma-px",
+        type=float,
+        nargs="+",
+        default=[0.0],
+        metavar="PX",
+        help="rig.disparity_sigma_px of --other, judged with each (default 0)",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--model", type=Path, metavar="FILE", help="default OUT/trust_model.json")
     head = {"nargs": "+", "choices": EVIDENCE_NAMES, "metavar": "COLUMN"}
