@@ -1,7 +1,7 @@
 """The Jacobian laboratory: every derivative of the energy three ways, in named regimes, with real image content.
 
-Every term (both silhouettes in both forms, photometric, shape, height, tilt in both forms, dimensions, pose) and every
-factor of the chain has its hand-derived Jacobian compared with autograd and with central differences (Richardson
+Every term (both silhouettes in both forms, photometric in two, shape, height, tilt in both forms, dimensions, pose) and
+every factor of the chain has its hand-derived Jacobian compared with autograd and with central differences (Richardson
 extrapolation over a sweep of steps). Entries whose difference stencil contains a kink of the function are excluded by
 a stated rule and counted. Exit code 1 when a bound is broken: analytic against autograd 1e-9, against numeric 1e-6,
 relative to the norm of the row, float64; less than 2 percent excluded in the typical regime.

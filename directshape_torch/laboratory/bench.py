@@ -25,7 +25,7 @@ from directshape_torch.solver.problem import Stage
 
 TERM_NAMES = (
     "silhouette_left", "silhouette_right", "silhouette_left_product", "silhouette_right_product", "photometric",
-    "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
+    "photometric_normalised", "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
 )  # fmt: skip
 
 # Brackets shrink superlinearly: more iterations than float64 can use; Newton's steps from there are quadratic.
@@ -59,7 +59,7 @@ class Bench:
     Attributes:
         regime: they were drawn from.
         problem: of these cars, its terms those of the default settings and the pose prior, the regime's stage begun.
-        terms: by the laboratory's names, the forms of the paper among them.
+        terms: by the laboratory's names, in all forms, the paper's among them.
         state: of the B cars.
         projected: at that state, with roots as precise as the dtype allows.
         cars: constants of the cars.
@@ -113,8 +113,12 @@ class Bench:
         stage_config = config.stages[regime.stage]
         stage = Stage(stage_config.contour_width_px, stage_config.image_level, stage_config.max_iterations)
         observation = _choose(observation, regime, prior, drawn.state, cars, stage, config, pixels_per_car, generator)
-        product = replace(config, silhouette=replace(config.silhouette, form="product"))
-        product = replace(product, priors=replace(config.priors, tilt_form="cosine"))
+        other_forms = replace(
+            config,
+            silhouette=replace(config.silhouette, form="product"),
+            photometric=replace(config.photometric, patch="normalised", brightness="affine"),
+            priors=replace(config.priors, tilt_form="cosine"),
+        )
         problem, other = (
             CarProblem(
                 prior,
@@ -123,7 +127,7 @@ class Bench:
                 observation.right,
                 c,
             )
-            for c in (config, product)
+            for c in (config, other_forms)
         )
         # Pixel sets are fixed where a refinement would begin, so that rows get lost on the way to the state.
         start = CarState(se3.inverse(drawn.detections.T_cam_obj), drawn.state.code)
@@ -139,11 +143,13 @@ def _with_pose_prior(config: RefinerConfig) -> RefinerConfig:
     return replace(config, priors=replace(config.priors, **sigmas))
 
 
-def _named(problem: CarProblem, paper: CarProblem) -> dict[str, Term]:
+def _named(problem: CarProblem, other_forms: CarProblem) -> dict[str, Term]:
     by_name = {("tilt_normal" if t.name == "tilt" else t.name): t for t in problem.terms}
-    for term in paper.terms:
+    for term in other_forms.terms:
         if term.name.startswith("silhouette"):
             by_name[f"{term.name}_product"] = term
+        elif term.name == "photometric":
+            by_name["photometric_normalised"] = term
         elif term.name == "tilt":
             by_name["tilt_cosine"] = term
     return {name: by_name[name] for name in TERM_NAMES}

@@ -108,7 +108,10 @@ def _photometric_branches(
     ids = {rule: x.repeat_interleave(neighbours, dim=0) for rule, x in per_pixel.items()}
     size = fixed.images.sizes[term.cars.frame_index[fixed.object_index]][:, None]
     cells = bilinear_cell(photometric_pixels_right(term, root.depth), size)
-    return ids | {BILINEAR: cells.flatten(0, 1), LOST: rows.usable.long()}
+    # Where the mean is taken off, each row depends on the cells of the whole neighbourhood.
+    own = cells.flatten(0, 1)
+    met = own if term.config.patch == "plain" else cells.flatten(1).repeat_interleave(neighbours, dim=0)
+    return ids | {BILINEAR: met, LOST: rows.usable.long()}
 
 
 def photometric_pixels_right(term: PhotometricTerm, depth: Tensor) -> Tensor:

@@ -115,6 +115,11 @@ TARGETS: dict[str, Target] = {
         ("surface_slope", "depth_state_jacobian", "photometric_residual"),
         ("tests/residuals/test_photometric.py",),
     ),
+    "photometric_patch": Target(
+        "directshape_torch/residuals/photometric_patch.py",
+        ("patch_residual", "patch_derivative", "_mean", "_centred", "_contrast"),
+        ("tests/residuals/test_photometric_patch.py",),
+    ),
     "priors": Target(
         "directshape_torch/residuals/priors.py",
         (
