@@ -12,7 +12,11 @@ scatter is worth; RMS, and MAD, which forgives a constant (labels that stand 4 c
 plane is the one that the refinement would use: files, or with a field the corrected stereo pair. A measured height is
 worth building in only where the figures under `local` are clearly below those under `plane`.
 
-    python scripts/judge_local_ground.py --data ROOT --detections DIR --masks DIR [--stereo-bias bias.json]
+    python scripts/judge_local_ground.py --data ROOT --detections DIR --masks DIR [--stereo-bias bias.json] [--refine]
+
+With --refine every frame is refined with its plane, and once for each car with the plane moved to the car's local
+(drawn towards 0) and to its true height, of which that car's box is kept: the last row is what
+perfect heights are worth.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +33,7 @@ from command_line import run_command
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import height_above
@@ -36,6 +41,8 @@ from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.io.atomic_files import write_text
 from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import KittiBoxes
 from directshape_torch.stereo_matching.disparity import match_disparity
 from directshape_torch.stereo_matching.points import points_from_disparity
 
@@ -58,6 +65,7 @@ class JudgedCar:
     """Heights above the frame's plane, metres."""
 
     frame_id: str
+    detection: int
     label_line: int
     depth_m: float
     lateral_m: float
@@ -98,7 +106,9 @@ def judge_frame(loaded: LoadedFrame, labels: Sequence[KittiObject]) -> list[Judg
         truth = float(height_above(position, normal, offset))
         depth, lateral = float(position[2]), float(position[0])
         judged.append(
-            JudgedCar(frame.frame_ids[0], label.line_number, depth, lateral, truth, float(local), sigma, len(found))
+            JudgedCar(
+                frame.frame_ids[0], nearest, label.line_number, depth, lateral, truth, float(local), sigma, len(found)
+            )
         )
     return judged
 
@@ -152,6 +162,43 @@ def _in_ring(points_cam: Tensor, T_cam_obj: Tensor, dimensions_hwl: Tensor) -> T
     return (beyond > RING_M[0]) & (beyond < RING_M[1])
 
 
+def refined_overlaps(
+    loaded: LoadedFrame, cars: Sequence[JudgedCar], refiner: DirectShapeRefiner
+) -> list[tuple[float, ...]]:
+    """BEV and 3D IoU with the label of each car: refined on the plane, at its local and at its true height."""
+    labels = {o.line_number: o for o in loaded.labels or ()}
+    common = refiner(loaded.frame, loaded.detections).boxes()
+    overlaps = []
+    for car in cars:
+        truth = _box(labels[car.label_line])
+        row = list(_overlap(common, car.detection, truth))
+        for height_m in (car.shrunk_m, car.truth_m):
+            ground = replace(loaded.frame.ground, offset=loaded.frame.ground.offset - height_m)
+            boxes = refiner(replace(loaded.frame, ground=ground), loaded.detections).boxes()
+            row += _overlap(boxes, car.detection, truth)
+        overlaps.append(tuple(row))
+    return overlaps
+
+
+def _box(label: KittiObject) -> Tensor:
+    return torch.tensor([[*label.location_ref, *label.hwl, label.rotation_y]], dtype=torch.float64)
+
+
+def _overlap(boxes: KittiBoxes, index: int, truth: Tensor) -> tuple[float, float]:
+    parts = (boxes.location_ref[index], boxes.dimensions_hwl[index], boxes.rotation_y[index : index + 1])
+    box = torch.cat(parts)[None].double()
+    return float(bev_iou(bev_boxes(box), bev_boxes(truth))[0]), float(iou_3d(box, truth)[0])
+
+
+def overlap_report(overlaps: Sequence[tuple[float, ...]]) -> str:
+    """Means over the cars."""
+    means = np.array(overlaps).mean(axis=0)
+    lines = [f"refined, {len(overlaps)} cars             mean BEV IoU   mean 3D IoU"]
+    for k, name in enumerate(("plane", "local height, shrunk", "true height")):
+        lines.append(f"  {name:<28}{means[2 * k]:10.3f}    {means[2 * k + 1]:10.3f}")
+    return "\n".join(lines) + "\n"
+
+
 def _line(name: str, cars: Sequence[JudgedCar]) -> str:
     truth, local, shrunk = (np.array([getattr(c, key) for c in cars]) for key in ("truth_m", "local_m", "shrunk_m"))
     errors = (truth, truth - local, truth - shrunk)
@@ -191,17 +238,24 @@ def run(args: argparse.Namespace) -> int:
     field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
     dataset = KittiStereoDataset(args.data, args.detections, args.masks, frames=args.frames, disparity_field=field)
     cars: list[JudgedCar] = []
+    overlaps: list[tuple[float, ...]] = []
+    refiner = DirectShapeRefiner() if args.refine else None
     num_labels = 0
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
         labels = counted_labels(loaded)
         num_labels += len(labels)
-        cars += judge_frame(loaded, labels)
+        judged = judge_frame(loaded, labels)
+        cars += judged
+        if refiner is not None and judged:
+            overlaps += refined_overlaps(loaded, judged, refiner)
     if not cars:
         print("no car could be measured", file=sys.stderr)
         return 1
     print(f"{len(cars)} of {num_labels} counted labels in {len(dataset)} frames have a detection and points near by")
     print(report(cars), end="")
+    if overlaps:
+        print(overlap_report(overlaps), end="")
     if args.csv is not None:
         write_text(args.csv, csv_text(cars))
     return 0
@@ -215,6 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--masks", type=Path, required=True, metavar="DIR", help="instance masks, as for refine")
     parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all that have detections")
+    parser.add_argument("--refine", action="store_true", help="refine at each height too (minutes)")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each car")
     return run_command(parser, run, arguments)
 

@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.calibration.zoomed_patches import align_zoomed
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.se3 import from_rotation_translation
+from directshape_torch.geometry.se3 import from_rotation_translation, transform
 from directshape_torch.image.gradients import grey_levels
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.disparity import match_disparity
@@ -25,7 +26,7 @@ _CORNER_QUALITY = 0.02
 _CORNER_DISTANCE_PX = 5
 _BORDER_PX = 12
 _WINDOW_PX = 11
-_LARGEST_RETURN_ERROR_PX = 0.15
+_LARGEST_RETURN_ERROR_PX = 0.5
 _RANSAC_TOLERANCE_PX = 2.0
 _FEWEST_TRACKS = 50
 # A car that stands shows no depth by its motion.
@@ -145,20 +146,27 @@ def track_features(
         if motion is None:
             break
         if step in STEPS and float(np.linalg.norm(motion[1])) >= _SMALLEST_MOTION_M:
-            tracked.append(_tracked(features, uv_later, found, motion))
+            tracked.append(_tracked(features, grey_later, uv_later, found, motion))
         foretold = _foretell(features.points_cam, motion, (step + 1) / step, camera)
     return tracked
 
 
 def _tracked(
     features: StereoFeatures,
+    grey_later: NDArray[np.uint8],
     uv_later: Tensor,
     found: Tensor,
     motion: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> TrackedFeatures:
+    """The points that were found, aligned anew with the size that they have in the later image."""
     T_later_cam = from_rotation_translation(torch.from_numpy(_rotation(motion[0])), torch.from_numpy(motion[1]))
-    uv_left, disparity, row_shift = (t[found] for t in (features.uv_left, features.disparity, features.row_shift))
-    return TrackedFeatures(uv_left, disparity, row_shift, uv_later[found], T_later_cam)
+    depth_later = transform(T_later_cam, features.points_cam)[:, 2]
+    zoom = (features.points_cam[:, 2] / depth_later.clamp_min(0.5))[found]
+    aligned, reliable = align_zoomed(features.grey_left, grey_later, features.uv_left[found], uv_later[found], zoom)
+    uv_left, disparity, row_shift = (
+        t[found][reliable] for t in (features.uv_left, features.disparity, features.row_shift)
+    )
+    return TrackedFeatures(uv_left, disparity, row_shift, aligned[reliable], T_later_cam)
 
 
 def _follow(

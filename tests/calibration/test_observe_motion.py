@@ -59,9 +59,7 @@ def test_a_wall_is_followed_to_where_it_is(tmp_path: Path) -> None:
         assert len(track.uv_left) > 100
         centre = torch.tensor([160.0, 80.0])
         error = track.uv_later - (centre + ratio * (track.uv_left - centre))
-        # Windows move but do not grow with the wall, so single points err; they must not err all to one side.
-        assert float(error.norm(dim=1).median()) < 0.4
-        assert float(error.median(dim=0).values.abs().max()) < 0.05
+        assert float(error.norm(dim=1).median()) < 0.05
     true = FOCAL_PX * BASELINE_M / 12.0
     assert float((tracks[0].disparity - true).median()) == pytest.approx(BIAS_PX, abs=0.05)
 
