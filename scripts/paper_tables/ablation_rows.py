@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from paper_tables.settings import DEFAULT, TRUSTED, Settings
+from paper_tables.settings import DEFAULT, TRUSTED, Exposure, Settings
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,14 @@ def _pose_sigmas(along_share: float, across_m: float, vertical_m: float, yaw_deg
     return Settings(tuple(f"priors.pose_sigma_{name}={value:g}" for name, value in sigmas.items()))
 
 
+_PHOTOMETRY = {
+    "factor and offset a car": ("photometric.brightness=affine",),
+    "neighbourhoods without brightness": ("photometric.patch=zero_mean",),
+    "neighbourhoods without brightness and contrast": ("photometric.patch=normalised",),
+}
+_EXPOSURES: tuple[Exposure, ...] = ("flatter", "vignetted")
+
+
 def _points(number: int) -> Settings:
     return Settings((f"sampling.min_pixels={number}", f"sampling.max_pixels={number}"))
 
@@ -66,6 +74,12 @@ ROWS: tuple[Row, ...] = (
     Row("terms", "the paper's product silhouette", Settings(("silhouette.form=product",))),
     Row("terms", "one brightness for both images", Settings(("photometric.brightness=none",))),
     Row("terms", "images and point cloud", Settings(("method=combined",))),
+    *(Row("photometry", name, Settings(overrides)) for name, overrides in _PHOTOMETRY.items()),
+    *(
+        Row(f"right image {exposure}", name, Settings(overrides, exposure=exposure))
+        for exposure in _EXPOSURES
+        for name, overrides in {"a factor a car (default)": (), **_PHOTOMETRY}.items()
+    ),
     Row("priors", "no priors", Settings(_NO_PRIORS)),
     Row("priors", "no shape prior", Settings(("priors.shape_weight=0",))),
     Row("priors", "no prior on dimensions (the paper)", Settings(("priors.dimensions_weight=0",))),

@@ -27,6 +27,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
 from paper_tables.data_sets import DataSet
+from paper_tables.exposures import ExposedDataset
 from paper_tables.mask_choices import masks_for
 from paper_tables.priors import prior_for
 from paper_tables.settings import Settings
@@ -98,12 +99,13 @@ class Refinery:
         prior = prior_for(settings.prior, self.meshes, self.out / "priors")
         refiner = DirectShapeRefiner(prior, load_config(settings.config, settings.all_overrides))
         refiner = refiner.to(find_device(self.device))
-        dataset = KittiStereoDataset(
+        dataset = ExposedDataset(
             data_set.root,
             detections,
             masks_for(data_set, detections, settings.masks),
             frames=frame_ids,
             disparity_field=self._field(data_set, settings),
+            exposure=settings.exposure,
         )
         out = self._folder(data_set, detections, settings, dataset, refiner)
         key = out, tuple(frame_ids)
@@ -134,9 +136,9 @@ class Refinery:
         dataset: KittiStereoDataset,
         refiner: DirectShapeRefiner,
     ) -> Path:
-        """Other settings, prior, field or masks are another folder."""
+        """Other settings, prior, field, masks or exposure are another folder."""
         manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
-        made_of = [manifest.package_version, manifest.config, manifest.sha256, settings.masks]
+        made_of = [manifest.package_version, manifest.config, manifest.sha256, settings.masks, settings.exposure]
         digest = hashlib.sha256(json.dumps(made_of, sort_keys=True, default=list).encode()).hexdigest()[:8]
         return self.out / "runs" / data_set.name / detections.name / f"{settings.slug}-{digest}"
 

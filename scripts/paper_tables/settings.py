@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Masks = Literal["true", "left", "boxes", "degraded"]
+Exposure = Literal["true", "flatter", "vignetted"]
 
 _ACCEPT_ALL = ("acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0")
 
@@ -22,6 +23,8 @@ class Settings:
         masks: "true" (the data set's own), "left" (those of the left images alone), "boxes" (the detector's 2D boxes,
             filled) or "degraded".
         with_field: use the residual disparity field where there is one.
+        exposure: of the right images: "true" (as they are), "flatter" (0.8 of the contrast, 25 grey levels brighter) or
+            "vignetted" (as they are at the left border, 0.65 of it at the right one); see `exposures`.
         every_result: return every result, so that rows compare methods and not whom they trust; False leaves the
             acceptance to the configuration, which may return the input instead.
     """
@@ -31,6 +34,7 @@ class Settings:
     prior: str = "pca"
     masks: Masks = "true"
     with_field: bool = True
+    exposure: Exposure = "true"
     every_result: bool = True
 
     @property
@@ -50,6 +54,7 @@ class Settings:
         parts += [self.prior] if self.prior != "pca" else []
         parts += [self.masks] if self.masks != "true" else []
         parts += [] if self.with_field else ["no-field"]
+        parts += [self.exposure] if self.exposure != "true" else []
         parts += [] if self.every_result else ["policy"]
         return re.sub(r"[^\w.]+", "-", "-".join(parts)).strip("-")[:60]
 

@@ -11,10 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import reproduce_tables as script
+import torch
 from helpers.exact_disparity import exact_disparity
 from helpers.kitti_folder import CODE, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
-from paper_tables import ablation_rows, ablation_table, data_sets, paper_rows, pose_table, settings, shape_table
+from paper_tables import (
+    ablation_rows,
+    ablation_table,
+    data_sets,
+    exposures,
+    paper_rows,
+    pose_table,
+    settings,
+    shape_table,
+)
 from paper_tables import simulated_detector as simulator
 
 from directshape_torch.config_files import load_config
@@ -27,8 +37,6 @@ from directshape_torch.refiner import DirectShapeRefiner
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A street in two frames, one of whose two cars is 25 px high; one detector named `data`, and true disparities."""
-    import torch
-
     root = tmp_path_factory.mktemp("street")
     frames = ("000000", "000001")
     prior = write_data_set(root, frames)
@@ -68,6 +76,25 @@ def test_every_row_is_a_valid_setting() -> None:
 def test_rows_that_ask_for_nothing_new_are_told_apart_by_prior_masks_field_or_start() -> None:
     rows = ablation_rows.ROWS
     assert len({(row.settings, row.start) for row in rows}) == len(rows)
+
+
+def test_exposures_by_hand() -> None:
+    images = torch.tensor([0.0, 10.0, 120.0]).expand(1, 3, 2, 3) / 255
+    assert torch.equal(exposures.exposed(images, "true"), images)
+    expected = {"flatter": [25.0, 33.0, 121.0], "vignetted": [0.0, 8.0, 78.0]}  # 10 * 0.825, 120 * 0.65
+    for exposure, row in expected.items():
+        torch.testing.assert_close(255 * exposures.exposed(images, exposure)[0, 2, 1], torch.tensor(row))
+    assert float(exposures.exposed(torch.ones(1, 3, 1, 1), "flatter").max()) <= 1
+
+
+def test_only_the_right_image_is_exposed_otherwise(data: Path) -> None:
+    plain, other = (
+        exposures.ExposedDataset(data, data / "detections" / "data", exposure=e) for e in ("true", "flatter")
+    )
+    before, after = (dataset.load(dataset.frame_ids[0]).frame for dataset in (plain, other))
+    assert torch.equal(before.images_left, after.images_left)
+    assert torch.equal(exposures.exposed(before.images_right, "flatter"), after.images_right)
+    assert not torch.equal(before.images_right, after.images_right)
 
 
 def test_the_papers_table_is_complete() -> None:
