@@ -353,6 +353,17 @@ def test_collate_pads_and_numbers(root: Path) -> None:
     assert detections.occluders.frame_index.tolist() == [0]
 
 
+def test_collate_keeps_standard_deviations_and_what_no_frame_knows_is_infinite(root: Path) -> None:
+    loaded = dataset(root).load("000003")
+    count = len(loaded.detections)
+    sigma = torch.rand(count, 4) + 0.1
+    known = replace(loaded, detections=replace(loaded.detections, pose_sigma=sigma))
+    joined = collate([known, loaded])[1].pose_sigma
+    assert joined is not None
+    assert torch.equal(joined, torch.cat([sigma, torch.full((count, 4), torch.inf)]))
+    assert collate([loaded, loaded])[1].pose_sigma is None
+
+
 def test_collate_of_one_frame_changes_nothing(root: Path) -> None:
     loaded = dataset(root).load("000000")
     frame, detections = collate([loaded])
