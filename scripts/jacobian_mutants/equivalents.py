@@ -25,6 +25,7 @@ class Equivalent:
 _OF_ZERO = "the negative of zero is zero"
 _EITHER_SIGN = "a quaternion and its negative are the same rotation, and so3_log turns it to w >= 0"
 _BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its value nor its derivative gets anywhere"
+_IN_PAIRS = "enters as a square, or twice as a factor"
 _FOR_SPEED = "a threshold that only saves work: what it leaves out is below the rounding of the sum"
 _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEIGHT, dtype=self.zeta.dtype))"
 
@@ -65,6 +66,15 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent("log_one_minus_exp", "-0.5", "(0.5)", _BRANCH_NOT_TAKEN),
     Equivalent("log_one_minus_exp", "-1.0", "(1.0)", _BRANCH_NOT_TAKEN),
+    *(
+        Equivalent("patch_derivative", text, f"(-{text})" if text.startswith("_") else f"(-({text}))", _IN_PAIRS)
+        for text in (
+            "_centred(intensity_left, weight)",
+            "_centred(residual + intensity_left, weight)",
+            "residual + intensity_left",
+            "right / contrast",
+        )
+    ),
     Equivalent(
         "residual_derivative_closest_approach",
         "zeta * closest_sdf",
