@@ -34,8 +34,6 @@ _NEWTON_STEPS = 5
 _CELLS_TO_CHOOSE_FROM = 3000
 _CONTOUR = 3.0
 _GRAZING_COSINE = 0.3
-# Of a stereo detector: without any the pose prior would not be there to be examined.
-_POSE_SIGMAS = {"along_share": 0.02, "across_m": 0.1, "vertical_m": 0.05, "yaw_deg": 4.0}
 
 
 class _RememberedView(ProjectedView):
@@ -139,8 +137,15 @@ class Bench:
 
 
 def _with_pose_prior(config: RefinerConfig) -> RefinerConfig:
-    sigmas = {f"pose_sigma_{name}": value for name, value in _POSE_SIGMAS.items()}
-    return replace(config, priors=replace(config.priors, **sigmas))
+    """With a stereo detector's standard deviations: without any that prior would not be there to be examined."""
+    priors = replace(
+        config.priors,
+        pose_sigma_along_share=0.02,
+        pose_sigma_across_m=0.1,
+        pose_sigma_vertical_m=0.05,
+        pose_sigma_yaw_deg=4.0,
+    )
+    return replace(config, priors=priors)
 
 
 def _named(problem: CarProblem, other_forms: CarProblem) -> dict[str, Term]:

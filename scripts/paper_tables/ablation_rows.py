@@ -99,8 +99,8 @@ ROWS: tuple[Row, ...] = (
     Row("masks", "left image only", Settings(masks="left")),
     Row("masks", "2D boxes for masks", Settings(masks="boxes")),
     *(Row("detector noise", f"{scale:g} times", start=f"noise:{scale:g}") for scale in (0.25, 0.5, 1, 2, 3, 4)),
-    # As that noise is drawn, a fourth of a stereo detector's: see `simulated_detector`.
-    Row("detector noise", "0.25 times, and its sigmas", _pose_sigmas(0.00625, 0.03, 0.0125, 1.25), "noise:0.25"),
+    # As that noise is drawn, on the ground a fourth of a stereo detector's: see `simulated_detector`.
+    Row("detector noise", "0.25 times, and its sigmas", _pose_sigmas(0.00625, 0.03, 0.05, 1.25), "noise:0.25"),
     Row("far start", "adaptive (default)", start="mono"),
     Row("far start", "the detector's pose and its sigmas", _pose_sigmas(0.05, 0.25, 0.06, 9.0), "mono"),
     *(Row("far start", name, Settings(overrides), "mono") for name, overrides in _SAMPLINGS.items()),
