@@ -32,6 +32,7 @@ _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEI
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("viewing_axes", "zero", "(-zero)", _OF_ZERO),
     Equivalent("_by_rotation", "zeros[..., :3]", "(-zeros[..., :3])", _OF_ZERO),
     Equivalent("_by_rotation", "zeros[..., 3:]", "(-zeros[..., 3:])", _OF_ZERO),
     Equivalent("dimensions_prior", "no_twist", "(-no_twist)", _OF_ZERO),
