@@ -56,11 +56,17 @@ _PHOTOMETRY = {
     "neighbourhoods without brightness": ("photometric.patch=zero_mean",),
     "neighbourhoods without brightness and contrast": ("photometric.patch=normalised",),
 }
+# Robust likelihoods: how sure a pixel of a mask can be at most is 0.99 by default.
+_FLOORS = (0.05, 0.1)
 _EXPOSURES: tuple[Exposure, ...] = ("flatter", "vignetted")
 
 
 def _points(number: int) -> Settings:
     return Settings((f"sampling.min_pixels={number}", f"sampling.max_pixels={number}"))
+
+
+def _floor(probability: float) -> tuple[str, ...]:
+    return (f"silhouette.probability_floor={probability:g}",)
 
 
 REFERENCE = Row("reference", "default settings, every result")
@@ -96,6 +102,11 @@ ROWS: tuple[Row, ...] = (
     Row("prior", "network (neural)", Settings(prior="neural")),
     Row("prior", "built from real meshes, K = 5", Settings(prior="meshes")),
     Row("masks", "degraded", Settings(masks="degraded")),
+    *(Row("masks", f"trusted to {1 - floor:g} only", Settings(_floor(floor))) for floor in _FLOORS),
+    *(
+        Row("masks", f"degraded, trusted to {1 - floor:g} only", Settings(_floor(floor), masks="degraded"))
+        for floor in _FLOORS
+    ),
     Row("masks", "left image only", Settings(masks="left")),
     Row("masks", "2D boxes for masks", Settings(masks="boxes")),
     *(Row("detector noise", f"{scale:g} times", start=f"noise:{scale:g}") for scale in (0.25, 0.5, 1, 2, 3, 4)),
