@@ -68,10 +68,12 @@ def development_cars(args: argparse.Namespace) -> Observations:
     """Refined cars of drawn detections, from OUT where they are there already."""
     parts = []
     for masks in args.masks:
-        kept = args.out / f"cars_{masks.name}_{'_'.join(map(str, args.seeds))}.npz"
+        name = "_".join(["cars", masks.name, *map(str, args.seeds), *(["sigmas"] if args.detector_says_sigmas else [])])
+        kept = args.out / f"{name}.npz"
         if not kept.is_file():
             dataset = KittiStereoDataset(args.data, args.exact, masks, frames=args.frames)
-            observe_noisy(dataset, refiner(), LEVELS, args.seeds, masks.name, _tell).save(kept)
+            says = args.detector_says_sigmas
+            observe_noisy(dataset, refiner(), LEVELS, args.seeds, masks.name, _tell, says_sigmas=says).save(kept)
         parts.append(Observations.load(kept))
     return Observations.joined(parts)
 
@@ -198,6 +200,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--masks", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    says = "the drawn detections carry the standard deviations of their errors (Detections.pose_sigma)"
+    parser.add_argument("--detector-says-sigmas", action="store_true", help=says)
     parser.add_argument("--other", type=Path, metavar="ROOT", help="real frames, judged and never fitted")
     parser.add_argument("--other-detections", type=Path, metavar="DIR")
     parser.add_argument("--other-masks", type=Path, metavar="DIR")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +32,12 @@ class NoiseLevel:
     yaw_deg: float
     dimensions_share: float
 
+    def pose_sigma(self, T_cam_obj: Tensor) -> Tensor:
+        """What such a detector would say of its own poses (B, 4, 4): `Detections.pose_sigma` (B, 4)."""
+        distance = torch.hypot(T_cam_obj[:, 0, 3], T_cam_obj[:, 2, 3])
+        others = distance.new_tensor([self.side_m, self.height_m, math.radians(self.yaw_deg)])
+        return torch.cat([self.depth_share * distance[:, None], others.expand(len(distance), 3)], dim=1)
+
 
 LEVELS = (
     NoiseLevel("fine", 0.008, 0.05, 0.03, 2.0, 0.03),
@@ -40,8 +47,8 @@ LEVELS = (
 """A good detector, and the two that the development data simulates."""
 
 
-def noisy(exact: Detections, level: NoiseLevel, seed: int) -> Detections:
-    """The detections with normal errors; equal seeds give equal errors."""
+def noisy(exact: Detections, level: NoiseLevel, seed: int, *, says_sigmas: bool = False) -> Detections:
+    """The detections with normal errors, whose size the detector may say; equal seeds give equal errors."""
     rng = np.random.default_rng(seed)
     draws = torch.from_numpy(rng.standard_normal((len(exact), 7))).to(exact.T_cam_obj)
     T = exact.T_cam_obj.clone()
@@ -49,7 +56,8 @@ def noisy(exact: Detections, level: NoiseLevel, seed: int) -> Detections:
     # R_cam_obj of a box is a turn about y (times the ground's lean), so a turn from the right is one of the heading.
     T[:, :3, :3] = T[:, :3, :3] @ rotation_about_y(torch.deg2rad(level.yaw_deg * draws[:, 3]))
     dimensions = exact.dimensions_hwl * (1 + level.dimensions_share * draws[:, 4:7]).clamp_min(0.5)
-    return replace(exact, T_cam_obj=T, dimensions_hwl=dimensions)
+    pose_sigma = level.pose_sigma(T) if says_sigmas else None
+    return replace(exact, T_cam_obj=T, dimensions_hwl=dimensions, pose_sigma=pose_sigma)
 
 
 def _moved(location: Tensor, level: NoiseLevel, draws: Tensor) -> Tensor:

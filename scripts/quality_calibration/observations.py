@@ -79,14 +79,16 @@ def observe_noisy(
     seeds: Sequence[int],
     masks_name: str,
     report: Callable[[str], None],
+    *,
+    says_sigmas: bool = False,
 ) -> Observations:
-    """Refine the labelled cars of all frames from detections of several noise levels and seeds."""
+    """Refine the labelled cars of all frames from detections of several noise levels and seeds, with their sigmas?"""
     parts = []
     for number, frame_id in enumerate(dataset.frame_ids):
         loaded = dataset.load(frame_id)
         for seed in seeds:
             for index, level in enumerate(levels):
-                draws = noisy(loaded.detections, level, seed=10_000 * seed + 100 * number + index)
+                draws = noisy(loaded.detections, level, 10_000 * seed + 100 * number + index, says_sigmas=says_sigmas)
                 parts += observe(loaded, draws, refiner, f"{level.name}, {masks_name}, seed {seed}")
         report(f"{masks_name} masks: frame {frame_id} done")
     return Observations.joined(parts)

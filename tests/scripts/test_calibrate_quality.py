@@ -114,6 +114,13 @@ def test_drawn_detections_have_the_errors_of_their_level() -> None:
     assert float(torch.rad2deg(yaw).std()) == pytest.approx(level.yaw_deg, rel=0.15)
     assert torch.equal(draws[7].T_cam_obj, noise.noisy(detections, level, 7).T_cam_obj)
     assert all(torch.equal(d.box_2d, detections.box_2d) for d in draws[:3])
+    said = noise.noisy(detections, level, 7, says_sigmas=True).pose_sigma
+    assert said is not None
+    sigmas = (first[:, :3, 3] - exact[:3, 3]).std(dim=0)
+    across = (first[:, :3, 3] - exact[:3, 3]) @ torch.tensor([exact[2, 3], 0.0, -exact[0, 3]]).double() / distance
+    measured = torch.stack([along.std(), across.std(), sigmas[1], yaw.std()])
+    torch.testing.assert_close(said[0], measured, rtol=0.15, atol=0)
+    assert draws[7].pose_sigma is None
 
 
 def test_cars_that_are_kept_make_model_report_and_pictures(tmp_path: Path) -> None:
