@@ -19,7 +19,6 @@ from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.errors import InputError
 from directshape_torch.observation.packing import PixelSamples
-from directshape_torch.solver.normal_equations import Segments
 
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
@@ -158,34 +157,11 @@ def disparity_profile(
     offsets = profile_offsets().to(after.code.device) if offsets_px is None else offsets_px
     for term in problem.terms:
         if isinstance(term, PhotometricTerm):
-            few = _thinned(term, max_pixels)
+            few = term.thinned(max_pixels)
             curves = [few.profile(_projected(problem, few.pixels, state), offsets) for state in (before, after)]
             return DisparityProfile(offsets, curves[0], curves[1], few.support())
     nan = after.code.new_full((len(after.code), len(offsets)), torch.nan, dtype=torch.float64)
     return DisparityProfile(offsets, nan, nan, nan[:, 0])
-
-
-def _thinned(term: PhotometricTerm, max_pixels: int) -> PhotometricTerm:
-    """The term with at most so many pixels of each car, and with no pixels beside those of its set."""
-    fixed = term.fixed
-    if fixed is None:
-        raise RuntimeError("the photometric term has no pixel set before a stage begins: call begin_stage first")
-    counts = fixed.segments.counts
-    first = torch.cumsum(counts, 0) - counts
-    rank = torch.arange(len(fixed.object_index), device=counts.device) - first[fixed.object_index]
-    stride = (counts + max_pixels - 1) // max_pixels
-    chosen = (rank % stride[fixed.object_index].clamp_min(1) == 0).nonzero()[:, 0]
-    object_index = fixed.object_index[chosen]
-    few = fixed._replace(
-        pixel_index=torch.arange(len(chosen), device=counts.device),
-        object_index=object_index,
-        intensity_left=fixed.intensity_left[chosen],
-        rays_left=fixed.rays_left[chosen],
-        gradient_weight=fixed.gradient_weight[chosen],
-        neighbour_weight=fixed.neighbour_weight[chosen],
-        segments=Segments.from_sorted_index(object_index, len(counts)),
-    )
-    return replace(term, pixels=term.pixels.select(fixed.pixel_index[chosen]), fixed=few)
 
 
 def _projected(problem: CarProblem, pixels: PixelSamples, state: CarState) -> ProjectedState:

@@ -237,5 +237,5 @@ def test_all_pixels_are_the_terms_own_and_few_are_much_the_same() -> None:
 def test_before_a_stage_there_is_no_curve() -> None:
     scene = far_street()
     problem, state = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).problem(scene.frames, scene.detections)
-    with pytest.raises(RuntimeError, match="begin_stage"):
+    with pytest.raises(RuntimeError, match="before a stage begins"):
         disparity_profile(problem, state, state)

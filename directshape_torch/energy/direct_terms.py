@@ -11,7 +11,8 @@ from torch import Tensor
 from directshape_torch.checks import check_shape
 from directshape_torch.config import PriorConfig, RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.photometric_term import GreyPair, PhotometricTerm
+from directshape_torch.energy.photometric_pixels import GreyPair
+from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.prior_terms import PriorTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.silhouette_term import silhouette_term

@@ -15,11 +15,11 @@ from torch import Tensor
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.energy.brightness import matched_brightness
 from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.photometric_pixels import GreyPair, PixelSet, neighbours_on_car
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.term import ResidualRows, TermLinearisation
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.image.pyramid import halve, halve_sizes
 from directshape_torch.observation.occlusion import OcclusionCrops
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.residuals import robust
@@ -39,33 +39,6 @@ from directshape_torch.solver.problem import Stage
 
 # Of a profile at once: 8 MB in single precision.
 _PROFILE_RESIDUALS = 2_000_000
-
-
-@dataclass(frozen=True)
-class GreyPair:
-    """Grey levels of both images at one pyramid level."""
-
-    left: Tensor  # (F, H, W)
-    right: Tensor  # (F, H, W)
-    sizes: Tensor  # (F, 2)
-    scale: float  # level pixels per full-resolution pixel
-
-    def halved(self) -> GreyPair:
-        both = halve(torch.stack([self.left, self.right], dim=1))
-        return GreyPair(both[:, 0], both[:, 1], halve_sizes(self.sizes), 0.5 * self.scale)
-
-
-class _Fixed(NamedTuple):
-    """What a stage fixes for its pixel set of Q pixels."""
-
-    pixel_index: Tensor  # (Q,) rows of the packed left pixels, ascending
-    object_index: Tensor  # (Q,)
-    intensity_left: Tensor  # (Q, N) brought to the brightness of the right image, as far as the settings say
-    rays_left: Tensor  # (Q, N, 3)
-    gradient_weight: Tensor  # (Q,)
-    neighbour_weight: Tensor  # (Q, N) zero for neighbours that the mask says are not on the car
-    images: GreyPair
-    segments: Segments
 
 
 class _ResidualInputs(NamedTuple):
@@ -95,7 +68,7 @@ class PhotometricTerm:
     pyramid: tuple[GreyPair, ...]
     hidden_right: OcclusionCrops | None
     mask_left: Tensor  # (detections of the call, H, W)
-    fixed: _Fixed | None = None
+    fixed: PixelSet | None = None
 
     @property
     def name(self) -> str:
@@ -230,21 +203,24 @@ class PhotometricTerm:
         new_row = torch.cumsum(kept_pixel.long(), 0) - 1
         chosen = kept_pixel[self.fixed.pixel_index]
         rows = new_row[self.fixed.pixel_index[chosen]]
-        object_index = pixels.object_index[rows]
-        fixed = self.fixed._replace(
-            pixel_index=rows,
-            object_index=object_index,
-            intensity_left=self.fixed.intensity_left[chosen],
-            rays_left=self.fixed.rays_left[chosen],
-            gradient_weight=self.fixed.gradient_weight[chosen],
-            neighbour_weight=self.fixed.neighbour_weight[chosen],
-            segments=Segments.from_sorted_index(object_index, int(keep.sum())),
-        )
-        return replace(reduced, fixed=fixed)
+        return replace(reduced, fixed=self.fixed.select(chosen, rows, pixels.object_index[rows], int(keep.sum())))
 
-    def _require(self) -> _Fixed:
+    def thinned(self, max_pixels: int) -> PhotometricTerm:
+        """The term with at most so many pixels of each car: every second, third, ..., and none packed beside them."""
+        fixed = self._require()
+        counts, number = fixed.segments.counts, fixed.object_index
+        rank = torch.arange(len(number), device=counts.device) - (torch.cumsum(counts, 0) - counts)[number]
+        stride = (counts + max_pixels - 1) // max_pixels
+        chosen = (rank % stride[number].clamp_min(1) == 0).nonzero()[:, 0]
+        rows = torch.arange(len(chosen), device=counts.device)
+        pixels = self.pixels.select(fixed.pixel_index[chosen])
+        return replace(self, pixels=pixels, fixed=fixed.select(chosen, rows, pixels.object_index, len(counts)))
+
+    def _require(self) -> PixelSet:
         if self.fixed is None:
-            raise RuntimeError("the photometric term has no pixel set before a stage begins: call at_stage first")
+            raise RuntimeError(
+                "the photometric term has no pixel set before a stage begins: call at_stage or begin_stage first"
+            )
         return self.fixed
 
     def _weight(self) -> Tensor:
@@ -267,7 +243,7 @@ class PhotometricTerm:
         lost = torch.tensor(self.config.lost_grey_levels, dtype=self.pixels.uv.dtype, device=self.pixels.uv.device)
         return robust.huber(lost, self.config.huber_grey_levels).rho
 
-    def _fix(self, pixel_index: Tensor, images: GreyPair) -> _Fixed:
+    def _fix(self, pixel_index: Tensor, images: GreyPair) -> PixelSet:
         """The pixels of a set with the left image's side of their residuals."""
         chosen = self.pixels.select(pixel_index)
         frame = self.cars.frame_index[chosen.object_index]
@@ -279,22 +255,11 @@ class PhotometricTerm:
         c2 = self.config.gradient_constant_grey_levels**2
         weight = c2 / (c2 + chosen.gradient_magnitude**2)
         segments = Segments.from_sorted_index(chosen.object_index, len(self.cars.frame_index))
-        neighbours = self._neighbour_weight(chosen.object_index, uv_full)
-        return _Fixed(pixel_index, chosen.object_index, intensity, rays, weight, neighbours, images, segments)
-
-    def _neighbour_weight(self, object_index: Tensor, uv: Tensor) -> Tensor:
-        """One (Q, N) for neighbours on the car, zero for those that the mask gives to something else.
-
-        All neighbours are warped with the centre's depth: background beside the contour would pull the depth of a
-        small car away from its surface. The paper's pixel set keeps them.
-        """
-        if self.config.pixel_set == "hit":
-            return torch.ones_like(uv[..., 0])
-        last_of_frame = self.pyramid[0].sizes[self.cars.frame_index[object_index]].flip(-1)[:, None] - 1
-        inside = ((uv >= -0.5) & (uv <= last_of_frame + 0.5)).all(dim=-1)
-        u, v = uv.round().long().clamp_min(0).minimum(last_of_frame).unbind(-1)
-        on_car = self.mask_left[self.cars.detection_row[object_index][:, None], v, u] > 0.5
-        return (inside & on_car).to(uv.dtype)
+        neighbours = torch.ones_like(intensity)
+        if self.config.pixel_set != "hit":  # the paper's keeps those that are not on the car
+            sizes = self.pyramid[0].sizes
+            neighbours = neighbours_on_car(self.mask_left, self.cars, sizes, chosen.object_index, uv_full)
+        return PixelSet(pixel_index, chosen.object_index, intensity, rays, weight, neighbours, images, segments)
 
     def _residual(self, depth: Tensor) -> PhotometricResidual:
         plain = photometric_residual(*self._residual_inputs(depth))
