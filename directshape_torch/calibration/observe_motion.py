@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from pathlib import Path
 
 import torch
 
@@ -13,6 +14,7 @@ from directshape_torch.calibration.motion_tracks import STEPS, StereoFeatures, f
 from directshape_torch.calibration.road_constraint import RoadConstraint
 from directshape_torch.calibration.road_pixels import find_road_pixels
 from directshape_torch.calibration.stereo_sequence import StereoSequence
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.stereo_matching.disparity import match_disparity
 
 
@@ -32,14 +34,14 @@ def observe_motion(
         constraints, and (width, height) of the images.
 
     Raises:
-        DataFormatError: an image is missing or damaged.
+        DataFormatError: an image is missing or damaged, or not as large as those before it.
     """
     constraints: list[FieldConstraint] = []
-    size_wh = (0, 0)
+    size_wh: tuple[int, int] | None = None
     waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)
     for frame_id in sequence.frame_ids if frame_ids is None else frame_ids:
         left, right = sequence.read(frame_id)
-        size_wh = (left.shape[1], left.shape[0])
+        size_wh = _one_size(size_wh, (left.shape[1], left.shape[0]), sequence.root / "image_02" / frame_id)
         matched = torch.from_numpy(match_disparity(left, right)).double()
         if height_m is not None:
             road = find_road_pixels(left, right, sequence.camera, matched)
@@ -49,11 +51,23 @@ def observe_motion(
         if len(waiting) == waiting.maxlen:
             constraints += _tracked(waiting, sequence, size_wh)
             waiting.popleft()
+    if size_wh is None:
+        raise InputError("frame_ids", "at least one frame", "none")
     # The last frames have fewer that follow them.
     while len(waiting) > 1:
         constraints += _tracked(waiting, sequence, size_wh)
         waiting.popleft()
     return constraints, size_wh
+
+
+def _one_size(before: tuple[int, int] | None, size_wh: tuple[int, int], path: Path) -> tuple[int, int]:
+    if before is not None and before != size_wh:
+        raise DataFormatError(
+            path,
+            f"is {size_wh[0]} x {size_wh[1]}, the frames before it {before[0]} x {before[1]}",
+            cure="give frames of one rig",
+        )
+    return size_wh
 
 
 def _tracked(

@@ -13,7 +13,8 @@ So motion gives constant and slopes, the road and the camera's height what motio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,7 +31,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
 from directshape_torch.scene import StereoCamera
 
-_NUM_ITERATIONS = 40
+_NUM_ITERATIONS = 150
 _FIRST_ITERATIONS = 10
 _SHRINK = 0.85
 _CONVERGED_PX = 1e-4
@@ -44,17 +45,34 @@ class SelfCalibration:
 
     Attributes:
         fit: field and statistics. `after` is measured against depths that were estimated together with the field.
-        covariance: (10, 10) of the coefficients, pixels squared, for independent constraints.
         observations: disparities and rows against those depths, at the points that count.
+        sigma_px: standard deviation of the bias at the data, from how far the fields of the first and of the second
+            half of the constraints are apart; what both share (height, baseline) is not in it. None where one of them
+            alone determines no field.
+        converged: whether the last step was below 1e-4 px.
     """
 
     fit: FieldFit
+    observations: DisparityObservations
+    sigma_px: float | None
+    converged: bool
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Coefficients (10,), their covariance (10, 10) were all constraints independent and the model true, the data."""
+
+    coefficients: Tensor
     covariance: Tensor
     observations: DisparityObservations
+    converged: bool
 
-    def sigma(self, uv_left: Tensor) -> Tensor:
-        """Standard deviation of the bias at left pixels (*, 2), pixels (*,); errors of the model not included."""
-        return _sigma(self.covariance, uv_left, self.fit.field.size_wh)
+    def formal_sigma_px(self, size_wh: tuple[int, int]) -> float:
+        """Of the bias at the data, median; too small by several times, but large where nothing is seen."""
+        if len(self.observations) == 0:
+            return math.inf
+        basis = polynomial_basis(self.observations.uv_left, size_wh)
+        return float(((basis @ self.covariance) * basis).sum(dim=-1).sqrt().median())
 
 
 def self_calibrate(
@@ -62,21 +80,31 @@ def self_calibrate(
     size_wh: tuple[int, int],
     camera: StereoCamera,
     frame_ids: tuple[str, ...] = (),
+    on_step: Callable[[], object] | None = None,
 ) -> SelfCalibration:
     """The field that explains all constraints best: robust Gauss-Newton, each constraint's own unknowns eliminated.
 
     Args:
-        constraints: `MotionConstraint` and `RoadConstraint` of many frames of one rig.
+        constraints: `MotionConstraint` and `RoadConstraint` of many frames of one rig, in their order in time.
         size_wh: width and height of its images.
         camera: its calibration.
         frame_ids: the frames; kept in the file.
+        on_step: called after each step, to show progress.
 
     Raises:
         InputError: no constraints, or the field is not determined by them (road alone, or a car that stands).
     """
+    solution = _solve(constraints, on_step)
+    _check_determined(solution, size_wh)
+    fit = build_field(solution.coefficients, solution.observations, size_wh, camera, "motion", frame_ids)
+    sigma_px = _sigma_from_halves(constraints, solution.observations.uv_left, size_wh, on_step)
+    return SelfCalibration(fit, solution.observations, sigma_px, solution.converged)
+
+
+def _solve(constraints: Sequence[FieldConstraint], on_step: Callable[[], object] | None) -> _Solution:
     current, scales = list(constraints), [5.0] * len(constraints)
     coefficients = torch.zeros(NUM_COEFFICIENTS, dtype=torch.float64)
-    H = _prior_information()
+    H, converged = _prior_information(), False
     for iteration in range(_NUM_ITERATIONS):
         linear = [c.linearise(coefficients, scale) for c, scale in zip(current, scales, strict=True)]
         parts = [one.of_field() for one in linear]
@@ -90,13 +118,13 @@ def self_calibrate(
             max(1.0, new if iteration < _FIRST_ITERATIONS else min(_SHRINK * old, new))
             for old, new in zip(scales, spread, strict=True)
         ]
-        if iteration > _FIRST_ITERATIONS and float(step.abs().max()) < _CONVERGED_PX:
+        if on_step is not None:
+            on_step()
+        converged = iteration > _FIRST_ITERATIONS and float(step.abs().max()) < _CONVERGED_PX
+        if converged:
             break
     observations = concatenate([c.observations(coefficients, s) for c, s in zip(current, scales, strict=True)])
-    covariance = torch.linalg.inv(H)
-    _check_determined(covariance, observations, size_wh)
-    fit = build_field(coefficients, observations, size_wh, camera, "motion", frame_ids)
-    return SelfCalibration(fit, covariance, observations)
+    return _Solution(coefficients, torch.linalg.inv(H), observations, converged)
 
 
 def _prior_information() -> Tensor:
@@ -104,17 +132,27 @@ def _prior_information() -> Tensor:
     return torch.diag(1 / sigma**2)
 
 
-def _sigma(covariance: Tensor, uv_left: Tensor, size_wh: tuple[int, int]) -> Tensor:
-    basis = polynomial_basis(uv_left.double(), size_wh)
-    return ((basis @ covariance) * basis).sum(dim=-1).sqrt()
+def _sigma_from_halves(
+    constraints: Sequence[FieldConstraint],
+    uv_left: Tensor,  # (P, 2) pixels
+    size_wh: tuple[int, int],
+    on_step: Callable[[], object] | None,
+) -> float | None:
+    """Half of the RMS difference between the fields of two halves: the standard deviation of the halves' mean."""
+    middle = len(constraints) // 2
+    first, second = (_solve(part, on_step) for part in (constraints[:middle], constraints[middle:]))
+    if max(first.formal_sigma_px(size_wh), second.formal_sigma_px(size_wh)) > _LARGEST_SIGMA_PX:
+        return None
+    difference = polynomial_basis(uv_left, size_wh) @ (first.coefficients - second.coefficients)
+    return 0.5 * float(difference.square().mean().sqrt())
 
 
-def _check_determined(covariance: Tensor, observations: DisparityObservations, size_wh: tuple[int, int]) -> None:
+def _check_determined(solution: _Solution, size_wh: tuple[int, int]) -> None:
     cure = "give consecutive frames of a car that drives past still things (a road alone shows no constant, no slope)"
-    if len(observations) == 0:
+    if len(solution.observations) == 0:
         raise InputError("frames", "points that were followed from frame to frame", "none", cure)
-    sigma = float(_sigma(covariance, observations.uv_left, size_wh).median())
-    if not sigma <= _LARGEST_SIGMA_PX:
+    sigma_px = solution.formal_sigma_px(size_wh)
+    if not sigma_px <= _LARGEST_SIGMA_PX:
         raise InputError(
-            "frames", f"images that determine the field to {_LARGEST_SIGMA_PX} px", f"{sigma:.2g} px", cure
+            "frames", f"images that determine the field to {_LARGEST_SIGMA_PX} px", f"{sigma_px:.2g} px", cure
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,15 @@ class StereoSequence:
     frame_ids: tuple[str, ...]
     camera: StereoCamera
 
+    def gaps(self) -> tuple[tuple[str, str], ...]:
+        """Neighbours (before, after) whose numbers are farther apart than those of the closest pair; none where ids
+        are no numbers."""
+        if not all(frame_id.isdecimal() for frame_id in self.frame_ids):
+            return ()
+        steps = [int(after) - int(before) for before, after in pairwise(self.frame_ids)]
+        pairs = zip(pairwise(self.frame_ids), steps, strict=True)
+        return tuple(pair for pair, step in pairs if step > min(steps))
+
     def read(self, frame_id: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Left and right image, (H, W, 3) RGB.
 
@@ -40,8 +50,11 @@ class StereoSequence:
         """
         left, right = (read_rgb(find_image(self.root / name, frame_id)) for name in ("image_02", "image_03"))
         if left.shape != right.shape:
-            path = self.root / "image_03" / frame_id
-            raise DataFormatError(path, f"has size {right.shape[:2]}, the left image {left.shape[:2]}")
+            raise DataFormatError(
+                find_image(self.root / "image_03", frame_id),
+                f"is {right.shape[1]} x {right.shape[0]}, the left image {left.shape[1]} x {left.shape[0]}",
+                cure="give rectified pairs of one size",
+            )
         return left, right
 
 
@@ -53,22 +66,41 @@ def open_sequence(root: Path, frames: Sequence[str] | None = None) -> StereoSequ
         frames: ids of the frames to use, or None for all; they must be consecutive frames of a moving car.
 
     Raises:
-        DataFormatError: there is no image or no calibration.
+        DataFormatError: there is no calibration, or no left or right image of a frame.
         InputError: one of `frames` has no image, or fewer than two frames are left.
     """
-    folder = root / "image_02"
-    found = sorted(path.stem for path in folder.glob("*") if path.suffix in _ENDINGS) if folder.is_dir() else []
+    found = _images(root, "image_02")
+    missing = sorted(set(frames or ()) - found, key=_in_time)
+    if missing:
+        known = ", ".join(sorted(found, key=_in_time)[:5])
+        raise InputError("frames", f"ids among {known} ...", ", ".join(missing[:5]), "check --frames")
+    chosen = tuple(sorted(found if frames is None else set(frames), key=_in_time))
+    if len(chosen) < 2:
+        raise InputError("frames", "at least two consecutive frames", str(len(chosen)), "give more frames")
+    # Now rather than after minutes of work on the frames before it.
+    lonely = sorted(set(chosen) - _images(root, "image_03"), key=_in_time)
+    if lonely:
+        raise DataFormatError(
+            root / "image_03",
+            f"has no image of {', '.join(lonely[:5])}",
+            cure="add the right image of every frame, or leave frames out with --frames",
+        )
+    camera = to_stereo_camera([read_calibration(root / "calib.txt")], dtype=torch.float64)
+    return StereoSequence(root, chosen, camera)
+
+
+def _images(root: Path, name: str) -> set[str]:
+    """Ids of the images in a subfolder."""
+    found = {path.stem for path in (root / name).glob("*") if path.suffix in _ENDINGS}
     if not found:
         raise DataFormatError(
             root,
-            "holds no image_02/*.png",
+            f"holds no {name}/*.png",
             cure="--from motion needs consecutive frames: a folder with image_02, image_03 and calib.txt",
         )
-    missing = [frame for frame in frames or () if frame not in found]
-    if missing:
-        raise InputError("frames", f"ids among {', '.join(found[:5])} ...", ", ".join(missing[:5]))
-    chosen = tuple(found if frames is None else sorted(set(frames)))
-    if len(chosen) < 2:
-        raise InputError("frames", "at least two consecutive frames", str(len(chosen)))
-    camera = to_stereo_camera([read_calibration(root / "calib.txt")], dtype=torch.float64)
-    return StereoSequence(root, chosen, camera)
+    return found
+
+
+def _in_time(frame_id: str) -> tuple[int, str]:
+    """Numbers in their order, with and without leading zeros."""
+    return len(frame_id), frame_id

@@ -82,9 +82,58 @@ def test_command_refuses_what_is_no_sequence(tmp_path: Path) -> None:
         calibrate(tmp_path, tmp_path / "bias.json", "--frames", "000000")
     with pytest.raises(InputError, match="camera-height"):
         calibrate(tmp_path, tmp_path / "bias.json", "--camera-height", "-1")
+    with pytest.raises(InputError, match="--camera-height: expected --from motion, got --from lidar"):
+        calibrate(tmp_path, tmp_path / "bias.json", "--from", "lidar", "--camera-height", "1.6")
+    with pytest.raises(DataFormatError, match=r"other\.json"):
+        calibrate(tmp_path, tmp_path / "bias.json", "--against", str(tmp_path / "other.json"))
     right = tmp_path / "image_03" / "000001.png"
     right.write_bytes(right.read_bytes()[:500])
     with pytest.raises(DataFormatError, match="000001"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+    right.unlink()
+    with pytest.raises(DataFormatError, match=r"image_03: has no image of 000001; add the right image"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+    for image in (tmp_path / "image_03").iterdir():
+        image.unlink()
+    with pytest.raises(DataFormatError, match=r"holds no image_03/\*\.png; --from motion needs consecutive frames"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+    assert not (tmp_path / "bias.json").exists()
+
+
+def test_calibration_and_sizes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    write_sequence(tmp_path)
+    small = np.zeros((SIZE[1], SIZE[0] - 8, 3), np.uint8)
+    write_png(tmp_path / "image_03" / "000001.png", small)
+    with pytest.raises(DataFormatError, match=r"image_03/000001\.png: is 312 x 160, the left image 320 x 160; give"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+    write_png(tmp_path / "image_02" / "000001.png", small)
+    with pytest.raises(DataFormatError, match=r"000001: is 312 x 160, the frames before it 320 x 160; give frames of"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+    (tmp_path / "calib.txt").write_text("P2: 300 0 160 0 0 300 80 0 0 0 1 0\n")
+    with pytest.raises(DataFormatError, match="has no line P3:; a stereo pair needs"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+    (tmp_path / "calib.txt").unlink()
+    with pytest.raises(DataFormatError, match=r"calib\.txt"):
+        calibrate(tmp_path, tmp_path / "bias.json")
+
+
+def test_frames_are_taken_in_time_and_gaps_are_named(tmp_path: Path) -> None:
+    write_sequence(tmp_path)
+    for folder in ("image_02", "image_03"):
+        for number, name in enumerate(("9", "10", "14")):
+            (tmp_path / folder / f"{number:06d}.png").rename(tmp_path / folder / f"{name}.png")
+    sequence = open_sequence(tmp_path)
+    assert sequence.frame_ids == ("9", "10", "14")
+    assert sequence.gaps() == (("10", "14"),)
+    assert open_sequence(tmp_path, ["10", "14"]).gaps() == ()
+
+
+def test_frames_that_do_not_move_are_refused(tmp_path: Path) -> None:
+    write_sequence(tmp_path)
+    for folder in ("image_02", "image_03"):
+        for number in (1, 2):
+            (tmp_path / folder / f"{number:06d}.png").write_bytes((tmp_path / folder / "000000.png").read_bytes())
+    with pytest.raises(InputError, match="drives past still things"):
         calibrate(tmp_path, tmp_path / "bias.json")
 
 
@@ -108,6 +157,7 @@ def test_five_real_frames_come_near_the_field_of_ground_truth(
     printed = capsys.readouterr().out
     assert "depth from motion and road" in printed
     assert "where both have data: mean" in printed
+    assert "half the RMS difference between the fields of the two halves" in printed
     field = DisparityField.load(out)
     left, middle, right = field.bias(torch.tensor([[60.0, 180.0], [620.0, 180.0], [1180.0, 150.0]]).double()).tolist()
     assert -2.3 < left < -1.0

@@ -90,11 +90,33 @@ def test_motion_and_road_find_the_field_beside_things_that_move() -> None:
     error = result.fit.field.bias(grid()) - polynomial_basis(grid(), SIZE) @ TRUE
     assert float(error.abs().max()) < 0.1
     assert float(error.square().mean().sqrt()) < 0.03
-    assert float(result.sigma(grid()).median()) < 0.1
+    assert result.converged
+    assert result.sigma_px is not None
+    assert result.sigma_px < 0.05
     rows = result.fit.field.vertical(grid())
     torch.testing.assert_close(rows, torch.full_like(rows, 0.2), atol=0.01, rtol=0)
     assert result.fit.field.provenance["source"] == "motion"
     assert result.fit.field.provenance["frames"] == "000000 000001"
+
+
+def test_standard_deviation_is_that_of_halves_that_disagree() -> None:
+    """The second half's disparities are 0.3 px larger: the halves' mean is off by half of that."""
+    first = [motion(k, noise_px=0.02) for k in range(3)]
+    second = [shifted(motion(k, noise_px=0.02), 0.3) for k in range(3, 6)]
+    steps: list[None] = []
+    result = self_calibrate([*first, *second], SIZE, camera(), on_step=lambda: steps.append(None))
+    assert result.sigma_px == pytest.approx(0.15, abs=0.03)
+    assert len(steps) > 30
+
+
+def test_standard_deviation_is_not_known_where_half_determines_no_field() -> None:
+    result = self_calibrate([*(road(k) for k in range(3)), *(motion(k) for k in range(3))], SIZE, camera())
+    assert result.sigma_px is None
+
+
+def shifted(constraint: MotionConstraint, by_px: float) -> MotionConstraint:
+    tracks = constraint.tracks
+    return replace(constraint, tracks=replace(tracks, disparity=tracks.disparity + by_px))
 
 
 def test_a_wrong_height_tilts_the_field_only_where_motion_is_weak() -> None:
