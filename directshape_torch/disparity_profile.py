@@ -97,9 +97,9 @@ class DisparityProfile:
         return replace(self, **{f.name: keep(getattr(self, f.name)) for f in fields(self)[1:]})
 
     @property
-    def range_px(self) -> float:
-        """The largest offset."""
-        return float(self.offsets_px[-1])
+    def range_px(self) -> Tensor:
+        """The largest offset, a number without axes."""
+        return self.offsets_px[-1]
 
     @property
     def lowest(self) -> CostPair:
@@ -108,8 +108,8 @@ class DisparityProfile:
 
     def cost_at(self, offset_px: float) -> CostPair:
         """Costs at the sample next to an offset."""
-        column = int((self.offsets_px - offset_px).abs().argmin())
-        return CostPair(self.cost_before[:, column], self.cost_after[:, column])
+        column = (self.offsets_px - offset_px).abs().argmin(dim=0, keepdim=True)
+        return CostPair(self.cost_before[:, column][:, 0], self.cost_after[:, column][:, 0])
 
     @property
     def before(self) -> ProfileFigures:
@@ -188,7 +188,9 @@ def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> Pro
     best = cost.argmin(dim=1)
     lowest = cost.gather(1, best[:, None])[:, 0]
     offset, sigma = _vertex(offsets_px, cost, best, num_pixels)
-    distinctness = _other_minimum(offsets_px, cost, best) / lowest
+    other = _other_minimum(offsets_px, cost, best)
+    # Of a cost of zero as well, another that is as low is as low.
+    distinctness = torch.where(other > lowest, other / lowest, torch.ones_like(lowest))
     nan = torch.full_like(lowest, torch.nan)
     offset, sigma, distinctness = (torch.where(known, x, nan) for x in (offset, sigma, distinctness))
     in_basin = known & _is_downhill(offsets_px, cost, best, _RIDGE_SHARE * lowest)
@@ -222,9 +224,9 @@ def _other_minimum(offsets_px: Tensor, cost: Tensor, best: Tensor) -> Tensor:
 
 def _is_downhill(offsets_px: Tensor, cost: Tensor, best: Tensor, tolerance: Tensor) -> Tensor:
     """Whether (B,) the cost falls all the way from offset 0 to the lowest one, but for rises within the tolerance."""
-    start = int(offsets_px.abs().argmin())
+    start = offsets_px.abs().argmin()
     index = torch.arange(len(offsets_px), device=cost.device)
-    low, high = best.clamp_max(start)[:, None], best.clamp_min(start)[:, None]
+    low, high = best.minimum(start)[:, None], best.maximum(start)[:, None]
     # Towards the lowest one: to the right where that lies on the right.
     on_way = torch.where((index >= low) & (index <= high), cost, torch.inf)
     rightwards = torch.where(on_way.isinf(), -torch.inf, on_way - on_way.cummin(dim=1).values)

@@ -216,7 +216,7 @@ def _profile(profile: DisparityProfile) -> dict[str, Tensor]:
     sides = torch.minimum(*(cost.after for cost in (profile.cost_at(-1.0), profile.cost_at(1.0))))
     return {
         # A flat curve has no width: no offset of its range is any worse.
-        "log_profile_sigma": after.sigma_px.clamp_max(profile.range_px).log(),
+        "log_profile_sigma": after.sigma_px.minimum(profile.range_px).log(),
         "log_profile_offset": (after.offset_px.abs() + 0.05).log(),
         "log_profile_contrast": (sides / lowest.after).log(),
         "profile_offset_before": before.offset_px.abs(),

@@ -157,8 +157,9 @@ def test_a_dent_beside_the_minimum_is_no_other_minimum_and_a_ripple_no_ridge() -
 def test_a_curve_that_falls_to_its_end_has_no_width() -> None:
     found = _figures(10 - OFFSETS)
     assert (found["offset_px"], found["sigma_px"], found["in_basin"]) == (3.0, math.inf, 1)
-    flat = _figures(torch.full_like(OFFSETS, 7.0))
-    assert (flat["sigma_px"], flat["distinctness"], flat["ambiguous"]) == (math.inf, 1.0, 1)
+    for height in (7.0, 0.0):  # zero: images without any texture
+        flat = _figures(torch.full_like(OFFSETS, height))
+        assert (flat["sigma_px"], flat["distinctness"], flat["ambiguous"]) == (math.inf, 1.0, 1)
 
 
 def test_no_curve_says_nothing() -> None:
