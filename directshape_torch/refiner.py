@@ -62,7 +62,7 @@ class DirectShapeRefiner(nn.Module):
 
         With `config.backward.mode` other than "none" pose and code of the result carry gradients to the masks, the
         images, the prior's tensors, the term weights, the disparity that the frames bring and the detector's standard
-        deviations, with "unroll" or where those are given to the input poses as well.
+        deviations; to the input poses with "unroll", and in the other modes where there are such standard deviations.
 
         Args:
             frames: F frames; dtype and device must be those of the prior.
@@ -99,12 +99,12 @@ class DirectShapeRefiner(nn.Module):
         failure = refusals(frames, detections, seen.pixels, seen.points, self.config)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
-        problem = self._problem(frames, detections, seen.of_objects(usable), usable, term_weights)
+        cars = CarBatch.from_scene(frames, detections).of_objects(usable)
+        problem = self._problem(frames, detections, cars, seen.of_objects(usable), term_weights)
         # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
         state, status = self._input_state(detections.T_cam_obj.detach()), failure
         outcome = Outcome.nothing(problem, state)
         if len(rows):
-            cars = CarBatch.from_scene(frames, detections).of_objects(usable)
             outcome = self._minimise(problem, self._input_state(detections.T_cam_obj[usable]), cars)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
@@ -115,8 +115,8 @@ class DirectShapeRefiner(nn.Module):
     ) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
         check_fit(frames, detections, self.prior)
-        all_cars = torch.ones_like(detections.has_mask_left)
-        problem = self._problem(frames, detections, self._observe(frames, detections), all_cars, term_weights)
+        cars = CarBatch.from_scene(frames, detections)
+        problem = self._problem(frames, detections, cars, self._observe(frames, detections), term_weights)
         return problem, self._input_state(detections.T_cam_obj)
 
     def _input_state(self, T_cam_obj: Tensor) -> CarState:
@@ -129,23 +129,23 @@ class DirectShapeRefiner(nn.Module):
         if self.config.method == "direct":
             return _Seen(pixels, None)
         cloud = self.config.point_cloud
-        return _Seen(pixels, car_points(with_disparity(frames, cloud.matcher), detections, cloud))
+        matched = with_disparity(frames, cloud.matcher, needed=detections.frame_index)
+        return _Seen(pixels, car_points(matched, detections, cloud))
 
     def _problem(
         self,
         frames: FrameBatch,
         detections: Detections,
+        cars: CarBatch,
         seen: _Seen,
-        chosen: Tensor,
         term_weights: Mapping[str, Tensor] | None,
     ) -> CarProblem:
-        """The problem of the chosen (B,) cars, of which `seen` is."""
-        cars = CarBatch.from_scene(frames, detections).of_objects(chosen)
+        """The problem of some of the detections, of which `cars` and `seen` are."""
         terms = method_terms(self.config, self.prior, frames, detections, cars, seen.pixels, seen.points)
         weights = stacked_weights(
             term_weights, terms, self.prior.initial_code(len(detections)).to(detections.T_cam_obj)
         )
-        weights = None if weights is None else weights[chosen]
+        weights = None if weights is None else weights[cars.detection_row]
         return CarProblem(self.prior, terms, seen.pixels.left, seen.pixels.right, self.config, weights)
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:

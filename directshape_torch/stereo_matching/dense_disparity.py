@@ -15,12 +15,13 @@ from directshape_torch.stereo_matching.disparity import match_disparity
 from directshape_torch.stereo_matching.elas import match_disparity_elas
 
 
-def with_disparity(frames: FrameBatch, matcher: Literal["sgbm", "elas"]) -> FrameBatch:
+def with_disparity(frames: FrameBatch, matcher: Literal["sgbm", "elas"], needed: Tensor | None = None) -> FrameBatch:
     """The frames with the disparity that they bring, or else with that of the matcher.
 
     Args:
         frames: F frames; the images pass through the CPU as 8-bit images.
         matcher: "sgbm" (OpenCV's semi-global matching) or "elas" (libelas, an optional package).
+        needed: numbers of the frames to match, in any order and number; the others get NaN. None: all.
 
     Raises:
         MissingDependencyError: "elas" without its package.
@@ -42,7 +43,9 @@ def with_disparity(frames: FrameBatch, matcher: Literal["sgbm", "elas"]) -> Fram
         return frames
     match = match_disparity if matcher == "sgbm" else match_disparity_elas
     maps = torch.full_like(frames.images_left[:, 0], torch.nan)
-    for k, (height, width) in enumerate(frames.sizes.tolist()):
+    sizes = frames.sizes.tolist()
+    for k in range(len(sizes)) if needed is None else sorted(set(needed.tolist())):
+        height, width = sizes[k]
         pair = (_rgb8(images[k, :, :height, :width]) for images in (frames.images_left, frames.images_right))
         maps[k, :height, :width] = torch.from_numpy(match(*pair)).to(maps)
     return replace(frames, disparity=maps)

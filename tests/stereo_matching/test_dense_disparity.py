@@ -44,6 +44,20 @@ def test_matching_finds_the_cars_of_every_frame_and_leaves_the_padding_alone() -
     assert error[error.isfinite()].abs().median() < 0.3
 
 
+def test_only_frames_that_are_needed_are_matched() -> None:
+    frame = cached_street()[1].frames
+    frames = joined_frames([frame, frame])
+    every = with_disparity(frames, "sgbm").disparity
+    one = with_disparity(frames, "sgbm", needed=torch.tensor([1, 1])).disparity
+    none = with_disparity(frames, "sgbm", needed=torch.zeros(0, dtype=torch.long)).disparity
+    assert every is not None
+    assert one is not None
+    assert none is not None
+    torch.testing.assert_close(one[1], every[1], rtol=0, atol=0, equal_nan=True)
+    assert one[0].isnan().all()
+    assert none.isnan().all()
+
+
 def test_elas_is_asked_for_by_name_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "elas", None)
     with pytest.raises(MissingDependencyError, match=r"matcher elas .*needs the package .pyelas.; .*\[elas\]"):
