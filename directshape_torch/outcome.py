@@ -48,17 +48,27 @@ class Outcome:
         """The outcome of no cars at all; `like` says dtype and device."""
         empty = CarState(like.T_obj_cam[:0], like.code[:0])
         nothing = empty.code.new_zeros(0, 0, dtype=torch.float64)
-        square = nothing.reshape(0, 6 + empty.code.shape[1], 6 + empty.code.shape[1])
+        unknowns = 6 + empty.code.shape[1]
         none = torch.zeros(0, dtype=torch.long, device=nothing.device)
         names = tuple(term.name for term in problem.terms)
-        costs = nothing.reshape(0, len(names))
-        quality, unseen = FitQuality.nothing(nothing, 0), Observability.nothing(nothing, 0)
-        profile, xyz_yaw = DisparityProfile.nothing(nothing, 0), nothing.reshape(0, 4, 4)
-        return cls(empty, none, none, nothing, names, costs, costs, square, xyz_yaw, quality, unseen, profile)
+        return cls(
+            state=empty,
+            status=none,
+            iterations=none,
+            cost_history=nothing,
+            term_names=names,
+            cost_before=nothing.reshape(0, len(names)),
+            cost_after=nothing.reshape(0, len(names)),
+            covariance=nothing.reshape(0, unknowns, unknowns),
+            covariance_xyz_yaw=nothing.reshape(0, 4, 4),
+            quality=FitQuality.nothing(nothing, 0),
+            observability=Observability.nothing(nothing, 0),
+            profile=DisparityProfile.nothing(nothing, 0),
+        )
 
 
 def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch) -> Outcome:
-    """Costs, covariance, quality and observability of the cars of a problem at its minimum."""
+    """Costs, covariance, quality, observability and profile of the cars of a problem at its minimum."""
     linearisations = problem.linearise_terms(minimum.state, with_fisher=True)
     covariance = covariance_of(linearisations) + _rig_covariance(problem, minimum.state, cars)
     unseen = observability_of(problem.prior, minimum.state, problem.terms, linearisations)
@@ -75,19 +85,19 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         profile=disparity_profile(problem, initial, minimum.state),
     )
     return Outcome(
-        minimum.state,
-        minimum.status,
-        minimum.iterations,
-        minimum.cost_history,
-        tuple(term.name for term in problem.terms),
-        course.cost_before,
-        course.cost_after,
-        covariance,
-        course.covariance_xyz_yaw,
-        fit_quality(problem, course),
+        state=minimum.state,
+        status=minimum.status,
+        iterations=minimum.iterations,
+        cost_history=minimum.cost_history,
+        term_names=tuple(term.name for term in problem.terms),
+        cost_before=course.cost_before,
+        cost_after=course.cost_after,
+        covariance=covariance,
+        covariance_xyz_yaw=course.covariance_xyz_yaw,
+        quality=fit_quality(problem, course),
         # The directions are mostly those of the depth, so its factor brings them to size.
-        unseen.scaled(bundled_trust_model().sigma_factors[0]),
-        course.profile,
+        observability=unseen.scaled(bundled_trust_model().sigma_factors[0]),
+        profile=course.profile,
     )
 
 
@@ -129,6 +139,7 @@ def assemble(
 
     iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
     refined = is_refined(status)
+    judged = refined | (status == Status.not_trusted.code)
     # The input pose is returned to the bit for cars that were not refined, not inverted twice.
     T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), detections.T_cam_obj)
     return RefinementResult(
@@ -142,9 +153,9 @@ def assemble(
         covariance=only_refined(spread(outcome.covariance)),
         covariance_xyz_yaw=only_refined(spread(outcome.covariance_xyz_yaw)),
         cost_history=spread(outcome.cost_history),
-        quality=outcome.quality.spread(rows, count).where(refined | (status == Status.not_trusted.code)),
+        quality=outcome.quality.spread(rows, count).where(judged),
         observability=outcome.observability.spread(rows, count).where(refined),
-        profile=outcome.profile.spread(rows, count).where(refined | (status == Status.not_trusted.code)),
+        profile=outcome.profile.spread(rows, count).where(judged),
         input_dimensions_hwl=detections.dimensions_hwl,
         ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
