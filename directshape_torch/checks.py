@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+
+# Calibration files have six digits or more, and float32 seven.
+_ROTATION_TOLERANCE = 1e-3
 
 
 def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str], cure: str = "") -> None:
@@ -22,3 +26,43 @@ def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str], cure: 
     if not fits:
         wanted = "(" + ", ".join(str(n) for n in expected) + ")"
         raise InputError(name, f"shape {wanted}", f"{tuple(tensor.shape)}", cure)
+
+
+def check_rotation(
+    name: str,
+    transform: Tensor,  # (N, 4, 4), finite
+) -> None:
+    """Raise `InputError` unless the upper left part of every transform is a rotation.
+
+    Example:
+        >>> import torch
+        >>> check_rotation("T_cam_obj", torch.eye(4)[None])
+    """
+    rotation = transform.detach()[:, :3, :3].double()
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().amax(dim=(1, 2))
+    wrong = (error > _ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
+    if wrong.any():
+        row = int(wrong.int().argmax())
+        raise InputError(
+            name,
+            "rotations R with R R^T = I and determinant 1",
+            f"R = {rotation[row].tolist()} in row {row}",
+            "leave scale out of the transform, and build it from a rotation matrix",
+        )
+
+
+def check_sigmas(
+    name: str,
+    sigma: Tensor,  # (N, M)
+) -> None:
+    """Raise `InputError` unless every standard deviation is above 0; infinity is.
+
+    Example:
+        >>> import torch
+        >>> check_sigmas("pose_sigma", torch.tensor([[0.5, torch.inf]]))
+    """
+    wrong = (~(sigma.detach() > 0)).nonzero().tolist()
+    if wrong:
+        row, column = wrong[0]
+        got = f"{float(sigma[row, column]):g} in row {row}"
+        raise InputError(name, "standard deviations above 0", got, "give infinity for what the detector does not know")

@@ -13,12 +13,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from directshape_torch.checks import check_shape
+from directshape_torch.checks import check_rotation, check_shape, check_sigmas
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 
-# Calibration files have six digits or more, and float32 seven.
-_ROTATION_TOLERANCE = 1e-3
 # Resampling by cubic kernels overshoots a little.
 _BRIGHTEST = 1.01
 
@@ -73,7 +71,7 @@ class StereoCamera(_TensorRecord):
         for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref"):
             if not bool(getattr(self, name).isfinite().all()):
                 raise InputError(name, "finite numbers", "NaN or infinity", "check the calibration of every frame")
-        _check_rotation("T_right_cam", self.T_right_cam)
+        check_rotation("T_right_cam", self.T_right_cam)
         if (self.baseline <= 0).any():
             raise InputError(
                 "T_right_cam",
@@ -281,7 +279,10 @@ class Detections(_TensorRecord):
         check_shape("frame_index", self.frame_index, ("B",))
         count = len(self.frame_index)
         check_shape("T_cam_obj", self.T_cam_obj, (count, 4, 4))
-        _check_rotation("T_cam_obj", self.T_cam_obj[self.T_cam_obj.isfinite().flatten(1).all(dim=1)])
+        has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
+        check_rotation(
+            "T_cam_obj", torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
+        )
         check_shape("dimensions_hwl", self.dimensions_hwl, (count, 3))
         check_shape("box_2d", self.box_2d, (count, 4))
         check_shape("score", self.score, (count,))
@@ -291,35 +292,10 @@ class Detections(_TensorRecord):
         check_shape("has_mask_right", self.has_mask_right, (count,))
         if self.pose_sigma is not None:
             check_shape("pose_sigma", self.pose_sigma, (count, 4))
-            _check_above_zero("pose_sigma", self.pose_sigma)
+            check_sigmas("pose_sigma", self.pose_sigma)
 
     def __len__(self) -> int:
         return len(self.frame_index)
-
-
-def _check_rotation(
-    name: str,
-    transform: Tensor,  # (N, 4, 4), finite
-) -> None:
-    rotation = transform.detach()[:, :3, :3].double()
-    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().amax(dim=(1, 2))
-    wrong = (error > _ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
-    if wrong.any():
-        row = int(wrong.int().argmax())
-        raise InputError(
-            name,
-            "rotations R with R R^T = I and determinant 1",
-            f"R = {rotation[row].tolist()} in row {row}",
-            "leave scale out of the transform, and build it from a rotation matrix",
-        )
-
-
-def _check_above_zero(name: str, sigma: Tensor) -> None:
-    wrong = (~(sigma.detach() > 0)).nonzero().tolist()
-    if wrong:
-        row, column = wrong[0]
-        got = f"{float(sigma[row, column]):g} in row {row}"
-        raise InputError(name, "standard deviations above 0", got, "give infinity for what the detector does not know")
 
 
 def _check_at_most_one(name: str, images: Tensor) -> None:

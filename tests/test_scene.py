@@ -46,6 +46,9 @@ def test_rotations_are_rotations(wrong: torch.Tensor) -> None:
         replace(scene.frames.camera, T_right_cam=T_right_cam)
     with pytest.raises(InputError, match=r"T_cam_obj: expected rotations R .* in row 1; leave scale out"):
         replace(scene.detections, T_cam_obj=T_cam_obj)
+    T_cam_obj[0] = torch.nan  # rows without a pose count when the wrong one is named
+    with pytest.raises(InputError, match=r"in row 1"):
+        replace(scene.detections, T_cam_obj=T_cam_obj)
 
 
 def test_poses_may_be_rounded_or_unknown() -> None:
