@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.image.interpolate import bilinear_with_gradient
+from directshape_torch.stereo_matching.subpixel import solve_displacement
 
 _RADIUS_PX = 5
 _NUM_ITERATIONS = 10
@@ -43,18 +44,14 @@ def align_zoomed(
     zoomed = zoom[:, None, None] * patch
     for _ in range(_NUM_ITERATIONS):
         seen, gradient, inside_later = bilinear_with_gradient(later, frame, current[:, None] + zoomed)
-        J = torch.cat([gradient, torch.ones_like(centred)[..., None], centred[..., None]], dim=-1)
-        weighted = J * weight[..., None]
-        inverse = torch.linalg.inv(weighted.mT @ J + 1e-3 * torch.eye(4, dtype=torch.float64))
-        step = -(inverse @ (weighted.mT @ (seen - observed)[..., None]))
-        left_over = seen - observed + (J @ step)[..., 0]
-        weight = _HUBER_GREY / left_over.abs().clamp_min(_HUBER_GREY)
-        moved = step[:, :2, 0].clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX)
-        current = current + moved
+        step, variance, residual = solve_displacement(seen - observed, gradient, centred, weight)
+        weight = _HUBER_GREY / residual.abs().clamp_min(_HUBER_GREY)
+        step = step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+        current = current + step
     reliable = (
-        (moved.abs() < _CONVERGED_PX).all(dim=1)
+        (step.abs() < _CONVERGED_PX).all(dim=1)
         & ((current - uv_later).abs() < _LARGEST_CHANGE_PX).all(dim=1)
-        & (inverse.diagonal(dim1=1, dim2=2)[:, :2] < _LARGEST_SIGMA_PX**2).all(dim=1)
+        & (variance < _LARGEST_SIGMA_PX**2).all(dim=1)
         & (inside_first & inside_later).all(dim=1)
     )
     return current, reliable

@@ -60,7 +60,7 @@ def refine_disparity(
     current, weight = start, torch.ones_like(observed)
     for _ in range(_NUM_ITERATIONS):
         predicted, gradient, inside_right = bilinear_with_gradient(grey_right[None], frame, uv - current[:, None])
-        step, variance, residual = _solve(predicted - observed, -gradient, centred, weight)
+        step, variance, residual = solve_displacement(predicted - observed, -gradient, centred, weight)
         weight = _HUBER_GREY / residual.abs().clamp_min(_HUBER_GREY)
         step = step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX)
         current = current + step
@@ -74,7 +74,7 @@ def refine_disparity(
     return RefinedDisparity(current[:, 0], current[:, 1], reliable)
 
 
-def _solve(
+def solve_displacement(
     residual: Tensor,  # (P, N)
     J_residual_displacement: Tensor,  # (P, N, 2)
     centred: Tensor,  # (P, N)
