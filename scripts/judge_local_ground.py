@@ -15,8 +15,8 @@ worth building in only where the figures under `local` are clearly below those u
     python scripts/judge_local_ground.py --data ROOT --detections DIR --masks DIR [--stereo-bias bias.json] [--refine]
 
 With --refine every frame is refined with its plane, and once for each car with the plane moved to the car's local
-(drawn towards 0) and to its true height, of which that car's box is kept: the last row is what
-perfect heights are worth.
+(drawn towards 0) and to its true height, of which that car's box is kept: the last row is what perfect heights are
+worth.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ import torch
 from command_line import run_command
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.geometry.box3d import box_corners
@@ -241,7 +242,7 @@ def run(args: argparse.Namespace) -> int:
     overlaps: list[tuple[float, ...]] = []
     refiner = DirectShapeRefiner() if args.refine else None
     num_labels = 0
-    for frame_id in dataset.frame_ids:
+    for frame_id in tqdm(dataset.frame_ids, desc="frames", unit="frame", disable=not sys.stderr.isatty()):
         loaded = dataset.load(frame_id)
         labels = counted_labels(loaded)
         num_labels += len(labels)
