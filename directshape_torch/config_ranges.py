@@ -40,7 +40,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "photometric.gradient_constant_grey_levels": _POSITIVE,
     "photometric.lost_grey_levels": _POSITIVE,
     "photometric.min_ray_cosine": (0, 0.999),
-    "photometric.contrast_floor_grey_levels": _POSITIVE,
+    "photometric.contrast_floor_grey_levels": (1e-3, math.inf),
     "point_cloud.weight": _NOT_NEGATIVE,
     "point_cloud.combined_weight": _NOT_NEGATIVE,
     "point_cloud.huber_m": _POSITIVE,

@@ -9,10 +9,13 @@ from typing import Any
 import pytest
 
 from directshape_torch.config import (
+    AcceptanceConfig,
+    BackwardConfig,
     PhotometricConfig,
     PointCloudConfig,
     PriorConfig,
     RefinerConfig,
+    RigConfig,
     SamplingConfig,
     SearchConfig,
     SilhouetteConfig,
@@ -69,6 +72,10 @@ def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) 
         ("silhouette.probability_floor=0.5", "silhouette.probability_floor: expected"),
         ("silhouette.weight=-1", "silhouette.weight: expected a number of at least 0, got -1.0"),
         ("photometric.huber_grey_levels=.nan", "photometric.huber_grey_levels: expected a number above 0, got nan"),
+        (
+            "photometric.contrast_floor_grey_levels=1e-30",  # nothing, squared in single precision
+            "photometric.contrast_floor_grey_levels: expected a number of at least 0.001, got 1e-30",
+        ),
         ("solver.max_code=.inf", "solver.max_code: expected a number above 0, got inf"),
         ("priors.dimensions_sigma_m=[0.1, 0, 0.1]", "priors.dimensions_sigma_m: expected a number above 0"),
         ("sampling.max_pixels=50", "sampling.max_pixels: expected at least sampling.min_pixels = 400, got 50"),
@@ -91,6 +98,7 @@ def test_every_number_has_a_range() -> None:
     groups = {
         "solver": SolverConfig, "silhouette": SilhouetteConfig, "photometric": PhotometricConfig,
         "priors": PriorConfig, "sampling": SamplingConfig, "search": SearchConfig, "point_cloud": PointCloudConfig,
+        "rig": RigConfig, "acceptance": AcceptanceConfig, "backward": BackwardConfig,
     }  # fmt: skip
     for group, kind in groups.items():
         for field in dataclasses.fields(kind):

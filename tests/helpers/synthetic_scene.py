@@ -12,6 +12,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
+from directshape_torch.laboratory.scenes import select_detections
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, StereoCamera
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
@@ -138,11 +139,7 @@ def disturbed(detections: Detections, metres: float = 0.15, radians: float = 0.0
 
 def select(detections: Detections, rows: Tensor) -> Detections:
     """Some of the detections, in the given order."""
-    names = (
-        "frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score",
-        "mask_left", "mask_right", "has_mask_left", "has_mask_right",
-    )  # fmt: skip
-    return replace(detections, **{name: getattr(detections, name)[rows] for name in names})
+    return select_detections(detections, rows)
 
 
 def joined_frames(parts: list[FrameBatch]) -> FrameBatch:
