@@ -2,6 +2,7 @@
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.config_files import load_config
+from directshape_torch.disparity_profile import DisparityProfile
 from directshape_torch.errors import (
     ConfigError,
     DataFormatError,
@@ -28,6 +29,7 @@ __all__ = [
     "DirectShapeError",
     "DirectShapeRefiner",
     "DisparityField",
+    "DisparityProfile",
     "FitQuality",
     "FrameBatch",
     "GroundPlane",
