@@ -80,7 +80,7 @@ def prior_terms(config: RefinerConfig, prior: ShapePrior, cars: CarBatch) -> lis
         sigma = torch.tensor(p.dimensions_sigma_m, dtype=code.dtype, device=code.device)
         return dimensions_prior(prior.dimensions_and_derivative(code), cars.detector_hwl, sigma)
 
-    def pose(cars: CarBatch, at: ProjectedState) -> PriorResidual:
+    def detector_pose(cars: CarBatch, at: ProjectedState) -> PriorResidual:
         sigma = detector_pose_sigma(p, cars)
         return pose_prior(at.state.T_obj_cam, cars.detector_T_cam_obj, sigma, at.state.code.shape[1])
 
@@ -91,7 +91,7 @@ def prior_terms(config: RefinerConfig, prior: ShapePrior, cars: CarBatch) -> lis
         PriorTerm("dimensions", p.dimensions_weight, cars, dimensions),
     ]
     if cars.detector_pose_sigma is not None or any(_pose_sigmas(p)):
-        all_terms.append(PriorTerm("pose", p.pose_weight, cars, pose))
+        all_terms.append(PriorTerm("pose", p.pose_weight, cars, detector_pose))
     return [term for term in all_terms if term.weight > 0]
 
 
