@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,21 @@ def test_command_finds_a_constant_bias_in_images(tmp_path: Path, capsys: pytest.
     torch.testing.assert_close(bias, torch.full((3,), -0.6, dtype=torch.float64), atol=0.05, rtol=0)
     assert (tmp_path / "bias.png").is_file()
     assert "before" in capsys.readouterr().out
+
+
+def test_fields_of_other_rigs_are_named_and_the_others_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_frame(tmp_path, "000001", bias_px=-0.6)
+    assert calibrate(tmp_path) == 0
+    field = DisparityField.load(tmp_path / "bias.json")
+    replace(field, size_wh=(99, 99)).save(tmp_path / "other.json")
+    field.save(tmp_path / "same.json")
+    against = ("--against", str(tmp_path / "other.json"), str(tmp_path / "same.json"))
+    assert calibrate(tmp_path, *against) == 1
+    captured = capsys.readouterr()
+    assert "other.json: disparity_field: expected images of" in captured.err
+    assert "RMS 0.000" in captured.out.split("same.json")[1]
 
 
 def test_command_reports_a_damaged_frame_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
