@@ -4,7 +4,7 @@
     directshape calibrate-stereo --data $K --from disparity --frames 007322 --out bias.json
     python scripts/calibrate_quality.py --data $R --exact $R/detections/gt --masks $R/training/masks $R/masks_degraded
         --seeds 0 1 2 --other $K --other-detections $K/detections/noisy_stereo --other-masks $K/training/masks
-        --stereo-bias bias.json --other-disparity-sigma-px 0 0.1
+        --stereo-bias bias.json --other-disparity-sigma-px 0 0.1 --detector-says-sigmas
         --out out/trust --model directshape_torch/assets/trust_model.json
 
 Detections of three noise levels are drawn around exact ones and refined with each kind of masks, every result being
@@ -64,16 +64,16 @@ def refiner(disparity_sigma_px: float = 0.0) -> DirectShapeRefiner:
     return DirectShapeRefiner(config=replace(RefinerConfig(), acceptance=EVERYTHING, rig=RigConfig(disparity_sigma_px)))
 
 
-def development_cars(args: argparse.Namespace) -> Observations:
-    """Refined cars of drawn detections, from OUT where they are there already."""
+def development_cars(args: argparse.Namespace, *, says_sigmas: bool = False) -> Observations:
+    """Refined cars of drawn detections, from OUT where they are there already; does the detector say its sigmas?"""
     parts = []
     for masks in args.masks:
-        name = "_".join(["cars", masks.name, *map(str, args.seeds), *(["sigmas"] if args.detector_says_sigmas else [])])
+        name = "_".join(["cars", masks.name, *map(str, args.seeds), *(["sigmas"] if says_sigmas else [])])
         kept = args.out / f"{name}.npz"
         if not kept.is_file():
             dataset = KittiStereoDataset(args.data, args.exact, masks, frames=args.frames)
-            says = args.detector_says_sigmas
-            observe_noisy(dataset, refiner(), LEVELS, args.seeds, masks.name, _tell, says_sigmas=says).save(kept)
+            drawn = observe_noisy(dataset, refiner(), LEVELS, args.seeds, masks.name, _tell, says_sigmas=says_sigmas)
+            drawn.save(kept)
         parts.append(Observations.load(kept))
     return Observations.joined(parts)
 
@@ -129,12 +129,48 @@ def judged_others(args: argparse.Namespace, model: TrustModel) -> list[Judged]:
     return entries
 
 
+def levels_of(everything: Judged, name: str) -> list[Judged]:
+    """All drawn cars, those of the usual detectors, and those of each level by itself."""
+    levels = np.array([source.partition(",")[0] for source in everything.observations.source.tolist()])
+    usual = everything.where(np.isin(levels, USUAL_LEVELS), f"{name}, {' and '.join(USUAL_LEVELS)}")
+    drawn = [level.name for level in LEVELS if (levels == level.name).any()]
+    return [everything, usual, *(everything.where(levels == level, f"{name}, {level}") for level in drawn)]
+
+
+def judged_with_sigmas(args: argparse.Namespace, cars: Observations, read: HeadColumns) -> list[Judged]:
+    """The same draws refined with the detector's sigmas, judged by models of cars of other frames without them."""
+
+    def fitted_elsewhere(_: Observations, test: Observations) -> Array:
+        seen = ~np.isin(cars.group, test.group)
+        return predictions(fitted(cars.where(seen), {}, read), test)
+
+    said = development_cars(args, says_sigmas=True)
+    return levels_of(judged("sigmas said, all", said, cross_validated(said, fitted_elsewhere)), "sigmas said")
+
+
 def run(args: argparse.Namespace) -> None:
     """Refine, fit, judge and write."""
     torch.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
     cars = development_cars(args)
-    provenance: dict[str, object] = {
+    read = HeadColumns(tuple(args.better), tuple(args.not_worse))
+    model = fitted(cars, _provenance(cars), read)
+    held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}, read), test))
+    drawn = levels_of(judged("rendered, all", cars, held_out), "rendered")
+    said = judged_with_sigmas(args, cars, read) if args.detector_says_sigmas else []
+    real = judged_others(args, model) if args.other else []
+    model.save(args.model or args.out / "trust_model.json")
+    chosen = choose_thresholds(drawn[1].observations, drawn[1].probabilities)
+    report = _report(model, drawn, [*said, *real], chosen)
+    (args.out / "report.md").write_text(report + "\n", encoding="utf-8")
+    shown = [*drawn[:1], *said[:1], *real]
+    plot_reliability(args.out / "trust_reliability.png", shown, [*(8 for _ in shown[len(real) :]), *(3 for _ in real)])
+    plot_policy(args.out / "trust_policy.png", [*drawn[:1], *drawn[2:], *said[1:2], *real], chosen)
+    print(report)
+
+
+def _provenance(cars: Observations) -> dict[str, object]:
+    return {
         "made_by": "scripts/calibrate_quality.py",
         "cars": len(cars),
         "frames": len(set(cars.group.tolist())),
@@ -142,39 +178,30 @@ def run(args: argparse.Namespace) -> None:
         "settings": "configs/default.yaml",
         "worse_by": 0.05,
     }
-    read = HeadColumns(tuple(args.better), tuple(args.not_worse))
-    model = fitted(cars, provenance, read)
-    held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}, read), test))
-    everything = judged("rendered, all", cars, held_out)
-    levels = np.array([source.partition(",")[0] for source in cars.source.tolist()])
-    drawn = [level.name for level in LEVELS if (levels == level.name).any()]
-    groups = [everything.where(levels == name, f"rendered, {name}") for name in drawn]
-    usual = everything.where(np.isin(levels, USUAL_LEVELS), " and ".join(USUAL_LEVELS))
-    chosen = choose_thresholds(usual.observations, usual.probabilities)
+
+
+def _report(model: TrustModel, drawn: list[Judged], others: list[Judged], chosen: Thresholds) -> str:
+    """All tables in Markdown; `drawn` are all cars that the model was fitted to, the usual ones and the levels."""
+    everything, usual = drawn[:2]
     nested = policy(usual.observations, kept_by_nested_choice(usual))
-    real = judged_others(args, model) if args.other else []
-    model.save(args.model or args.out / "trust_model.json")
-    report = "\n\n".join(
-        [
-            f"Thresholds of highest mean IoU below 2 % worse, {usual.name}: {chosen.better:g} for better and "
-            f"{chosen.not_worse:g} for not worse. Chosen anew without each frame: {100 * nested.kept:.1f} % kept, "
-            f"{100 * nested.worse:.1f} % worse, mean IoU {nested.iou:.3f}.",
-            head_table((("better", model.better), ("not worse", model.not_worse))),
-            discrimination_table([everything, *groups, *real]),
-            *(
-                reliability_table(f"{c.name}, {name}", reliability(p, y, c.observations.group, bins))
-                for c, bins in ((everything, 8), *((r, 3) for r in real))
-                for name, p, y in (("better", c.better, c.is_better), ("not worse", c.not_worse, c.is_not_worse))
-            ),
-            policy_table([usual, everything, *groups, *real], [Thresholds(0.0, 0.0), chosen, STRICT]),
-            "Sigmas: " + sigma_line(fit_sigmas(*in_view(cars))),
-            coverage_table([everything, *groups, *real]),
-        ]
-    )
-    (args.out / "report.md").write_text(report + "\n", encoding="utf-8")
-    plot_reliability(args.out / "trust_reliability.png", [everything, *real], [8, *(3 for _ in real)])
-    plot_policy(args.out / "trust_policy.png", [everything, *groups, *real], chosen)
-    print(report)
+    groups = [*drawn, *others]
+    parts = [
+        f"Thresholds of highest mean IoU below 2 % worse, {usual.name}: {chosen.better:g} for better and "
+        f"{chosen.not_worse:g} for not worse. Chosen anew without each frame: {100 * nested.kept:.1f} % kept, "
+        f"{100 * nested.worse:.1f} % worse, mean IoU {nested.iou:.3f}.",
+        head_table((("better", model.better), ("not worse", model.not_worse))),
+        discrimination_table(groups),
+        *(
+            reliability_table(f"{c.name}, {name}", reliability(p, y, c.observations.group, bins))
+            for c in (everything, *others)
+            for bins in (8 if len(c.observations) > 400 else 3,)
+            for name, p, y in (("better", c.better, c.is_better), ("not worse", c.not_worse, c.is_not_worse))
+        ),
+        policy_table(groups, [Thresholds(0.0, 0.0), chosen, STRICT]),
+        "Sigmas: " + sigma_line(fit_sigmas(*in_view(everything.observations))),
+        coverage_table(groups),
+    ]
+    return "\n\n".join(parts)
 
 
 def kept_by_nested_choice(cars: Judged) -> NDArray[np.bool_]:
@@ -200,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--masks", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    says = "the drawn detections carry the standard deviations of their errors (Detections.pose_sigma)"
+    says = "judge the same draws as well where the detector says the standard deviations of its poses"
     parser.add_argument("--detector-says-sigmas", action="store_true", help=says)
     parser.add_argument("--other", type=Path, metavar="ROOT", help="real frames, judged and never fitted")
     parser.add_argument("--other-detections", type=Path, metavar="DIR")

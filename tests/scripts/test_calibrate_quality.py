@@ -125,16 +125,18 @@ def test_drawn_detections_have_the_errors_of_their_level() -> None:
 
 def test_cars_that_are_kept_make_model_report_and_pictures(tmp_path: Path) -> None:
     simulated(480).save(tmp_path / "out" / "cars_masks_0.npz")
+    simulated(480).save(tmp_path / "out" / "cars_masks_0_sigmas.npz")
     simulated(48).save(tmp_path / "out" / "cars_other_0px.npz")
     simulated(48).save(tmp_path / "out" / "cars_other_0.1px.npz")
     arguments = ["--data", ".", "--exact", ".", "--masks", "masks", "--seeds", "0", "--other", "kitti"]
-    arguments += ["--other-disparity-sigma-px", "0", "0.1", "--out"]
+    arguments += ["--other-disparity-sigma-px", "0", "0.1", "--detector-says-sigmas", "--out"]
     model = tmp_path / "model.json"
     assert calibrate_quality.main([*arguments, str(tmp_path / "out"), "--model", str(model)]) == 0
     assert load_trust_model(model).provenance["cars"] == 480
     report = (tmp_path / "out" / "report.md").read_text()
     assert "| rendered, all | 480 | better |" in report
     assert "| kitti | 48 | not worse |" in report
+    assert "| sigmas said, stereo and mono | 480 | not worse |" in report
     assert "| kitti, rig off by 0.1 px | 48 | not worse |" in report
     for name in ("trust_reliability.png", "trust_policy.png"):
         assert (tmp_path / "out" / name).stat().st_size > 5000
