@@ -257,7 +257,8 @@ class Detections(_TensorRecord):
         occluders: other instances that may hide the cars, or None.
         pose_sigma: (B, 4) standard deviations of the detector's own error: along the viewing ray of the object origin
             (in the plane of the camera's x and z axes), across it in that plane, along the camera's y axis (metres),
-            and of the heading (radians). Infinity where not known. None: the settings' (`priors.pose_sigma_*`), if any.
+            and of the heading (radians). Infinity where not known. None: the settings' (`priors.pose_sigma_*`), if any;
+            collated with frames that have some, infinity stands for none.
 
     Raises:
         InputError: wrong shapes, a rotation that is none, or a standard deviation that is not above 0.

@@ -107,6 +107,9 @@ def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: st
         unseen=tuple(words[row] for row in rows.tolist()),
         unseen_sigmas_m=_numpy(result.observability.sigmas_m[rows]),
         unseen_directions=_numpy(result.observability.directions[rows]),
+        profile_offsets_px=_numpy(result.profile.offsets_px),
+        profile_costs_before=_numpy(result.profile.cost_before[rows]),
+        profile_costs_after=_numpy(result.profile.cost_after[rows]),
     )
 
 

@@ -87,7 +87,7 @@ def _shape(*sizes: str | int) -> dict[str, tuple[str | int, ...]]:
 
 @dataclass(frozen=True)
 class ShapeArrays:
-    """Content of `OUT/shapes/NNNNNN.npz` for the B refined lines of a frame; K codes, D = 6 + K, T terms.
+    """Content of `OUT/shapes/NNNNNN.npz` for the B refined lines of a frame; K codes, D = 6 + K, T terms, P offsets.
 
     Attributes:
         frame_id: the frame.
@@ -114,6 +114,8 @@ class ShapeArrays:
         unseen: (B,) text, the direction that the view shows least.
         unseen_sigmas_m: (B, 7) standard deviations along the principal directions, falling, without priors.
         unseen_directions: (B, 7, 7) these directions, rows; columns `observability.CAR_QUANTITIES`.
+        profile_offsets_px: (P,) offsets of disparity.
+        profile_costs_before, profile_costs_after: (B, P) photometric cost there, see `DisparityProfile`.
     """
 
     frame_id: str
@@ -145,10 +147,13 @@ class ShapeArrays:
     unseen: tuple[str, ...] = field(metadata=_shape("B"))
     unseen_sigmas_m: Floats = field(metadata=_shape("B", 7))
     unseen_directions: Floats = field(metadata=_shape("B", 7, 7))
+    profile_offsets_px: Floats = field(metadata=_shape("P"))
+    profile_costs_before: Floats = field(metadata=_shape("B", "P"))
+    profile_costs_after: Floats = field(metadata=_shape("B", "P"))
 
     def __post_init__(self) -> None:
         B, T, K = len(self.input_lines), len(self.term_names), self.codes.shape[-1]
-        sizes = {"B": B, "K": K, "D": 6 + K, "T": T}
+        sizes = {"B": B, "K": K, "D": 6 + K, "T": T, "P": len(self.profile_offsets_px)}
         for entry in fields(self):
             shape = tuple(sizes.get(size, size) for size in entry.metadata.get("shape", ()))
             got = np.shape(getattr(self, entry.name))

@@ -44,5 +44,8 @@ def shape_arrays(num_cars: int, **changes: Any) -> ShapeArrays:
         unseen=("rear view: length alone (sigma 0.20 m)", "", "")[:B],
         unseen_sigmas_m=random.random((B, 7)),
         unseen_directions=random.random((B, 7, 7)),
+        profile_offsets_px=np.linspace(-3, 3, 25),
+        profile_costs_before=random.random((B, 25)),
+        profile_costs_after=random.random((B, 25)),
     )
     return dataclasses.replace(arrays, **changes)
