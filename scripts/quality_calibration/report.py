@@ -143,7 +143,7 @@ def sigma_line(scales: SigmaScales) -> str:
 
 def plot_reliability(path: Path, cars: Sequence[Judged], bins: Sequence[int]) -> None:
     """Predicted against observed for both heads, 95 % intervals over frames."""
-    figure = new_figure(9, 4.4, "the reliability diagram")
+    figure = new_figure(9, 4.8, "the reliability diagram")
     axes = figure.subplots(1, 2)
     heads = (("better than the input", "better", "is_better"), ("not worse by 0.05", "not_worse", "is_not_worse"))
     for axis, (title, probability, outcome) in zip(axes, heads, strict=True):
@@ -157,13 +157,13 @@ def plot_reliability(path: Path, cars: Sequence[Judged], bins: Sequence[int]) ->
         axis.set_aspect("equal")
     axes[0].set(xlim=(0, 1.02), ylim=(0, 1.02))
     axes[1].set(xlim=(0.5, 1.02), ylim=(0.5, 1.02))
-    axes[0].legend(loc="upper left", fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     write_bytes(path, figure_png(figure))
 
 
 def plot_policy(path: Path, cars: Sequence[Judged], chosen: Thresholds) -> None:
     """Share made worse and mean overlap over the share of results that are kept, as both thresholds move together."""
-    figure = new_figure(9, 3.8, "the picture of the policy")
+    figure = new_figure(9, 4.3, "the picture of the policy")
     axes = figure.subplots(1, 2)
     for c in cars:
         margin = (_logit(c.probabilities) - _logit(np.array(chosen))).min(axis=1)
@@ -178,7 +178,7 @@ def plot_policy(path: Path, cars: Sequence[Judged], chosen: Thresholds) -> None:
     axes[0].axhline(2, color="0.7", linewidth=1)
     axes[0].set(xlabel="results kept, %", ylabel="made worse by 0.05, % of all cars")
     axes[1].set(xlabel="results kept, %", ylabel="mean BEV IoU of what is returned")
-    axes[0].legend(fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     write_bytes(path, figure_png(figure))
 
 
