@@ -22,7 +22,10 @@ _MIN_DEPTH_M = 1.0
 
 def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
     """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
-    for name, tensor in (("frames", frames.images_left), ("detections", detections.T_cam_obj)):
+    tensors = {"frames": frames.images_left, "detections": detections.T_cam_obj}
+    if detections.pose_sigma is not None:
+        tensors["detections.pose_sigma"] = detections.pose_sigma
+    for name, tensor in tensors.items():
         if tensor.dtype != prior.origin.dtype or tensor.device != prior.origin.device:
             raise InputError(
                 name,

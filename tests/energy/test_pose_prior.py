@@ -130,6 +130,11 @@ def test_standard_deviations_are_above_zero(wrong: float) -> None:
         _start(SIGMA)
 
 
+def test_standard_deviations_are_of_the_refiners_dtype() -> None:
+    with pytest.raises(InputError, match=r"detections.pose_sigma: expected dtype torch.float64 .*got torch.float32"):
+        _refined(_start(SIGMA.float().expand(2, 4)))
+
+
 @pytest.mark.parametrize(("mode", "iterations", "tolerance"), [("unroll", 2, 1e-5), ("implicit", 40, 0.05)])
 def test_the_anchor_follows_the_input_pose(mode: str, iterations: int, tolerance: float) -> None:
     inputs = StreetInputs()
