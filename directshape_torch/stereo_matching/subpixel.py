@@ -12,17 +12,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.image.interpolate import bilinear_with_gradient
+from directshape_torch.stereo_matching.patch_alignment import PatchLimits, align_patches
 
-_RADIUS_PX = 4
-_NUM_ITERATIONS = 10
-_HUBER_GREY = 10.0
-_LARGEST_STEP_PX = 0.5
-_LARGEST_CHANGE_PX = 1.0
-_CONVERGED_PX = 0.02
-# Standard deviation of the disparity for residuals of one grey level; a weaker patch says little.
-_LARGEST_SIGMA_PX = 0.03
-_LARGEST_ROW_SIGMA_PX = 0.1
+_LIMITS = PatchLimits(radius_px=4, change_px=1.0, sigma_px=(0.03, 0.1))
 
 
 class RefinedDisparity(NamedTuple):
@@ -50,41 +42,7 @@ def refine_disparity(
         >>> round(float(refined.disparity), 1), bool(refined.reliable)
         (7.3, True)
     """
-    offsets = torch.arange(-_RADIUS_PX, _RADIUS_PX + 1, dtype=uv_left.dtype, device=uv_left.device)
-    patch = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).reshape(-1, 2)
-    uv = uv_left[:, None] + patch
-    frame = torch.zeros(len(uv), 1, dtype=torch.long, device=uv.device)
-    observed, _, inside_left = bilinear_with_gradient(grey_left[None], frame, uv)
-    centred = observed - observed.mean(dim=1, keepdim=True)
     start = torch.stack([disparity, row_shift], dim=-1)
-    current, weight = start, torch.ones_like(observed)
-    for _ in range(_NUM_ITERATIONS):
-        predicted, gradient, inside_right = bilinear_with_gradient(grey_right[None], frame, uv - current[:, None])
-        step, variance, residual = solve_displacement(predicted - observed, -gradient, centred, weight)
-        weight = _HUBER_GREY / residual.abs().clamp_min(_HUBER_GREY)
-        step = step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX)
-        current = current + step
-    reliable = (
-        (step.abs() < _CONVERGED_PX).all(dim=1)
-        & ((current - start).abs() < _LARGEST_CHANGE_PX).all(dim=1)
-        & (variance[:, 0] < _LARGEST_SIGMA_PX**2)
-        & (variance[:, 1] < _LARGEST_ROW_SIGMA_PX**2)
-        & (inside_left & inside_right).all(dim=1)
-    )
-    return RefinedDisparity(current[:, 0], current[:, 1], reliable)
-
-
-def solve_displacement(
-    residual: Tensor,  # (P, N)
-    J_residual_displacement: Tensor,  # (P, N, 2)
-    centred: Tensor,  # (P, N)
-    weight: Tensor,  # (P, N)
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Least squares for displacement, offset and gain: step (P, 2), its unit variance (P, 2), residual after it."""
-    J = torch.cat([J_residual_displacement, torch.ones_like(centred)[..., None], centred[..., None]], dim=-1)
-    weighted = J * weight[..., None]
-    # The floor keeps patches without texture solvable; they are rejected by their variance.
-    H = weighted.mT @ J + 1e-3 * torch.eye(4, dtype=J.dtype, device=J.device)
-    inverse = torch.linalg.inv(H)
-    step = -(inverse @ (weighted.mT @ residual[..., None]))
-    return step[:, :2, 0], inverse.diagonal(dim1=1, dim2=2)[:, :2], residual + (J @ step)[..., 0]
+    uv_right, reliable = align_patches(grey_left, grey_right, uv_left, uv_left - start, _LIMITS)
+    disparity, row_shift = (uv_left - uv_right).unbind(dim=-1)
+    return RefinedDisparity(disparity, row_shift, reliable)

@@ -1,0 +1,89 @@
+"""Where patches of one image are in another: robust Gauss-Newton (Lucas and Kanade, 1981), free of gain and offset."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.image.interpolate import bilinear_with_gradient
+
+_NUM_ITERATIONS = 10
+_HUBER_GREY = 10.0
+_LARGEST_STEP_PX = 0.5
+_CONVERGED_PX = 0.02
+
+
+class PatchLimits(NamedTuple):
+    """Size of the patches, and what a reliable alignment is.
+
+    Attributes:
+        radius_px: patches are 2 radius + 1 pixels wide.
+        change_px: from the start at most, in u and in v.
+        sigma_px: standard deviations of u and v at most, for residuals of one grey level; a weaker patch says little.
+    """
+
+    radius_px: int
+    change_px: float
+    sigma_px: tuple[float, float]
+
+
+def align_patches(
+    grey: Tensor,  # (H, W) grey levels 0..255
+    grey_other: Tensor,  # (H, W)
+    uv: Tensor,  # (P, 2) pixels
+    uv_start: Tensor,  # (P, 2) pixels in the other image
+    limits: PatchLimits,
+    zoom: Tensor | None = None,  # (P,) size in the other image over that in the first; None for 1
+) -> tuple[Tensor, Tensor]:
+    """Align a patch round each pixel with the other image.
+
+    Returns:
+        pixels (P, 2) in the other image, and (P,) bool: converged near the start, textured, inside of both images.
+
+    Example:
+        >>> u, v = torch.meshgrid(torch.arange(60.0), torch.arange(20.0), indexing="xy")
+        >>> first, other = (100 + 50 * torch.sin((u - shift) / 3) + 30 * torch.cos(v / 2) for shift in (0.0, 2.3))
+        >>> uv = torch.tensor([[30.0, 10.0]])
+        >>> start = uv + torch.tensor([2.0, 0.0])
+        >>> found, reliable = align_patches(first, other, uv, start, PatchLimits(4, 1.0, (0.1, 0.1)))
+        >>> round(float(found[0, 0]), 1), bool(reliable)
+        (32.3, True)
+    """
+    offsets = torch.arange(-limits.radius_px, limits.radius_px + 1, dtype=uv.dtype, device=uv.device)
+    patch = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).reshape(-1, 2)
+    frame = torch.zeros(len(uv), 1, dtype=torch.long, device=uv.device)
+    observed, _, inside = bilinear_with_gradient(grey[None], frame, uv[:, None] + patch)
+    centred = observed - observed.mean(dim=1, keepdim=True)
+    zoomed = patch if zoom is None else zoom[:, None, None] * patch
+    current, weight = uv_start, torch.ones_like(observed)
+    for _ in range(_NUM_ITERATIONS):
+        predicted, gradient, inside_other = bilinear_with_gradient(grey_other[None], frame, current[:, None] + zoomed)
+        step, variance, residual = _solve_displacement(predicted - observed, gradient, centred, weight)
+        weight = _HUBER_GREY / residual.abs().clamp_min(_HUBER_GREY)
+        step = step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX)
+        current = current + step
+    reliable = (
+        (step.abs() < _CONVERGED_PX).all(dim=1)
+        & ((current - uv_start).abs() < limits.change_px).all(dim=1)
+        & (variance < variance.new_tensor(limits.sigma_px) ** 2).all(dim=1)
+        & (inside & inside_other).all(dim=1)
+    )
+    return current, reliable
+
+
+def _solve_displacement(
+    residual: Tensor,  # (P, N)
+    J_residual_displacement: Tensor,  # (P, N, 2)
+    centred: Tensor,  # (P, N)
+    weight: Tensor,  # (P, N)
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Least squares for displacement, offset and gain: step (P, 2), its unit variance (P, 2), residual after it."""
+    J = torch.cat([J_residual_displacement, torch.ones_like(centred)[..., None], centred[..., None]], dim=-1)
+    weighted = J * weight[..., None]
+    # The floor keeps patches without texture solvable; they are rejected by their variance.
+    H = weighted.mT @ J + 1e-3 * torch.eye(4, dtype=J.dtype, device=J.device)
+    inverse = torch.linalg.inv(H)
+    step = -(inverse @ (weighted.mT @ residual[..., None]))
+    return step[:, :2, 0], inverse.diagonal(dim1=1, dim2=2)[:, :2], residual + (J @ step)[..., 0]
