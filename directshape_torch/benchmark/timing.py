@@ -49,15 +49,13 @@ class Spread:
     @classmethod
     def of(cls, sample: Sequence[float]) -> Spread:
         """Of a sample of one number or more; the quartiles of one number are the number."""
-        low, median, high = (
-            statistics.quantiles(sample, n=4, method="inclusive") if len(sample) > 1 else (sample[0],) * 3
-        )
+        quarters = statistics.quantiles(sample, n=4, method="inclusive") if len(sample) > 1 else [sample[0]] * 3
+        low, median, high = quarters
         return cls(median, low, high, min(sample), len(sample))
 
     def scaled(self, factor: float) -> Spread:
         """The spread of the sample times a positive factor."""
-        parts = (factor * x for x in (self.median, self.low, self.high, self.least))
-        return Spread(*parts, self.count)
+        return Spread(factor * self.median, factor * self.low, factor * self.high, factor * self.least, self.count)
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ def time_interleaved(
     for number in range(max(1, repetitions.rounds)):
         if number and clock() - begin > repetitions.budget_s:
             break
-        for name in list(sides) if number % 2 == 0 else list(reversed(sides)):
+        for name in list(sides) if number % 2 == 0 else list(sides)[::-1]:
             seconds[name].append(_seconds_of(sides[name], device, clock))
     return InterleavedTimes({name: tuple(values) for name, values in seconds.items()})
 

@@ -1,0 +1,110 @@
+"""The committed baseline: ratios, slopes and counts that must not get worse. Absolute times are never in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from directshape_torch.benchmark.rows import COMPARABLE, Kind, Row
+from directshape_torch.errors import DataFormatError
+from directshape_torch.io.atomic_files import write_json
+
+SCHEMA_VERSION = 1
+
+# Ratios wander by a quarter on a busy machine, slopes less and on an absolute scale; counts do not at all.
+_TOLERANCES: dict[Kind, float] = {"ratio": 0.3, "slope": 0.2, "count": 0.0}
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a row should be.
+
+    Attributes:
+        value: it had.
+        kind: "ratio", "slope" or "count".
+        better: "lower" or "higher".
+        tolerance: by which it may be worse: a share of the value of a ratio, else absolute.
+    """
+
+    value: float
+    kind: Kind
+    better: Literal["lower", "higher"]
+    tolerance: float
+
+    @property
+    def limit(self) -> float:
+        """The worst value that passes.
+
+        Example:
+            >>> Expected(4.0, "ratio", "higher", 0.25).limit, Expected(2.0, "slope", "lower", 0.5).limit
+            (3.0, 2.5)
+        """
+        allowed = self.tolerance * abs(self.value) if self.kind == "ratio" else self.tolerance
+        return self.value + allowed if self.better == "lower" else self.value - allowed
+
+    def allows(self, value: float) -> bool:
+        return value <= self.limit if self.better == "lower" else value >= self.limit
+
+
+def make_baseline(rows: Iterable[Row]) -> dict[str, Expected]:
+    """What later runs are held to: the comparable rows by key."""
+    return {r.key: Expected(r.value, r.kind, r.better, _TOLERANCES[r.kind]) for r in rows if r.kind in COMPARABLE}
+
+
+def regressions(rows: Iterable[Row], baseline: dict[str, Expected], suites: Iterable[str]) -> list[str]:
+    """A sentence for every row that is worse than the baseline allows, or that is missing though its suite ran.
+
+    Args:
+        rows: of this run.
+        baseline: by key.
+        suites: that this run was asked for; rows of others are not expected.
+    """
+    found = {row.key: row for row in rows}
+    ran = set(suites)
+    sentences = []
+    for key, expected in baseline.items():
+        if key.partition(": ")[0] not in ran:
+            continue
+        if key not in found:
+            sentences.append(f"{key}: was not measured; the baseline has {expected.value:.3g}")
+        elif not expected.allows(found[key].value):
+            side = "at most" if expected.better == "lower" else "at least"
+            sentences.append(
+                f"{key}: {found[key].value:.3g}, {side} {expected.limit:.3g} allowed (baseline {expected.value:.3g})"
+            )
+    return sentences
+
+
+def write_baseline(path: Path | str, baseline: dict[str, Expected]) -> None:
+    """Write a baseline; rows of suites that did not run are to be among what is given."""
+    rows = {key: asdict(expected) for key, expected in baseline.items()}
+    write_json(path, {"schema_version": SCHEMA_VERSION, "rows": rows})
+
+
+def read_baseline(path: Path | str) -> dict[str, Expected]:
+    """Read what `write_baseline` wrote.
+
+    Raises:
+        DataFormatError: no such file, or of another schema version.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        if content["schema_version"] != SCHEMA_VERSION:
+            raise ValueError(f"not of schema version {SCHEMA_VERSION}")
+        return {key: Expected(**row) for key, row in content["rows"].items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        cure = "make one with scripts/benchmark.py --write-baseline"
+        raise DataFormatError(Path(path), f"is no baseline: {error}", cure=cure) from error
+
+
+def updated(old: dict[str, Expected], new: dict[str, Expected], suites: Iterable[str]) -> dict[str, Expected]:
+    """The old baseline with the rows of these suites replaced; a tolerance once set by hand stays."""
+    ran = set(suites)
+    kept = {key: expected for key, expected in old.items() if key.partition(": ")[0] not in ran}
+    for key, expected in new.items():
+        tolerance = old[key].tolerance if key in old else expected.tolerance
+        kept[key] = Expected(expected.value, expected.kind, expected.better, tolerance)
+    return kept

@@ -1,0 +1,126 @@
+"""One call of the benchmark: suites in turn, tables as they come, then files and the comparison with the baseline."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from directshape_torch.benchmark.baseline import (
+    Expected,
+    make_baseline,
+    read_baseline,
+    regressions,
+    updated,
+    write_baseline,
+)
+from directshape_torch.benchmark.machine import describe_machine
+from directshape_torch.benchmark.report import BenchmarkRun, format_machine, format_suite, write_run
+from directshape_torch.benchmark.rows import SuiteResult
+from directshape_torch.benchmark.settings import SuiteSettings
+from directshape_torch.config_files import config_to_mapping, load_config
+from directshape_torch.errors import InputError
+
+_PACKAGE = "directshape_torch.benchmark"
+
+# Module and function, imported when the suite runs: not all of them have what they need on every machine.
+SUITES = {
+    "cpu": ("suite_cpu", "run_cpu"),
+    "gpu": ("suite_gpu", "run_gpu"),
+    "scaling": ("suite_scaling", "run_scaling"),
+    "kernels": ("suite_kernels", "run_kernels"),
+    "peers": ("suite_peers", "run_peers_suite"),
+}
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    """What a call of the benchmark is told.
+
+    Attributes:
+        suites: names of `SUITES`.
+        data_root: folder that holds `rendered` and `kitti`, or None for the bundled frame.
+        quick: cut everything short.
+        json_path: file for everything that was measured, or None.
+        plots_dir: folder for pictures, or None.
+        baseline_path: file of the baseline.
+        check: compare with it.
+        write_baseline: replace its rows of these suites.
+        profile: measure one refinement by stage as well.
+        command_line: for the record.
+    """
+
+    suites: tuple[str, ...]
+    data_root: Path | None
+    quick: bool
+    json_path: Path | None
+    plots_dir: Path | None
+    baseline_path: Path
+    check: bool
+    write_baseline: bool
+    profile: bool
+    command_line: str
+
+
+def run_benchmark(options: BenchmarkOptions, progress: Progress) -> int:
+    """Run the suites and print their tables; returns the exit code, 1 for a regression.
+
+    Raises:
+        InputError: a baseline is to be made of a quick run.
+        DataFormatError: no baseline to compare with.
+        MissingDependencyError: pictures are asked for and matplotlib is not installed.
+    """
+    if options.write_baseline and options.quick:
+        raise InputError("--write-baseline", "a run without --quick", "--quick", "quick figures are no baseline")
+    baseline = read_baseline(options.baseline_path) if options.check else {}
+    machine = describe_machine()
+    print(format_machine(machine), flush=True)
+    settings = SuiteSettings.make(options.data_root, options.quick, progress)
+    results = []
+    for name in (*(["profile"] if options.profile else []), *options.suites):
+        results.append(_run_suite(name, settings))
+        print(f"\n{format_suite(results[-1])}", flush=True)
+    presets = {name: config_to_mapping(load_config(name)) for name in ("default", "fast")}
+    run = BenchmarkRun(machine, options.command_line, presets, options.quick, tuple(results))
+    _write_files(run, options)
+    return _report_regressions(run, baseline) if options.check else 0
+
+
+def _run_suite(name: str, settings: SuiteSettings) -> SuiteResult:
+    module, function = ("suite_profile", "run_profile") if name == "profile" else SUITES[name]
+    result = getattr(importlib.import_module(f"{_PACKAGE}.{module}"), function)(settings)
+    assert isinstance(result, SuiteResult)
+    return result
+
+
+def _write_files(run: BenchmarkRun, options: BenchmarkOptions) -> None:
+    if options.json_path is not None:
+        write_run(options.json_path, run)
+        print(f"\nwrote {options.json_path}")
+    curves = [curve for suite in run.suites for curve in suite.curves]
+    if options.plots_dir is not None and curves:
+        from directshape_torch.benchmark.plots import write_plots
+
+        for path in write_plots(options.plots_dir, curves):
+            print(f"wrote {path}")
+    if options.write_baseline:
+        old = read_baseline(options.baseline_path) if options.baseline_path.is_file() else {}
+        write_baseline(options.baseline_path, updated(old, make_baseline(run.rows), _measured(run)))
+        print(f"wrote {options.baseline_path}")
+
+
+def _report_regressions(run: BenchmarkRun, baseline: dict[str, Expected]) -> int:
+    sentences = regressions(run.rows, baseline, _measured(run))
+    for sentence in sentences:
+        print(f"regression: {sentence}")
+    if not sentences:
+        print("\nno regression")
+    return 1 if sentences else 0
+
+
+def _measured(run: BenchmarkRun) -> list[str]:
+    """Suites that could run here: one without rows found nothing to run on."""
+    return [suite.suite for suite in run.suites if suite.rows]

@@ -1,0 +1,109 @@
+"""Suite `cpu`: time of whole calls, and the accuracy of the very results that were timed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+from directshape_torch.benchmark.accuracy import mean_bev_iou
+from directshape_torch.benchmark.compile_cost import compile_rows
+from directshape_torch.benchmark.presets import available_modes, make_refiner
+from directshape_torch.benchmark.rows import Goal, Row, SuiteResult
+from directshape_torch.benchmark.settings import SuiteSettings
+from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
+from directshape_torch.benchmark.workloads import Scene, load_scenes
+from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+
+_SUITE = "cpu"
+_PRESETS = ("default", "fast")
+_ROUNDS = 3  # of each frame; the median over the frames needs few
+
+_GOALS_MS_PER_CAR = {("default", "compiled"): 10.0, ("default", "eager"): 50.0, ("fast", "compiled"): 4.0}
+_GOALS_MS_PER_FRAME = {("default", "compiled"): 50.0}
+
+
+def run_cpu(settings: SuiteSettings) -> SuiteResult:
+    """Both presets, eager and compiled, on every frame; then what compiling costs."""
+    sides = {
+        f"{preset} {mode}": _Side(preset, mode, make_refiner(preset, mode), {})
+        for preset in _PRESETS
+        for mode in available_modes()
+    }
+    rows: list[Row] = []
+    notes = [] if "compiled" in available_modes() else ["compiled: not measured, there is no C++ compiler"]
+    for scene in load_scenes(settings.data_root, settings.max_frames):
+        rows += _scene_rows(scene, sides, settings)
+        notes.append(f"{scene.name}: {len(scene.frames)} frames with {scene.num_cars} cars")
+    if "compiled" in available_modes():
+        rows += compile_rows(settings)
+    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
+
+
+@dataclass
+class _Side:
+    """One preset in one mode, and the results of its last call of each frame."""
+
+    preset: str
+    mode: str
+    refiner: DirectShapeRefiner
+    results: dict[str, RefinementResult]
+
+    def refine(self, loaded: LoadedFrame) -> None:
+        self.results[loaded.frame_id] = self.refiner(loaded.frame, loaded.detections)
+
+
+def _scene_rows(scene: Scene, sides: dict[str, _Side], settings: SuiteSettings) -> list[Row]:
+    repetitions = replace(settings.repetitions, warm_up=1, rounds=min(_ROUNDS, settings.repetitions.rounds))
+    times: list[InterleavedTimes] = []
+    for number, loaded in enumerate(scene.frames):
+        settings.progress(f"cpu: {scene.name}, frame {number + 1} of {len(scene.frames)}")
+        calls = {name: partial(side.refine, loaded) for name, side in sides.items()}
+        times.append(time_interleaved(calls, repetitions))
+    cars = [len(loaded.detections) for loaded in scene.frames]
+    rows = [row for name, side in sides.items() for row in _side_rows(scene, name, side, times, cars)]
+    return rows + _ratio_rows(scene, times)
+
+
+def _side_rows(scene: Scene, name: str, side: _Side, times: list[InterleavedTimes], cars: list[int]) -> list[Row]:
+    key = side.preset, side.mode
+    ms_per_frame = [1000 * frame.spread(name).median for frame in times]
+    ms_per_car = [ms / count for ms, count in zip(ms_per_frame, cars, strict=True)]
+    rows = [
+        _time_row(f"{scene.name}, {name}, per car", ms_per_car, _GOALS_MS_PER_CAR.get(key)),
+        _time_row(f"{scene.name}, {name}, per frame", ms_per_frame, _GOALS_MS_PER_FRAME.get(key)),
+    ]
+    overlap = mean_bev_iou(scene, side.results)
+    if overlap is not None:
+        before, after = overlap
+        note = f"interval over cars; input {before.value:.3f}; of the results that were timed"
+        what = f"{scene.name}, {name}, bird's-eye IoU"
+        rows.append(
+            Row(_SUITE, what, after.value, "", "accuracy", after.low, after.high, len(cars), "higher", note=note)
+        )
+    return rows
+
+
+def _time_row(name: str, milliseconds: list[float], goal_ms: float | None) -> Row:
+    spread = Spread.of(milliseconds)
+    goal = None if goal_ms is None else Goal("at most", goal_ms)
+    note = "median and quartiles over frames"
+    return Row(_SUITE, name, spread.median, "ms", "time", spread.low, spread.high, spread.count, goal=goal, note=note)
+
+
+def _ratio_rows(scene: Scene, times: list[InterleavedTimes]) -> list[Row]:
+    """Ratios within one frame, their median over the frames."""
+    pairs = [("default eager", "default compiled"), ("fast eager", "fast compiled")]
+    pairs += [(f"default {mode}", f"fast {mode}") for mode in available_modes()]
+    rows = []
+    for slow, fast in pairs:
+        if fast not in times[0].seconds:
+            continue
+        ratio = Spread.of([frame.ratio(slow, fast).median for frame in times])
+        name = f"{scene.name}, {slow} over {fast}"
+        rows.append(
+            Row(_SUITE, name, ratio.median, "", "ratio", ratio.low, ratio.high, ratio.count, "higher",
+                note="over frames")
+        )  # fmt: skip
+    return rows

@@ -1,0 +1,151 @@
+"""Suite `kernels`: an iteration against the lookups it cannot avoid, Jacobians by hand against autograd, parts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from directshape_torch.benchmark.needed_lookups import NeededLookups, needed_lookups
+from directshape_torch.benchmark.presets import available_modes, make_refiner
+from directshape_torch.benchmark.rows import Goal, Kind, Row, SuiteResult
+from directshape_torch.benchmark.settings import SuiteSettings
+from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
+from directshape_torch.benchmark.workloads import demo_scene
+from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.geometry import se3
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import BoundShape
+from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.normal_equations import Segments
+
+_SUITE = "kernels"
+_ITERATION_GOAL, _AUTOGRAD_GOAL = Goal("at most", 3.0), Goal("at least", 5.0)
+_FEW, _MANY = 4, 20
+
+# One stage in which no car settles, so that every car takes part in every iteration.
+_ENDLESS = ("solver.cost_tolerance=0", "solver.step_tolerance=0", "solver.accept_every_step=true")
+
+
+def run_kernels(settings: SuiteSettings) -> SuiteResult:
+    """Everything on the bundled frame: where the data are does not change what a kernel costs."""
+    frames, detections = collate(demo_scene().frames)
+    rows: list[Row] = []
+    notes = ["the bundled frame with its six cars, default preset, single precision"]
+    needed, shape = _needed(frames, detections)
+    for mode in available_modes():
+        settings.progress(f"kernels: one iteration and bare lookups, {mode}")
+        rows += _iteration_rows(mode, needed, shape, frames, detections, settings)
+        settings.progress(f"kernels: Jacobians by hand and by autograd, {mode}")
+        rows.append(_autograd_row(mode, frames, detections, settings))
+    notes.append(f"needed: {needed.num_contour} points of contours and {needed.num_surface} of surfaces, twice each")
+    settings.progress("kernels: parts")
+    rows += _part_rows(frames, detections, settings)
+    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
+
+
+def _needed(frames: FrameBatch, detections: Detections) -> tuple[NeededLookups, BoundShape]:
+    """At the states that a refinement ends in."""
+    refiner = make_refiner("default", "eager")
+    problem, _ = refiner.problem(frames, detections)
+    result = refiner(frames, detections)
+    state = CarState(se3.inverse(result.T_cam_obj), result.code)
+    cars = CarBatch.from_scene(frames, detections)
+    found = needed_lookups(refiner.prior, state, cars, problem.left, problem.right, refiner.config)
+    return found, refiner.prior.bind(state.code)
+
+
+def _iteration_rows(
+    mode: str,
+    needed: NeededLookups,
+    shape: BoundShape,
+    frames: FrameBatch,
+    detections: Detections,
+    settings: SuiteSettings,
+) -> list[Row]:
+    few, many = (partial(_endless(mode, n), frames, detections) for n in (_FEW, _MANY))
+    lookups = _bare_lookups(mode, needed, shape)
+    times = time_interleaved({"few": few, "many": many, "lookups": lookups}, settings.repetitions)
+    iteration = _per_iteration(times)
+    ratio = Spread.of([a / b for a, b in zip(iteration, times.seconds["lookups"], strict=True)])
+    bare = times.spread("lookups")
+    note = f"calls of {_MANY} less calls of {_FEW} iterations, which all cars take part in"
+    rate = bare.median / needed.num_lookups
+    return [
+        _row(f"one iteration over the lookups it needs, {mode}", ratio, "", "ratio", goal=_ITERATION_GOAL, note=note),
+        _row(f"one iteration, {mode}", Spread.of(iteration).scaled(1e3), "ms", "time"),
+        _row(f"the lookups it needs, {mode}", bare.scaled(1e3), "ms", "time"),
+        Row(_SUITE, f"lookups a second, {mode}", 1e-6 / rate, "million", "rate", better="higher"),
+    ]
+
+
+def _endless(mode: str, iterations: int) -> DirectShapeRefiner:
+    """A refiner that does exactly so many iterations of the default's last stage."""
+    stage = f"stages=[{{contour_width_px: 0.5, image_level: 0, max_iterations: {iterations}}}]"
+    return make_refiner("default", mode, [stage, *_ENDLESS])
+
+
+def _per_iteration(times: InterleavedTimes) -> list[float]:
+    """Seconds of one iteration, by round."""
+    pairs = zip(times.seconds["many"], times.seconds["few"], strict=True)
+    return [max(many - few, 0.0) / (_MANY - _FEW) for many, few in pairs]
+
+
+def _bare_lookups(mode: str, needed: NeededLookups, shape: BoundShape) -> Callable[[], object]:
+    """One value, and one value with its derivatives, at every point: nothing else."""
+
+    def both(points_obj: Tensor, object_index: Tensor) -> tuple[Tensor, ...]:
+        return shape.value(points_obj, object_index), *shape.value_and_derivatives(points_obj, object_index)
+
+    call = torch.compile(both, dynamic=True) if mode == "compiled" else both
+
+    @torch.no_grad()
+    def run() -> object:
+        return call(needed.points_obj, needed.object_index)
+
+    return run
+
+
+def _autograd_row(mode: str, frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> Row:
+    refiners = {j: make_refiner("default", mode, [f"solver.jacobian={j}"]) for j in ("analytic", "autograd")}
+    calls = {name: partial(refiner, frames, detections) for name, refiner in refiners.items()}
+    ratio = time_interleaved(calls, settings.repetitions).ratio("autograd", "analytic")
+    note = "whole calls; forward mode, D tangents batched over the cars, same solver"
+    name = f"Jacobians by autograd over those by hand, {mode}"
+    return _row(name, ratio, "", "ratio", "higher", _AUTOGRAD_GOAL, note)
+
+
+def _part_rows(frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> list[Row]:
+    """Parts of an iteration by themselves, eager."""
+    problem, state = make_refiner("default", "eager").problem(frames, detections)
+    num_cars, unknowns = len(detections), 6 + state.code.shape[1]
+    generator = torch.Generator().manual_seed(0)
+    rays = torch.cat([problem.left.object_index, problem.right.object_index]).sort().values
+    segments = Segments.from_sorted_index(rays, num_cars)
+    J = torch.randn(len(rays), unknowns, generator=generator)
+    weight = torch.rand(len(rays), generator=generator)
+    gradient, hessian = segments.accumulate(J, weight, weight)
+    calls: dict[str, Callable[[], object]] = {
+        f"normal equations of {len(rays)} rows": partial(segments.accumulate, J, weight, weight),
+        f"damped solve of {num_cars} systems": partial(damped_step, hessian, gradient, torch.full((num_cars,), 1e-2)),
+    }
+    times = time_interleaved(calls, settings.repetitions)
+    return [_row(f"{name}, eager", times.spread(name).scaled(1e3), "ms", "time") for name in calls]
+
+
+def _row(
+    name: str,
+    spread: Spread,
+    unit: str,
+    kind: Kind,
+    better: Literal["lower", "higher"] = "lower",
+    goal: Goal | None = None,
+    note: str = "",
+) -> Row:
+    return Row(_SUITE, name, spread.median, unit, kind, spread.low, spread.high, spread.count, better, goal, note)

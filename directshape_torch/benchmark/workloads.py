@@ -1,0 +1,162 @@
+"""What is refined: scenes with labels, and calls of any number of cars and any frame size made from one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import directshape_torch
+from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
+from directshape_torch.calibration.kitti_observations import observe_frame, truth_files
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.scene import Detections, FrameBatch
+
+# The frame that the README fits the rig of the KITTI frames from.
+_FRAME_OF_FIELD = "007322"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Frames of one data set with their labels.
+
+    Attributes:
+        name: of the data set.
+        labels: folder of label files.
+        detections: folder of the detections that are refined.
+        frames: with at least one car each.
+    """
+
+    name: str
+    labels: Path
+    detections: Path
+    frames: tuple[LoadedFrame, ...]
+
+    @property
+    def num_cars(self) -> int:
+        return sum(len(frame.detections) for frame in self.frames)
+
+
+def load_scenes(data_root: Path | None, max_frames: int | None = None) -> tuple[Scene, ...]:
+    """The rendered and the KITTI frames below a data folder, or else the bundled demo frame.
+
+    Args:
+        data_root: holds `rendered` or `kitti` (DIRECTSHAPE_DATA), or None.
+        max_frames: of each, the first; None for all.
+
+    Raises:
+        InputError: the folder holds neither.
+    """
+    if data_root is None:
+        return (demo_scene(),)
+    scenes = []
+    if (data_root / "rendered").is_dir():
+        scenes.append(_scene(data_root / "rendered", "stereo", None, max_frames))
+    if (data_root / "kitti").is_dir():
+        scenes.append(_scene(data_root / "kitti", "noisy_stereo", _rig_field(data_root / "kitti"), max_frames))
+    if not scenes:
+        raise InputError("--data", "a folder that holds rendered or kitti", str(data_root), "or leave it out")
+    return tuple(scenes)
+
+
+def demo_scene() -> Scene:
+    """The bundled frame with six cars."""
+    return _scene(Path(directshape_torch.__file__).parent / "assets" / "demo", "noisy_stereo", None, None)
+
+
+def _scene(root: Path, detector: str, field: DisparityField | None, max_frames: int | None) -> Scene:
+    detections, masks = root / "detections" / detector, root / "training" / "masks"
+    dataset = KittiStereoDataset(root, detections, masks, disparity_field=field)
+    frames: list[LoadedFrame] = []
+    for frame_id in dataset.frame_ids:
+        if max_frames is not None and len(frames) == max_frames:
+            break
+        loaded = dataset.load(frame_id)
+        if len(loaded.detections):
+            frames.append(loaded)
+    return Scene(root.name, root / "training" / "label_2", detections, tuple(frames))
+
+
+def _rig_field(root: Path) -> DisparityField:
+    """As `directshape calibrate-stereo --from disparity --frames 007322` fits it."""
+    frame = observe_frame(root, _FRAME_OF_FIELD, truth_files(root, "disparity")[_FRAME_OF_FIELD], "disparity")
+    return fit_disparity_field(frame.observations, frame.size_wh, frame.camera, "disparity", (_FRAME_OF_FIELD,)).field
+
+
+def with_cars(frames: Sequence[LoadedFrame], num_cars: int) -> tuple[FrameBatch, Detections]:
+    """One call of exactly so many cars: the frames over and over, of the last one its first cars.
+
+    Raises:
+        InputError: no cars to repeat.
+    """
+    if not sum(len(frame.detections) for frame in frames):
+        raise InputError("frames", "at least one car", "none")
+    chosen: list[LoadedFrame] = []
+    missing = num_cars
+    while missing > 0:
+        loaded = frames[len(chosen) % len(frames)]
+        chosen.append(first_cars(loaded, min(missing, len(loaded.detections))))
+        missing -= len(chosen[-1].detections)
+    return collate(chosen)
+
+
+def first_cars(loaded: LoadedFrame, count: int) -> LoadedFrame:
+    """A frame of which only the first cars are refined; the others are not there, so that they hide nothing either."""
+    return replace(loaded, detections=_rows(loaded.detections, slice(0, count)))
+
+
+def one_car(loaded: LoadedFrame, index: int) -> LoadedFrame:
+    """A frame of which only one car is refined, as in `first_cars`."""
+    return replace(loaded, detections=_rows(loaded.detections, slice(index, index + 1)))
+
+
+def _rows(detections: Detections, rows: slice) -> Detections:
+    names = ("frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right")
+    kept = {name: getattr(detections, name)[rows] for name in (*names, "has_mask_left", "has_mask_right")}
+    sigma = None if detections.pose_sigma is None else detections.pose_sigma[rows]
+    return replace(detections, pose_sigma=sigma, **kept)
+
+
+def enlarged(loaded: LoadedFrame, factor: int) -> LoadedFrame:
+    """The same frame in images of `factor` times the height: below the picture it is repeated upside down and again.
+
+    Cars, masks and calibration stay, so all that grows is the part of the images where no car is.
+    """
+    frame, detections = loaded.frame, loaded.detections
+    sizes = frame.sizes * torch.tensor([factor, 1])
+    frame = replace(
+        frame,
+        images_left=_repeated(frame.images_left, factor),
+        images_right=_repeated(frame.images_right, factor),
+        sizes=sizes,
+        camera=replace(frame.camera, disparity_field=None),
+        disparity=None,
+    )
+    detections = replace(
+        detections,
+        mask_left=_with_empty_rows(detections.mask_left, factor),
+        mask_right=_with_empty_rows(detections.mask_right, factor),
+    )
+    if detections.occluders is not None:
+        occluders = replace(
+            detections.occluders,
+            mask_left=_with_empty_rows(detections.occluders.mask_left, factor),
+            mask_right=_with_empty_rows(detections.occluders.mask_right, factor),
+        )
+        detections = replace(detections, occluders=occluders)
+    return replace(loaded, frame=frame, detections=detections)
+
+
+def _repeated(images: Tensor, factor: int) -> Tensor:
+    return torch.cat([images if k % 2 == 0 else images.flip(-2) for k in range(factor)], dim=-2)
+
+
+def _with_empty_rows(masks: Tensor, factor: int) -> Tensor:
+    empty = masks.new_zeros(*masks.shape[:-2], (factor - 1) * masks.shape[-2], masks.shape[-1])
+    return torch.cat([masks, empty], dim=-2)
