@@ -55,6 +55,9 @@ class CarProblem:
         projected = self.project(state)
         self.terms = [term.at_stage(stage, projected) for term in self.terms]
 
+    def follow(self, accepted: Tensor) -> None:
+        """Nothing is tracked from iteration to iteration."""
+
     def project(
         self,
         state: CarState,

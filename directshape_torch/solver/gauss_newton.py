@@ -39,6 +39,7 @@ class Minimum(Generic[StateT]):
 
     Attributes:
         state: final states; the input's where the status says so.
+        end: states where the iterations ended, whatever the status says.
         status: (B,) integer codes of `Status`.
         iterations: (B,) iterations done.
         cost_history: cost of the current state after each iteration, (B, iterations done in all), NaN where a problem
@@ -48,6 +49,7 @@ class Minimum(Generic[StateT]):
     """
 
     state: StateT
+    end: StateT
     status: Tensor
     iterations: Tensor
     cost_history: Tensor
@@ -142,7 +144,7 @@ def minimise(
         refined = is_refined(status)
         columns = torch.stack(history, dim=1) if history else torch.empty(num_problems, 0, device=device)
         final = where_rows(refined, state, initial)
-        return Minimum(final, status, iterations, columns, tuple(starts), tuple(trajectory or ()))
+        return Minimum(final, state, status, iterations, columns, tuple(starts), tuple(trajectory or ()))
 
 
 def _run_stage(
@@ -206,6 +208,7 @@ def _iterate(problem: Problem[StateT], p: _Progress[StateT], config: SolverConfi
     decrease = p.at_state.cost - at_candidate.cost
     lower = finite & (decrease >= 0)
     accepted = p.running & solvable & (finite if config.accept_every_step else lower)
+    problem.follow(accepted)
     # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.
     hopeless = ~solvable & ((p.damping == 0) | (p.damping >= config.max_damping))
     if config.accept_every_step:

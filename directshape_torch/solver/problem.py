@@ -64,6 +64,13 @@ class Problem(Protocol[StateT]):
         """Cost, gradient and Gauss-Newton matrix in the present stage."""
         ...
 
+    def follow(self, accepted: Tensor) -> None:
+        """The states of these problems (B,) bool are now those of the latest `linearise`.
+
+        What is tracked from iteration to iteration moves on with them, and stays where it was for the others.
+        """
+        ...
+
     def retract(self, state: StateT, step: Tensor) -> StateT:
         """The state moved by tangent vectors (B, D): the only place where a state changes."""
         ...

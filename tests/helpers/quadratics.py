@@ -33,6 +33,7 @@ class ResidualProblem:
         self.begun: list[Stage] = []
         self.compactions: list[int] = []
         self.evaluated: list[Tensor] = []
+        self.followed: list[Tensor] = []
 
     def stages(self) -> list[Stage]:
         return self._stages
@@ -57,6 +58,10 @@ class ResidualProblem:
         gradient = (J.mT @ r[..., None])[..., 0]
         return Linearisation(0.5 * (r * r).sum(1), gradient, J.mT @ J)
 
+    def follow(self, accepted: Tensor) -> None:
+        """Nothing is tracked; kept for tests of the loop."""
+        self.followed.append(accepted)
+
     def retract(self, state: Vector, step: Tensor) -> Vector:
         return Vector(state.x + step)
 
@@ -66,7 +71,7 @@ class ResidualProblem:
     def compact(self, keep: Tensor) -> ResidualProblem:
         self.compactions.append(int(keep.sum()))
         part = ResidualProblem(self.residual, self.identity[keep], self.num_unknowns, self._stages, self.limit)
-        part.compactions, part.evaluated = self.compactions, self.evaluated
+        part.compactions, part.evaluated, part.followed = self.compactions, self.evaluated, self.followed
         return part
 
 

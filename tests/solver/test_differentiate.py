@@ -72,6 +72,9 @@ class Curved:
         )
         return Linearisation(0.5 * (r * r).sum(dim=1), (J.mT @ r[..., None])[..., 0], J.mT @ J)
 
+    def follow(self, accepted: Tensor) -> None:
+        """Nothing is tracked."""
+
     def retract(self, state: Vector, step: Tensor) -> Vector:
         return Vector((state.x + step).clamp(-self.bound, self.bound))
 

@@ -206,6 +206,26 @@ def test_steps_stay_in_the_trust_region() -> None:
     assert moved.max() <= 0.1 + 1e-12  # a refused candidate is followed by one from the old state
 
 
+def test_problems_follow_the_steps_that_were_taken() -> None:
+    """Once an iteration, after its `linearise`: the states that `follow` names are the latest evaluated ones."""
+    problem = rosenbrock(3)
+    result = minimise(problem, start(3, 2, -1.3), replace(DAMPED, block_iterations=1000), record=True)
+    assert len(problem.followed) == len(result.trajectory) == len(problem.evaluated) - 1
+    for accepted, it in zip(problem.followed, result.trajectory, strict=True):
+        assert torch.equal(accepted, it.accepted)
+    for n, accepted in enumerate(problem.followed[:-1]):
+        moved_on = torch.where(accepted[:, None], problem.evaluated[n + 1], result.trajectory[n].state.x)
+        assert torch.equal(moved_on, result.trajectory[n + 1].state.x)
+
+
+def test_the_end_is_known_whatever_the_status() -> None:
+    problem, solution = linear_problem(2, 3, [Stage(1.0, 0, 0)])
+    result = minimise(problem, Vector(solution), DAMPED, start(2))
+    assert status_of(result.status) == [Status.rejected_worse] * 2
+    assert (result.end.x == 0).all()
+    assert (result.state.x == solution).all()
+
+
 def test_a_start_of_its_own_is_compared_with_the_input() -> None:
     problem, solution = linear_problem(2, 3, [Stage(1.0, 0, 0)])
     better = minimise(problem, start(2), DAMPED, Vector(solution))
