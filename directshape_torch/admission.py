@@ -9,8 +9,8 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
+from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.packing import Observation
-from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
@@ -40,14 +40,20 @@ def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> 
                 f"masks of the (padded) image size {tuple(frames.images_left.shape[2:])}",
                 f"{tuple(detections.mask_left.shape[1:])}",
             )
-        lowest, highest = int(detections.frame_index.min()), int(detections.frame_index.max())
+        lowest, highest = torch.stack(torch.aminmax(detections.frame_index)).tolist()
         if lowest < 0 or highest >= len(frames):
             raise InputError("detections.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
 
 
-def without_empty_masks(detections: Detections) -> Detections:
-    """A mask without any foreground counts as none: it would only say that there is no car."""
-    left, right = (_mask_areas(detections) > 0).unbind(dim=1)
+def without_empty_masks(detections: Detections, extents: SceneExtents | None = None) -> Detections:
+    """A mask without any foreground counts as none: it would only say that there is no car.
+
+    Args:
+        detections: B cars.
+        extents: of their masks, where they are known already; they hold for the result too.
+    """
+    areas = (scene_extents(detections) if extents is None else extents).areas()
+    left, right = (areas > 0).unbind(dim=1)
     return replace(detections, has_mask_left=left, has_mask_right=right)
 
 
@@ -59,7 +65,7 @@ def refusals(
     Args:
         frames: F frames.
         detections: B cars.
-        pixels: packed pixels of the cars.
+        pixels: packed pixels of all cars.
         points: their stereo points; None for methods without.
         config: method and least numbers.
     """
@@ -70,7 +76,7 @@ def refusals(
     if config.method == "geometric" and points is not None:
         lacking = [(points.counts < config.point_cloud.min_points, Status.too_few_points)]
     else:
-        lacking = _lacking_pixels(detections, pixels, config.sampling.min_usable_pixels)
+        lacking = _lacking_pixels(pixels, config.sampling.min_usable_pixels)
     code = torch.full((len(detections),), -1, device=T.device)
     # Later ones say more.
     for condition, status in (*lacking, (~in_front, Status.behind_camera), (~finite, Status.non_finite)):
@@ -78,16 +84,9 @@ def refusals(
     return code
 
 
-def _lacking_pixels(detections: Detections, pixels: Observation, least: int) -> list[tuple[Tensor, Status]]:
-    areas = _mask_areas(detections)
-    left, right = (torch.bincount(x.object_index, minlength=len(detections)) for x in (pixels.left, pixels.right))
+def _lacking_pixels(pixels: Observation, least: int) -> list[tuple[Tensor, Status]]:
+    areas = pixels.mask_areas
+    left, right = (torch.bincount(x.object_index, minlength=len(areas)) for x in (pixels.left, pixels.right))
     # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
     too_few = torch.minimum(left + right, areas.sum(dim=1)) < least
     return [(too_few, Status.too_few_pixels), (~(areas > 0).any(dim=1), Status.no_mask)]
-
-
-def _mask_areas(detections: Detections) -> Tensor:
-    """Foreground pixels (B, 2) of the left and right masks, zero where absent; NaN counts, to be noticed later."""
-    masks = (detections.mask_left, detections.mask_right)
-    areas = torch.stack([(~(mask <= MASK_THRESHOLD)).flatten(1).sum(dim=1) for mask in masks], dim=1)
-    return areas * torch.stack([detections.has_mask_left, detections.has_mask_right], dim=1)

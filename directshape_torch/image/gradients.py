@@ -33,8 +33,22 @@ def grey_levels(
         raise InputError("images", "shape (F, 3, H, W)", f"{tuple(images.shape)}", "put the colour axis second")
     if not images.is_floating_point():
         raise InputError("images", "floating point in [0, 1]", str(images.dtype), "divide by 255")
-    red, green, blue = (255.0 * weight for weight in LUMA_WEIGHTS)
-    return torch.add(images[:, 0] * red, images[:, 1], alpha=green).add(images[:, 2], alpha=blue)
+    return grey_of_channels(images[:, 0], images[:, 1], images[:, 2])
+
+
+def grey_of_channels(
+    red: Tensor,  # (*,)
+    green: Tensor,  # (*,)
+    blue: Tensor,  # (*,)
+) -> Tensor:
+    """`grey_levels` of pixels whose channels lie in tensors of their own, in [0, 1].
+
+    Example:
+        >>> grey_of_channels(*torch.eye(3, dtype=torch.float64))
+        tensor([ 76.2450, 149.6850,  29.0700], dtype=torch.float64)
+    """
+    of_red, of_green, of_blue = (255.0 * weight for weight in LUMA_WEIGHTS)
+    return torch.add(red * of_red, green, alpha=of_green).add(blue, alpha=of_blue)
 
 
 def image_gradient(

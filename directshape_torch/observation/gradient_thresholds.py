@@ -41,10 +41,24 @@ def cell_thresholds(
     rows, columns = (-(-length // settings.threshold_cell_px) for length in (height, width))
     wanted = torch.ones(num_frames, rows, columns, dtype=torch.bool, device=magnitude.device)
     if needed is not None:
-        # Smoothing reads the neighbours of a needed cell.
-        wanted = torch.nn.functional.max_pool2d(needed.to(magnitude.dtype)[:, None], 3, stride=1, padding=1)[:, 0] > 0
+        wanted = with_neighbours(needed)
     medians = magnitude.new_full((num_frames, rows, columns), torch.nan)
     medians[wanted] = _cell_medians(magnitude, sizes, wanted, settings.threshold_cell_px)
+    return smoothed_thresholds(medians, settings)
+
+
+def with_neighbours(
+    needed: Tensor,  # (F, rows, columns)
+) -> Tensor:
+    """The cells that smoothing reads for the needed ones: those, and the eight around each; bool like `needed`."""
+    return torch.nn.functional.max_pool2d(needed.float()[:, None], 3, stride=1, padding=1)[:, 0] > 0
+
+
+def smoothed_thresholds(
+    medians: Tensor,  # (F, rows, columns)
+    settings: SamplingSettings = DEFAULT_SETTINGS,
+) -> Tensor:
+    """Thresholds (F, rows, columns) from the medians of the cells, NaN for those without."""
     return _mean_of_neighbours(medians) + settings.threshold_offset_grey
 
 

@@ -6,14 +6,17 @@ other detections, and `Detections.occluders` of any class. An occluder hides whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.regions import MASK_THRESHOLD, region_pixels
+from directshape_torch.observation.instance_crops import InstanceCrops, instance_crops
+from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
+from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections
 
 Side = Literal["left", "right"]
@@ -93,17 +96,39 @@ def instances_in_front(
 
 @dataclass(frozen=True)
 class OcclusionCrops:
-    """Union of the masks in front of each object, within a region of each object: memory follows the regions.
+    """What hides each object within a region of it: one lookup a point, however many instances are in front.
 
     Attributes:
-        regions: (B, 4) integer (u0, v0, u1, v1), half open, pixels.
-        start: (B,) first entry of each object in `hidden`.
-        hidden: (A,) bool, all regions' pixels, row-major, packed.
+        regions: (B, 4) integer (u0, v0, u1, v1), half open: where a pixel can be hidden at all.
+        wanted: (B, 4) the regions asked for, half open.
+        boxes: (B, 4) crops of the objects' frames, half open.
+        corner: (B,) row of `covering` that pixel (0, 0) of the object's frame would have.
+        width: (B,) of the crop of the object's frame.
+        in_front: (B, W) int64, bits of the instances in front of each object.
+        covering: (A, W) int64, bits of the instances that cover each pixel, see `InstanceCrops`.
     """
 
     regions: Tensor
-    start: Tensor
-    hidden: Tensor
+    wanted: Tensor
+    boxes: Tensor
+    corner: Tensor
+    width: Tensor
+    in_front: Tensor
+    covering: Tensor
+
+    @classmethod
+    def of(cls, crops: InstanceCrops, in_front: Tensor, frame_index: Tensor, wanted: Tensor) -> OcclusionCrops:
+        """From instances (N), which of them is in front (N, B), and frames (B,) and regions (B, 4) of the objects."""
+        boxes = crops.boxes[frame_index]
+        width = boxes[:, 2] - boxes[:, 0]
+        corner = crops.start[frame_index] - boxes[:, 1] * width - boxes[:, 0]
+        words = [torch.where(in_front, word[:, None], 0).sum(dim=0) for word in crops.bits.unbind(dim=1)]
+        regions = _common(wanted, boxes)
+        return cls(regions, wanted, boxes, corner, width, torch.stack(words, dim=1), crops.covering)
+
+    def within(self, wanted: Tensor) -> OcclusionCrops:
+        """The same for other regions (B, 4) of the objects."""
+        return replace(self, regions=_common(wanted, self.boxes), wanted=wanted)
 
     def at(
         self,
@@ -123,17 +148,25 @@ class OcclusionCrops:
         u0, v0, u1, v1 = self.regions[object_index].unbind(-1)
         u, v = rounded.unbind(-1)
         inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
-        if not len(self.hidden):
-            return inside  # no region has a pixel, so nothing is inside
-        offset = (torch.where(inside, v, v0).long() - v0) * (u1 - u0) + torch.where(inside, u, u0).long() - u0
-        entry = torch.where(inside, self.start[object_index] + offset, 0)
-        return self.hidden[entry] & inside
+        u, v = torch.where(inside, u, 0).long(), torch.where(inside, v, 0).long()
+        entry = torch.where(inside, self.corner[object_index] + v * self.width[object_index] + u, 0)
+        return ((self.covering[entry] & self.in_front[object_index]) != 0).any(dim=-1) & inside
+
+    def objects(self, chosen: slice) -> OcclusionCrops:
+        """Those of some objects, which are numbered anew; `covering` is shared."""
+        of_objects = ("regions", "wanted", "boxes", "corner", "width", "in_front")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in of_objects})
 
     def crop(self, index: int) -> Tensor:
         """The occlusion mask of one object in its region, (v1 - v0, u1 - u0) bool, for pictures."""
-        u0, v0, u1, v1 = self.regions[index].tolist()
-        start = int(self.start[index])
-        return self.hidden[start : start + (v1 - v0) * (u1 - u0)].reshape(v1 - v0, u1 - u0)
+        u0, v0, u1, v1 = self.wanted[index].tolist()
+        v, u = torch.meshgrid(torch.arange(v0, v1), torch.arange(u0, u1), indexing="ij")
+        return self.at(torch.tensor(index), torch.stack([u, v], dim=-1).to(self.wanted.device))
+
+
+def _common(a: Tensor, b: Tensor) -> Tensor:
+    """Intersections of half-open boxes (B, 4)."""
+    return torch.cat([torch.maximum(a[:, :2], b[:, :2]), torch.minimum(a[:, 2:], b[:, 2:])], dim=1)
 
 
 def occlusion_crops(
@@ -155,10 +188,46 @@ def occlusion_crops(
     """
     if regions.shape != (len(detections), 4):
         raise InputError("regions", f"shape ({len(detections)}, 4)", f"{tuple(regions.shape)}", "use region_boxes")
-    object_index, uv = region_pixels(regions)
-    areas = (regions[:, 2] - regions[:, 0]) * (regions[:, 3] - regions[:, 1])
-    start = areas.cumsum(0) - areas
-    return OcclusionCrops(regions, start, hidden_pixels(detections, side, object_index, uv, order))
+    num_frames = int(detections.frame_index.max()) + 1 if len(detections) else 0
+    others = detections.occluders
+    if others is not None and len(others.frame_index):
+        num_frames = max(num_frames, int(others.frame_index.max()) + 1)
+    _masks(detections, side)
+    return crops_of_sides(detections, (side,), scene_extents(detections), regions, num_frames, order)
+
+
+def crops_of_sides(
+    detections: Detections,
+    sides: Sequence[Side],
+    extents: SceneExtents,
+    regions: Tensor,  # (S * B, 4)
+    num_frames: int,
+    order: OcclusionOrder = "depth",
+) -> OcclusionCrops:
+    """`occlusion_crops` of several sides at once: the B objects of the first side, then those of the next.
+
+    Args:
+        detections: B objects.
+        sides: S images.
+        extents: of the masks of these detections.
+        regions: (S B, 4) integer, half open.
+        num_frames: F.
+        order: see `instances_in_front`.
+    """
+    in_front = [instances_in_front(detections, side, order) for side in sides]
+    masks = [stack for side in sides for stack in _masks(detections, side)]
+    # Instances that hide nobody are left out.
+    boxes = [extents.boxes(s) * hides.any(dim=1)[:, None] for s, hides in zip(sides, in_front, strict=True)]
+    frame = _instances(detections, sides[0])[0]
+    frame_of_instance = torch.cat([frame + number * num_frames for number in range(len(sides))])
+    frame_of_object = torch.cat([detections.frame_index + number * num_frames for number in range(len(sides))])
+    crops = instance_crops(masks, torch.cat(boxes), frame_of_instance, num_frames * len(sides))
+    # No side hides anything on another one.
+    blocks = [
+        torch.cat([h if k == n else torch.zeros_like(h) for k in range(len(sides))], dim=1)
+        for n, h in enumerate(in_front)
+    ]
+    return OcclusionCrops.of(crops, torch.cat(blocks), frame_of_object, regions)
 
 
 def _instances(detections: Detections, side: Side) -> tuple[Tensor, Tensor, Tensor, Tensor]:

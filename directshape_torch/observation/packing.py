@@ -6,6 +6,7 @@ Pixels are packed over cars and frames, sorted by object, because a near car has
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,10 +14,11 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
-from directshape_torch.observation.occlusion import OcclusionCrops, Side, hidden_pixels, occlusion_crops
-from directshape_torch.observation.pixel_sampling import select_pixels
-from directshape_torch.observation.regions import region_boxes
+from directshape_torch.observation.gradient_tiles import gradient_tiles
+from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
+from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides
+from directshape_torch.observation.pixel_sampling import candidate_pixels
+from directshape_torch.observation.regions import RegionPixels, region_boxes
 from directshape_torch.observation.sampling_settings import SamplingSettings
 from directshape_torch.scene import Detections, FrameBatch
 
@@ -70,6 +72,7 @@ class Observation:
         left, right: packed pixels of the two images.
         region_left, region_right: (B, 4) integer regions (u0, v0, u1, v1), half open, pixels.
         hidden_right: where nearer instances cover the right image, by row of the detections; None: not asked for.
+        mask_areas: (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent.
     """
 
     left: PixelSamples
@@ -77,9 +80,10 @@ class Observation:
     region_left: Tensor
     region_right: Tensor
     hidden_right: OcclusionCrops | None
+    mask_areas: Tensor
 
     def of_objects(self, keep: Tensor) -> Observation:
-        """What the objects where `keep` (B,) holds see; `hidden_right` stays that of all detections."""
+        """What the objects where `keep` (B,) holds see; occlusion and areas stay those of all detections."""
         return replace(
             self,
             left=self.left.of_objects(keep),
@@ -89,22 +93,35 @@ class Observation:
         )
 
 
-def pack_pixels(frames: FrameBatch, detections: Detections, config: SamplingConfig) -> Observation:
+def pack_pixels(
+    frames: FrameBatch, detections: Detections, config: SamplingConfig, extents: SceneExtents | None = None
+) -> Observation:
     """Choose the pixels of every car in both images and gather what the residuals need of them.
+
+    Both images are treated as one: cars 0 .. B-1 are those of the left image, B .. 2B-1 those of the right one.
 
     Args:
         frames: F frames.
         detections: B cars, whose initial poses fix regions and correspondence for the disparity field.
         config: density, regions, occlusion.
+        extents: of the masks of these detections, where they are known already.
     """
-    regions = car_regions(frames, detections, config)
-    left = _pack_side(frames, detections, "left", regions[0], config)
-    right = _pack_side(frames, detections, "right", regions[1], config)
-    hidden = None
+    extents = scene_extents(detections) if extents is None else extents
+    regions = car_regions(frames, detections, config, extents)
+    both, hidden = torch.cat(regions), None
     if config.occlusion:
+        hidden = crops_of_sides(detections, ("left", "right"), extents, both, len(frames), config.occlusion_order)
+    left, right = _chosen_pixels(frames, detections, both, hidden, config)
+    if hidden is not None:
         strips = _strips_in_right_image(regions[0], frames.sizes[detections.frame_index])
-        hidden = occlusion_crops(detections, "right", strips, config.occlusion_order)
-    return Observation(left, right, *regions, hidden)
+        hidden = hidden.objects(slice(len(detections), None)).within(strips)
+    return Observation(
+        _pack_side(frames, detections, "left", left),
+        _pack_side(frames, detections, "right", right),
+        *regions,
+        hidden,
+        extents.areas(),
+    )
 
 
 def _strips_in_right_image(region_left: Tensor, sizes: Tensor) -> Tensor:
@@ -132,31 +149,61 @@ def sampling_settings(config: SamplingConfig) -> SamplingSettings:
     return SamplingSettings(config.mode, config.density, config.min_pixels, config.max_pixels)
 
 
-def car_regions(frames: FrameBatch, d: Detections, config: SamplingConfig) -> tuple[Tensor, Tensor]:
+def car_regions(
+    frames: FrameBatch, d: Detections, config: SamplingConfig, extents: SceneExtents | None = None
+) -> tuple[Tensor, Tensor]:
     """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
+    extents = scene_extents(d) if extents is None else extents
     sizes = frames.sizes[d.frame_index]
     margins = {"margin_px": config.region_margin_px, "margin_share": config.region_margin_share}
-    left = region_boxes(d.box_2d, d.mask_left, d.has_mask_left, sizes, join=True, **margins)
+    left = region_boxes(d.box_2d, extents.left.boxes, sizes, join=True, **margins)
     # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
     nowhere = torch.full_like(d.box_2d, torch.nan)
-    right = region_boxes(nowhere, d.mask_right, d.has_mask_right, sizes, join=False, **margins)
+    right = region_boxes(nowhere, extents.right.boxes, sizes, join=False, **margins)
     return left * d.has_mask_left[:, None], right
 
 
-def _pack_side(
-    frames: FrameBatch, detections: Detections, side: Side, regions: Tensor, config: SamplingConfig
-) -> PixelSamples:
+class _Chosen(NamedTuple):
+    """P pixels of one image."""
+
+    object_index: Tensor  # (P,)
+    uv: Tensor  # (P, 2) integer
+    gradient_magnitude: Tensor  # (P,)
+
+
+def _chosen_pixels(
+    frames: FrameBatch, detections: Detections, regions: Tensor, hidden: OcclusionCrops | None, config: SamplingConfig
+) -> tuple[_Chosen, _Chosen]:
+    """The visible ones of the pixels that `select_pixels` chooses, of the regions (2 B, 4) of both images."""
+    settings = sampling_settings(config)
+    frame = torch.cat([detections.frame_index, detections.frame_index + len(frames)])
+    tiles = gradient_tiles((frames.images_left, frames.images_right), frames.sizes, regions, frame, settings)
+    pixels = RegionPixels.of(regions)
+    entry, threshold = tiles.entries_and_thresholds(pixels, frame)
+    magnitudes = tiles.magnitude.flatten()
+    magnitude = magnitudes.detach().index_select(0, entry)
+    above = magnitude.float() > threshold.float()
+    index, exists = candidate_pixels(pixels, regions, magnitude, above, settings)
+    run = pixels.run.index_select(0, index)
+    object_index = pixels.run_object.index_select(0, run)
+    uv = torch.stack([pixels.u.index_select(0, index), pixels.run_v.index_select(0, run)], dim=-1)
+    if hidden is not None:
+        exists = exists & ~hidden.at(object_index, uv)
+    kept = exists.nonzero()[:, 0]
+    object_index, uv = object_index.index_select(0, kept), uv.index_select(0, kept)
+    magnitude = magnitudes.index_select(0, entry.index_select(0, index.index_select(0, kept)))
+    num_left = int((object_index < len(detections)).sum())
+    return (
+        _Chosen(object_index[:num_left], uv[:num_left], magnitude[:num_left]),
+        _Chosen(object_index[num_left:] - len(detections), uv[num_left:], magnitude[num_left:]),
+    )
+
+
+def _pack_side(frames: FrameBatch, detections: Detections, side: Side, chosen: _Chosen) -> PixelSamples:
     left = side == "left"
-    grey = grey_levels(frames.images_left if left else frames.images_right)
-    magnitude = gradient_magnitude(image_gradient(grey, frames.sizes))
-    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config))
     object_index, uv = chosen.object_index, chosen.uv
-    if config.occlusion:
-        visible = ~hidden_pixels(detections, side, object_index, uv, config.occlusion_order)
-        object_index, uv = object_index[visible], uv[visible]
-    frame = detections.frame_index[object_index]
     mask = detections.mask_left if left else detections.mask_right
-    dtype = grey.dtype
+    dtype = frames.images_left.dtype
     uv_float = uv.to(dtype)
     rays = _rays_left(frames, detections, object_index, uv_float) if left else _rays_right(
         frames, detections, object_index, uv_float
@@ -167,7 +214,7 @@ def _pack_side(
         origin_cam=rays[0],
         ray_cam=rays[1],
         foreground=mask[object_index, uv[:, 1], uv[:, 0]].to(dtype),
-        gradient_magnitude=magnitude[frame, uv[:, 1], uv[:, 0]],
+        gradient_magnitude=chosen.gradient_magnitude,
         bias_px=rays[2][0],
         vertical_px=rays[2][1],
     )

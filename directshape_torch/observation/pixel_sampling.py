@@ -8,13 +8,14 @@ paper's figure), else the strongest ("red").
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.observation.gradient_thresholds import cell_thresholds, cells_of_regions
-from directshape_torch.observation.regions import region_pixels
+from directshape_torch.observation.regions import RegionPixels
 from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 
 _LOW_31_BITS = 2**31 - 1
@@ -104,42 +105,75 @@ def sample_pixels(
         tensor([[9, 7]])
     """
     _check_sampling(magnitude, thresholds, regions, frame_index)
-    object_index, uv = region_pixels(regions)
-    u, v = uv.unbind(-1)
-    frame = frame_index[object_index]
-    strength = magnitude.detach()[frame, v, u].float().nan_to_num(nan=0.0, posinf=0.0)
-    above = _above_threshold(strength, thresholds, frame, u, v, settings.threshold_cell_px)
-    if settings.mode == "dense":
-        return PixelSelection(object_index, uv, above)
+    pixels = RegionPixels.of(regions)
+    frame, u, v = frame_index[pixels.object_index], pixels.u, pixels.v
+    strength = magnitude[frame, v, u]
+    above = strength.detach().float() > thresholds.float()[
+        frame, torch.div(v, settings.threshold_cell_px, rounding_mode="floor"),
+        torch.div(u, settings.threshold_cell_px, rounding_mode="floor"),
+    ]  # fmt: skip
+    candidates = candidate_pixels(pixels, regions, strength, above, settings)
+    chosen = candidates.pixel[candidates.exists]
+    uv = torch.stack([u[chosen], v[chosen]], dim=-1)
+    return PixelSelection(pixels.object_index[chosen], uv, above[chosen])
 
+
+class Candidates(NamedTuple):
+    """One for each cell of all regions, in order; `pixel` means nothing where there is none."""
+
+    pixel: Tensor  # (N,) number of a pixel among those of the regions
+    exists: Tensor  # (N,) bool
+
+
+def candidate_pixels(
+    pixels: RegionPixels,
+    regions: Tensor,  # (B, 4)
+    magnitude: Tensor,  # (A,)
+    above_threshold: Tensor,  # (A,)
+    settings: SamplingSettings = DEFAULT_SETTINGS,
+) -> Candidates:
+    """The pixel of every small cell, see `sample_pixels`; not yet brought together, so that others may leave first.
+
+    Args:
+        pixels: A pixels of the regions.
+        regions: (B, 4) integer, half open.
+        magnitude: (A,) gradient magnitude, grey levels per pixel; what is not finite counts as 0.
+        above_threshold: (A,) bool.
+        settings: density and mode.
+    """
+    if settings.mode == "dense":
+        every = torch.arange(len(pixels), device=regions.device)
+        return Candidates(every, torch.ones_like(above_threshold))
     side = _small_cell_side(regions, settings)
-    cell, num_cells = _small_cells(regions, side, object_index, u, v)
+    cell, num_cells = _small_cells(regions, side, pixels)
     if settings.mode == "uniform":
-        closeness = _closeness_to_cell_centre(regions, side, object_index, uv)
-        chosen = _strongest_of_each_cell(closeness, torch.ones_like(above), cell, num_cells)
+        uv = torch.stack([pixels.u, pixels.v], dim=-1)
+        strength, preferred = _closeness_to_cell_centre(regions, side, pixels.object_index, uv), None
     else:
-        chosen = _strongest_of_each_cell(strength, above, cell, num_cells)
-    if settings.mode == "round_one":
-        chosen = chosen[above[chosen]]
-    return PixelSelection(object_index[chosen], uv[chosen], above[chosen])
+        strength = magnitude.detach().float().nan_to_num(nan=0.0, posinf=0.0)
+        preferred = above_threshold
+    index, exists = _strongest_of_each_cell(strength, preferred, cell, num_cells)
+    if settings.mode == "round_one" and len(pixels):
+        exists = exists & above_threshold[index]
+    return Candidates(index, exists)
 
 
 def _strongest_of_each_cell(
     strength: Tensor,  # (A,) float32, not negative
-    preferred: Tensor,  # (A,) bool
+    preferred: Tensor | None,  # (A,) bool
     cell: Tensor,  # (A,)
     num_cells: int,
-) -> Tensor:
-    """Index of the preferred, then strongest, then first entry of every cell that has one, by ascending cell."""
-    count = len(strength)
-    if not count:
-        return cell
+) -> tuple[Tensor, Tensor]:
+    """Index (N,) of the preferred, then strongest, then first entry of every cell, and whether there is one."""
     # One maximum over a packed key decides all three: bit 62 preferred, bits 31..61 the strength, below them the
     # reversed index. The bits of floats that are not negative are ordered as the floats are.
-    bits = strength.contiguous().view(torch.int32).long()
-    key = (preferred.long() << 62) | (bits << 31) | (_LOW_31_BITS - torch.arange(count, device=strength.device))
+    key = strength.contiguous().view(torch.int32).long()
+    if preferred is not None:
+        key |= preferred.long() << 31
+    key <<= 31
+    key += torch.arange(_LOW_31_BITS, _LOW_31_BITS - len(strength), -1, device=strength.device)
     best = key.new_full((num_cells,), -1).scatter_reduce_(0, cell, key, "amax")
-    return _LOW_31_BITS - (best[best >= 0] & _LOW_31_BITS)
+    return (_LOW_31_BITS - (best & _LOW_31_BITS)) * (best >= 0), best >= 0
 
 
 def _small_cell_side(
@@ -155,23 +189,22 @@ def _small_cell_side(
 def _small_cells(
     regions: Tensor,  # (B, 4)
     side: Tensor,  # (B,)
-    object_index: Tensor,  # (A,)
-    u: Tensor,  # (A,)
-    v: Tensor,  # (A,)
+    pixels: RegionPixels,
 ) -> tuple[Tensor, int]:
     """Cell (A,) of each pixel, numbered through all regions, and the number of cells."""
     heights, widths = regions[:, 3] - regions[:, 1], regions[:, 2] - regions[:, 0]
     columns = (widths / side).ceil().long()
     num_cells = columns * (heights / side).ceil().long()
     start = num_cells.cumsum(0) - num_cells
+    widest = torch.cat([widths, widths.new_zeros(1)]).amax()
+    longest, total = torch.stack([widest, num_cells.sum()]).tolist()
     # The cell of a row or a column is found once a region, not once a pixel.
-    longest = torch.arange(int(torch.cat([heights, widths]).max()) if len(regions) else 0, device=regions.device)
-    along = (longest / side[:, None]).floor().long()
-    row_start = start[:, None] + along * columns[:, None]
-    pixel = object_index * len(longest)
-    row = row_start.reshape(-1)[pixel + v - regions[:, 1][object_index]]
-    column = along.reshape(-1)[pixel + u - regions[:, 0][object_index]]
-    return row + column, int(num_cells.sum())
+    of = pixels.run_object
+    run_cell = start[of] + ((pixels.run_v - regions[of, 1]) / side[of]).floor().long() * columns[of]
+    column_cell = (torch.arange(longest, device=regions.device) / side[:, None]).floor().long().flatten()
+    run_first = of * longest - regions[of, 0]
+    column = column_cell.index_select(0, pixels.of_runs(run_first) + pixels.u)
+    return pixels.of_runs(run_cell) + column, total
 
 
 def _closeness_to_cell_centre(
@@ -185,19 +218,6 @@ def _closeness_to_cell_centre(
     # The centre of a pixel lies half a pixel into it.
     offset = along - along.floor() + 0.5 / side[object_index, None] - 0.5
     return (1 - offset.square().sum(dim=1)).clamp(min=0).float()
-
-
-def _above_threshold(
-    strength: Tensor,  # (A,)
-    thresholds: Tensor,  # (F, rows, columns)
-    frame: Tensor,  # (A,)
-    u: Tensor,  # (A,)
-    v: Tensor,  # (A,)
-    cell_px: int,
-) -> Tensor:
-    row = torch.div(v, cell_px, rounding_mode="floor")
-    column = torch.div(u, cell_px, rounding_mode="floor")
-    return strength > thresholds.float()[frame, row, column]
 
 
 def _check_sampling(magnitude: Tensor, thresholds: Tensor, regions: Tensor, frame_index: Tensor) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -13,8 +15,7 @@ MASK_THRESHOLD = 0.5
 
 def region_boxes(
     boxes: Tensor,  # (B, 4)
-    masks: Tensor,  # (B, H, W)
-    has_mask: Tensor,  # (B,)
+    mask_boxes: Tensor,  # (B, 4)
     sizes: Tensor,  # (B, 2)
     *,
     join: bool,
@@ -30,8 +31,7 @@ def region_boxes(
 
     Args:
         boxes: (B, 4) u_min, v_min, u_max, v_max, pixels. NaN, or outside of the image: no box.
-        masks: (B, H, W) foreground probability or bool.
-        has_mask: (B,) bool.
+        mask_boxes: (B, 4) integer, half open, as `mask_extents` finds them; all 0 where there is no mask.
         sizes: (B, 2) integer (height, width) of each object's frame without padding.
         join: whether the box counts beside a mask.
 
@@ -41,9 +41,14 @@ def region_boxes(
     Raises:
         InputError: wrong shapes.
     """
-    _check_boxes(boxes, masks, has_mask, sizes)
+    count = len(boxes)
+    expected = (("boxes", boxes, (count, 4)), ("mask_boxes", mask_boxes, (count, 4)), ("sizes", sizes, (count, 2)))
+    for name, tensor, shape in expected:
+        if tensor.shape != shape:
+            raise InputError(name, f"shape {shape}", f"{tuple(tensor.shape)}")
     last_uv = (sizes.flip(-1) - 1).to(boxes.dtype)
-    mask_box, in_mask = _mask_boxes(masks, has_mask, boxes.dtype)
+    in_mask = mask_boxes[:, 2] > mask_boxes[:, 0]
+    mask_box = torch.cat([mask_boxes[:, :2], mask_boxes[:, 2:] - 1], dim=1).to(boxes.dtype)
     in_image = (boxes[:, 2:] >= 0).all(dim=1) & (boxes[:, :2] <= last_uv).all(dim=1)
     box_counts = in_image & (boxes[:, 2:] >= boxes[:, :2]).all(dim=1) & (~in_mask | join)
 
@@ -57,6 +62,58 @@ def region_boxes(
     first = (low - margin).floor().clamp(min=0)
     end = (high + margin).ceil().minimum(last_uv) + 1
     return torch.cat([first, end], dim=1).long() * (in_mask | box_counts)[:, None]
+
+
+@dataclass(frozen=True)
+class RegionPixels:
+    """All A pixels of B regions, object by object, row-major: R runs of pixels, one for each row of a region.
+
+    Attributes:
+        run_object, run_v: (R,) object and row of each run.
+        run: (A,) the run of each pixel.
+        u: (A,) column of each pixel.
+    """
+
+    run_object: Tensor
+    run_v: Tensor
+    run: Tensor
+    u: Tensor
+
+    def __len__(self) -> int:
+        return len(self.u)
+
+    def of_runs(self, values: Tensor) -> Tensor:
+        """Values (R,) of the runs as values (A,) of their pixels."""
+        return values.index_select(0, self.run)
+
+    @property
+    def object_index(self) -> Tensor:
+        """(A,)"""
+        return self.of_runs(self.run_object)
+
+    @property
+    def v(self) -> Tensor:
+        """(A,)"""
+        return self.of_runs(self.run_v)
+
+    @classmethod
+    def of(
+        cls,
+        regions: Tensor,  # (B, 4)
+    ) -> RegionPixels:
+        """The pixels of half-open regions (u0, v0, u1, v1), with one host synchronisation."""
+        u0, v0, u1, v1 = regions.unbind(dim=1)
+        widths, heights = u1 - u0, v1 - v0
+        num_runs, num_pixels = torch.stack([heights.sum(), (widths * heights).sum()]).tolist()
+        number = torch.arange(len(regions), device=regions.device)
+        run_object = number.repeat_interleave(heights, output_size=num_runs)
+        run_number = torch.arange(num_runs, device=regions.device)
+        run_v = run_number - (heights.cumsum(0) - heights - v0).index_select(0, run_object)
+        run_width = widths.index_select(0, run_object)
+        run = run_number.repeat_interleave(run_width, output_size=num_pixels)
+        before = run_width.cumsum(0) - run_width - u0.index_select(0, run_object)
+        u = torch.arange(num_pixels, device=regions.device) - before.index_select(0, run)
+        return cls(run_object, run_v, run, u)
 
 
 def region_pixels(
@@ -75,51 +132,5 @@ def region_pixels(
         >>> object_index.tolist(), uv.tolist()
         ([0, 0, 1, 1], [[5, 2], [6, 2], [0, 0], [0, 1]])
     """
-    widths, heights = regions[:, 2] - regions[:, 0], regions[:, 3] - regions[:, 1]
-    # Row by row: one division-free expansion a level.
-    row_object = torch.arange(len(regions), device=regions.device).repeat_interleave(heights)
-    row_v = _position_in_run(heights) + regions[row_object, 1]
-    row_width = widths[row_object]
-    row = torch.arange(len(row_v), device=regions.device).repeat_interleave(row_width)
-    object_index = row_object[row]
-    u = _position_in_run(row_width) + regions[:, 0][object_index]
-    return object_index, torch.stack([u, row_v[row]], dim=-1)
-
-
-def _mask_boxes(
-    masks: Tensor,  # (B, H, W)
-    has_mask: Tensor,  # (B,)
-    dtype: torch.dtype,
-) -> tuple[Tensor, Tensor]:
-    """Box (B, 4) of the pixel centres of each mask, and whether there is such a pixel (B,)."""
-    covered = masks > MASK_THRESHOLD
-    in_rows, in_columns = covered.any(dim=2), covered.any(dim=1)
-    (u0, u1), (v0, v1) = _first_and_last(in_columns), _first_and_last(in_rows)
-    return torch.stack([u0, v0, u1, v1], dim=1).to(dtype), in_rows.any(dim=1) & has_mask
-
-
-def _first_and_last(
-    flags: Tensor,  # (B, L)
-) -> tuple[Tensor, Tensor]:
-    """Position of the first and last True of each row; (0, L - 1) or nonsense where there is none."""
-    position = torch.arange(flags.shape[1], device=flags.device)
-    first = torch.where(flags, position, flags.shape[1]).amin(dim=1)
-    return first, torch.where(flags, position, -1).amax(dim=1)
-
-
-def _position_in_run(
-    lengths: Tensor,  # (R,)
-) -> Tensor:
-    """0 .. length - 1 for each run, one after the other."""
-    starts = lengths.cumsum(0) - lengths
-    return torch.arange(int(lengths.sum()), device=lengths.device) - starts.repeat_interleave(lengths)
-
-
-def _check_boxes(boxes: Tensor, masks: Tensor, has_mask: Tensor, sizes: Tensor) -> None:
-    count = len(boxes)
-    expected = (("boxes", boxes, (count, 4)), ("has_mask", has_mask, (count,)), ("sizes", sizes, (count, 2)))
-    for name, tensor, shape in expected:
-        if tensor.shape != shape:
-            raise InputError(name, f"shape {shape}", f"{tuple(tensor.shape)}")
-    if masks.ndim != 3 or len(masks) != count:
-        raise InputError("masks", f"shape ({count}, H, W)", f"{tuple(masks.shape)}")
+    pixels = RegionPixels.of(regions)
+    return pixels.object_index, torch.stack([pixels.u, pixels.v], dim=-1)

@@ -161,7 +161,8 @@ def test_outside_the_image_and_no_objects() -> None:
     nobody = scene([], [], torch.zeros(0, HEIGHT, WIDTH))
     none = torch.zeros(0, dtype=torch.long)
     assert hidden_pixels(nobody, "left", none, none.reshape(0, 2)).shape == (0,)
-    assert occlusion_crops(nobody, "left", none.reshape(0, 4)).hidden.shape == (0,)
+    crops = occlusion_crops(nobody, "left", none.reshape(0, 4))
+    assert crops.at(none, none.reshape(0, 2)).shape == (0,)
 
 
 def test_wrong_input_is_named() -> None:

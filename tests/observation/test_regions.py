@@ -10,14 +10,11 @@ from directshape_torch.observation.regions import region_boxes, region_pixels
 
 
 def boxes_of(mask_box: tuple[int, int, int, int] | None, box: list[float], join: bool) -> list[int]:
-    masks = torch.zeros(1, 100, 200)
+    mask_boxes = torch.zeros(1, 4, dtype=torch.long)
     if mask_box is not None:
         u0, v0, u1, v1 = mask_box
-        masks[0, v0 : v1 + 1, u0 : u1 + 1] = 0.9
-    has_mask = torch.tensor([mask_box is not None])
-    result: list[int] = region_boxes(torch.tensor([box]), masks, has_mask, torch.tensor([[100, 200]]), join=join)[
-        0
-    ].tolist()
+        mask_boxes[0] = torch.tensor([u0, v0, u1 + 1, v1 + 1])
+    result: list[int] = region_boxes(torch.tensor([box]), mask_boxes, torch.tensor([[100, 200]]), join=join)[0].tolist()
     return result
 
 
@@ -36,13 +33,6 @@ def test_region_is_clipped_and_may_be_empty() -> None:
         assert boxes_of((40, 40, 60, 60), nowhere, join=True) == [36, 36, 65, 65]
 
 
-def test_all_zero_mask_counts_as_none_and_absent_mask_is_not_read() -> None:
-    box, sizes = torch.tensor([[60.0, 30.0, 100.0, 45.0]]), torch.tensor([[100, 200]])
-    empty = region_boxes(box, torch.zeros(1, 100, 200), torch.tensor([True]), sizes, join=True)
-    absent = region_boxes(box, torch.ones(1, 100, 200), torch.tensor([False]), sizes, join=True)
-    assert empty.tolist() == absent.tolist() == [[56, 26, 105, 50]]
-
-
 def test_region_pixels_are_row_major() -> None:
     object_index, uv = region_pixels(torch.tensor([[3, 4, 5, 6], [0, 0, 0, 0], [7, 1, 8, 2]]))
     assert object_index.tolist() == [0, 0, 0, 0, 2]
@@ -50,8 +40,8 @@ def test_region_pixels_are_row_major() -> None:
 
 
 def test_wrong_regions_are_named() -> None:
-    zeros, sizes = torch.zeros(1, 40, 40), torch.tensor([[40, 40]])
-    with pytest.raises(InputError, match=r"has_mask: expected shape \(1,\)"):
-        region_boxes(torch.zeros(1, 4), zeros, torch.tensor([True, True]), sizes, join=True)
-    with pytest.raises(InputError, match=r"masks: expected shape \(1, H, W\)"):
-        region_boxes(torch.zeros(1, 4), zeros[0], torch.tensor([True]), sizes, join=True)
+    boxes, sizes = torch.zeros(1, 4), torch.tensor([[40, 40]])
+    with pytest.raises(InputError, match=r"mask_boxes: expected shape \(1, 4\)"):
+        region_boxes(boxes, torch.zeros(2, 4).long(), sizes, join=True)
+    with pytest.raises(InputError, match=r"sizes: expected shape \(1, 2\)"):
+        region_boxes(boxes, boxes.long(), sizes[0], join=True)

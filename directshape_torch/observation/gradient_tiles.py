@@ -1,0 +1,100 @@
+"""Gradient magnitudes and thresholds where cars are: only the cells that their regions touch, and those around them.
+
+What `image_gradient` and `cell_thresholds` find in whole frames, number for number, at a cost that follows the cars.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from directshape_torch.image.tiles import grey_tiles, tile_gradient_magnitude
+from directshape_torch.observation.gradient_thresholds import cells_of_regions, smoothed_thresholds, with_neighbours
+from directshape_torch.observation.lower_median import lower_medians
+from directshape_torch.observation.regions import RegionPixels
+from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
+
+
+@dataclass(frozen=True)
+class GradientTiles:
+    """Cells of S stacks of F frames, numbered through: frame f of stack s is `s F + f`.
+
+    Attributes:
+        magnitude: (C, side, side) grey levels per pixel; differentiable by the images.
+        first: (S F, rows, columns) where each cell begins among all magnitudes; nonsense where it is not needed.
+        thresholds: (S F, rows, columns) as `cell_thresholds` gives them where needed.
+        side_px: of the cells.
+    """
+
+    magnitude: Tensor
+    first: Tensor
+    thresholds: Tensor
+    side_px: int
+
+    def entries_and_thresholds(self, pixels: RegionPixels, frame_index: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the pixels (A,) of regions lie among all magnitudes, and their thresholds.
+
+        Args:
+            pixels: of B regions.
+            frame_index: (B,) numbered through the stacks.
+        """
+        side, (_, rows, columns) = self.side_px, self.first.shape
+        run_row = torch.div(pixels.run_v, side, rounding_mode="floor")
+        run_cell = (frame_index.index_select(0, pixels.run_object) * rows + run_row) * columns
+        run_offset = (pixels.run_v - run_row * side) * side
+        position = torch.arange(columns * side, device=frame_index.device)
+        column = torch.div(position, side, rounding_mode="floor")
+        cell = pixels.of_runs(run_cell) + column.index_select(0, pixels.u)
+        offset = pixels.of_runs(run_offset) + (position - column * side).index_select(0, pixels.u)
+        entry = self.first.flatten().index_select(0, cell) + offset
+        return entry, self.thresholds.flatten().index_select(0, cell)
+
+
+def gradient_tiles(
+    images: tuple[Tensor, ...],
+    sizes: Tensor,  # (F, 2)
+    regions: Tensor,  # (B, 4)
+    frame_index: Tensor,  # (B,)
+    settings: SamplingSettings = DEFAULT_SETTINGS,
+) -> GradientTiles:
+    """Gradient magnitudes and thresholds of all cells that the regions touch.
+
+    Args:
+        images: S stacks (F, 3, H, W), RGB in [0, 1], such as left and right.
+        sizes: (F, 2) integer (height, width) without padding, the same for all stacks.
+        regions: (B, 4) integer, half open.
+        frame_index: (B,) integer, numbered through the stacks.
+        settings: the side of the cells and the offset of the thresholds.
+    """
+    side = settings.threshold_cell_px
+    shape = (len(images) * len(sizes), *images[0].shape[2:])
+    wanted = with_neighbours(cells_of_regions(regions, frame_index, shape, settings))
+    frame, row, column = wanted.nonzero().unbind(dim=1)
+    grey = _grey(images, sizes, frame, row, column, side)
+    magnitude = tile_gradient_magnitude(grey)
+    step = torch.arange(side, device=frame.device)
+    last = sizes.repeat(len(images), 1)[frame]
+    inside = ((row[:, None] * side + step) < last[:, :1])[:, :, None]
+    inside = inside & ((column[:, None] * side + step) < last[:, 1:])[:, None, :]
+    medians = magnitude.detach().new_full(wanted.shape, torch.nan)
+    plain = magnitude.detach()
+    medians[frame, row, column] = lower_medians(plain.flatten(1), (inside & plain.isfinite()).flatten(1))
+    first = (wanted.flatten().long().cumsum(0) - 1).view(wanted.shape) * side**2
+    return GradientTiles(magnitude, first, smoothed_thresholds(medians, settings), side)
+
+
+def _grey(
+    images: tuple[Tensor, ...], sizes: Tensor, frame: Tensor, row: Tensor, column: Tensor, side_px: int
+) -> Tensor:
+    """Grey levels (C, side + 2, side + 2) of cells whose frames ascend through the stacks."""
+    num_frames = len(sizes)
+    if len(images) == 1:
+        return grey_tiles(images[0], sizes, frame, row, column, side_px)
+    ends = torch.searchsorted(frame, torch.arange(1, len(images) + 1, device=frame.device) * num_frames).tolist()
+    parts = []
+    for number, (stack, begin, end) in enumerate(zip(images, [0, *ends], ends, strict=False)):
+        part = slice(begin, end)
+        parts.append(grey_tiles(stack, sizes, frame[part] - number * num_frames, row[part], column[part], side_px))
+    return torch.cat(parts)

@@ -1,0 +1,72 @@
+"""Extents of masks: hand-made ones, and random ones against the plain form that reads every pixel."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.observation.mask_extents import mask_extents
+
+
+def plain_extents(masks: Tensor, present: Tensor) -> tuple[list[list[int]], list[int]]:
+    """Every pixel of every mask, one mask at a time."""
+    boxes, areas = [], []
+    for mask, exists in zip(masks, present.tolist(), strict=True):
+        v, u = (mask > 0.5).nonzero(as_tuple=True)
+        found = exists and len(u) > 0
+        boxes.append([int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1] if found else [0, 0, 0, 0])
+        areas.append(int((~(mask <= 0.5)).sum()) if exists else 0)
+    return boxes, areas
+
+
+def random_masks(count: int, generator: torch.Generator) -> Tensor:
+    masks = torch.rand(count, 23, 31, generator=generator) * 0.5  # never above 0.5
+    for mask in masks:
+        u, v, w, h = (int(torch.randint(n, (1,), generator=generator)) for n in (30, 22, 9, 8))
+        mask[v : v + h, u : u + w] = torch.rand((), generator=generator)
+        mask[torch.rand(23, 31, generator=generator) > 0.995] = torch.nan
+    return masks
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_masks_equal_the_plain_form(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    stacks = [random_masks(count, generator) for count in (5, 0, 3)]
+    present = [torch.rand(len(stack), generator=generator) > 0.3 for stack in stacks]
+    extents = mask_extents(stacks, present)
+    for got, stack, exists in zip(extents, stacks, present, strict=True):
+        assert (got.boxes.tolist(), got.areas.tolist()) == plain_extents(stack, exists)
+        assert torch.equal(got.covers(), (got.boxes != 0).any(dim=1))
+
+
+def test_corners_and_whole_frames() -> None:
+    masks = torch.zeros(5, 4, 6)
+    masks[0, 3, 5] = masks[1, 0, 0] = masks[3] = 1.0
+    masks[4, 0, 0] = masks[4, 3, 5] = 1.0
+    (extents,) = mask_extents([masks], [torch.ones(5, dtype=torch.bool)])
+    assert extents.boxes.tolist() == [[5, 3, 6, 4], [0, 0, 1, 1], [0, 0, 0, 0], [0, 0, 6, 4], [0, 0, 6, 4]]
+    assert extents.areas.tolist() == [1, 1, 0, 24, 2]
+
+
+def test_bool_masks_strided_masks_and_absent_ones() -> None:
+    masks = torch.zeros(2, 4, 6)
+    masks[:, 1:3, 2:5] = 1.0
+    present = torch.tensor([True, False])
+    for stack in (masks, masks > 0.5, masks.double(), masks.mT.contiguous().mT, masks[:1].expand(2, 4, 6)):
+        (extents,) = mask_extents([stack], [present])
+        assert extents.boxes.tolist() == [[2, 1, 5, 3], [0, 0, 0, 0]]
+        assert extents.areas.tolist() == [6, 0]
+
+
+def test_nan_counts_for_the_area_alone() -> None:
+    mask = torch.full((1, 4, 6), torch.nan)
+    (extents,) = mask_extents([mask], [torch.tensor([True])])
+    assert extents.boxes.tolist() == [[0, 0, 0, 0]]
+    assert extents.areas.tolist() == [24]
+
+
+def test_wrong_masks_are_named() -> None:
+    with pytest.raises(InputError, match=r"masks: expected shape \(1, H, W\)"):
+        mask_extents([torch.zeros(4, 6)], [torch.tensor([True])])
