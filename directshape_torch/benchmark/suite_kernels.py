@@ -14,7 +14,7 @@ from directshape_torch.benchmark.presets import available_modes, make_refiner
 from directshape_torch.benchmark.rows import Goal, Kind, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
-from directshape_torch.benchmark.workloads import demo_scene
+from directshape_torch.benchmark.workloads import demo_scene, first_cars
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
@@ -35,9 +35,10 @@ _ENDLESS = ("solver.cost_tolerance=0", "solver.step_tolerance=0", "solver.accept
 
 def run_kernels(settings: SuiteSettings) -> SuiteResult:
     """Everything on the bundled frame: where the data are does not change what a kernel costs."""
-    frames, detections = collate(demo_scene().frames)
+    loaded = demo_scene().frames[0]
+    frames, detections = collate([first_cars(loaded, 1) if settings.quick else loaded])
     rows: list[Row] = []
-    notes = ["the bundled frame with its six cars, default preset, single precision"]
+    notes = [f"the bundled frame, cars: {len(detections)}, default preset, single precision"]
     needed, shape = _needed(frames, detections)
     for mode in available_modes():
         settings.progress(f"kernels: one iteration and bare lookups, {mode}")
@@ -113,7 +114,8 @@ def _bare_lookups(mode: str, needed: NeededLookups, shape: BoundShape) -> Callab
 
 
 def _autograd_row(mode: str, frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> Row:
-    refiners = {j: make_refiner("default", mode, [f"solver.jacobian={j}"]) for j in ("analytic", "autograd")}
+    short = ["stages=[{max_iterations: 2}]"] if settings.quick else []
+    refiners = {j: make_refiner("default", mode, [f"solver.jacobian={j}", *short]) for j in ("analytic", "autograd")}
     calls = {name: partial(refiner, frames, detections) for name, refiner in refiners.items()}
     ratio = time_interleaved(calls, settings.repetitions).ratio("autograd", "analytic")
     note = "whole calls; forward mode, D tangents batched over the cars, same solver"

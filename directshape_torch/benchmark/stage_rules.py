@@ -1,0 +1,116 @@
+"""Which part of a refinement a function belongs to.
+
+The first rule whose module and name match decides. Helpers, and everything outside this package, belong to whoever
+called them. A function of this package that neither a rule nor a helper matches is unattributed and shows up as such.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+Stage = Literal[
+    "sampling",
+    "shape binding",
+    "silhouette value",
+    "silhouette Jacobian",
+    "ray depth",
+    "warp",
+    "priors",
+    "normal equations",
+    "solve",
+    "outcome",
+    "bookkeeping",
+    "unattributed",
+]
+
+STAGES: dict[Stage, str] = {
+    "sampling": "regions, gradients, occlusion, pixels of the images, pixel sets of the stages",
+    "shape binding": "grids of the cars from their codes",
+    "silhouette value": "rays, their points of closest approach, residuals",
+    "silhouette Jacobian": "derivatives at those points",
+    "ray depth": "where rays enter the shape, and the derivative of that depth",
+    "warp": "from the left image to the right, residuals, brightness",
+    "priors": "shape, ground, dimensions, pose",
+    "normal equations": "sums over the pixels of each car",
+    "solve": "damped step and new state",
+    "outcome": "covariance, quality, profile, trust; what it evaluates of the energy counts above",
+    "bookkeeping": "the loop, compaction, checks, assembling the result",
+    "unattributed": "functions that no rule knows",
+}
+
+PACKAGE = "directshape_torch"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Functions of the modules that match, by their qualified names.
+
+    Attributes:
+        module: regular expression of the whole module name below the package.
+        function: regular expression that occurs in the qualified name.
+        stage: they belong to; None for helpers.
+    """
+
+    module: str
+    function: str
+    stage: Stage | None
+
+    def matches(self, module: str, function: str) -> bool:
+        return re.fullmatch(self.module, module) is not None and re.search(self.function, function) is not None
+
+
+_ANY = ""
+
+RULES = (
+    Rule(r"observation\..*|initial_search", _ANY, "sampling"),
+    Rule(r"stereo_matching\..*", _ANY, "sampling"),
+    Rule(r"energy\.photometric_term", r"at_stage|_fix|thinned", "sampling"),
+    Rule(r"energy\.photometric_pixels", _ANY, "sampling"),
+    Rule(r"shape\..*", r"\bbind\b|initial_code", "shape binding"),
+    Rule(r"shape\.raycast", r"march|closest|_interval|_least|_vertex", "silhouette value"),
+    Rule(r"shape\.raycast", r"crossing|false_position|polished|depth|newton", "ray depth"),
+    Rule(r"energy\.projected_state", r"surface", "ray depth"),
+    Rule(r"energy\.projected_state", _ANY, "silhouette value"),
+    Rule(r"energy\.silhouette_term", r"_rows_|jacobian", "silhouette Jacobian"),
+    Rule(r"residuals\.silhouette", r"derivative", "silhouette Jacobian"),
+    Rule(r"(energy|residuals)\.silhouette.*", _ANY, "silhouette value"),
+    Rule(r"residuals\.photometric", r"depth_state_jacobian|surface_slope", "ray depth"),
+    Rule(r"(energy|residuals)\.photometric.*|energy\.brightness", _ANY, "warp"),
+    Rule(r"(energy|residuals)\.(prior|point_cloud).*", _ANY, "priors"),
+    Rule(r"solver\.normal_equations", _ANY, "normal equations"),
+    Rule(r"solver\.damped_solve", _ANY, "solve"),
+    Rule(r"energy\.car_state|energy\.car_problem", r"retract", "solve"),
+    Rule(r"outcome|quality|covariance|observability|evidence|disparity_profile|trust_model", _ANY, "outcome"),
+    Rule(r"refiner|admission|result|status|backward|checks|config.*|scene", _ANY, "bookkeeping"),
+    Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms)", _ANY, "bookkeeping"),
+    Rule(r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)", _ANY, None),
+)
+
+
+def stage_of(module: str, function: str) -> tuple[bool, Stage | None]:
+    """Whether a function decides for itself, and its stage.
+
+    Args:
+        module: its full name.
+        function: its qualified name.
+
+    Returns:
+        (False, None) for functions that belong to their caller's stage.
+
+    Example:
+        >>> stage_of("directshape_torch.solver.damped_solve", "damped_step")
+        (True, 'solve')
+        >>> stage_of("torch.functional", "einsum")
+        (False, None)
+        >>> stage_of("directshape_torch.brand_new", "f")
+        (True, 'unattributed')
+    """
+    package, _, inner = module.partition(".")
+    if package != PACKAGE:
+        return False, None
+    for rule in RULES:
+        if rule.matches(inner, function):
+            return rule.stage is not None, rule.stage
+    return True, "unattributed"
