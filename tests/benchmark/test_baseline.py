@@ -1,0 +1,98 @@
+"""A baseline holds ratios, slopes and counts, and says which of them got worse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from directshape_torch.benchmark.baseline import (
+    Expected,
+    make_baseline,
+    read_baseline,
+    regressions,
+    updated,
+    write_baseline,
+)
+from directshape_torch.benchmark.rows import Kind, Row
+from directshape_torch.errors import DataFormatError
+
+
+def row(
+    name: str, value: float, kind: Kind = "ratio", better: Literal["lower", "higher"] = "lower", suite: str = "kernels"
+) -> Row:
+    return Row(suite, name, value, "", kind, better=better)
+
+
+def test_absolute_figures_are_never_in_a_baseline() -> None:
+    rows = [row("a", 2.0), row("b", 0.9, "slope"), row("c", 1.0, "count")]
+    rows += [row("t", 12.0, "time"), row("m", 40.0, "memory"), row("i", 0.9, "accuracy"), row("r", 5.0, "rate")]
+
+    assert set(make_baseline(rows)) == {"kernels: a", "kernels: b", "kernels: c"}
+
+
+@pytest.mark.parametrize(
+    ("expected", "passes", "fails"),
+    [
+        (Expected(4.0, "ratio", "lower", 0.25), 5.0, 5.01),  # 4 + a quarter of 4
+        (Expected(4.0, "ratio", "higher", 0.25), 3.0, 2.99),
+        (Expected(0.9, "slope", "lower", 0.2), 1.09, 1.11),  # absolute
+        (Expected(1.0, "count", "lower", 0.0), 1.0, 1.5),
+    ],
+)
+def test_the_limit_by_hand(expected: Expected, passes: float, fails: float) -> None:
+    assert expected.allows(passes)
+    assert not expected.allows(fails)
+    assert not expected.allows(float("nan"))
+
+
+def test_a_better_figure_is_no_regression() -> None:
+    baseline = make_baseline([row("a", 4.0), row("b", 4.0, better="higher")])
+
+    assert regressions([row("a", 0.1), row("b", 100.0, better="higher")], baseline, ["kernels"]) == []
+
+
+def test_a_regression_names_row_figure_and_limit() -> None:
+    baseline = {"kernels: a": Expected(4.0, "ratio", "lower", 0.25)}
+
+    (sentence,) = regressions([row("a", 6.0)], baseline, ["kernels"])
+
+    assert sentence == "kernels: a: 6, at most 5 allowed (baseline 4)"
+
+
+def test_a_row_that_vanished_is_a_regression_only_where_its_suite_ran() -> None:
+    baseline = make_baseline([row("a", 4.0), row("b", 2.0, suite="gpu")])
+
+    assert regressions([row("a", 4.0)], baseline, ["kernels"]) == []
+    assert "was not measured" in regressions([row("a", 4.0)], baseline, ["kernels", "gpu"])[0]
+
+
+def test_a_baseline_survives_its_file(tmp_path: Path) -> None:
+    baseline = make_baseline([row("a", 4.0), row("b", 0.5, "slope", "higher")])
+
+    write_baseline(tmp_path / "b.json", baseline)
+
+    assert read_baseline(tmp_path / "b.json") == baseline
+
+
+def test_an_update_keeps_other_suites_and_tolerances_set_by_hand() -> None:
+    old = {
+        "kernels: a": Expected(4.0, "ratio", "lower", 0.9),
+        "kernels: gone": Expected(1.0, "ratio", "lower", 0.3),
+        "gpu: b": Expected(2.0, "count", "lower", 0.0),
+    }
+
+    new = updated(old, make_baseline([row("a", 3.0)]), ["kernels"])
+
+    assert new == {"gpu: b": old["gpu: b"], "kernels: a": Expected(3.0, "ratio", "lower", 0.9)}
+
+
+@pytest.mark.parametrize("text", ["", "[]", json.dumps({"schema_version": 99, "rows": {}}), '{"schema_version": 1}'])
+def test_a_file_that_is_no_baseline_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "b.json"
+    path.write_text(text)
+
+    with pytest.raises(DataFormatError, match="no baseline"):
+        read_baseline(path)
