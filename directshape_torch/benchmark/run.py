@@ -30,7 +30,7 @@ SUITES = {
     "gpu": ("suite_gpu", "run_gpu"),
     "scaling": ("suite_scaling", "run_scaling"),
     "kernels": ("suite_kernels", "run_kernels"),
-    "peers": ("suite_peers", "run_peers_suite"),
+    "peers": ("peers", "run_peers_suite"),
 }
 
 Progress = Callable[[str], None]
