@@ -276,9 +276,13 @@ class RefinerConfig:
 
     Attributes:
         method: terms of the energy: "direct" (images), "geometric" (the rival's: point cloud) or "combined" (both).
+        compile: compile the hot functions: "on", "off", or "auto" where there is a C++ compiler and the cars so far, or
+            known to be ahead, make up for it. Results differ in the last digits, so a choice makes runs repeatable to
+            the bit, whatever came before them.
     """
 
     method: Literal["direct", "geometric", "combined"] = "direct"
+    compile: Literal["auto", "on", "off"] = "auto"
     stages: tuple[StageConfig, ...] = (
         StageConfig(contour_width_px=2.0, image_level=1, max_iterations=10),
         StageConfig(contour_width_px=0.5, image_level=0, max_iterations=12),

@@ -54,6 +54,9 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
             _convert(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
         )
     if origin is Literal:
+        if isinstance(value, bool) and {"on", "off"} <= set(arguments):
+            # YAML 1.1 reads the words on and off as truth values.
+            return "on" if value else "off"
         if value not in arguments:
             raise ConfigError(f"{where}: expected one of {', '.join(map(str, arguments))}, got {value!r}")
         return value

@@ -118,6 +118,14 @@ def test_numbers_that_yaml_reads_as_text() -> None:
     assert load_config(None, ["priors.tilt_weight=1e7"]).priors.tilt_weight == 1e7
 
 
+def test_on_and_off_are_words_though_yaml_reads_truth_values(tmp_path: Path) -> None:
+    file = tmp_path / "off.yaml"
+    file.write_text("compile: off\n")
+    assert load_config(file).compile == "off"
+    assert load_config(None, ["compile=on"]).compile == "on"
+    assert config_from_mapping(RefinerConfig, config_to_mapping(RefinerConfig(compile="off"))).compile == "off"
+
+
 def test_files_and_overrides(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("silhouette: {weight: 5}\nphotometric: {brightness: none}\n", encoding="utf-8")

@@ -1,0 +1,312 @@
+"""Hot tensor functions, compiled where that pays and plain otherwise: the setting `compile: auto | on | off`.
+
+A function is marked once, `@compilable(sizes={...})`, and called like any other. It is compiled only inside a
+`compiling` region, which the refiner opens around its work, so that every other use of it stays plain. The rules of
+"auto" count cars and not seconds: the same calls make the same decisions on a busy machine as on an idle one.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import logging
+import os
+import threading
+import types
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk
+from directshape_torch.errors import CompilationError
+
+CompileMode = Literal["auto", "on", "off"]
+
+# What compiling everything costs and saves, on one core of 2023 (docs/results.md has the measurements). Slower machines
+# are slower at both, so the numbers of cars that follow hold for them too.
+_COLD_SECONDS, _WARM_SECONDS, _SAVED_SECONDS_PER_CAR = 40.0, 5.0, 0.03
+CARS_WORTH_COMPILING = round(_COLD_SECONDS / _SAVED_SECONDS_PER_CAR)
+CARS_WORTH_LOADING = round(_WARM_SECONDS / _SAVED_SECONDS_PER_CAR)
+
+# Indices are right by construction (NaN included); sizes are checked before a call. Both checks cost a multiple of the
+# arithmetic. Code that asks for the number of threads serves every setting of the user with one entry on disk.
+_OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
+    "assert_indirect_indexing": False,
+    "size_asserts": False,
+    "cpp.dynamic_threads": True,
+}
+# Sizes below are special to the compiler: each would be one more compilation.
+_LEAST_SIZE = 2
+_MAX_VARIANTS = 64
+
+_logger = logging.getLogger(__name__)
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+@dataclass
+class _Job:
+    """Work whose amount is known beforehand."""
+
+    cars_ahead: int
+
+
+@dataclass(frozen=True)
+class _Region:
+    mode: CompileMode
+    cars: int  # that speak for compiling: those ahead where that is known, else those so far
+
+
+@dataclass
+class _Process:
+    """What this process has done so far."""
+
+    lock: threading.RLock
+    cars: int = 0
+    given_up: bool = False
+    forked: bool = False
+
+
+_process = _Process(threading.RLock())
+_job: ContextVar[_Job | None] = ContextVar("directshape_torch_job", default=None)
+_region: ContextVar[_Region | None] = ContextVar("directshape_torch_compiling", default=None)
+
+
+def _in_child() -> None:
+    # The threads of OpenMP do not survive a fork, and the parent may have held the lock.
+    _process.forked = True
+    _process.lock = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_in_child)
+
+
+@contextmanager
+def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
+    """Region in which marked functions may be compiled, for the refinement of some cars.
+
+    "on" compiles always, "off" never. "auto" compiles once the cars that are known to be ahead (`cars_ahead`) make up
+    for it; where nobody knows, once the cars refined so far would have, so that at most twice the best possible time is
+    spent. Code that is on disk from an earlier process is loaded for far fewer cars. Without a working compiler "auto"
+    stays plain and says so once in the log. Forked processes stay plain.
+
+    Args:
+        mode: the setting.
+        num_cars: of this call.
+
+    Raises:
+        CompilationError: mode "on" and no working C++ compiler.
+
+    Example:
+        >>> @compilable(sizes={"x": 0})
+        ... def doubled(x: torch.Tensor) -> torch.Tensor:
+        ...     return 2 * x
+        >>> with compiling("auto", num_cars=1):
+        ...     doubled(torch.ones(3))  # one car: plain
+        tensor([2., 2., 2.])
+        >>> doubled.num_variants
+        0
+    """
+    if mode == "on":
+        _require_compiler()
+    job = _job.get()
+    token = _region.set(_Region(mode, _process.cars + num_cars if job is None else max(job.cars_ahead, num_cars)))
+    try:
+        yield
+    finally:
+        _region.reset(token)
+        with _process.lock:
+            _process.cars += num_cars
+            if job is not None:
+                job.cars_ahead = max(job.cars_ahead - num_cars, 0)
+
+
+@contextmanager
+def cars_ahead(num_cars: int) -> Iterator[None]:
+    """Tell the `compiling` regions inside how many cars are going to be refined in all, at least roughly.
+
+    Example:
+        >>> with cars_ahead(5000), compiling("off", num_cars=7):
+        ...     pass
+    """
+    token = _job.set(_Job(num_cars))
+    try:
+        yield
+    finally:
+        _job.reset(token)
+
+
+class Compilable(Generic[_P, _R]):
+    """A pure function of tensors in two forms, plain and compiled; see `compilable`."""
+
+    def __init__(self, function: Callable[_P, _R], sizes: Mapping[str, int | tuple[int, ...]]) -> None:
+        self.plain = function
+        self._signature = inspect.signature(function)
+        names = list(self._signature.parameters)
+        unknown = sorted(set(sizes) - set(names))
+        if unknown:
+            raise ValueError(f"{function.__qualname__} has no argument {unknown[0]!r}: {', '.join(names)}")
+        varying = (sizes.get(name, ()) for name in names)
+        self._varying = tuple((dims,) if isinstance(dims, int) else tuple(dims) for dims in varying)
+        self._compiled: Callable[..., Any] | None = None
+        self._variants: set[tuple[object, ...]] = set()
+        functools.update_wrapper(self, function)
+
+    @property
+    def num_variants(self) -> int:
+        """How many combinations of dtypes, devices and fixed sizes were compiled."""
+        return len(self._variants)
+
+    def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        # First of all: the user's own compilation traces the plain form.
+        if torch.compiler.is_compiling():
+            return self.plain(*args, **kwargs)
+        region = _region.get()
+        if region is None or region.mode == "off" or _process.forked or _is_transformed():
+            return self.plain(*args, **kwargs)
+        values = self._signature.bind(*args, **kwargs).args if kwargs else args
+        variant = self._variant(values)
+        if variant is None:
+            return self.plain(*args, **kwargs)
+        if variant not in self._variants and not self._may_compile(variant, region):
+            return self.plain(*args, **kwargs)
+        # Always the same kind of tensor: memory layout, parameters and gradients that are off make no further variants.
+        values = tuple(_normal(value) for value in values)
+        with torch.no_grad():
+            if variant in self._variants:
+                assert self._compiled is not None
+                result: _R = self._compiled(*values)
+                return result
+            return self._first_call(variant, region, values)
+
+    def _variant(self, values: tuple[object, ...]) -> tuple[object, ...] | None:
+        """What a compilation holds for, or None where the plain form is called for."""
+        grad = torch.is_grad_enabled()
+        variant: list[object] = [torch.is_inference_mode_enabled()]
+        for value, varying in zip(values, self._varying, strict=False):
+            if not isinstance(value, Tensor):
+                variant.append(value)
+                continue
+            if value.dtype == torch.float64 or (grad and value.requires_grad):
+                return None
+            shape = list(value.shape)
+            for dim in varying:
+                if shape[dim] < _LEAST_SIZE:
+                    return None
+                shape[dim] = -1
+            variant += [value.dtype, value.device, tuple(shape)]
+        return tuple(variant)
+
+    def _may_compile(self, variant: tuple[object, ...], region: _Region) -> bool:
+        if region.mode == "on":
+            return True
+        if _process.given_up or region.cars < CARS_WORTH_LOADING:
+            return False
+        if region.cars < CARS_WORTH_COMPILING and not is_on_disk(self.plain, variant):
+            return False
+        problem = compiler_problem()
+        if problem is not None:
+            _give_up(problem)
+        return problem is None
+
+    def _first_call(self, variant: tuple[object, ...], region: _Region, values: tuple[Any, ...]) -> _R:
+        """Compile for a variant; other threads that need it wait."""
+        from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
+
+        with _process.lock:
+            try:
+                result: _R = self._compile(values)
+            except (TorchDynamoException, FailOnRecompileLimitHit) as error:
+                reason = str(error).strip().splitlines()[0]
+                if region.mode == "on":
+                    raise CompilationError(f"{self.plain.__qualname__} could not be compiled: {reason}") from error
+                _give_up(f"{self.plain.__qualname__} could not be compiled: {reason}")
+                return self.plain(*values)  # type: ignore[call-arg]
+            self._variants.add(variant)
+        note_on_disk(self.plain, variant)
+        return result
+
+    def _compile(self, values: tuple[Any, ...]) -> _R:
+        import torch._dynamo
+
+        if self._compiled is None:
+            self._compiled = torch.compile(self.plain, fullgraph=True, options=_OPTIONS)
+        # Copies of the tensor objects: the marks must not stay on the caller's.
+        values = tuple(value.detach() if isinstance(value, Tensor) else value for value in values)
+        for value, varying in zip(values, self._varying, strict=False):
+            for dim in varying:
+                torch._dynamo.mark_dynamic(value, dim)
+        _logger.info("compiling %s", self.plain.__qualname__)
+        # Two sizes that are equal by accident in this call must not have to be equal in the next one.
+        with (
+            warnings.catch_warnings(),
+            _shape_settings().patch(use_duck_shape=False),
+            torch._dynamo.config.patch(recompile_limit=_MAX_VARIANTS),
+        ):
+            warnings.simplefilter("ignore")
+            result: _R = self._compiled(*values)
+        return result
+
+
+def compilable(
+    sizes: Mapping[str, int | tuple[int, ...]],
+) -> Callable[[Callable[_P, _R]], Compilable[_P, _R]]:
+    """Mark a pure function of tensors for compilation.
+
+    Inside a `compiling` region it is compiled once for all values of the named sizes; each combination of the other
+    sizes, dtypes, devices and values of arguments that are not tensors is a compilation of its own. Calls with
+    gradients, in float64, inside a functorch transform or forward-mode region, inside the user's own `torch.compile` or
+    with a named size below 2 take the plain form.
+
+    Args:
+        sizes: dimensions of the arguments, by name, whose sizes vary from call to call.
+
+    Example:
+        >>> @compilable(sizes={"points": 0})
+        ... def distances(points: torch.Tensor) -> torch.Tensor:
+        ...     return points.norm(dim=-1)
+        >>> distances(torch.tensor([[3.0, 4.0]]))
+        tensor([5.])
+    """
+
+    def mark(function: Callable[_P, _R]) -> Compilable[_P, _R]:
+        return Compilable(function, sizes)
+
+    return mark
+
+
+def _normal(value: object) -> object:
+    if not isinstance(value, Tensor):
+        return value
+    plain = value if type(value) is Tensor and not value.requires_grad else value.detach()
+    return plain.contiguous()
+
+
+def _shape_settings() -> types.ModuleType:
+    return importlib.import_module("torch.fx.experimental._config")
+
+
+def _is_transformed() -> bool:
+    """Inside jacfwd, vmap, ... or a region of forward-mode differentiation."""
+    return bool(torch._C._are_functorch_transforms_active()) or torch.autograd.forward_ad._current_level >= 0
+
+
+def _require_compiler() -> None:
+    problem = compiler_problem()
+    if problem is not None:
+        raise CompilationError(f"compile: on needs a working C++ compiler, but {problem}; set compile to auto or off")
+
+
+def _give_up(reason: str) -> None:
+    with _process.lock:
+        if not _process.given_up:
+            _logger.warning("compile: auto goes on without compiling, several times slower: %s", reason)
+        _process.given_up = True

@@ -1,0 +1,109 @@
+"""What the machine has for compiling: a working compiler, and code that an earlier process left on disk."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sysconfig
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_TRIAL = "#include <Python.h>\n#include <omp.h>\nint threads() { return omp_get_max_threads(); }\n"
+_TRIAL_SECONDS = 60
+
+
+@functools.cache
+def compiler_problem() -> str | None:
+    """Why no C++ code can be compiled here, or None if it can; tried once with a few lines.
+
+    Example:
+        >>> problem = compiler_problem()
+        >>> problem is None or isinstance(problem, str)
+        True
+    """
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
+    try:
+        compiler = get_cpp_compiler()
+    except RuntimeError as error:
+        return f"none was found ({_first_line(str(error)) or type(error).__name__})"
+    with tempfile.TemporaryDirectory() as folder:
+        command = [compiler, "-x", "c++", "-", "-shared", "-fPIC", "-fopenmp", "-o", os.path.join(folder, "trial.so")]
+        command += ["-I", sysconfig.get_paths()["include"]]
+        try:
+            trial = subprocess.run(
+                command, input=_TRIAL, capture_output=True, text=True, timeout=_TRIAL_SECONDS, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return f"{compiler} does not run ({error})"
+    return None if trial.returncode == 0 else f"{compiler} fails ({_first_line(trial.stderr)})"
+
+
+def is_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> bool:
+    """Whether an earlier process compiled the function, with this very source, for the variant on such a machine."""
+    return _marker(function, variant).is_file()
+
+
+def note_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> None:
+    """Remember for later processes that the compiler's disk cache holds the function.
+
+    The note lies in the cache's own folder: who empties the cache takes the note with it.
+    """
+    from torch._inductor import config
+
+    marker = _marker(function, variant)
+    if config.force_disable_caches or not config.fx_graph_cache:
+        return
+    try:
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
+    except OSError:
+        # A cache that cannot be written has nothing to remember either.
+        return
+
+
+def _marker(function: Callable[..., Any], variant: tuple[object, ...]) -> Path:
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    name = f"{function.__module__}.{function.__qualname__}"
+    number = hashlib.sha256(repr(variant).encode()).hexdigest()[:16]
+    return Path(cache_dir()) / "directshape_torch" / _fingerprint() / f"{name}-{number}"
+
+
+@functools.cache
+def _fingerprint() -> str:
+    """Changes whenever code in the disk cache no longer fits: versions, sources, processor."""
+    digest = hashlib.sha256()
+    machine = (platform.machine(), _processor(), torch.backends.cpu.get_cpu_capability(), platform.python_version())
+    for part in (torch.__version__, _package_version(), *machine):
+        digest.update(f"{part}\n".encode())
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:32]
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line for line in lines if line.startswith("model name")), platform.processor())
+
+
+def _package_version() -> str:
+    try:
+        return importlib.metadata.version("directshape_torch")
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _first_line(text: str) -> str:
+    return next((line.strip() for line in text.splitlines() if line.strip()), "")

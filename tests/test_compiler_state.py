@@ -1,0 +1,86 @@
+"""Is there a compiler that works, and what did an earlier process leave on disk?"""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import pytest
+import torch._inductor.config
+import torch._inductor.cpp_builder
+from torch._inductor.runtime import cache_dir_utils
+
+from directshape_torch import compiler_state
+from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk
+
+VARIANT = ("float32", (-1, 3))
+
+
+@pytest.fixture(autouse=True)
+def _ask_again() -> None:
+    compiler_problem.cache_clear()
+
+
+def _pretend(monkeypatch: pytest.MonkeyPatch, compiler: str) -> None:
+    monkeypatch.setattr(torch._inductor.cpp_builder, "get_cpp_compiler", lambda: compiler)
+
+
+def test_no_compiler(monkeypatch) -> None:
+    def nothing() -> str:
+        raise torch._inductor.exc.InvalidCxxCompiler
+
+    monkeypatch.setattr(torch._inductor.cpp_builder, "get_cpp_compiler", nothing)
+    assert (compiler_problem() or "").startswith("none was found (")
+
+
+def test_a_compiler_that_does_not_run(monkeypatch, tmp_path: Path) -> None:
+    _pretend(monkeypatch, str(tmp_path / "missing"))
+    assert "missing does not run" in (compiler_problem() or "")
+
+
+def test_a_compiler_that_fails_says_why(monkeypatch, tmp_path: Path) -> None:
+    script = tmp_path / "broken"
+    script.write_text("#!/bin/sh\necho 'fatal error: Python.h: No such file' >&2\nexit 1\n")
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    _pretend(monkeypatch, str(script))
+    assert compiler_problem() == f"{script} fails (fatal error: Python.h: No such file)"
+
+
+def _function() -> None: ...
+
+
+@pytest.fixture
+def _cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cache_dir_utils, "cache_dir", lambda: str(tmp_path))
+
+
+@pytest.mark.usefixtures("_cache_folder")
+def test_a_note_is_found_for_the_same_variant_only() -> None:
+    assert not is_on_disk(_function, VARIANT)
+    note_on_disk(_function, VARIANT)
+    assert is_on_disk(_function, VARIANT)
+    assert not is_on_disk(_function, (*VARIANT, "else"))
+
+
+@pytest.mark.usefixtures("_cache_folder")
+def test_other_versions_and_sources_do_not_find_it(monkeypatch) -> None:
+    note_on_disk(_function, VARIANT)
+    compiler_state._fingerprint.cache_clear()
+    monkeypatch.setattr(compiler_state, "_package_version", lambda: "another")
+    assert not is_on_disk(_function, VARIANT)
+    compiler_state._fingerprint.cache_clear()
+
+
+@pytest.mark.usefixtures("_cache_folder")
+def test_nothing_is_noted_where_there_is_no_cache() -> None:
+    with torch._inductor.config.patch(force_disable_caches=True):
+        note_on_disk(_function, VARIANT)
+    assert not is_on_disk(_function, VARIANT)
+
+
+def test_a_folder_that_cannot_be_written_is_no_error(monkeypatch, tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    monkeypatch.setattr(cache_dir_utils, "cache_dir", lambda: str(file))
+    note_on_disk(_function, VARIANT)
+    assert not is_on_disk(_function, VARIANT)
