@@ -18,7 +18,7 @@ from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.errors import InputError
-from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.photometric_match import SeenSurface, matching_costs, seen_surface, stage_pixels
 
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
@@ -157,16 +157,40 @@ def disparity_profile(
     offsets = profile_offsets().to(after.code.device) if offsets_px is None else offsets_px
     for term in problem.terms:
         if isinstance(term, PhotometricTerm):
-            few = term.thinned(max_pixels)
-            curves = [few.profile(_projected(problem, few.pixels, state), offsets) for state in (before, after)]
-            return DisparityProfile(offsets, curves[0], curves[1], few.support())
+            return _profile_of(term, (problem.project(before), problem.project(after)), offsets, max_pixels)
     nan = after.code.new_full((len(after.code), len(offsets)), torch.nan, dtype=torch.float64)
     return DisparityProfile(offsets, nan, nan, nan[:, 0])
 
 
-def _projected(problem: CarProblem, pixels: PixelSamples, state: CarState) -> ProjectedState:
-    """The rays of these pixels alone; the term does not look at the right ones."""
-    return ProjectedState(problem.prior, state, pixels, pixels, problem.config.silhouette.samples_per_ray)
+def _profile_of(
+    term: PhotometricTerm, states: tuple[ProjectedState, ProjectedState], offsets: Tensor, max_pixels: int
+) -> DisparityProfile:
+    """Both curves in one pass: the same pixels at the depths of two states."""
+    fixed = stage_pixels(term)
+    table, counts = _thinned(fixed.segments.counts, len(fixed.pixel_index), max_pixels)
+    rows = table.flatten()
+    seen = [seen_surface(term, state, rows) for state in states]
+    both = SeenSurface(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
+    costs = matching_costs(term, rows.repeat(2), both, offsets).view(-1, 2, *table.shape)
+    total = torch.where(counts, costs, 0.0).sum(dim=-1, dtype=torch.float64).permute(1, 2, 0)
+    weight = torch.where(counts, fixed.neighbour_weight.sum(dim=1)[table], 0.0).sum(dim=1, dtype=torch.float64)
+    num_pixels = counts.sum(dim=1)
+    mean = term.config.weight * total / weight.clamp_min(1)[:, None]
+    before, after = mean.masked_fill((num_pixels == 0)[:, None], torch.nan)
+    return DisparityProfile(offsets, before, after, num_pixels.to(torch.float64))
+
+
+def _thinned(counts: Tensor, num_rows: int, max_pixels: int) -> tuple[Tensor, Tensor]:
+    """Rows (B, M) of a set that is sorted by car: every second, third, ... of each, and which of them count.
+
+    A table rather than a list: how many pixels each car has, the host need not know.
+    """
+    place = torch.arange(min(max_pixels, num_rows), device=counts.device)
+    stride = (counts + max_pixels - 1) // max_pixels
+    step = place * stride[:, None]
+    first = torch.cumsum(counts, 0) - counts
+    # An empty place repeats some row, which is not counted.
+    return (first[:, None] + step).clamp_max(num_rows - 1), (step < counts[:, None]) & (stride > 0)[:, None]
 
 
 def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:
