@@ -174,18 +174,16 @@ class Compilable(Generic[_P, _R]):
             return self.plain(*args, **kwargs)
         values = self._signature.bind(*args, **kwargs).args if kwargs else args
         variant = self._variant(values)
-        if variant is None:
-            return self.plain(*args, **kwargs)
-        if variant not in self._variants and not self._may_compile(variant, region):
+        known = variant in self._variants
+        if variant is None or not (known or self._may_compile(variant, region)):
             return self.plain(*args, **kwargs)
         # Always the same kind of tensor: memory layout, parameters and gradients that are off make no further variants.
-        values = tuple(_normal(value) for value in values)
+        values = tuple(value if _is_normal(value) else _normal(value) for value in values)
         with torch.no_grad():
-            if variant in self._variants:
-                assert self._compiled is not None
-                result: _R = self._compiled(*values)
-                return result
-            return self._first_call(variant, region, values)
+            if not known or self._compiled is None:
+                return self._first_call(variant, region, values)
+            result: _R = self._compiled(*values)
+            return result
 
     def _variant(self, values: tuple[object, ...]) -> tuple[object, ...] | None:
         """What a compilation holds for, or None where the plain form is called for."""
@@ -202,7 +200,7 @@ class Compilable(Generic[_P, _R]):
                 if shape[dim] < _LEAST_SIZE:
                     return None
                 shape[dim] = -1
-            variant += [value.dtype, value.device, tuple(shape)]
+            variant += (value.dtype, value.device, *shape)
         return tuple(variant)
 
     def _may_compile(self, variant: tuple[object, ...], region: _Region) -> bool:
@@ -283,11 +281,12 @@ def compilable(
     return mark
 
 
+def _is_normal(value: object) -> bool:
+    return type(value) is Tensor and not value.requires_grad and value.is_contiguous()
+
+
 def _normal(value: object) -> object:
-    if not isinstance(value, Tensor):
-        return value
-    plain = value if type(value) is Tensor and not value.requires_grad else value.detach()
-    return plain.contiguous()
+    return value.detach().contiguous() if isinstance(value, Tensor) else value
 
 
 def _shape_settings() -> types.ModuleType:
