@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 
-from directshape_torch.benchmark.machine import compiler
-from directshape_torch.config import RefinerConfig
+from directshape_torch.compiler_state import compiler_problem
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
@@ -15,9 +13,8 @@ MODES = {"eager": "off", "compiled": "on"}
 
 
 def available_modes() -> tuple[str, ...]:
-    """The modes that can run here: "eager" always, "compiled" where there is a compiler and the setting."""
-    can_compile = _has_compile_setting() and compiler() is not None
-    return tuple(MODES) if can_compile else ("eager",)
+    """The modes that can run here: "eager" always, "compiled" where there is a working compiler."""
+    return tuple(MODES) if compiler_problem() is None else ("eager",)
 
 
 def make_refiner(preset: str, mode: str, overrides: Sequence[str] = ()) -> DirectShapeRefiner:
@@ -27,10 +24,9 @@ def make_refiner(preset: str, mode: str, overrides: Sequence[str] = ()) -> Direc
         preset: "default", "fast" or "paper", or a file.
         mode: of `MODES`.
         overrides: `key=value`.
+
+    Example:
+        >>> make_refiner("fast", "eager", ["silhouette.weight=6"]).config.silhouette.weight
+        6.0
     """
-    compiling = [f'compile="{MODES[mode]}"'] if _has_compile_setting() else []
-    return DirectShapeRefiner(config=load_config(preset, [*compiling, *overrides]))
-
-
-def _has_compile_setting() -> bool:
-    return any(field.name == "compile" for field in fields(RefinerConfig))
+    return DirectShapeRefiner(config=load_config(preset, [f"compile={MODES[mode]}", *overrides]))

@@ -56,12 +56,12 @@ def format_suite(result: SuiteResult) -> str:
 
     Example:
         >>> print(format_suite(SuiteResult("cpu", (Row("cpu", "a", 2.5, "ms", "time", goal=Goal("at most", 2)),))))
-        cpu  value   quartiles  n  goal             note
-        ---  ------  ---------  -  ---------------  ----
-        a    2.5 ms             1  at most 2: MISS
+        cpu  value   spread  n  goal             note
+        ---  ------  ------  -  ---------------  ----
+        a    2.5 ms          1  at most 2: MISS
     """
-    rows = [[result.suite, "value", "quartiles", "n", "goal", "note"]]
-    rows += [[r.name, _figure(r.value, r.unit), _quartiles(r), str(r.count), _goal(r), r.note] for r in result.rows]
+    rows = [[result.suite, "value", "spread", "n", "goal", "note"]]
+    rows += [[r.name, _figure(r.value, r.unit), _spread(r), str(r.count), _goal(r), r.note] for r in result.rows]
     return "\n".join([align(rows), *(f"note: {note}" for note in result.notes)])
 
 
@@ -71,7 +71,7 @@ def _figure(value: float, unit: str) -> str:
     return f"{text} {unit}".strip()
 
 
-def _quartiles(row: Row) -> str:
+def _spread(row: Row) -> str:
     if row.low is None or row.high is None:
         return ""
     return f"{_figure(row.low, '')} .. {_figure(row.high, '')}"

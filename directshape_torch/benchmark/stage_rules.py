@@ -85,7 +85,7 @@ RULES = (
     Rule(r"outcome|quality|covariance|observability|evidence|disparity_profile|trust_model", _ANY, "outcome"),
     Rule(r"refiner|admission|result|status|backward|checks|config.*|scene", _ANY, "bookkeeping"),
     Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms)", _ANY, "bookkeeping"),
-    Rule(r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)", _ANY, None),
+    Rule(r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)|compil.*", _ANY, None),
 )
 
 

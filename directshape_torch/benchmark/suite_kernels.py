@@ -15,6 +15,7 @@ from directshape_torch.benchmark.rows import Goal, Kind, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import demo_scene, first_cars
+from directshape_torch.compilation import CompileMode, compilable, compiling
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
@@ -74,8 +75,9 @@ def _iteration_rows(
     lookups = _bare_lookups(mode, needed, shape)
     times = time_interleaved({"few": few, "many": many, "lookups": lookups}, settings.repetitions)
     iteration = _per_iteration(times)
-    ratio = Spread.of([a / b for a, b in zip(iteration, times.seconds["lookups"], strict=True)])
-    bare = times.spread("lookups")
+    lookup = [seconds / (_MANY - _FEW) for seconds in times.seconds["lookups"]]
+    ratio = Spread.of([a / b for a, b in zip(iteration, lookup, strict=True)])
+    bare = Spread.of(lookup)
     note = f"calls of {_MANY} less calls of {_FEW} iterations, which all cars take part in"
     rate = bare.median / needed.num_lookups
     return [
@@ -98,19 +100,30 @@ def _per_iteration(times: InterleavedTimes) -> list[float]:
     return [max(many - few, 0.0) / (_MANY - _FEW) for many, few in pairs]
 
 
-def _bare_lookups(mode: str, needed: NeededLookups, shape: BoundShape) -> Callable[[], object]:
+@compilable(sizes={"points_obj": 0, "object_index": 0})
+def _value_and_derivatives(
+    shape: BoundShape,
+    points_obj: Tensor,  # (P, 3)
+    object_index: Tensor,  # (P,)
+) -> tuple[Tensor, ...]:
     """One value, and one value with its derivatives, at every point: nothing else."""
+    return shape.value(points_obj, object_index), *shape.value_and_derivatives(points_obj, object_index)
 
-    def both(points_obj: Tensor, object_index: Tensor) -> tuple[Tensor, ...]:
-        return shape.value(points_obj, object_index), *shape.value_and_derivatives(points_obj, object_index)
 
-    call = torch.compile(both, dynamic=True) if mode == "compiled" else both
+def _bare_lookups(mode: str, needed: NeededLookups, shape: BoundShape) -> Callable[[], object]:
+    """The lookups as often as there are iterations to compare with, compiled like the refiner's own functions."""
 
     @torch.no_grad()
-    def run() -> object:
-        return call(needed.points_obj, needed.object_index)
+    def run() -> None:
+        with compiling(_compile_mode(mode), num_cars=1):
+            for _ in range(_MANY - _FEW):
+                _value_and_derivatives(shape, needed.points_obj, needed.object_index)
 
     return run
+
+
+def _compile_mode(mode: str) -> CompileMode:
+    return "on" if mode == "compiled" else "off"
 
 
 def _autograd_row(mode: str, frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> Row:
