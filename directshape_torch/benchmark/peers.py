@@ -94,7 +94,7 @@ def missing_libraries() -> dict[str, str]:
 
 
 @dataclass
-class _Side:
+class TimedSolver:
     """A solver, all its runs, and the seconds of them all."""
 
     solver: StageSolver
@@ -119,7 +119,7 @@ class PeerCase:
 
     name: str
     tasks: list[StageTask]
-    sides: Mapping[str, _Side]
+    sides: Mapping[str, TimedSolver]
 
     def measure(self, figures: Mapping[str, Figures], settings: SuiteSettings) -> None:
         """Run all solvers in turn."""
@@ -162,7 +162,12 @@ def prepare_case(loaded: LoadedFrame, names: list[str]) -> PeerCase:
     }
     for mode in available_modes():
         makers[f"ours, {mode}"] = partial(own, make_refiner("default", mode))
-    return PeerCase(loaded.frame_id, tasks, {name: _Side(makers[name]()) for name in names})
+    return PeerCase(loaded.frame_id, tasks, timed_sides({name: makers[name]() for name in names}))
+
+
+def timed_sides(solvers: Mapping[str, StageSolver]) -> dict[str, TimedSolver]:
+    """Prepared solvers, none of which has run."""
+    return {name: TimedSolver(solver) for name, solver in solvers.items()}
 
 
 def _library(module: str) -> Any:

@@ -42,8 +42,9 @@ class WeightedNorms(NamedTuple):
         """Twice the weighted norm (..., R) of residuals given by their squares.
 
         Example:
-            >>> norms = WeightedNorms(torch.tensor([1.0, 1.0, 3.0]), torch.tensor([0.0, 2.0, 1e100]).double())
-            >>> norms.of_squares(torch.tensor([16.0, 16.0, 16.0]).double()) / 2
+            >>> corner = torch.tensor([0.0, 2.0, 1e100], dtype=torch.float64)
+            >>> norms = WeightedNorms(torch.tensor([1.0, 1.0, 3.0], dtype=torch.float64), corner)
+            >>> norms.of_squares(torch.full((3,), 16.0, dtype=torch.float64)) / 2
             tensor([ 4.,  6., 24.], dtype=torch.float64)
         """
         root = squared.clamp_min(_RESIDUAL_FLOOR**2).sqrt()

@@ -56,6 +56,20 @@ def state_of(pose: Any, code: Any, max_code: float) -> CarState:
     return CarState(se3.inverse(T_cam_obj), code.tensor.clamp(-max_code, max_code))
 
 
+def theseus_variables(state: CarState) -> tuple[Any, Any]:
+    """Pose `T_cam_obj` and code as Theseus' variables, float64."""
+    tensors = tensors_of(state)
+    # A rotation that was computed in single precision is none to its checks.
+    pose = theseus.SE3(tensor=tensors["pose"], name="pose", disable_checks=True)
+    return pose, theseus.Vector(tensor=tensors["code"], name="code")
+
+
+def tensors_of(state: CarState) -> dict[str, Tensor]:
+    """Values of the variables, by name."""
+    T_cam_obj = se3.inverse(state.T_obj_cam.to(torch.float64))
+    return {"pose": T_cam_obj[:, :3].contiguous(), "code": state.code.to(torch.float64, copy=True)}
+
+
 def unit_weight() -> Any:
     """A cost weight of 1; weights are a matter of the norms."""
     return theseus.ScaleCostWeight(torch.ones(1, 1, dtype=torch.float64))
@@ -166,12 +180,12 @@ class SettlingLevenbergMarquardt(theseus.LevenbergMarquardt):
 
     def reset(self, **kwargs: Any) -> None:
         super().reset(**kwargs)
-        self._settled = torch.zeros(self.objective.batch_size, dtype=torch.bool, device=self.objective.device)
+        self.settled = torch.zeros(self.objective.batch_size, dtype=torch.bool, device=self.objective.device)
 
     def _check_convergence(self, err: Tensor, last_err: Tensor) -> Tensor:
         decrease = last_err - err
-        self._settled = self._settled | ((decrease != 0) & (decrease <= self.cost_tolerance * last_err))
-        return self._settled
+        self.settled = self.settled | ((decrease != 0) & (decrease <= self.cost_tolerance * last_err))
+        return self.settled
 
 
 class TheseusSolver:
@@ -199,8 +213,7 @@ class _TheseusStage:
         self.task = task
         self.energy = CarEnergy(task.problem, task.start)
         self.energies = [self.energy]
-        self.pose = theseus.SE3(tensor=self._initial()["pose"], name="pose", disable_checks=True)
-        self.code = theseus.Vector(tensor=self._initial()["code"], name="code")
+        self.pose, self.code = theseus_variables(task.start)
         rows = CarRows(self.energy)
         if form == "batched":
             cost: Any = BatchedCost(self.energy, rows, self.pose, self.code, name="residuals")
@@ -227,7 +240,7 @@ class _TheseusStage:
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of its own use of NumPy
             self.layer.forward(
-                self._initial(),
+                tensors_of(self.task.start),
                 optimizer_kwargs={
                     "adaptive_damping": True,
                     "ellipsoidal_damping": True,
@@ -238,9 +251,8 @@ class _TheseusStage:
                     "end_iter_callback": keep,
                 },
             )
-            if (
-                len(seconds) < self.task.max_iterations
-            ):  # of the iteration after which all had settled, it does not tell
+            # It does not call back after the iteration with which all had settled.
+            if len(seconds) < self.task.max_iterations:
                 keep()
         traces = tuple(Trace(tuple(seconds), each) for each in zip(*costs, strict=True))
         state = CarState(*(x.to(self.task.start.code.dtype) for x in self._state()))
@@ -248,7 +260,3 @@ class _TheseusStage:
 
     def _state(self) -> CarState:
         return state_of(self.pose, self.code, self.task.solver.max_code)
-
-    def _initial(self) -> dict[str, Tensor]:
-        T_cam_obj = se3.inverse(self.task.start.T_obj_cam.to(torch.float64))
-        return {"pose": T_cam_obj[:, :3].contiguous(), "code": self.task.start.code.to(torch.float64, copy=True)}
