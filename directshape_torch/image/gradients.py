@@ -82,13 +82,32 @@ def image_gradient(
 def gradient_magnitude(
     gradient: Tensor,  # (F, 2, H, W)
 ) -> Tensor:
-    """Euclidean length of an image gradient, (F, H, W).
+    """Euclidean length of an image gradient, (F, H, W); its derivative is 0 where the image is flat.
 
     Example:
         >>> gradient_magnitude(torch.tensor([3.0, 4.0]).reshape(1, 2, 1, 1))
         tensor([[[5.]]])
     """
-    return torch.hypot(gradient[:, 0], gradient[:, 1])
+    return length_2d(gradient[:, 0], gradient[:, 1])
+
+
+def length_2d(
+    d_u: Tensor,  # (*,)
+    d_v: Tensor,  # (*,)
+) -> Tensor:
+    """`gradient_magnitude` of components that lie in tensors of their own.
+
+    Example:
+        >>> flat = torch.zeros(1, requires_grad=True)
+        >>> length_2d(flat, flat).backward()
+        >>> flat.grad
+        tensor([0.])
+    """
+    length = torch.hypot(d_u, d_v)
+    if not length.requires_grad:
+        return length
+    flat = length.detach() == 0
+    return torch.where(flat, 0, torch.hypot(torch.where(flat, 1, d_u), d_v))
 
 
 def _central_difference(

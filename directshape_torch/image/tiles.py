@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.image.gradients import grey_of_channels
+from directshape_torch.image.gradients import grey_of_channels, length_2d
 
 
 def grey_tiles(
@@ -40,7 +40,10 @@ def grey_tiles(
     last = sizes[frame] - 1
     v = (row[:, None] * side_px + step).clamp_min(0).minimum(last[:, :1])
     u = (column[:, None] * side_px + step).clamp_min(0).minimum(last[:, 1:])
-    pixel = ((frame[:, None] * (3 * height) + v) * width)[:, :, None] + u[:, None, :]
+    # Half as wide indices are twice as fast, where they reach.
+    index_dtype = torch.int32 if images.numel() < 2**31 else torch.int64
+    line = ((frame[:, None] * (3 * height) + v) * width).to(index_dtype)
+    pixel = line[:, :, None] + u.to(index_dtype)[:, None, :]
     flat, index, image_size = images.reshape(-1), pixel.flatten(), height * width
     red = flat.index_select(0, index)
     green, blue = (flat[c * image_size :].index_select(0, index) for c in (1, 2))
@@ -59,4 +62,4 @@ def tile_gradient_magnitude(
     """
     d_u = (grey[:, 1:-1, 2:] - grey[:, 1:-1, :-2]) / 2
     d_v = (grey[:, 2:, 1:-1] - grey[:, :-2, 1:-1]) / 2
-    return torch.hypot(d_u, d_v)
+    return length_2d(d_u, d_v)

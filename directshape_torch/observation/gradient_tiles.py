@@ -44,11 +44,12 @@ class GradientTiles:
         run_row = torch.div(pixels.run_v, side, rounding_mode="floor")
         run_cell = (frame_index.index_select(0, pixels.run_object) * rows + run_row) * columns
         run_offset = (pixels.run_v - run_row * side) * side
-        position = torch.arange(columns * side, device=frame_index.device)
+        position = torch.arange(columns * side, device=frame_index.device, dtype=pixels.u.dtype)
         column = torch.div(position, side, rounding_mode="floor")
-        cell = pixels.of_runs(run_cell) + column.index_select(0, pixels.u)
-        offset = pixels.of_runs(run_offset) + (position - column * side).index_select(0, pixels.u)
-        entry = self.first.flatten().index_select(0, cell) + offset
+        cell = pixels.of_runs(run_cell.to(pixels.u.dtype)) + column.index_select(0, pixels.u)
+        entry = self.first.flatten().index_select(0, cell)
+        entry += pixels.of_runs(run_offset.to(pixels.u.dtype))
+        entry += (position - column * side).index_select(0, pixels.u)
         return entry, self.thresholds.flatten().index_select(0, cell)
 
 
@@ -72,17 +73,21 @@ def gradient_tiles(
     shape = (len(images) * len(sizes), *images[0].shape[2:])
     wanted = with_neighbours(cells_of_regions(regions, frame_index, shape, settings))
     frame, row, column = wanted.nonzero().unbind(dim=1)
-    grey = _grey(images, sizes, frame, row, column, side)
-    magnitude = tile_gradient_magnitude(grey)
-    step = torch.arange(side, device=frame.device)
-    last = sizes.repeat(len(images), 1)[frame]
-    inside = ((row[:, None] * side + step) < last[:, :1])[:, :, None]
-    inside = inside & ((column[:, None] * side + step) < last[:, 1:])[:, None, :]
+    magnitude = tile_gradient_magnitude(_grey(images, sizes, frame, row, column, side))
     medians = magnitude.detach().new_full(wanted.shape, torch.nan)
-    plain = magnitude.detach()
-    medians[frame, row, column] = lower_medians(plain.flatten(1), (inside & plain.isfinite()).flatten(1))
-    first = (wanted.flatten().long().cumsum(0) - 1).view(wanted.shape) * side**2
+    last = sizes.repeat(len(images), 1)[frame] - 1
+    medians[frame, row, column] = _medians(magnitude.detach(), last[:, 0] - row * side, last[:, 1] - column * side)
+    first = ((wanted.flatten().long().cumsum(0) - 1) * side**2).view(wanted.shape)
     return GradientTiles(magnitude, first, smoothed_thresholds(medians, settings), side)
+
+
+def _medians(magnitude: Tensor, last_row: Tensor, last_column: Tensor) -> Tensor:
+    """Median (C,) of each cell (C, side, side), of its pixels inside the frame: up to its last row and column there."""
+    step = torch.arange(magnitude.shape[1], device=magnitude.device)
+    outside = magnitude.new_tensor(torch.inf)
+    rows = torch.where(step > last_row[:, None], outside, 0)
+    columns = torch.where(step > last_column[:, None], outside, 0)
+    return lower_medians((magnitude + (rows[:, :, None] + columns[:, None, :])).flatten(1))
 
 
 def _grey(

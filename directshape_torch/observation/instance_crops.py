@@ -105,17 +105,17 @@ def _boxes_around(boxes: Tensor, there: Tensor, frame_index: Tensor, num_frames:
 
 def _covers(masks: Sequence[Tensor], pixels: RegionPixels) -> Tensor:
     """Whether each pixel (A,) is covered by the mask whose box it lies in."""
-    if len(masks) > 1:
-        masks = [stack for stack in masks if len(stack)] or masks[:1]
-    object_index, v = pixels.object_index, pixels.v
+    masks = [stack.detach() for stack in masks if len(stack)] or list(masks[:1])
+    height, width = masks[0].shape[1:]
+    line = (pixels.run_object * height + pixels.run_v) * width
     if len(masks) == 1:
-        return masks[0].detach()[object_index, v, pixels.u] > MASK_THRESHOLD
-    # Objects ascend, so each stack's pixels are a run of them.
-    ends = torch.tensor([len(stack) for stack in masks], device=v.device).cumsum(0)
-    split = torch.searchsorted(object_index, ends).tolist()
+        return masks[0].flatten().index_select(0, pixels.of_runs(line) + pixels.u) > MASK_THRESHOLD
+    # Objects ascend, so the pixels of each stack are neighbours.
+    objects = torch.tensor([len(stack) for stack in masks], device=line.device).cumsum(0)
+    ends = torch.searchsorted(pixels.run, torch.searchsorted(pixels.run_object, objects).int()).tolist()
     parts, begin, first = [], 0, 0
-    for stack, end in zip(masks, split, strict=True):
-        part = slice(begin, end)
-        parts.append(stack.detach()[object_index[part] - first, v[part], pixels.u[part]] > MASK_THRESHOLD)
+    for stack, end in zip(masks, ends, strict=True):
+        pixel = (line - first * height * width).index_select(0, pixels.run[begin:end]) + pixels.u[begin:end]
+        parts.append(stack.flatten().index_select(0, pixel) > MASK_THRESHOLD)
         begin, first = end, first + len(stack)
     return torch.cat(parts)

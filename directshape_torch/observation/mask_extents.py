@@ -59,11 +59,11 @@ def scene_extents(detections: Detections) -> SceneExtents:
     """
     d, others = detections, detections.occluders
     masks, present = [d.mask_left, d.mask_right], [d.has_mask_left, d.has_mask_right]
-    if others is not None:
+    if others is not None and len(others.frame_index):
         masks += [others.mask_left, others.mask_right]
         present += [torch.ones_like(others.frame_index, dtype=torch.bool)] * 2
     extents = mask_extents(masks, present)
-    if others is None:
+    if len(extents) == 2:
         nothing = MaskExtents(extents[0].boxes[:0], extents[0].areas[:0])
         extents += [nothing, nothing]
     return SceneExtents(*extents)
@@ -111,14 +111,13 @@ def _extents_of_rows(
 ) -> MaskExtents:
     count, height, width = masks.shape
     number = torch.div(rows, height, rounding_mode="floor")
-    v = rows - number * height
-    lines = masks[number, v]
+    lines = masks.flatten(0, 1).index_select(0, rows)
     flags = torch.empty(lines.shape, dtype=torch.float32, device=lines.device)
     # Floating-point flags: comparing into them and summing them up is many times faster than with bool ones.
     covered = torch.gt(lines, MASK_THRESHOLD, out=flags)
     in_columns = torch.zeros(count, width, dtype=torch.float32, device=rows.device).index_add_(0, number, covered) > 0
     in_rows = torch.zeros(count, height, dtype=torch.bool, device=rows.device)
-    in_rows[number, v] = covered.sum(dim=1) > 0
+    in_rows.flatten()[rows] = covered.sum(dim=1) > 0
     background = torch.le(lines, MASK_THRESHOLD, out=flags).sum(dim=1).long()
     areas = torch.zeros(count, dtype=torch.long, device=rows.device).index_add_(0, number, width - background)
     (u0, u1), (v0, v1) = _first_and_end(in_columns), _first_and_end(in_rows)

@@ -186,7 +186,7 @@ def _chosen_pixels(
     index, exists = candidate_pixels(pixels, regions, magnitude, above, settings)
     run = pixels.run.index_select(0, index)
     object_index = pixels.run_object.index_select(0, run)
-    uv = torch.stack([pixels.u.index_select(0, index), pixels.run_v.index_select(0, run)], dim=-1)
+    uv = torch.stack([pixels.u.index_select(0, index).long(), pixels.run_v.index_select(0, run)], dim=-1)
     if hidden is not None:
         exists = exists & ~hidden.at(object_index, uv)
     kept = exists.nonzero()[:, 0]

@@ -18,7 +18,7 @@ from directshape_torch.observation.gradient_thresholds import cell_thresholds, c
 from directshape_torch.observation.regions import RegionPixels
 from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 
-_LOW_31_BITS = 2**31 - 1
+_INT32_MIN, _INT64_MIN = torch.iinfo(torch.int32).min, torch.iinfo(torch.int64).min
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def sample_pixels(
     """
     _check_sampling(magnitude, thresholds, regions, frame_index)
     pixels = RegionPixels.of(regions)
-    frame, u, v = frame_index[pixels.object_index], pixels.u, pixels.v
+    frame, u, v = frame_index[pixels.object_index], pixels.u.long(), pixels.v
     strength = magnitude[frame, v, u]
     above = strength.detach().float() > thresholds.float()[
         frame, torch.div(v, settings.threshold_cell_px, rounding_mode="floor"),
@@ -165,15 +165,17 @@ def _strongest_of_each_cell(
     num_cells: int,
 ) -> tuple[Tensor, Tensor]:
     """Index (N,) of the preferred, then strongest, then first entry of every cell, and whether there is one."""
-    # One maximum over a packed key decides all three: bit 62 preferred, bits 31..61 the strength, below them the
-    # reversed index. The bits of floats that are not negative are ordered as the floats are.
-    key = strength.contiguous().view(torch.int32).long()
+    # One maximum over a packed key decides all three. Its upper half: the bits of floats that are not negative are
+    # ordered as the floats are, and the sign bit puts all that are not preferred behind. Its lower half, without sign:
+    # the reversed index.
+    upper = strength.contiguous().view(torch.int32)
     if preferred is not None:
-        key |= preferred.long() << 31
-    key <<= 31
-    key += torch.arange(_LOW_31_BITS, _LOW_31_BITS - len(strength), -1, device=strength.device)
-    best = key.new_full((num_cells,), -1).scatter_reduce_(0, cell, key, "amax")
-    return (_LOW_31_BITS - (best & _LOW_31_BITS)) * (best >= 0), best >= 0
+        upper = torch.where(preferred, upper, upper + _INT32_MIN)
+    lower = torch.arange(-1, -1 - len(strength), -1, dtype=torch.int32, device=strength.device)
+    key = torch.stack([lower, upper], dim=-1).view(torch.int64)[:, 0]
+    best = key.new_full((num_cells,), _INT64_MIN).scatter_reduce_(0, cell, key, "amax")
+    exists = best != _INT64_MIN
+    return (-1 - best.view(torch.int32)[::2]).long() * exists, exists
 
 
 def _small_cell_side(
@@ -202,7 +204,7 @@ def _small_cells(
     of = pixels.run_object
     run_cell = start[of] + ((pixels.run_v - regions[of, 1]) / side[of]).floor().long() * columns[of]
     column_cell = (torch.arange(longest, device=regions.device) / side[:, None]).floor().long().flatten()
-    run_first = of * longest - regions[of, 0]
+    run_first = (of * longest - regions[of, 0]).to(pixels.u.dtype)
     column = column_cell.index_select(0, pixels.of_runs(run_first) + pixels.u)
     return pixels.of_runs(run_cell) + column, total
 

@@ -57,6 +57,14 @@ def test_magnitude_and_shapes() -> None:
     assert image_gradient(torch.ones(1, 1, 1)).abs().max() == 0
 
 
+def test_flat_images_have_a_derivative() -> None:
+    grey = torch.tensor([[[1.0, 1.0, 1.0, 4.0]]], requires_grad=True)
+    gradient_magnitude(image_gradient(grey)).sum().backward()
+    assert grey.grad is not None
+    # |d/du| is 0, 0, 1.5, 1.5: the flat ones pull at nothing.
+    assert grey.grad.tolist() == [[[0.0, -0.5, -0.5, 1.0]]]
+
+
 def test_wrong_input_is_named() -> None:
     with pytest.raises(InputError, match=r"images: expected shape \(F, 3, H, W\), got \(2, 4, 5\)"):
         grey_levels(torch.zeros(2, 4, 5))

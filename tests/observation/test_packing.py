@@ -1,0 +1,232 @@
+"""Packed pixels: the sparse form against the whole-frame one over random scenes, and how its work grows."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from directshape_torch.config import SamplingConfig
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.observation.mask_extents import scene_extents
+from directshape_torch.observation.occlusion import Side, hidden_pixels
+from directshape_torch.observation.packing import Observation, car_regions, pack_pixels, sampling_settings
+from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
+from tests.helpers.synthetic_scene import stereo_camera
+
+PADDING = 0.77  # grey that must not matter
+
+
+def whole_frame_side(frames: FrameBatch, d: Detections, side: Side, regions: Tensor, config: SamplingConfig) -> Any:
+    """Object, pixel, foreground and gradient of the chosen pixels of one image: every pixel of every frame is read."""
+    images, masks = (
+        (frames.images_left, d.mask_left) if side == "left" else (frames.images_right, d.mask_right)
+    )  # fmt: skip
+    magnitude = gradient_magnitude(image_gradient(grey_levels(images), frames.sizes))
+    chosen = select_pixels(magnitude, frames.sizes, d.frame_index, regions, sampling_settings(config))
+    object_index, uv = chosen.object_index, chosen.uv
+    if config.occlusion:
+        visible = ~hidden_pixels(d, side, object_index, uv, config.occlusion_order)
+        object_index, uv = object_index[visible], uv[visible]
+    u, v = uv.unbind(-1)
+    return object_index, uv, masks[object_index, v, u], magnitude[d.frame_index[object_index], v, u]
+
+
+def random_masks(generator: torch.Generator, frame: Tensor, sizes: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Rectangles of random probabilities with holes, often over a border; some stay empty."""
+    masks = torch.zeros(len(frame), *shape)
+    for mask, (height, width) in zip(masks, sizes[frame].tolist(), strict=True):
+        u, v = (int(torch.randint(-20, n, (1,), generator=generator)) for n in (width, height))
+        w, h = (int(torch.randint(1, n, (1,), generator=generator)) for n in (60, 45))
+        patch = mask[max(v, 0) : min(max(v + h, 0), height), max(u, 0) : min(max(u + w, 0), width)]
+        patch[:] = torch.rand(patch.shape, generator=generator) ** 0.3
+    return masks
+
+
+def random_scene(seed: int, count: int, num_frames: int = 3, others: int = 4) -> tuple[FrameBatch, Detections]:
+    """Frames of different sizes, padded, and cars anywhere in them."""
+    generator = torch.Generator().manual_seed(seed)
+    sizes = torch.stack([torch.randint(40, n, (num_frames,), generator=generator) for n in (110, 190)], dim=1)
+    shape = tuple(sizes.amax(dim=0).tolist()) if num_frames else (50, 60)
+    images = torch.full((2, num_frames, 3, *shape), PADDING)
+    for frame, (height, width) in enumerate(sizes.tolist()):
+        noise = torch.rand(2, 3, height, width, generator=generator)
+        images[:, frame, :, :height, :width] = noise * torch.rand(2, 3, height, 1, generator=generator)
+    frame_index = torch.randint(max(num_frames, 1), (count,), generator=generator)
+    camera = stereo_camera(150, 100, 120.0, torch.float32)
+    camera = replace(
+        camera, **{n: getattr(camera, n).expand(num_frames, *[-1] * (getattr(camera, n).ndim - 1)) for n in
+                   ("K_left", "K_right", "T_right_cam", "t_cam_ref")}
+    )  # fmt: skip
+    ground = GroundPlane.from_camera_height(1.65, num_frames)
+    frames = FrameBatch(images[0], images[1], sizes, camera, ground, tuple(f"{n:06d}" for n in range(num_frames)))
+    location = torch.rand(count, 3, generator=generator) * torch.tensor([8.0, 0.0, 30.0]) + torch.tensor([-4, 1.6, 4.0])
+    low = torch.rand(count, 2, generator=generator) * 150 - 30
+    frame_of_other = torch.randint(max(num_frames, 1), (others,), generator=generator)
+    depth = torch.rand(others, generator=generator) * 30
+    occluders = Occluders(
+        frame_index=frame_of_other,
+        mask_left=random_masks(generator, frame_of_other, sizes, shape) > 0.5,
+        mask_right=random_masks(generator, frame_of_other, sizes, shape) > 0.5,
+        depth_m=torch.where(torch.rand(others, generator=generator) > 0.5, depth, torch.nan),
+        bottom_v=torch.rand(others, generator=generator) * 100,
+    )
+    detections = Detections(
+        frame_index=frame_index,
+        T_cam_obj=pose_from_kitti(location, torch.rand(count, generator=generator)),
+        dimensions_hwl=torch.ones(count, 3),
+        box_2d=torch.cat([low, low + torch.rand(count, 2, generator=generator) * 60], dim=1),
+        score=torch.ones(count),
+        mask_left=random_masks(generator, frame_index, sizes, shape),
+        mask_right=random_masks(generator, frame_index, sizes, shape),
+        has_mask_left=torch.rand(count, generator=generator) > 0.1,
+        has_mask_right=torch.rand(count, generator=generator) > 0.1,
+        occluders=occluders if others else None,
+    )
+    return frames, detections
+
+
+def assert_equal_to_whole_frames(frames: FrameBatch, d: Detections, config: SamplingConfig) -> Observation:
+    seen = pack_pixels(frames, d, config)
+    for side, pixels, regions in zip(
+        ("left", "right"), (seen.left, seen.right), car_regions(frames, d, config), strict=True
+    ):
+        object_index, uv, foreground, magnitude = whole_frame_side(frames, d, side, regions, config)
+        assert torch.equal(pixels.object_index, object_index)
+        assert torch.equal(pixels.uv, uv.to(pixels.uv.dtype))
+        assert torch.equal(pixels.foreground, foreground)
+        assert torch.equal(pixels.gradient_magnitude, magnitude)
+    return seen
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_scenes_equal_the_whole_frame_form(seed: int) -> None:
+    frames, detections = random_scene(seed, count=9)
+    seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig())
+    assert len(seen.left) > 100
+    assert torch.equal(seen.mask_areas, scene_extents(detections).areas())
+
+
+@pytest.mark.parametrize("mode", ["adaptive", "round_one", "uniform", "dense"])
+@pytest.mark.parametrize("order", ["depth", "box_bottom", None])
+def test_every_mode_and_order_equals_the_whole_frame_form(mode: str, order: str | None) -> None:
+    config = SamplingConfig(mode=mode, occlusion=order is not None, occlusion_order=order or "depth")
+    frames, detections = random_scene(11, count=7)
+    assert_equal_to_whole_frames(frames, detections, config)
+
+
+def test_more_instances_in_a_frame_than_bits_in_a_word() -> None:
+    frames, detections = random_scene(12, count=150, num_frames=1, others=30)
+    seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig())
+    assert seen.hidden_right is not None
+    assert seen.hidden_right.covering.shape[1] == 3
+
+
+@pytest.mark.parametrize("num_frames", [0, 2])
+@pytest.mark.parametrize("others", [0, 3])
+def test_no_cars(num_frames: int, others: int) -> None:
+    frames, detections = random_scene(13, count=0, num_frames=num_frames, others=others if num_frames else 0)
+    seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig())
+    assert len(seen.left) == len(seen.right) == 0
+    assert seen.mask_areas.shape == (0, 2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hidden_in_the_right_image_wherever_a_car_may_land(seed: int) -> None:
+    frames, detections = random_scene(seed, count=9)
+    seen = pack_pixels(frames, detections, SamplingConfig())
+    assert seen.hidden_right is not None
+    height, width = frames.images_left.shape[2:]
+    v, u = torch.meshgrid(torch.arange(-3, height + 3), torch.arange(-3, width + 3), indexing="ij")
+    uv = torch.stack([u, v], dim=-1).reshape(-1, 2)
+    for number in range(len(detections)):
+        index = torch.full((len(uv),), number)
+        expected = hidden_pixels(detections, "right", index, uv)
+        frame_height, frame_width = frames.sizes[detections.frame_index[number]].tolist()
+        u0, v0, u1, v1 = seen.region_left[number].tolist()
+        in_strip = (uv[:, 1] >= v0 - 8) & (uv[:, 1] < v1 + 8) & (uv[:, 0] < frame_width) & (uv[:, 1] < frame_height)
+        expected &= in_strip & (u1 > u0)
+        assert torch.equal(seen.hidden_right.at(index, uv), expected)
+        assert torch.equal(seen.hidden_right.at(index, uv + 0.4), expected)
+
+
+def test_gradients_reach_images_and_masks() -> None:
+    frames, detections = random_scene(5, count=4)
+    attached = frames.images_left.clone().requires_grad_()
+    mask = detections.mask_right.clone().requires_grad_()
+    seen = pack_pixels(replace(frames, images_left=attached), replace(detections, mask_right=mask), SamplingConfig())
+    (seen.left.gradient_magnitude.sum() + seen.right.foreground.sum()).backward()
+    reference = frames.images_left.clone().requires_grad_()
+    magnitude = gradient_magnitude(image_gradient(grey_levels(reference), frames.sizes))
+    u, v = seen.left.uv.long().unbind(-1)
+    magnitude[detections.frame_index[seen.left.object_index], v, u].sum().backward()
+    torch.testing.assert_close(attached.grad, reference.grad)
+    assert mask.grad is not None
+    assert mask.grad.sum() == len(seen.right)
+
+
+class TouchedElements(TorchDispatchMode):
+    """Counts what every operation reads and writes; lookups touch what they bring back, not what they search in."""
+
+    LOOKUPS = ("index_select", "index.Tensor", "gather")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if not func.is_view:
+            touched = result if isinstance(result, (tuple, list)) else (result,)
+            if not any(name in str(func) for name in self.LOOKUPS):
+                touched = (*touched, *args)
+            self.count += sum(item.numel() for item in touched if isinstance(item, Tensor))
+        return result
+
+
+def enlarged(frames: FrameBatch, d: Detections, factor: int) -> tuple[FrameBatch, Detections]:
+    """The same cars in a frame that has more to see below and to the right of them."""
+    height, width = frames.images_left.shape[2:]
+    more = (0, (factor - 1) * width, 0, (factor - 1) * height)
+    images = {
+        name: torch.nn.functional.pad(getattr(frames, name), more, value=PADDING)
+        for name in ("images_left", "images_right")
+    }
+    masks = {name: torch.nn.functional.pad(getattr(d, name), more) for name in ("mask_left", "mask_right")}
+    return replace(frames, sizes=frames.sizes * factor, **images), replace(d, **masks)
+
+
+def touched_by_packing(frames: FrameBatch, d: Detections) -> tuple[int, int]:
+    """Elements touched to find the masks' extents, and by all the rest."""
+    with TouchedElements() as finding:
+        extents = scene_extents(d)
+    with TouchedElements() as packing:
+        pack_pixels(frames, d, SamplingConfig(), extents)
+    return finding.count, packing.count
+
+
+def test_work_follows_the_cars_and_not_the_frame() -> None:
+    frames, detections = random_scene(6, count=5, num_frames=1, others=0)
+    small, large = (touched_by_packing(*enlarged(frames, detections, factor)) for factor in (4, 8))
+    pixels = [detections.mask_left[0].numel() * factor**2 for factor in (4, 8)]
+    # Four times the frame: every mask is read once more, and nothing else of the size of a frame.
+    masks_read = 2 * len(detections) * (pixels[1] - pixels[0])
+    assert masks_read <= large[0] - small[0] < 1.2 * masks_read
+    assert large[1] - small[1] < 0.2 * (pixels[1] - pixels[0])  # one number a threshold cell and car
+    assert large[1] < 1.02 * small[1]
+
+
+def test_work_is_linear_in_the_cars() -> None:
+    frames, detections = random_scene(7, count=6, num_frames=1, others=0)
+    once = touched_by_packing(frames, detections)
+    many = {f.name: getattr(detections, f.name) for f in fields(detections)}
+    rows = {name: torch.cat([value] * 8) for name, value in many.items() if isinstance(value, Tensor)}
+    eight = touched_by_packing(frames, replace(detections, **rows))
+    assert eight[0] < 8.1 * once[0]
+    assert eight[1] < 8.1 * once[1]
