@@ -24,7 +24,7 @@ def tangent_covariance(problem: CarProblem, state: CarState) -> Tensor:
 def covariance_of(linearisations: Sequence[TermLinearisation]) -> Tensor:
     """`tangent_covariance` (B, D, D) from the linearisations of all terms, made with their Fisher information."""
     fisher = sum_of([part.fisher for part in linearisations])
-    finite = fisher.isfinite().all(-1).all(-1)
+    finite = fisher.flatten(1).isfinite().all(1)
     identity = torch.eye(fisher.shape[-1], dtype=fisher.dtype, device=fisher.device)
     factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], fisher, identity))
     regular = (finite & (info == 0))[:, None, None]

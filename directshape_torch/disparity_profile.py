@@ -109,7 +109,7 @@ class DisparityProfile:
     def cost_at(self, offset_px: float) -> CostPair:
         """Costs at the sample next to an offset."""
         column = (self.offsets_px - offset_px).abs().argmin(dim=0, keepdim=True)
-        return CostPair(self.cost_before[:, column][:, 0], self.cost_after[:, column][:, 0])
+        return CostPair(*(cost.index_select(1, column)[:, 0] for cost in (self.cost_before, self.cost_after)))
 
     @property
     def before(self) -> ProfileFigures:
@@ -120,6 +120,13 @@ class DisparityProfile:
     def after(self) -> ProfileFigures:
         """Figures of the curve at the end; a good fit has its minimum near 0 and no other that is as low."""
         return profile_figures(self.offsets_px, self.cost_after, self.num_pixels)
+
+    @property
+    def figures(self) -> tuple[ProfileFigures, ProfileFigures]:
+        """`before` and `after` in one go."""
+        cost, pixels = torch.cat([self.cost_before, self.cost_after]), torch.cat([self.num_pixels, self.num_pixels])
+        both = [figure.tensor_split(2) for figure in profile_figures(self.offsets_px, cost, pixels)]
+        return ProfileFigures(*(x[0] for x in both)), ProfileFigures(*(x[1] for x in both))
 
 
 def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
@@ -227,7 +234,7 @@ def _vertex(offsets_px: Tensor, cost: Tensor, best: Tensor, num_pixels: Tensor) 
     With a mean squared residual of twice the cost, `sigma^2 = 2 cost / (curvature num_pixels)`.
     """
     inner = best.clamp(1, cost.shape[1] - 2)
-    left, here, right = (cost.gather(1, (inner + i)[:, None])[:, 0] for i in (-1, 0, 1))
+    left, here, right = cost.gather(1, torch.stack([inner - 1, inner, inner + 1], dim=1)).unbind(dim=1)
     step = offsets_px[1] - offsets_px[0]
     curvature = (left - 2 * here + right) / step**2
     is_valley = (inner == best) & (curvature > 0)
@@ -249,12 +256,13 @@ def _other_minimum(offsets_px: Tensor, cost: Tensor, best: Tensor) -> Tensor:
 def _is_downhill(offsets_px: Tensor, cost: Tensor, best: Tensor, tolerance: Tensor) -> Tensor:
     """Whether (B,) the cost falls all the way from offset 0 to the lowest one, but for rises within the tolerance."""
     start = offsets_px.abs().argmin()
-    index = torch.arange(len(offsets_px), device=cost.device)
-    low, high = best.minimum(start)[:, None], best.maximum(start)[:, None]
-    # Towards the lowest one: to the right where that lies on the right.
-    on_way = torch.where((index >= low) & (index <= high), cost, torch.inf)
-    rightwards = torch.where(on_way.isinf(), -torch.inf, on_way - on_way.cummin(dim=1).values)
-    flipped = on_way.flip(1)
-    leftwards = torch.where(flipped.isinf(), -torch.inf, flipped - flipped.cummin(dim=1).values)
-    rise = torch.where(best >= start, rightwards.amax(dim=1), leftwards.amax(dim=1))
+    last = len(offsets_px) - 1
+    index = torch.arange(last + 1, device=cost.device)
+    # Rightwards from the start, by way of the mirrored curve where the lowest cost lies on the left.
+    rightwards = best >= start
+    ahead = torch.where(rightwards[:, None], cost, cost.flip(1))
+    begin, end = torch.where(rightwards, start, last - start), torch.where(rightwards, best, last - best)
+    is_on_way = (index >= begin[:, None]) & (index <= end[:, None])
+    lowest_so_far = torch.where(is_on_way, ahead, torch.inf).cummin(dim=1).values
+    rise = torch.where(is_on_way, ahead - lowest_so_far, -torch.inf).amax(dim=1)
     return rise <= tolerance

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.device_constants import constant_like
 from directshape_torch.disparity_profile import DisparityProfile
 from directshape_torch.energy.car_problem import CarProblem, sum_of
 from directshape_torch.energy.car_state import CarState
@@ -120,27 +121,31 @@ def evidence_of(problem: CarProblem, course: Course, agreement: Agreement) -> Te
 
 def _motion(problem: CarProblem, course: Course) -> dict[str, Tensor]:
     """How far the box moved, in metres, in shares of itself and in standard deviations."""
-    T_before, T_after = (se3.inverse(s.T_obj_cam).to(torch.float64) for s in (course.before, course.after))
+    T_obj_cam = torch.stack([course.before.T_obj_cam, course.after.T_obj_cam]).to(torch.float64)
+    T_cam_obj = se3.inverse(T_obj_cam)
+    T_before, T_after = T_cam_obj
     dimensions = problem.prior.dimensions_and_derivative(course.after.code)
+    hwl = dimensions.hwl.to(torch.float64)
     shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
-    turned = wrap_angle(rotation_y_from_pose(T_after) - rotation_y_from_pose(T_before))
-    change_hwl = dimensions.hwl.to(torch.float64) - course.detector_hwl.to(torch.float64)
-    shift_obj = (T_after[:, :3, :3].mT @ shift_cam[..., None])[..., 0]
-    motion = torch.stack([shift_obj[:, 0], shift_obj[:, 2], turned, change_hwl[:, 2], change_hwl[:, 1]], dim=1)
-    misfit, gain = _expected(motion, _footprint_sigmas(course, dimensions), dimensions.hwl.to(torch.float64))
-    ray = _horizontal_ray(T_after)
-    along, across = (shift_cam * ray).sum(1), shift_cam[:, 0] * ray[:, 2] - shift_cam[:, 2] * ray[:, 0]
-    in_view = torch.stack([along, across, turned], dim=1)
-    covariance = _covariance_in_view(course.covariance_xyz_yaw, ray)
-    sigma = covariance.diagonal(dim1=1, dim2=2).clamp_min(_TINY**2).sqrt()
+    heading_before, heading_after = rotation_y_from_pose(T_cam_obj)
+    turned = wrap_angle(heading_after - heading_before)
+    change_hwl = hwl - course.detector_hwl
+    shift_obj = (shift_cam[:, None] @ T_after[:, :3, :3])[:, 0]
+    motion = torch.cat([shift_obj[:, 0::2], turned[:, None], change_hwl[:, 1:].flip(1)], dim=1)
+    misfit, gain = _expected(motion, _footprint_sigmas(course, dimensions), hwl)
+    J = _view_jacobian(T_after[:, :3, 3])
+    shift_and_turn = torch.cat([shift_cam, turned[:, None]], dim=1)
+    in_view = (J @ shift_and_turn[..., None])[..., 0]
+    covariance = J @ course.covariance_xyz_yaw @ J.mT
+    log_sigma = 0.5 * covariance.diagonal(dim1=1, dim2=2).clamp_min(_TINY**2).log()
     return {
         "log_depth": (T_after[:, 2, 3].clamp_min(1.0) / 20).log(),
-        "log_sigma_depth": sigma[:, 0].log(),
-        "log_sigma_side": sigma[:, 1].log(),
-        "log_sigma_yaw": sigma[:, 2].log(),
+        "log_sigma_depth": log_sigma[:, 0],
+        "log_sigma_side": log_sigma[:, 1],
+        "log_sigma_yaw": log_sigma[:, 2],
         "log_expected_misfit": misfit.log(),
         "log_expected_gain": (gain + 0.005).log(),
-        "moved_depth": along.abs(),
+        "moved_depth": in_view[:, 0].abs(),
         "turned": turned.abs(),
         "log_moved_sigmas": torch.log1p(_mahalanobis(in_view, covariance)),
         "length_change": change_hwl[:, 2].abs(),
@@ -150,11 +155,11 @@ def _motion(problem: CarProblem, course: Course) -> dict[str, Tensor]:
 
 def _footprint_sigmas(course: Course, dimensions: DimensionsDerivative) -> Tensor:
     """Standard deviations (B, 5) along and across the car, of its heading, length and width, of the right size."""
-    J = dimensions.J_hwl_code[:, [2, 1]].to(torch.float64)
+    J = dimensions.J_hwl_code[:, 1:].flip(1).to(torch.float64)
     C = course.covariance
-    size_variance = (J @ C[:, 6:, 6:] @ J.mT).diagonal(dim1=1, dim2=2)
-    variance = torch.cat([C.diagonal(dim1=1, dim2=2)[:, [0, 2, 4]], size_variance], dim=1)
-    return (variance * _SIGMA_FACTOR**2 + variance.new_tensor(_SIGMA_FLOORS) ** 2).sqrt()
+    size_variance = (J @ C[:, 6:, 6:] * J).sum(dim=2)
+    variance = torch.cat([C.diagonal(dim1=1, dim2=2)[:, 0:6:2], size_variance], dim=1)
+    return (variance * _SIGMA_FACTOR**2 + constant_like(_SIGMA_FLOORS, variance).square()).sqrt()
 
 
 def _expected(motion: Tensor, sigma: Tensor, hwl: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,11 +173,12 @@ def _expected(motion: Tensor, sigma: Tensor, hwl: Tensor) -> tuple[Tensor, Tenso
     _, width, length = hwl.clamp_min(0.1).unbind(1)
     # IoU falls by twice the shift over the side, by the change of a side over itself, and by the corners cut in a turn.
     turn = 0.5 * (length / width + width / length)
-    loss = torch.stack([2 / length, 2 / width, turn, 1 / length, 1 / width], dim=1)
+    per_length, per_width = 1 / length, 1 / width
+    loss = torch.stack([2 * per_length, 2 * per_width, turn, per_length, per_width], dim=1)
     # E|x| of x ~ N(0, sigma^2) and of N(motion, sigma^2).
     at_output = sigma * math.sqrt(2 / math.pi)
     ratio = motion / sigma
-    at_input = at_output * torch.exp(-0.5 * ratio**2) + motion * torch.erf(ratio / math.sqrt(2))
+    at_input = at_output * torch.exp(-0.5 * ratio.square()) + motion * torch.erf(ratio / math.sqrt(2))
     return (loss * at_output).sum(1), (loss * (at_input - at_output)).sum(1).clamp_min(0)
 
 
@@ -194,46 +200,53 @@ def _costs(problem: CarProblem, course: Course) -> dict[str, Tensor]:
     silhouettes = [name.startswith("silhouette") for name in names]
     photometric = [name == "photometric" for name in names]
     priors = [isinstance(term, PriorTerm) for term in problem.terms]
-
-    def paid(costs: Tensor, chosen: list[bool]) -> Tensor:
-        return costs[:, torch.tensor(chosen, device=costs.device)].sum(1).clamp_min(_TINY).log()
-
-    before, after, everything = course.cost_before, course.cost_after, [True] * len(names)
+    # (T, 2, B): before and after.
+    costs = torch.stack([course.cost_before, course.cost_after]).permute(2, 0, 1)
+    everything = costs.sum(dim=0)
+    paid = torch.stack([*(_total(costs, chosen) for chosen in (silhouettes, priors, photometric)), everything])
+    log_before, log_after = paid.clamp_min(_TINY).log().unbind(dim=1)
+    decrease = log_before - log_after
     return {
-        "log_silhouette_cost": paid(after, silhouettes),
-        "log_prior_cost": paid(after, priors),
-        "silhouette_decrease": paid(before, silhouettes) - paid(after, silhouettes),
-        "photometric_decrease": paid(before, photometric) - paid(after, photometric),
-        "relative_decrease": paid(before, everything) - paid(after, everything),
-        "log_conflict": _conflict(course, photometric),
+        "log_silhouette_cost": log_after[0],
+        "log_prior_cost": log_after[1],
+        "silhouette_decrease": decrease[0],
+        "photometric_decrease": decrease[2],
+        "relative_decrease": decrease[3],
+        "log_conflict": _conflict(course, photometric, everything[1]),
     }
+
+
+def _total(costs: Tensor, chosen: list[bool]) -> Tensor:
+    """Sum (2, B) of some rows of the costs (T, 2, B); the host knows which, so that no device has to look."""
+    rows = [row for row, wanted in zip(costs, chosen, strict=True) if wanted]
+    return sum_of(rows) if rows else torch.zeros_like(costs[0])
 
 
 def _profile(profile: DisparityProfile) -> dict[str, Tensor]:
     """How sharply the images know the disparity at the end, and how far they pulled the input."""
-    before, after = profile.before, profile.after
-    here, lowest = profile.cost_at(0.0), profile.lowest
-    sides = torch.minimum(*(cost.after for cost in (profile.cost_at(-1.0), profile.cost_at(1.0))))
+    before, after = profile.figures
+    lowest = profile.lowest
+    here, *sides = (profile.cost_at(offset_px) for offset_px in (0.0, -1.0, 1.0))
+    rise_after, fall_before = torch.minimum(sides[0].after, sides[1].after) / lowest.after, here.before / lowest.before
     return {
         # A flat curve has no width: no offset of its range is any worse.
         "log_profile_sigma": after.sigma_px.minimum(profile.range_px).log(),
         "log_profile_offset": (after.offset_px.abs() + 0.05).log(),
-        "log_profile_contrast": (sides / lowest.after).log(),
+        "log_profile_contrast": rise_after.log(),
         "profile_offset_before": before.offset_px.abs(),
-        "log_profile_fall_before": (here.before / lowest.before).log(),
+        "log_profile_fall_before": fall_before.log(),
         "outside_basin": torch.where(after.offset_px.isnan(), after.offset_px, (~after.in_basin).to(torch.float64)),
     }
 
 
-def _conflict(course: Course, photometric: list[bool]) -> Tensor:
+def _conflict(course: Course, photometric: list[bool], cost: Tensor) -> Tensor:
     """log(1 + 100 g_p^T H^-1 g_p / 2 / cost): what photometry alone asks for at the minimum of the sum."""
-    hessian = sum_of([part.hessian for part in course.linearisations])
     pulls = [part.gradient for part, chosen in zip(course.linearisations, photometric, strict=True) if chosen]
     if not pulls:
-        return torch.zeros_like(course.cost_after[:, 0])
-    pull = sum_of(pulls)
-    gain = 0.5 * _mahalanobis(pull, hessian).square()
-    return torch.log1p(100 * gain / course.cost_after.sum(1).clamp_min(_TINY))
+        return torch.zeros_like(cost)
+    hessian = sum_of([part.hessian for part in course.linearisations])
+    gain = 0.5 * _mahalanobis(sum_of(pulls), hessian).square()
+    return torch.log1p(100 * gain / cost.clamp_min(_TINY))
 
 
 def _support(terms: Sequence[Term], like: Tensor) -> Tensor:
@@ -244,25 +257,22 @@ def _support(terms: Sequence[Term], like: Tensor) -> Tensor:
     return torch.zeros_like(like, dtype=torch.float64)
 
 
-def _horizontal_ray(T_cam_obj: Tensor) -> Tensor:
-    """Unit vectors (B, 3) of the viewing rays of the object origins, in the plane y = 0."""
-    ray = T_cam_obj[:, :3, 3] * T_cam_obj.new_tensor([1.0, 0.0, 1.0])
-    unit: Tensor = ray / ray.norm(dim=1, keepdim=True).clamp_min(_TINY)
-    return unit
+def _view_jacobian(location: Tensor) -> Tensor:
+    """J (B, 3, 4) of shifts along and across the viewing ray in the plane y = 0, and of the heading, by (x, y, z, yaw).
 
-
-def _covariance_in_view(covariance_xyz_yaw: Tensor, ray: Tensor) -> Tensor:
-    """Covariance (B, 3, 3) along and across the viewing ray, and of the heading."""
-    J = ray.new_zeros(len(ray), 3, 4)
-    J[:, 0, :3] = ray
-    J[:, 1, 0], J[:, 1, 2] = ray[:, 2], -ray[:, 0]
-    J[:, 2, 3] = 1
-    return J @ covariance_xyz_yaw @ J.mT
+    Args:
+        location: (B, 3) of the object origins.
+    """
+    ray = location[:, 0::2]
+    x, z = (ray / ray.norm(dim=1, keepdim=True).clamp_min(_TINY)).unbind(dim=1)
+    zero = torch.zeros_like(x)
+    rows = [x, zero, z, zero, z, zero, -x, zero, zero, zero, zero, zero + 1]
+    return torch.stack(rows, dim=1).view(-1, 3, 4)
 
 
 def _mahalanobis(vector: Tensor, matrix: Tensor) -> Tensor:
     """sqrt(v^T M^-1 v) (B,) of vectors (B, n); NaN where M is not positive definite."""
-    finite = matrix.isfinite().all(-1).all(-1)
+    finite = matrix.flatten(1).isfinite().all(1)
     identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
     factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], matrix, identity))
     regular = finite & (info == 0)

@@ -146,32 +146,30 @@ def quantities_jacobian(prior: ShapePrior, state: CarState) -> Tensor:
 
     The object origin, in the middle of the footprint, moves by `-R_cam_obj v`; `rotation_y` by `-R_cam_obj[1] omega`.
     """
-    R_cam_obj = state.T_obj_cam[:, :3, :3].mT.to(torch.float64)
-    origin = se3.inverse(state.T_obj_cam)[:, :3, 3].to(torch.float64)
-    x, z = origin[:, 0], origin[:, 2]
-    distance = torch.hypot(x, z).clamp_min(1e-9)
-    zero = torch.zeros_like(x)
-    axes = torch.stack([x / distance, zero, z / distance, z / distance, zero, -x / distance, zero, zero - 1, zero], 1)
+    T_cam_obj = se3.inverse(state.T_obj_cam).to(torch.float64)
+    R_cam_obj = T_cam_obj[:, :3, :3]
     J_hwl_code = prior.dimensions_and_derivative(state.code).J_hwl_code.to(torch.float64)
-    J = origin.new_zeros(len(origin), len(CAR_QUANTITIES), 6 + J_hwl_code.shape[-1])
-    J[:, :3, :3] = -axes.view(-1, 3, 3) @ R_cam_obj
-    J[:, 3, 3:6] = -HEADING_LEVER_M * R_cam_obj[:, 1]
-    J[:, 4:, 6:] = J_hwl_code[:, [2, 1, 0]]
-    return J
+    ray = T_cam_obj[:, 0:3:2, 3]
+    x, z = (ray / ray.norm(dim=1, keepdim=True).clamp_min(1e-9)).unbind(dim=1)
+    zero = torch.zeros_like(x)
+    axes = torch.stack([-x, zero, -z, -z, zero, x, zero, zero + 1, zero], dim=1).view(-1, 3, 3)
+    J_position = torch.cat([axes @ R_cam_obj, torch.zeros_like(R_cam_obj)], dim=2)
+    J_heading = torch.cat([torch.zeros_like(R_cam_obj[:, 1]), -HEADING_LEVER_M * R_cam_obj[:, 1]], dim=1)
+    J_pose = torch.cat([J_position, J_heading[:, None]], dim=1)
+    no_pose, no_code = J_pose.new_zeros(len(x), 3, 6), J_pose.new_zeros(len(x), 4, J_hwl_code.shape[2])
+    return torch.cat([torch.cat([J_pose, no_code], dim=2), torch.cat([no_pose, J_hwl_code.flip(1)], dim=2)], dim=1)
 
 
 def _principal(information: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
     """Standard deviations (B, 7), falling, and directions (B, 7, 7), rows, of J (B, 7, D) times the unknowns."""
-    finite = information.isfinite().all(-1).all(-1) & J.isfinite().all(-1).all(-1)
+    finite = torch.cat([information, J], dim=1).flatten(1).isfinite().all(1)
     identity = torch.eye(information.shape[-1], dtype=information.dtype, device=information.device)
-    information = torch.where(finite[:, None, None], information, identity) + identity / _BLIND_SIGMA**2
-    half = torch.linalg.solve_triangular(
-        torch.linalg.cholesky_ex(information)[0], torch.where(finite[:, None, None], J, 0.0).mT, upper=False
-    )
+    information = torch.where(finite[:, None, None], information, 0.0) + identity / _BLIND_SIGMA**2
+    J = torch.where(finite[:, None, None], J, 0.0)
+    half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(information)[0], J.mT, upper=False)
     variances, vectors = torch.linalg.eigh(half.mT @ half)
     directions = vectors.mT.flip(1)
     # The sign of a direction means nothing: its largest part grows.
     largest = directions.gather(2, directions.abs().argmax(2, keepdim=True))
-    nan = torch.full_like(variances, torch.nan)
-    sigmas = torch.where(finite[:, None], variances.flip(1).clamp_min(0).sqrt(), nan)
-    return sigmas, torch.where(finite[:, None, None], directions * largest.sign(), nan[..., None])
+    sigmas = torch.where(finite[:, None], variances.flip(1).clamp_min(0).sqrt(), torch.nan)
+    return sigmas, torch.where(finite[:, None, None], directions * largest.sign(), torch.nan)

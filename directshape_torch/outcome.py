@@ -68,29 +68,36 @@ class Outcome:
 
 
 def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch) -> Outcome:
-    """Costs, covariance, quality, observability and profile of the cars of a problem at its minimum."""
-    linearisations = problem.linearise_terms(minimum.state, with_fisher=True)
-    covariance = covariance_of(linearisations) + _rig_covariance(problem, minimum.state, cars)
-    unseen = observability_of(problem.prior, minimum.state, problem.terms, linearisations)
+    """Costs, covariance, quality, observability and profile of the cars of a problem at its minimum.
+
+    All of them where the iterations ended, which the solver has just projected and the problem remembers; cars that
+    the solver gave their input back show nothing of it in a result but their costs.
+    """
+    end, refined = minimum.end, is_refined(minimum.status)
+    linearisations = problem.linearise_terms(end, with_fisher=True)
+    cost_before = problem.term_costs(initial)
+    cost_end = torch.stack([part.cost for part in linearisations], dim=1)
+    covariance = covariance_of(linearisations) + _rig_covariance(problem, end, cars)
     course = Course(
         before=initial,
-        after=minimum.state,
+        after=end,
         detector_hwl=cars.detector_hwl,
-        cost_before=problem.term_costs(initial),
-        cost_after=torch.stack([part.cost for part in linearisations], dim=1),
+        cost_before=cost_before,
+        cost_after=torch.where(refined[:, None], cost_end, cost_before),
         linearisations=linearisations,
         covariance=covariance,
-        covariance_xyz_yaw=covariance_xyz_yaw(covariance, minimum.state.T_obj_cam),
+        covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
-        profile=disparity_profile(problem, initial, minimum.state),
+        profile=disparity_profile(problem, initial, end),
     )
+    unseen = observability_of(problem.prior, end, problem.terms, linearisations)
     return Outcome(
         state=minimum.state,
         status=minimum.status,
         iterations=minimum.iterations,
         cost_history=minimum.cost_history,
         term_names=tuple(term.name for term in problem.terms),
-        cost_before=course.cost_before,
+        cost_before=cost_before,
         cost_after=course.cost_after,
         covariance=covariance,
         covariance_xyz_yaw=course.covariance_xyz_yaw,

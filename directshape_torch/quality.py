@@ -10,10 +10,10 @@ from torch import Tensor
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
-from directshape_torch.energy.projected_state import ProjectedView
+from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
 from directshape_torch.observation.packing import PixelSamples
-from directshape_torch.shape.shape_prior import BoundShape
+from directshape_torch.photometric_match import agreement
 from directshape_torch.trust_model import bundled_trust_model
 
 
@@ -68,10 +68,10 @@ class FitQuality:
 @torch.no_grad()
 def fit_quality(problem: CarProblem, course: Course) -> FitQuality:
     """Figures of B cars at the end of a refinement whose last stage is the problem's present one."""
-    agreement = _agreement(problem, course.after)
-    evidence = evidence_of(problem, course, agreement)
+    agreed = _agreement(problem, course.after)
+    evidence = evidence_of(problem, course, agreed)
     better, not_worse = _probabilities(problem, evidence)
-    return FitQuality(*agreement, evidence, better, not_worse)
+    return FitQuality(*agreed, evidence, better, not_worse)
 
 
 def _probabilities(problem: CarProblem, evidence: Tensor) -> tuple[Tensor, Tensor]:
@@ -86,21 +86,25 @@ def _probabilities(problem: CarProblem, evidence: Tensor) -> tuple[Tensor, Tenso
 
 def _agreement(problem: CarProblem, state: CarState) -> Agreement:
     projected = problem.project(state)
-    count = len(state.code)
-    left = _mask_iou(projected.shape, projected.left, problem.left, count)
-    right = _mask_iou(projected.shape, projected.right, problem.right, count)
+    left, right = _mask_ious(projected, problem.left, problem.right)
     nan = torch.full_like(left, torch.nan)
     for term in problem.terms:
         if isinstance(term, PhotometricTerm):
-            error, share = term.agreement(projected)
+            error, share = agreement(term, projected)
             return Agreement(left, right, error, share)
     return Agreement(left, right, nan, nan)
 
 
-def _mask_iou(shape: BoundShape, view: ProjectedView, pixels: PixelSamples, count: int) -> Tensor:
-    closest = shape.value(view.rays.at(view.closest_depth), view.rays.object_index)
-    covered = (closest < 0) & view.march.crosses_bounds
-    masked = pixels.foreground > 0.5
-    both = torch.bincount(pixels.object_index[covered & masked], minlength=count).to(torch.float64)
-    either = torch.bincount(pixels.object_index[covered | masked], minlength=count).to(torch.float64)
-    return torch.where(either > 0, both / either.clamp_min(1), torch.full_like(both, torch.nan))
+def _mask_ious(projected: ProjectedState, left: PixelSamples, right: PixelSamples) -> Tensor:
+    """Overlap (2, B) of shape and mask over the pixels of the left and the right image."""
+    views, count = (projected.left, projected.right), len(projected.state.code)
+    points = torch.cat([view.rays.at(view.closest_depth) for view in views])
+    closest = projected.shape.value(points, torch.cat([view.rays.object_index for view in views]))
+    covered = (closest < 0) & torch.cat([view.march.crosses_bounds for view in views])
+    masked = torch.cat([left.foreground, right.foreground]) > 0.5
+    car = torch.cat([left.object_index, right.object_index + count])
+    nothing = torch.zeros(2 * count, dtype=torch.long, device=car.device)
+    # Of whole numbers the sum is the same in whatever order a device adds them.
+    both, either = (nothing.scatter_add(0, car, pixels.long()) for pixels in (covered & masked, covered | masked))
+    overlap = both.to(torch.float64) / either
+    return torch.where(either > 0, overlap, torch.nan).view(2, count)

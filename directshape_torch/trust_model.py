@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from directshape_torch.device_constants import constant_like
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evidence import EVIDENCE_NAMES
 
@@ -43,12 +44,13 @@ class LogisticHead:
 
     def __call__(self, evidence: Tensor) -> Tensor:
         """Probabilities (B,) from the evidence (B, E); figures that do not exist count as the mean."""
-        chosen = evidence[:, [EVIDENCE_NAMES.index(name) for name in self.columns]]
-        new = chosen.new_tensor
-        standard = ((chosen - new(self.means)) / new(self.scales)).clamp(-_KNOWN_SIGMAS, _KNOWN_SIGMAS)
+        columns = evidence.unbind(dim=1)
+        chosen = torch.stack([columns[EVIDENCE_NAMES.index(name)] for name in self.columns], dim=1)
+        means, scales, weights = (constant_like(x, chosen) for x in (self.means, self.scales, self.weights))
+        standard = ((chosen - means) / scales).clamp(-_KNOWN_SIGMAS, _KNOWN_SIGMAS)
         # A product and a sum rather than a matrix product, an exponential rather than PyTorch's sigmoid, which rounds
         # another way at the end of a batch: equal bits whatever its size.
-        log_odds = self.bias + (torch.nan_to_num(standard, nan=0.0) * new(self.weights)).sum(dim=1)
+        log_odds = self.bias + (torch.nan_to_num(standard, nan=0.0) * weights).sum(dim=1)
         return 1 / (1 + torch.exp(-log_odds))
 
 
@@ -79,7 +81,7 @@ class TrustModel:
     ) -> Tensor:  # (B, 4, 4)
         """Covariance of (x, y, z, yaw) in true units: metres and radians."""
         J = _view_from_xyz_yaw(location.to(covariance_xyz_yaw))
-        factors, floors = (covariance_xyz_yaw.new_tensor(x) for x in (self.sigma_factors, self.sigma_floors))
+        factors, floors = (constant_like(x, covariance_xyz_yaw) for x in (self.sigma_factors, self.sigma_floors))
         in_view = factors[:, None] * (J @ covariance_xyz_yaw @ J.mT) * factors + torch.diag(floors**2)
         return J.mT @ in_view @ J
 
