@@ -1,0 +1,212 @@
+"""All prior terms of a batch of cars at once: the sums of the terms by themselves, in a few small operations.
+
+The rows of height, tilt and pose come from one product with constants (`pose_rows`); what is quadratic in the code has
+a constant matrix. With five cars the terms one by one are hundreds of operations on a handful of numbers each.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeGuard
+
+import torch
+from torch import Tensor
+
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.pose_rows import (
+    NUM_COLUMNS,
+    RESIDUAL,
+    cosine_rows,
+    heading_constants,
+    heading_rows,
+    level_rows,
+    pose_features,
+    position_rows,
+    without_heading,
+)
+from directshape_torch.energy.prior_terms import (
+    DimensionsResidual,
+    HeightResidual,
+    PoseResidual,
+    PriorTerm,
+    ShapeResidual,
+    TiltResidual,
+    detector_pose_sigma,
+)
+from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.errors import InputError
+from directshape_torch.residuals.priors import viewing_axes
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
+
+_TWIST = 6
+
+
+@dataclass(frozen=True)
+class _Dimensions:
+    """The prior of the dimensions: three rows by the code."""
+
+    prior: ShapePrior
+    detector_hwl: Tensor  # (B, 3, 1)
+    scale: Tensor  # (B, 3, 1) root of the weight over sigma
+
+    @property
+    def are_linear(self) -> bool:
+        """Has the code a constant influence on the dimensions?"""
+        return isinstance(self.prior, PCAShapePrior)
+
+    def rows(self, code: Tensor) -> Tensor:
+        """`[J r]` at codes (B, K), (B, 3, K + 1)."""
+        at = self.prior.dimensions_and_derivative(code)
+        return torch.cat([at.J_hwl_code, at.hwl[..., None] - self.detector_hwl], dim=2) * self.scale
+
+    def of_objects(self, keep: Tensor) -> _Dimensions:
+        return _Dimensions(self.prior, self.detector_hwl[keep], self.scale[keep])
+
+
+@dataclass(frozen=True)
+class StackedPriors:
+    """The sum of several `PriorTerm`s, in float64 throughout.
+
+    Attributes:
+        pose_rows: (B, R * 7, F) from the features of a pose to the rows (R, 7) of its priors.
+        heading: (B, 4, 2) of `heading_constants`; None where no prior asks for the heading.
+        code_form: (B, K + 1, K + 1) the cost of the priors that are quadratic in the code is half this form of
+            `[code, 1]`.
+        hessian: (B, D, D) its part by the code, zero elsewhere.
+        one: (B, 1, 1).
+        dimensions: dimensions that are not linear in the code, if there are such.
+    """
+
+    pose_rows: Tensor
+    heading: Tensor | None
+    code_form: Tensor
+    hessian: Tensor
+    one: Tensor
+    dimensions: _Dimensions | None
+
+    @staticmethod
+    def takes(term: Term) -> TypeGuard[PriorTerm]:
+        """Is the term one of the priors that can be stacked, and not a user's own?"""
+        known = ShapeResidual, HeightResidual, TiltResidual, DimensionsResidual, PoseResidual
+        return isinstance(term, PriorTerm) and isinstance(term.residual_of, known)
+
+    @classmethod
+    def from_terms(cls, terms: Sequence[PriorTerm], num_codes: int, factors: Tensor | None = None) -> StackedPriors:
+        """The sum of these terms.
+
+        Args:
+            terms: T priors of the same B cars, at least one, each of a kind that `takes` accepts.
+            num_codes: K.
+            factors: (B, T) by which the terms of each car are multiplied beside their own weights; None for 1.
+
+        Raises:
+            InputError: no term, or one of an unknown kind.
+        """
+        strange = [term.name for term in terms if not cls.takes(term)]
+        if strange or not terms:
+            raise InputError("terms", "at least one prior, all of known kinds", ", ".join(strange) or "none")
+        scaled = list(zip(terms, _roots_of_weights(terms, factors), strict=True))
+        pose_rows = torch.cat([_pose_rows(term, root) for term, root in scaled], dim=1)
+        code_rows = torch.cat([_code_rows(term, root, num_codes) for term, root in scaled], dim=1)
+        code_form = code_rows.mT @ code_rows
+        sees_heading = any(isinstance(term.residual_of, PoseResidual) for term in terms)
+        dimensions = (_dimensions(term, root) for term, root in scaled)
+        return cls(
+            pose_rows=(pose_rows if sees_heading else without_heading(pose_rows)).flatten(1, 2),
+            heading=heading_constants(terms[0].cars.detector_T_cam_obj.to(torch.float64)) if sees_heading else None,
+            code_form=code_form,
+            hessian=torch.nn.functional.pad(code_form[:, :-1, :-1], (_TWIST, 0, _TWIST, 0)),
+            one=code_form.new_ones(len(code_form), 1, 1),
+            dimensions=next((d for d in dimensions if d is not None and not d.are_linear), None),
+        )
+
+    @property
+    def num_pose_rows(self) -> int:
+        """R."""
+        return self.pose_rows.shape[1] // NUM_COLUMNS
+
+    def cost(self, state: CarState) -> Tensor:
+        """Cost (B,) of a state."""
+        return self.linearise(state).cost
+
+    def linearise(self, state: CarState) -> TermLinearisation:
+        """Cost, gradient and Gauss-Newton matrix, which is the Fisher matrix too; differentiable by autograd."""
+        features = pose_features(state.T_obj_cam.to(torch.float64), self.heading)
+        rows = torch.bmm(self.pose_rows, features).view(len(features), self.num_pose_rows, NUM_COLUMNS)
+        squares = torch.bmm(rows.mT, rows)
+        by_twist = squares[:, :RESIDUAL]
+        code = torch.cat([state.code.to(torch.float64)[..., None], self.one], dim=1)
+        slopes = torch.bmm(self.code_form, code)
+        cost = 0.5 * (squares[:, RESIDUAL, RESIDUAL] + (slopes * code).sum(dim=(1, 2)))
+        gradient = torch.cat([by_twist[:, :, RESIDUAL], slopes[:, :-1, 0]], dim=1)
+        hessian = self.hessian.clone()
+        hessian[:, :_TWIST, :_TWIST] = by_twist[:, :, :RESIDUAL]
+        if self.dimensions is not None:
+            curved = self.dimensions.rows(state.code)
+            more = torch.bmm(curved.mT, curved)
+            hessian[:, _TWIST:, _TWIST:] += more[:, :-1, :-1]
+            gradient[:, _TWIST:] += more[:, :-1, -1]
+            cost = cost + 0.5 * more[:, -1, -1]
+        return TermLinearisation(cost, gradient, hessian, hessian)
+
+    def of_objects(self, keep: Tensor) -> StackedPriors:
+        """Those of the cars where `keep` (B,) holds, or of the cars with these numbers."""
+        return StackedPriors(
+            self.pose_rows[keep],
+            None if self.heading is None else self.heading[keep],
+            self.code_form[keep],
+            self.hessian[keep],
+            self.one[keep],
+            None if self.dimensions is None else self.dimensions.of_objects(keep),
+        )
+
+
+def _roots_of_weights(terms: Sequence[PriorTerm], factors: Tensor | None) -> list[Tensor]:
+    """For each term the root (B,) of its weight for each car."""
+    ones = torch.ones_like(terms[0].cars.input_depth, dtype=torch.float64)
+    roots = [math.sqrt(term.weight) * ones for term in terms]
+    if factors is None:
+        return roots
+    return [root * factor.to(torch.float64).sqrt() for root, factor in zip(roots, factors.unbind(dim=1), strict=True)]
+
+
+def _pose_rows(term: PriorTerm, root: Tensor) -> Tensor:
+    """Rows (B, R, 7, F) of a prior of the pose times `root` (B,); none of another prior."""
+    cars, normal = term.cars, term.cars.ground_normal_cam.to(torch.float64)
+    match term.residual_of:
+        case HeightResidual():
+            scale = (root / normal[:, 1])[:, None]
+            return position_rows((scale * normal)[:, None], scale * cars.ground_offset[:, None])
+        case TiltResidual("normal"):
+            return level_rows(root[:, None] * normal)
+        case TiltResidual("cosine"):
+            return cosine_rows(root[:, None] * normal, root)
+        case PoseResidual(config):
+            scale = root[:, None] / detector_pose_sigma(config, cars)
+            origin = cars.detector_T_cam_obj[:, :3, 3].to(torch.float64)
+            axes = scale[:, :3, None] * viewing_axes(origin)
+            return torch.cat([position_rows(axes, -(axes @ origin[..., None])[..., 0]), heading_rows(scale[:, 3])], 1)
+        case _:
+            return level_rows(normal)[:, :0]
+
+
+def _code_rows(term: PriorTerm, root: Tensor, num_codes: int) -> Tensor:
+    """Rows `[J r]` (B, R, K + 1) at the code 0 of a prior that is linear in it, times `root` (B,); else none."""
+    identity = torch.eye(num_codes, num_codes + 1, dtype=torch.float64, device=root.device)
+    dimensions = _dimensions(term, root)
+    if dimensions is not None and dimensions.are_linear:
+        return dimensions.rows(dimensions.prior.initial_code(len(root)))
+    rows = root[:, None, None] * identity
+    return rows if isinstance(term.residual_of, ShapeResidual) else rows[:, :0]
+
+
+def _dimensions(term: PriorTerm, root: Tensor) -> _Dimensions | None:
+    match term.residual_of:
+        case DimensionsResidual(prior, sigma_hwl_m):
+            sigma = torch.tensor(sigma_hwl_m, dtype=torch.float64, device=root.device)
+            return _Dimensions(prior, term.cars.detector_hwl[..., None], (root[:, None] / sigma)[..., None])
+        case _:
+            return None

@@ -1,0 +1,211 @@
+"""All priors at once against the priors one by one, in value, gradient and matrix, and against autograd."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.derivatives import moved, tangent_of
+from helpers.priors import KINDS, prior_of
+from helpers.problems import CONFIGS
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from directshape_torch.config import PriorConfig, RefinerConfig
+from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.prior_terms import PriorTerm, prior_terms
+from directshape_torch.energy.stacked_priors import StackedPriors
+from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.residuals.priors import PriorResidual, shape_prior
+
+POSE = PriorConfig(pose_sigma_along_share=0.02, pose_sigma_vertical_m=0.3, pose_sigma_yaw_deg=4.0)
+SETTINGS = {
+    "default": CONFIGS["default"].priors,
+    "paper": CONFIGS["paper"].priors,
+    "pose": POSE,
+    "all of them, of other weights": replace(
+        POSE, shape_weight=0.3, height_weight=7.0, tilt_weight=11.0, dimensions_weight=0.7, pose_weight=0.2
+    ),
+    "only the shape": PriorConfig(height_weight=0.0, tilt_weight=0.0, dimensions_weight=0.0),
+    "no shape": PriorConfig(shape_weight=0.0, dimensions_weight=0.0),
+}
+
+
+def _random(*shape: int, seed: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def _cars(count: int, sigma: bool = False) -> CarBatch:
+    detector = se3.exp(torch.cat([_random(count, 3, seed=1), 0.5 * _random(count, 3, seed=2)], dim=1))
+    detector[:, 2, 3] += 15.0
+    normal = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64) + 0.05 * _random(count, 3, seed=3)
+    eye = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
+    return CarBatch(
+        detection_row=torch.arange(count),
+        frame_index=torch.zeros(count, dtype=torch.long),
+        input_depth=detector[:, 2, 3],
+        K_left=eye[:, :3, :3],
+        K_right=eye[:, :3, :3],
+        T_right_cam=eye,
+        ground_normal_cam=torch.nn.functional.normalize(normal, dim=1),
+        ground_offset=1.65 + 0.1 * _random(count, seed=4),
+        detector_hwl=torch.tensor([1.5, 1.6, 4.2], dtype=torch.float64) + 0.2 * _random(count, 3, seed=5),
+        detector_T_cam_obj=detector,
+        detector_pose_sigma=0.05 + _random(count, 4, seed=6).abs() if sigma else None,
+    )
+
+
+def _state(cars: CarBatch, num_codes: int, size: float = 0.3) -> CarState:
+    count = len(cars.input_depth)
+    T = se3.exp(size * _random(count, 6, seed=7)) @ se3.inverse(cars.detector_T_cam_obj)
+    return CarState(T, _random(count, num_codes, seed=8))
+
+
+class _At:
+    def __init__(self, state: CarState) -> None:
+        self.state = state
+
+
+def _one_by_one(terms: list[PriorTerm], state: CarState, factors: Tensor | None = None) -> TermLinearisation:
+    """The sum of the terms, from their readable residuals and Jacobians."""
+    count, unknowns = len(state.code), 6 + state.code.shape[1]
+    cost, gradient, hessian = (torch.zeros(count, *shape).double() for shape in ((), (unknowns,), (unknowns, unknowns)))
+    for i, term in enumerate(terms):
+        r, J = term.residual_of(term.cars, _At(state))
+        weight = term.weight * (torch.ones(count).double() if factors is None else factors[:, i])
+        cost = cost + 0.5 * weight * (r * r).sum(dim=1)
+        gradient = gradient + weight[:, None] * (J.mT @ r[..., None])[..., 0]
+        hessian = hessian + weight[:, None, None] * (J.mT @ J)
+    return TermLinearisation(cost, gradient, hessian, hessian)
+
+
+def _terms(priors: PriorConfig, kind: str, cars: CarBatch) -> list[PriorTerm]:
+    terms: list[Term] = prior_terms(replace(RefinerConfig(), priors=priors), prior_of(kind), cars)
+    stackable = [term for term in terms if StackedPriors.takes(term)]
+    assert len(stackable) == len(terms)
+    return stackable
+
+
+def _same(found: TermLinearisation, expected: TermLinearisation) -> None:
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12 * float(b.abs().max()) if b.numel() else 0.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", SETTINGS)
+def test_equal_to_the_terms_by_themselves(name: str, kind: str) -> None:
+    cars = _cars(4)
+    terms = _terms(SETTINGS[name], kind, cars)
+    num_codes = prior_of(kind).num_codes
+    stacked = StackedPriors.from_terms(terms, num_codes)
+    for size in (0.3, 1e-6):
+        state = _state(cars, num_codes, size)
+        _same(stacked.linearise(state), _one_by_one(terms, state))
+        assert torch.equal(stacked.cost(state), stacked.linearise(state).cost)
+
+
+def test_a_pose_that_has_lost_its_orthonormality_to_rounding_is_no_other() -> None:
+    """As float32 leaves it after many steps; of every entry of the matrix the same use is made."""
+    cars = _cars(3, sigma=True)
+    terms = _terms(SETTINGS["pose"], "pca", cars)
+    state = _state(cars, 3)
+    drifted = CarState(state.T_obj_cam * (1 + 1e-4 * _random(3, 4, 4, seed=9)), state.code)
+    drifted.T_obj_cam[:, 3] = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    _same(StackedPriors.from_terms(terms, 3).linearise(drifted), _one_by_one(terms, drifted))
+
+
+def test_sigmas_of_the_detections_and_factors_of_the_cars() -> None:
+    cars = _cars(5, sigma=True)
+    assert cars.detector_pose_sigma is not None
+    cars.detector_pose_sigma[0] = torch.inf
+    terms = _terms(SETTINGS["default"], "pca", cars)
+    assert [term.name for term in terms][-1] == "pose"
+    factors = _random(5, len(terms), seed=10).abs()
+    factors[1, 2] = 0.0
+    stacked = StackedPriors.from_terms(terms, 3, factors)
+    state = _state(cars, 3)
+    _same(stacked.linearise(state), _one_by_one(terms, state, factors))
+
+
+@pytest.mark.parametrize("kind", ["pca", "neural"])
+def test_the_gradient_is_that_of_the_cost(kind: str) -> None:
+    cars = _cars(3, sigma=True)
+    num_codes = prior_of(kind).num_codes
+    stacked = StackedPriors.from_terms(_terms(SETTINGS["pose"], kind, cars), num_codes)
+    state = _state(cars, num_codes)
+    delta = tangent_of(state).requires_grad_()
+    (expected,) = torch.autograd.grad(stacked.cost(moved(state, delta)).sum(), delta)
+    torch.testing.assert_close(stacked.linearise(state).gradient, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["pca", "neural"])
+def test_some_of_the_cars(kind: str) -> None:
+    cars = _cars(4, sigma=True)
+    num_codes = prior_of(kind).num_codes
+    stacked = StackedPriors.from_terms(_terms(SETTINGS["pose"], kind, cars), num_codes)
+    state = _state(cars, num_codes)
+    keep = torch.tensor([True, False, False, True])
+    whole, part = stacked.linearise(state), stacked.of_objects(keep).linearise(CarState(*(x[keep] for x in state)))
+    for a, b in zip(part, whole, strict=True):
+        torch.testing.assert_close(a, b[keep], rtol=1e-14, atol=1e-14)
+    none = stacked.of_objects(torch.zeros(4, dtype=torch.bool))
+    empty = none.linearise(CarState(state.T_obj_cam[:0], state.code[:0]))
+    assert [x.shape for x in empty[:3]] == [(0,), (0, 6 + num_codes), (0, 6 + num_codes, 6 + num_codes)]
+
+
+def test_a_broken_car_touches_no_other() -> None:
+    cars = _cars(3, sigma=True)
+    stacked = StackedPriors.from_terms(_terms(SETTINGS["pose"], "pca", cars), 3)
+    state = _state(cars, 3)
+    whole = stacked.linearise(state)
+    state.T_obj_cam[1], state.code[1] = torch.nan, torch.inf
+    broken = stacked.linearise(state)
+    assert not broken.cost[1].isfinite()
+    for a, b in zip(broken, whole, strict=True):
+        assert torch.equal(a[[0, 2]], b[[0, 2]])
+
+
+def test_single_precision_states_are_computed_with_in_double() -> None:
+    cars = _cars(3, sigma=True)
+    terms = _terms(SETTINGS["pose"], "pca", cars)
+    stacked = StackedPriors.from_terms(terms, 3)
+    single = CarState(*(x.float() for x in _state(cars, 3)))
+    found = stacked.linearise(single)
+    assert found.cost.dtype == found.hessian.dtype == torch.float64
+    _same(found, _one_by_one(terms, CarState(*(x.double() for x in single))))
+
+
+def test_only_known_priors_are_stacked() -> None:
+    def own(_: CarBatch, at: _At) -> PriorResidual:
+        return shape_prior(at.state.code)
+
+    term = PriorTerm("own", 1.0, _cars(2), own)
+    assert not StackedPriors.takes(term)
+    with pytest.raises(InputError, match="terms: expected at least one prior, all of known kinds, got own"):
+        StackedPriors.from_terms([term], 3)
+    with pytest.raises(InputError, match="got none"):
+        StackedPriors.from_terms([], 3)
+
+
+class _Count(TorchDispatchMode):
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_few_operations() -> None:
+    """A guard, not a measure: one by one these priors take more than three hundred."""
+    cars = _cars(2, sigma=True)
+    stacked = StackedPriors.from_terms(_terms(SETTINGS["pose"], "pca", cars), 3)
+    state = CarState(*(x.float() for x in _state(cars, 3)))
+    with torch.no_grad(), _Count() as counted:
+        stacked.linearise(state)
+    assert counted.count <= 60
