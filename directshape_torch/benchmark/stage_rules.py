@@ -35,7 +35,7 @@ STAGES: dict[Stage, str] = {
     "priors": "shape, ground, dimensions, pose",
     "normal equations": "sums over the pixels of each car",
     "solve": "damped step and new state",
-    "outcome": "covariance, quality, profile, trust; what it evaluates of the energy counts above",
+    "outcome": "covariance, quality, profile, trust, with all that they evaluate",
     "bookkeeping": "the loop, compaction, checks, assembling the result",
     "unattributed": "functions that no rule knows",
 }
@@ -51,17 +51,20 @@ class Rule:
         module: regular expression of the whole module name below the package.
         function: regular expression that occurs in the qualified name.
         stage: they belong to; None for helpers.
+        encloses: whatever they call belongs to it as well.
     """
 
     module: str
     function: str
     stage: Stage | None
+    encloses: bool = False
 
     def matches(self, module: str, function: str) -> bool:
         return re.fullmatch(self.module, module) is not None and re.search(self.function, function) is not None
 
 
 _ANY = ""
+_OUTCOME = r"outcome|quality|covariance|observability|evidence|disparity_profile|photometric_match|trust_model"
 
 RULES = (
     Rule(r"observation\..*|initial_search", _ANY, "sampling"),
@@ -78,39 +81,41 @@ RULES = (
     Rule(r"(energy|residuals)\.silhouette.*", _ANY, "silhouette value"),
     Rule(r"residuals\.photometric", r"depth_state_jacobian|surface_slope", "ray depth"),
     Rule(r"(energy|residuals)\.photometric.*|energy\.brightness", _ANY, "warp"),
-    Rule(r"(energy|residuals)\.(prior|point_cloud).*", _ANY, "priors"),
+    Rule(r"(energy|residuals)\.(prior|stacked_priors|pose_rows|point_cloud).*", _ANY, "priors"),
     Rule(r"solver\.normal_equations", _ANY, "normal equations"),
     Rule(r"solver\.damped_solve", _ANY, "solve"),
     Rule(r"energy\.car_state|energy\.car_problem", r"retract", "solve"),
-    Rule(r"outcome|quality|covariance|observability|evidence|disparity_profile|trust_model", _ANY, "outcome"),
+    Rule(r"outcome", r"assemble|nothing", "bookkeeping"),
+    Rule(_OUTCOME, _ANY, "outcome", encloses=True),
     Rule(r"refiner|admission|result|status|backward|checks|config.*|scene", _ANY, "bookkeeping"),
     Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms)", _ANY, "bookkeeping"),
-    Rule(r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)|compil.*", _ANY, None),
+    Rule(r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)|compil.*|device_constants", _ANY, None),
 )
 
 
-def stage_of(module: str, function: str) -> tuple[bool, Stage | None]:
-    """Whether a function decides for itself, and its stage.
+UNKNOWN = Rule(_ANY, _ANY, "unattributed")
+OF_CALLER = Rule(_ANY, _ANY, None)
+
+
+def rule_of(module: str, function: str) -> Rule:
+    """The rule that decides for a function.
 
     Args:
         module: its full name.
         function: its qualified name.
 
     Returns:
-        (False, None) for functions that belong to their caller's stage.
+        One without a stage for functions that belong to their caller's.
 
     Example:
-        >>> stage_of("directshape_torch.solver.damped_solve", "damped_step")
-        (True, 'solve')
-        >>> stage_of("torch.functional", "einsum")
-        (False, None)
-        >>> stage_of("directshape_torch.brand_new", "f")
-        (True, 'unattributed')
+        >>> rule_of("directshape_torch.solver.damped_solve", "damped_step").stage
+        'solve'
+        >>> rule_of("torch.functional", "einsum").stage is None
+        True
+        >>> rule_of("directshape_torch.brand_new", "f").stage
+        'unattributed'
     """
     package, _, inner = module.partition(".")
     if package != PACKAGE:
-        return False, None
-    for rule in RULES:
-        if rule.matches(inner, function):
-            return rule.stage is not None, rule.stage
-    return True, "unattributed"
+        return OF_CALLER
+    return next((rule for rule in RULES if rule.matches(inner, function)), UNKNOWN)

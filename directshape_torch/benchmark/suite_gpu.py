@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -13,6 +14,7 @@ from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.synchronisations import count_synchronisations
 from directshape_torch.benchmark.timing import Repetitions, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import Scene, load_scenes
+from directshape_torch.errors import CompilationError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
@@ -34,20 +36,26 @@ def run_gpu(settings: SuiteSettings) -> SuiteResult:
     """One frame and a batch of 64, or a note that there is no graphics card."""
     if not torch.cuda.is_available():
         return SuiteResult(_SUITE, (), notes=("not measured: PyTorch finds no CUDA device",))
-    device = torch.device("cuda")
+    return measure_device(torch.device("cuda"), load_scenes(settings.data_root, settings.max_frames), settings)
+
+
+def measure_device(device: torch.device, scenes: Sequence[Scene], settings: SuiteSettings) -> SuiteResult:
+    """All rows of a device, in the modes that work there."""
     rows: list[Row] = []
-    modes = available_modes()
-    for scene in load_scenes(settings.data_root, settings.max_frames):
-        for mode in modes:
-            settings.progress(f"gpu: {scene.name}, {mode}")
-            rows += _batch_rows(scene, mode, device, settings)
+    notes = [f"agreement: centres within {_SAME_CENTRE_M} m of those of the CPU, eager, single precision"]
+    for mode in available_modes():
+        try:
+            for scene in scenes:
+                settings.progress(f"gpu: {scene.name}, {mode}")
+                rows += _batch_rows(scene, mode, device, settings)
+            settings.progress(f"gpu: synchronisations, {mode}")
+            rows += _synchronisation_rows(mode, device, scenes[0], settings)
+        except CompilationError as error:
+            notes.append(f"{mode}: not measured, {error}")
+    for scene in scenes:
         settings.progress(f"gpu: {scene.name}, against the CPU")
         rows += _agreement_rows(scene, device)
-    for mode in modes:
-        settings.progress(f"gpu: synchronisations, {mode}")
-        rows += _synchronisation_rows(mode, device, settings)
-    notes = (f"agreement: centres within {_SAME_CENTRE_M} m of those of the CPU, eager, single precision",)
-    return SuiteResult(_SUITE, tuple(rows), notes=notes)
+    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
 
 
 def _batch_rows(scene: Scene, mode: str, device: torch.device, settings: SuiteSettings) -> list[Row]:
@@ -100,10 +108,9 @@ def _agreement_rows(scene: Scene, device: torch.device) -> list[Row]:
     ]  # fmt: skip
 
 
-def _synchronisation_rows(mode: str, device: torch.device, settings: SuiteSettings) -> list[Row]:
+def _synchronisation_rows(mode: str, device: torch.device, scene: Scene, settings: SuiteSettings) -> list[Row]:
     """Those of one more block of iterations: calls of many blocks less calls of few, everything else being equal."""
-    scene = load_scenes(None)[0]
-    inputs = _on_device(*collate(scene.frames), device)
+    inputs = _on_device(*collate(scene.frames[:1]), device)
     found = []
     for blocks in (_FEW_BLOCKS, _MANY_BLOCKS):
         refiner = _of_blocks(mode, blocks).to(device)

@@ -10,7 +10,7 @@ import pytest
 import directshape_torch
 from directshape_torch.benchmark.presets import make_refiner
 from directshape_torch.benchmark.stage_profile import profile_stages
-from directshape_torch.benchmark.stage_rules import RULES, stage_of
+from directshape_torch.benchmark.stage_rules import RULES, rule_of
 from directshape_torch.benchmark.workloads import demo_scene, first_cars
 
 
@@ -64,6 +64,18 @@ def test_a_function_that_no_rule_knows_shows_up_by_name() -> None:
     assert profile.unattributed == {"directshape_torch.brand_new.f": 3}
 
 
+def test_what_the_outcome_evaluates_is_part_of_it() -> None:
+    clock = FakeClock()
+
+    def wait(seconds: float) -> None:
+        clock.now += seconds
+
+    solve = function_of("directshape_torch.solver.damped_solve", "wait(2)", wait=wait)
+    outcome = function_of("directshape_torch.covariance", "solve(); wait(1)", wait=wait, solve=solve)
+
+    assert profile_stages(outcome, clock).seconds["outcome"] == 3
+
+
 def test_an_error_leaves_no_hook_behind() -> None:
     import sys
 
@@ -102,6 +114,6 @@ def test_no_stage_of_a_refinement_is_empty_and_hardly_anything_is_unattributed()
 
 def test_stages_of_known_functions() -> None:
     package = "directshape_torch"
-    assert stage_of(f"{package}.solver.normal_equations", "Segments.accumulate") == (True, "normal equations")
-    assert stage_of(f"{package}.geometry.se3", "exp") == (False, None)
-    assert stage_of("torch._tensor", "Tensor.__rsub__") == (False, None)
+    assert rule_of(f"{package}.solver.normal_equations", "Segments.accumulate").stage == "normal equations"
+    assert rule_of(f"{package}.geometry.se3", "exp").stage is None
+    assert rule_of("torch._tensor", "Tensor.__rsub__").stage is None

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from directshape_torch.benchmark import compile_cost, suite_cpu
+from directshape_torch.benchmark import compile_cost, suite_cpu, suite_gpu
 from directshape_torch.benchmark.compile_probe import ProbeResult, probe
 from directshape_torch.benchmark.presets import make_refiner
+from directshape_torch.benchmark.rows import Row
 from directshape_torch.benchmark.run import SUITES
 from directshape_torch.benchmark.settings import SuiteSettings
-from directshape_torch.benchmark.suite_gpu import run_gpu
 from directshape_torch.benchmark.suite_profile import run_profile
 from directshape_torch.benchmark.timing import Repetitions
 from directshape_torch.benchmark.workloads import demo_scene, first_cars
+from directshape_torch.errors import CompilationError
 
+_ONE_ITERATION = ["stages=[{max_iterations: 1}]"]
 SMALLEST = SuiteSettings(quick=True, repetitions=Repetitions(warm_up=0, rounds=1))
 
 
@@ -58,7 +61,7 @@ def test_what_compiling_costs_is_the_first_calls_less_the_second(monkeypatch: py
 
 def test_an_eager_process_compiles_nothing() -> None:
     loaded = first_cars(demo_scene().frames[0], 1)
-    refiner = make_refiner("fast", "eager", ["stages=[{max_iterations: 1}]"])
+    refiner = make_refiner("fast", "eager", _ONE_ITERATION)
 
     found = probe(refiner, [loaded])
 
@@ -69,10 +72,45 @@ def test_an_eager_process_compiles_nothing() -> None:
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="of a machine without a CUDA device")
 def test_without_a_graphics_card_the_suite_says_so() -> None:
-    result = run_gpu(SMALLEST)
+    result = suite_gpu.run_gpu(SMALLEST)
 
     assert result.rows == ()
     assert result.notes == ("not measured: PyTorch finds no CUDA device",)
+
+
+def test_a_device_is_measured_and_compared_with_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CPU stands in for the card: it agrees with itself, and never waits."""
+    monkeypatch.setattr(suite_gpu, "available_modes", lambda: ("eager",))
+    monkeypatch.setattr(suite_gpu, "_busy_share", lambda *_: 0.5)
+    monkeypatch.setattr(suite_gpu, "make_refiner", lambda _, mode, __=(): make_refiner("fast", mode, _ONE_ITERATION))
+    monkeypatch.setattr(suite_gpu, "_QUICK_BATCH_FRAMES", 2)
+    monkeypatch.setattr(torch.cuda, "get_sync_debug_mode", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "set_sync_debug_mode", lambda _: None)
+    scene = demo_scene()
+    scene = replace(scene, frames=(first_cars(scene.frames[0], 1),))
+
+    result = suite_gpu.measure_device(torch.device("cpu"), [scene], SMALLEST)
+
+    values = {row.name: row.value for row in result.rows}
+    batch = "demo, default eager, 2 frames in a batch"
+    assert values[f"{batch}, per frame"] == pytest.approx(values[f"{batch}, per car"])
+    assert values[f"{batch}, peak memory per car"] > 0
+    assert values[f"{batch}, card at work"] == 50
+    assert values["demo, cars with the CPU's result"] == 1
+    assert values["synchronisations a block, eager"] == 0
+
+
+def test_a_device_without_a_compiler_is_measured_eagerly(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> list[Row]:
+        raise CompilationError("no Triton")
+
+    monkeypatch.setattr(suite_gpu, "available_modes", lambda: ("compiled",))
+    monkeypatch.setattr(suite_gpu, "_batch_rows", refuse)
+    monkeypatch.setattr(suite_gpu, "_agreement_rows", lambda *_: [])
+
+    result = suite_gpu.measure_device(torch.device("cpu"), [demo_scene()], SMALLEST)
+
+    assert result.notes[-1] == "compiled: not measured, no Triton"
 
 
 def test_the_stages_of_a_profile_add_up() -> None:
