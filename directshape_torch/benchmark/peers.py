@@ -37,6 +37,7 @@ _ROUNDS = 3
 
 _AUTOGRAD, _PYPOSE, _THESEUS = "ours, autograd", "PyPose", "Theseus"
 _AUTODIFF = "Theseus, its own differentiation"
+_NEAR = ", until near its cost"
 _LIBRARY_MODULES = {_PYPOSE: "peers_pypose", _THESEUS: "peers_theseus", _AUTODIFF: "peers_theseus"}
 # Theseus' own requirements cannot be built without the headers of SuiteSparse, whose sparse solver is not used here.
 _CURE = (
@@ -67,7 +68,8 @@ def run_peers_suite(settings: SuiteSettings) -> SuiteResult:
     scene = load_scenes(settings.data_root, 1 if settings.quick else _FRAMES)[0]
     peers = [name for name in _LIBRARY_MODULES if name not in missing]
     own = [f"ours, {mode}" for mode in available_modes()]
-    figures = {name: Figures(name, _GOALS.get(name)) for name in (*own, _AUTOGRAD, *peers)}
+    names = (*own, *(name + _NEAR for name in own), _AUTOGRAD, *peers)
+    figures = {name: Figures(name, _GOALS.get(name)) for name in names}
     notes = [f"{scene.name}, frames {', '.join(loaded.frame_id for loaded in scene.frames)}"]
     notes += [f"{name}: not measured: {reason}" for name, reason in missing.items()]
     notes += [f"{name}: {limits}" for name, limits in _LIMITS.items() if name in peers]
@@ -151,8 +153,8 @@ def prepare_case(loaded: LoadedFrame, names: list[str]) -> PeerCase:
     tasks = stage_tasks(OwnSolver(eager, frames, detections))
     starts = [task.start for task in tasks]
 
-    def own(refiner: DirectShapeRefiner) -> StageSolver:
-        return OwnSolver(refiner, frames, detections, starts)
+    def own(refiner: DirectShapeRefiner, max_iterations: list[int] | None = None) -> StageSolver:
+        return OwnSolver(refiner, frames, detections, starts, max_iterations)
 
     makers: dict[str, Callable[[], StageSolver]] = {
         _AUTOGRAD: lambda: own(with_jacobian(eager, "autograd")),
@@ -161,7 +163,9 @@ def prepare_case(loaded: LoadedFrame, names: list[str]) -> PeerCase:
         _AUTODIFF: lambda: _library("peers_theseus").TheseusSolver(tasks, "autodiff"),
     }
     for mode in available_modes():
-        makers[f"ours, {mode}"] = partial(own, make_refiner("default", mode))
+        refiner = make_refiner("default", mode)
+        makers[f"ours, {mode}"] = partial(own, refiner)
+        makers[f"ours, {mode}{_NEAR}"] = partial(own, refiner, [task.near_iterations for task in tasks])
     return PeerCase(loaded.frame_id, tasks, timed_sides({name: makers[name]() for name in names}))
 
 
@@ -176,13 +180,13 @@ def _library(module: str) -> Any:
 
 def _all_rows(figures: Mapping[str, Figures], own: list[str]) -> list[Row]:
     rows = [time_row(each) for each in figures.values()]
+    others = [each for name, each in figures.items() if name.removesuffix(_NEAR) not in own]
     for reference in own:
         # The goals are for the default preset as it comes: compiled where it can be.
         is_goal = reference == own[-1]
-        for name, each in figures.items():
-            if name not in own:
-                rows += ratio_rows(each, figures[reference], is_goal)
-    return rows + [row for name, each in figures.items() if name not in own for row in cost_rows(each)]
+        for each in others:
+            rows += ratio_rows(each, figures[reference], figures[reference + _NEAR], is_goal)
+    return rows + [row for each in others for row in cost_rows(each)]
 
 
 def _documented_rows(task: StageTask) -> list[Row]:

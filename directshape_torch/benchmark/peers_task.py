@@ -16,7 +16,7 @@ from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.solver.gauss_newton import minimise
+from directshape_torch.solver.gauss_newton import Minimum, minimise
 
 # A cost up to this factor above ours counts as the same.
 _NEAR = 1.01
@@ -66,6 +66,7 @@ class StageTask:
         max_iterations: of the stage.
         solver: damping and tolerances of the own solver.
         target_cost: (B,) where our own solver ends.
+        near_iterations: of our own solver until the costs of all cars stay near that.
     """
 
     problem: CarProblem
@@ -73,6 +74,7 @@ class StageTask:
     max_iterations: int
     solver: SolverConfig
     target_cost: Tensor
+    near_iterations: int
 
     @property
     def near_cost(self) -> Tensor:
@@ -100,6 +102,7 @@ class OwnSolver:
         refiner: its prior and its configuration.
         frames, detections: one call.
         starts: where the stages begin; None for one after the other.
+        max_iterations: of the stages; None for those of the configuration.
     """
 
     def __init__(
@@ -108,22 +111,28 @@ class OwnSolver:
         frames: FrameBatch,
         detections: Detections,
         starts: Sequence[CarState] | None = None,
+        max_iterations: Sequence[int] | None = None,
     ) -> None:
         self.solver = refiner.config.solver
         self.problems: list[CarProblem] = []
-        for stage in refiner.config.stages:
+        for number, stage in enumerate(refiner.config.stages):
+            if max_iterations is not None:
+                stage = replace(stage, max_iterations=max_iterations[number])
             one_stage = DirectShapeRefiner(refiner.prior, replace(refiner.config, stages=(stage,)))
             problem, initial = one_stage.problem(frames, detections)
             self.problems.append(problem)
         self.starts = [initial] if starts is None else list(starts)
 
     def run(self) -> list[StageRun]:
-        runs: list[StageRun] = []
+        return [StageRun(minimum.state, minimum.iterations) for minimum in self.minima()]
+
+    def minima(self) -> list[Minimum[CarState]]:
+        """Of the stages."""
+        minima: list[Minimum[CarState]] = []
         for number, problem in enumerate(self.problems):
-            start = self.starts[number] if number < len(self.starts) else runs[-1].state
-            minimum = minimise(problem, start, self.solver)
-            runs.append(StageRun(minimum.state, minimum.iterations))
-        return runs
+            start = self.starts[number] if number < len(self.starts) else minima[-1].state
+            minima.append(minimise(problem, start, self.solver))
+        return minima
 
     @property
     def energy_seconds(self) -> float:
@@ -151,9 +160,23 @@ def stage_tasks(own: OwnSolver) -> list[StageTask]:
     """The stages as our own solver meets them."""
     state, tasks = own.starts[0], []
     with torch.no_grad():
-        for problem, run in zip(own.problems, own.run(), strict=True):
+        for problem, minimum in zip(own.problems, own.minima(), strict=True):
             stage = problem.stages()[0]
             problem.begin_stage(stage, state)
-            tasks.append(StageTask(problem, state, stage.max_iterations, own.solver, problem.cost(run.state)))
-            state = run.state
+            cost = problem.cost(minimum.state)
+            near = iterations_to(_NEAR * cost, minimum.cost_history)
+            tasks.append(StageTask(problem, state, stage.max_iterations, own.solver, cost, near))
+            state = minimum.state
     return tasks
+
+
+def iterations_to(costs: Tensor, history: Tensor) -> int:
+    """After how many iterations no car has a cost above `costs` (B,) any more; history (B, n), NaN where it has ended.
+
+    Example:
+        >>> history = torch.tensor([[5.0, 3.0, 3.0], [9.0, torch.nan, torch.nan]])
+        >>> iterations_to(torch.tensor([4.0, 9.0]), history)
+        2
+    """
+    above = (history > costs[:, None]).any(dim=0).nonzero()[:, 0].tolist()
+    return min(above[-1] + 2, history.shape[1]) if above else 1

@@ -14,7 +14,7 @@ from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.benchmark.peers import PeerCase, missing_libraries, timed_sides
 from directshape_torch.benchmark.peers_rows import Figures, cost_rows, ratio_rows, time_row
-from directshape_torch.benchmark.peers_task import StageRun, Trace, stage_tasks
+from directshape_torch.benchmark.peers_task import StageRun, Trace, iterations_to, stage_tasks
 from directshape_torch.benchmark.rows import Goal
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import Repetitions
@@ -28,6 +28,24 @@ def test_stages_follow_one_another_as_in_a_refinement() -> None:
 
     assert [task.max_iterations for task in tasks] == [6, 8]
     torch.testing.assert_close(tasks[-1].target_cost, whole.cost_after.sum(dim=1).to(torch.float64), rtol=1e-6, atol=0)
+
+
+def test_iterations_until_near_lead_near() -> None:
+    tasks = stage_tasks(street_solver())
+    short = [task.near_iterations for task in tasks]
+    assert all(1 <= near < task.max_iterations for near, task in zip(short, tasks, strict=True))
+    for fewer, reaches in ((0, True), (1, False)):
+        runs = street_solver(tasks, max_iterations=[max(1, near - fewer) for near in short]).run()
+        costs = [task.problem.cost(run.state) <= task.near_cost for run, task in zip(runs, tasks, strict=True)]
+        assert all(cost.all() for cost in costs) == reaches
+
+
+@pytest.mark.parametrize(
+    ("history", "iterations"),
+    [([[2.0, 1.0]], 1), ([[9.0, 2.0, 1.0]], 2), ([[9.0, 2.0, 9.0, 1.0]], 4), ([[9.0, 1.0, math.nan]], 2)],
+)
+def test_iterations_to_a_cost(history: list[list[float]], iterations: int) -> None:
+    assert iterations_to(torch.tensor([3.0]), torch.tensor(history)) == iterations
 
 
 def test_autograd_ends_where_the_hand_derived_jacobians_end() -> None:
@@ -58,21 +76,22 @@ def figures(name: str, seconds: list[float], near: float) -> Figures:
 def test_rows_of_a_solver() -> None:
     peer, own = figures("peer", [10.0, 24.0], 5.0), figures("ours", [1.0, 2.0], math.nan)
     time = time_row(peer)
-    whole, near = ratio_rows(peer, own, is_goal=True)
+    near_own = figures("ours, near", [0.5, 0.5], math.nan)
+    whole, near = ratio_rows(peer, own, near_own, is_goal=True)
     cost, share = cost_rows(peer)
 
     assert (time.value, time.unit, time.low, time.high) == (8500.0, "ms", 6750.0, 10250.0)
     assert "8 iterations" in time.note
     assert "75 %" in time.note
     assert (whole.name, whole.value, whole.meets_goal) == ("peer over ours", 11.0, True)
-    assert (near.name, near.value, near.goal) == ("peer over ours, near our cost", 3.75, None)
+    assert (near.name, near.value, near.goal) == ("peer over ours, near our cost", 10.0, None)
     assert (cost.value, cost.note) == (pytest.approx(1.0025), "0.990 to 1.200, cars and stages")
     assert share.value == 0.75
 
 
 def test_a_solver_that_does_not_say_how_it_went_has_no_row_for_the_way() -> None:
     own = figures("ours", [1.0], math.nan)
-    assert [row.name for row in ratio_rows(own, own, is_goal=False)] == ["ours over ours"]
+    assert [row.name for row in ratio_rows(own, own, own, is_goal=False)] == ["ours over ours"]
 
 
 def test_a_frame_is_measured_by_all_solvers_in_turn() -> None:

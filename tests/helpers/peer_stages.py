@@ -12,10 +12,12 @@ from helpers.synthetic_scene import cached_street, disturbed
 
 
 def street_solver(
-    tasks: Sequence[StageTask] | None = None, jacobian: Literal["analytic", "autograd"] = "analytic"
+    tasks: Sequence[StageTask] | None = None,
+    jacobian: Literal["analytic", "autograd"] = "analytic",
+    max_iterations: Sequence[int] | None = None,
 ) -> OwnSolver:
     """Prepared for two disturbed cars; with tasks its stages begin where theirs do."""
     prior, scene = cached_street()
     refiner = with_jacobian(DirectShapeRefiner(prior, DEFAULT), jacobian)
     starts = None if tasks is None else [task.start for task in tasks]
-    return OwnSolver(refiner, scene.frames, disturbed(scene.detections), starts)
+    return OwnSolver(refiner, scene.frames, disturbed(scene.detections), starts, max_iterations)
