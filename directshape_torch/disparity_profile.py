@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.car_rows import kept, placed
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
@@ -82,19 +83,11 @@ class DisparityProfile:
 
     def spread(self, rows: Tensor, count: int) -> DisparityProfile:
         """Some cars placed among `count` cars."""
-
-        def place(values: Tensor) -> Tensor:
-            return values.new_full((count, *values.shape[1:]), torch.nan).index_copy(0, rows, values)
-
-        return replace(self, **{f.name: place(getattr(self, f.name)) for f in fields(self)[1:]})
+        return replace(self, **{f.name: placed(getattr(self, f.name), rows, count) for f in fields(self)[1:]})
 
     def where(self, condition: Tensor) -> DisparityProfile:
         """What is known where the condition (B,) holds, NaN elsewhere."""
-
-        def keep(values: Tensor) -> Tensor:
-            return torch.where(condition.view(-1, *[1] * (values.ndim - 1)), values, torch.full_like(values, torch.nan))
-
-        return replace(self, **{f.name: keep(getattr(self, f.name)) for f in fields(self)[1:]})
+        return replace(self, **{f.name: kept(getattr(self, f.name), condition) for f in fields(self)[1:]})
 
     @property
     def range_px(self) -> Tensor:
@@ -178,7 +171,7 @@ def _profile_of(
     rows = table.flatten()
     seen = [seen_surface(term, state, rows) for state in states]
     both = SeenSurface(*(torch.cat(parts) for parts in zip(*seen, strict=True)))
-    costs = matching_costs(term, rows.repeat(2), both, offsets).view(-1, 2, *table.shape)
+    costs = matching_costs(term, rows.repeat(2), both, offsets).view(len(offsets), 2, *table.shape)
     total = torch.where(counts, costs, 0.0).sum(dim=-1, dtype=torch.float64).permute(1, 2, 0)
     weight = torch.where(counts, fixed.neighbour_weight.sum(dim=1)[table], 0.0).sum(dim=1, dtype=torch.float64)
     num_pixels = counts.sum(dim=1)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from directshape_torch.car_rows import kept, placed
 from directshape_torch.energy.car_problem import sum_of
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.prior_terms import PriorTerm
@@ -56,19 +57,11 @@ class Observability:
 
     def spread(self, rows: Tensor, count: int) -> Observability:
         """Some cars placed among `count` cars."""
-
-        def place(values: Tensor) -> Tensor:
-            return values.new_full((count, *values.shape[1:]), torch.nan).index_copy(0, rows, values)
-
-        return Observability(*(place(getattr(self, f.name)) for f in fields(self)))
+        return Observability(*(placed(getattr(self, f.name), rows, count) for f in fields(self)))
 
     def where(self, condition: Tensor) -> Observability:
         """What is known where the condition (B,) holds, NaN elsewhere."""
-
-        def keep(values: Tensor) -> Tensor:
-            return torch.where(condition.view(-1, *[1] * (values.ndim - 1)), values, torch.full_like(values, torch.nan))
-
-        return Observability(*(keep(getattr(self, f.name)) for f in fields(self)))
+        return Observability(*(kept(getattr(self, f.name), condition) for f in fields(self)))
 
     def scaled(self, factor: float) -> Observability:
         """With all standard deviations multiplied."""

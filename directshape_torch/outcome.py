@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from directshape_torch.car_rows import kept, placed
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.covariance import covariance_of, covariance_xyz_yaw, shared_disparity_covariance
 from directshape_torch.disparity_profile import DisparityProfile, disparity_profile
@@ -138,11 +139,7 @@ def assemble(
     count = len(detections)
 
     def spread(part: Tensor) -> Tensor:
-        full = torch.full((count, *part.shape[1:]), torch.nan, dtype=torch.float64, device=status.device)
-        return full.index_copy(0, rows, part.to(torch.float64))
-
-    def only_refined(values: Tensor) -> Tensor:
-        return torch.where(refined[:, None, None], values, torch.full_like(values, torch.nan))
+        return placed(part.to(torch.float64), rows, count)
 
     iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
     refined = is_refined(status)
@@ -157,14 +154,22 @@ def assemble(
         term_names=outcome.term_names,
         cost_before=spread(outcome.cost_before),
         cost_after=spread(outcome.cost_after),
-        covariance=only_refined(spread(outcome.covariance)),
-        covariance_xyz_yaw=only_refined(spread(outcome.covariance_xyz_yaw)),
+        covariance=kept(spread(outcome.covariance), refined),
+        covariance_xyz_yaw=kept(spread(outcome.covariance_xyz_yaw), refined),
         cost_history=spread(outcome.cost_history),
         quality=outcome.quality.spread(rows, count).where(judged),
         observability=outcome.observability.spread(rows, count).where(refined),
         profile=outcome.profile.spread(rows, count).where(judged),
         input_dimensions_hwl=detections.dimensions_hwl,
-        ground_source=tuple(frames.ground.source[f] for f in detections.frame_index.tolist()),
+        ground_source=_ground_sources(frames, detections),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
         prior=prior,
     )
+
+
+def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ...]:
+    """Where the plane of each car's frame came from; which frame that is the host asks only where it matters."""
+    sources = frames.ground.source
+    if len(set(sources)) == 1:
+        return sources[:1] * len(detections)
+    return tuple(sources[frame] for frame in detections.frame_index.tolist())

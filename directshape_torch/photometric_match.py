@@ -92,7 +92,7 @@ def agreement(term: PhotometricTerm, projected: ProjectedState) -> tuple[Tensor,
     """Mean absolute residual (B,) in grey levels of the usable pixels, and their share (B,) of the pixel set."""
     fixed, everything = stage_pixels(term), slice(None)
     seen = seen_surface(term, projected, everything)
-    found = match(term, everything, seen, torch.zeros_like(seen.depth[:1]))
+    found = match(term, everything, seen, seen.depth.new_zeros(1))
     residual, usable = found.residual[0], found.usable[0]
     weight = fixed.neighbour_weight * usable[:, None]
     per_pixel = [(weight * residual.abs()).sum(dim=1), weight.sum(dim=1), usable.to(weight.dtype)]
@@ -129,5 +129,5 @@ def _norm(residual: Tensor, config: PhotometricConfig) -> Tensor:
     """`rho` of the term's robust norm in one pass over the residuals, for its weights are not asked for."""
     if config.truncated:
         residual = residual.clamp(-config.lost_grey_levels, config.lost_grey_levels)
-    nothing = torch.zeros_like(residual[:1, :1, :1]).expand_as(residual)
+    nothing = residual.new_zeros(()).expand_as(residual)
     return torch.nn.functional.huber_loss(residual, nothing, reduction="none", delta=config.huber_grey_levels)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from directshape_torch.car_rows import kept, placed
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
@@ -50,19 +51,11 @@ class FitQuality:
 
     def spread(self, rows: Tensor, count: int) -> FitQuality:
         """The figures of some cars placed among `count` cars."""
-
-        def place(values: Tensor) -> Tensor:
-            return values.new_full((count, *values.shape[1:]), torch.nan).index_copy(0, rows, values)
-
-        return FitQuality(*(place(getattr(self, f.name)) for f in fields(self)))
+        return FitQuality(*(placed(getattr(self, f.name), rows, count) for f in fields(self)))
 
     def where(self, condition: Tensor) -> FitQuality:
         """The figures where the condition (B,) holds, NaN elsewhere."""
-
-        def keep(values: Tensor) -> Tensor:
-            return torch.where(condition.view(-1, *[1] * (values.ndim - 1)), values, torch.full_like(values, torch.nan))
-
-        return FitQuality(*(keep(getattr(self, f.name)) for f in fields(self)))
+        return FitQuality(*(kept(getattr(self, f.name), condition) for f in fields(self)))
 
 
 @torch.no_grad()

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from directshape_torch.disparity_profile import (
     DisparityProfile,
+    _thinned,
     disparity_profile,
     profile_figures,
     profile_offsets,
@@ -118,6 +119,15 @@ def test_repeated_texture_is_ambiguous() -> None:
 def _figures(cost: Tensor, pixels: float = 100.0) -> dict[str, float]:
     found = profile_figures(OFFSETS, cost[None], torch.tensor([pixels]).double())
     return {name: float(value[0]) for name, value in found._asdict().items()}
+
+
+def test_both_curves_in_one_go_have_the_figures_of_each() -> None:
+    before, after = 2 + (OFFSETS - 0.6)[None] ** 2, torch.stack([1 + OFFSETS.abs(), 3 + (OFFSETS + 1) ** 2])
+    pixels = torch.tensor([100.0, 50.0]).double()
+    profile = DisparityProfile(OFFSETS, before.expand(2, -1), after, pixels)
+    for found, expected in zip(profile.figures, (profile.before, profile.after), strict=True):
+        for x, y in zip(found, expected, strict=True):
+            assert torch.equal(x, y)
 
 
 def test_a_parabola_by_hand() -> None:
@@ -233,6 +243,38 @@ def test_all_pixels_are_the_terms_own_and_few_are_much_the_same() -> None:
     assert (few.num_pixels <= 60).all()
     assert (few.num_pixels > 30).all()
     torch.testing.assert_close(few.after.offset_px, every.after.offset_px, rtol=0, atol=0.05)
+
+
+def test_without_a_pixel_there_is_no_curve_and_a_car_without_them_touches_no_other() -> None:
+    scene = far_street()
+    whole = scene.detections.mask_left
+    expected = disparity_profile(*_begun_with_masks(whole))
+    for empty in ([0], [1], [0, 1]):
+        masks = whole.clone()
+        masks[empty] = 0
+        found = disparity_profile(*_begun_with_masks(masks))
+        for car in range(2):
+            if car in empty:
+                assert found.cost_before[car].isnan().all()
+                assert found.cost_after[car].isnan().all()
+                assert found.num_pixels[car] == 0
+            else:
+                torch.testing.assert_close(found.cost_after[car], expected.cost_after[car], rtol=1e-9, atol=1e-9)
+
+
+def _begun_with_masks(mask_left: Tensor) -> tuple[CarProblem, CarState, CarState]:
+    scene = far_street()
+    scene = replace(scene, detections=replace(scene.detections, mask_left=mask_left))
+    problem, state = begun(scene.frames, scene)
+    return problem, state, state
+
+
+def test_fewer_pixels_are_every_second_or_third_of_each_car() -> None:
+    """Of 5, 0 and 2 pixels at most 2: rows 0 and 3 of the first, 5 and 6 of the last."""
+    rows, counts = _thinned(torch.tensor([5, 0, 2]), 7, 2)
+    assert counts.tolist() == [[True, True], [False, False], [True, True]]
+    assert rows[counts].tolist() == [0, 3, 5, 6]
+    assert ((rows >= 0) & (rows < 7)).all()
 
 
 def test_before_a_stage_there_is_no_curve() -> None:
