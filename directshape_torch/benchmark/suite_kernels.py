@@ -46,9 +46,10 @@ def run_kernels(settings: SuiteSettings) -> SuiteResult:
         rows += _iteration_rows(mode, needed, shape, frames, detections, settings)
         settings.progress(f"kernels: Jacobians by hand and by autograd, {mode}")
         rows.append(_autograd_row(mode, frames, detections, settings))
+        rows += _problem_rows(mode, frames, detections, settings)
     notes.append(f"needed: {needed.num_contour} points of contours and {needed.num_surface} of surfaces, twice each")
     settings.progress("kernels: parts")
-    rows += _part_rows(frames, detections, settings)
+    rows += _sum_and_solve_rows(frames, detections, settings)
     return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
 
 
@@ -113,13 +114,11 @@ def _value_and_derivatives(
 def _bare_lookups(mode: str, needed: NeededLookups, shape: BoundShape) -> Callable[[], object]:
     """The lookups as often as there are iterations to compare with, compiled like the refiner's own functions."""
 
-    @torch.no_grad()
     def run() -> None:
-        with compiling(_compile_mode(mode), num_cars=1):
-            for _ in range(_MANY - _FEW):
-                _value_and_derivatives(shape, needed.points_obj, needed.object_index)
+        for _ in range(_MANY - _FEW):
+            _value_and_derivatives(shape, needed.points_obj, needed.object_index)
 
-    return run
+    return _in_mode(mode, run)
 
 
 def _compile_mode(mode: str) -> CompileMode:
@@ -136,8 +135,33 @@ def _autograd_row(mode: str, frames: FrameBatch, detections: Detections, setting
     return _row(name, ratio, "", "ratio", "higher", _AUTOGRAD_GOAL, note)
 
 
-def _part_rows(frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> list[Row]:
-    """Parts of an iteration by themselves, eager."""
+def _problem_rows(mode: str, frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> list[Row]:
+    """The energy at a state of the last stage: where a stage begins, its value, its value with derivatives."""
+    problem, state = make_refiner("default", mode).problem(frames, detections)
+    stage = problem.stages()[-1]
+    kernels: dict[str, Callable[[], object]] = {
+        "beginning of a stage": partial(problem.begin_stage, stage, state),
+        "cost of a state": partial(problem.cost, state),
+        "cost, gradient and Hessian of a state": partial(problem.linearise, state),
+    }
+    calls = {name: _in_mode(mode, call) for name, call in kernels.items()}
+    times = time_interleaved(calls, settings.repetitions)
+    return [_row(f"{name}, {mode}", times.spread(name).scaled(1e3), "ms", "time") for name in calls]
+
+
+def _in_mode(mode: str, call: Callable[[], object]) -> Callable[[], object]:
+    """What the refiner opens around its work."""
+
+    @torch.no_grad()
+    def run() -> object:
+        with compiling(_compile_mode(mode), num_cars=1):
+            return call()
+
+    return run
+
+
+def _sum_and_solve_rows(frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> list[Row]:
+    """Parts of an iteration by themselves, eager, on numbers drawn at random."""
     problem, state = make_refiner("default", "eager").problem(frames, detections)
     num_cars, unknowns = len(detections), 6 + state.code.shape[1]
     generator = torch.Generator().manual_seed(0)
