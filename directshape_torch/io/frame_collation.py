@@ -49,7 +49,13 @@ def _largest_size(loaded: Sequence[LoadedFrame]) -> tuple[int, int]:
 
 def _padded(images: Sequence[Tensor], size_hw: tuple[int, int]) -> Tensor:
     height, width = size_hw
-    return torch.cat([pad(image, (0, width - image.shape[-1], 0, height - image.shape[-2])) for image in images])
+    missing = [(width - image.shape[-1], height - image.shape[-2]) for image in images]
+    # Padding by nothing copies too: frames of one size are copied once, into the batch.
+    grown = [
+        image if extra == (0, 0) else pad(image, (0, extra[0], 0, extra[1]))
+        for image, extra in zip(images, missing, strict=True)
+    ]
+    return torch.cat(grown)
 
 
 def _disparities(maps: Sequence[Tensor | None], size_hw: tuple[int, int]) -> Tensor | None:

@@ -222,6 +222,36 @@ def test_work_follows_the_cars_and_not_the_frame() -> None:
     assert large[1] < 1.02 * small[1]
 
 
+class HostWaits(TorchDispatchMode):
+    """Names the operations that wait for a number on the host."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name, kwargs = str(func), kwargs or {}
+        waits = ("_local_scalar_dense", "nonzero", "bincount", "masked_select", "aten.equal", "unique")
+        by_mask = "aten.index" in name and any(
+            isinstance(part, Tensor) and part.dtype == torch.bool
+            for arg in args[1:] if isinstance(arg, (list, tuple)) for part in arg
+        )  # fmt: skip
+        unsized = "repeat_interleave.Tensor" in name and kwargs.get("output_size") is None
+        if by_mask or unsized or any(word in name for word in waits):
+            self.names.append(name)
+        return func(*args, **kwargs)
+
+
+@pytest.mark.parametrize("count", [2, 40])
+def test_few_host_synchronisations_however_many_cars(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, detections = random_scene(8, count=count)
+    to_list = Tensor.tolist
+    with HostWaits() as waits:
+        monkeypatch.setattr(Tensor, "tolist", lambda self: (waits.names.append("tolist"), to_list(self))[1])
+        pack_pixels(frames, detections, SamplingConfig())
+    assert 0 < len(waits.names) <= 11, waits.names
+
+
 def test_work_is_linear_in_the_cars() -> None:
     frames, detections = random_scene(7, count=6, num_frames=1, others=0)
     once = touched_by_packing(frames, detections)
