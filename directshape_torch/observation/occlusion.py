@@ -99,20 +99,17 @@ class OcclusionCrops:
     """What hides each object within a region of it: one lookup a point, however many instances are in front.
 
     Attributes:
-        regions: (B, 4) integer (u0, v0, u1, v1), half open: where a pixel can be hidden at all.
-        wanted: (B, 4) the regions asked for, half open.
+        wanted: (B, 4) integer (u0, v0, u1, v1), half open: the regions.
         boxes: (B, 4) crops of the objects' frames, half open.
-        corner: (B,) row of `covering` that pixel (0, 0) of the object's frame would have.
-        width: (B,) of the crop of the object's frame.
+        table: (B, 6) integer, of each object: what its region has in common with the crop; the row of `covering` that
+            pixel (0, 0) of its frame would have; the crop's width.
         in_front: (B, W) int64, bits of the instances in front of each object.
         covering: (A, W) int64, bits of the instances that cover each pixel, see `InstanceCrops`.
     """
 
-    regions: Tensor
     wanted: Tensor
     boxes: Tensor
-    corner: Tensor
-    width: Tensor
+    table: Tensor
     in_front: Tensor
     covering: Tensor
 
@@ -123,12 +120,13 @@ class OcclusionCrops:
         width = boxes[:, 2] - boxes[:, 0]
         corner = crops.start[frame_index] - boxes[:, 1] * width - boxes[:, 0]
         words = [torch.where(in_front, word[:, None], 0).sum(dim=0) for word in crops.bits.unbind(dim=1)]
-        regions = _common(wanted, boxes)
-        return cls(regions, wanted, boxes, corner, width, torch.stack(words, dim=1), crops.covering)
+        table = torch.cat([_common(wanted, boxes), corner[:, None], width[:, None]], dim=1)
+        return cls(wanted, boxes, table, torch.stack(words, dim=1), crops.covering)
 
     def within(self, wanted: Tensor) -> OcclusionCrops:
         """The same for other regions (B, 4) of the objects."""
-        return replace(self, regions=_common(wanted, self.boxes), wanted=wanted)
+        table = torch.cat([_common(wanted, self.boxes), self.table[:, 4:]], dim=1)
+        return replace(self, wanted=wanted, table=table)
 
     def at(
         self,
@@ -144,17 +142,18 @@ class OcclusionCrops:
         Returns:
             (...) bool.
         """
-        rounded = uv.round() if uv.is_floating_point() else uv
-        u0, v0, u1, v1 = self.regions[object_index].unbind(-1)
-        u, v = rounded.unbind(-1)
+        if uv.is_floating_point():
+            # Far beyond any image, but within the integers.
+            uv = uv.round().nan_to_num(nan=-1.0, posinf=-1.0, neginf=-1.0).clamp(-1.0, 2.0**30)
+        u, v = uv.long().unbind(-1)
+        u0, v0, u1, v1, corner, width = _rows(self.table, object_index).unbind(-1)
         inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
-        u, v = torch.where(inside, u, 0).long(), torch.where(inside, v, 0).long()
-        entry = torch.where(inside, self.corner[object_index] + v * self.width[object_index] + u, 0)
-        return ((self.covering[entry] & self.in_front[object_index]) != 0).any(dim=-1) & inside
+        entry = torch.where(inside, corner + v * width + u, 0)
+        return ((_rows(self.covering, entry) & _rows(self.in_front, object_index)) != 0).any(dim=-1) & inside
 
     def objects(self, chosen: slice) -> OcclusionCrops:
         """Those of some objects, which are numbered anew; `covering` is shared."""
-        of_objects = ("regions", "wanted", "boxes", "corner", "width", "in_front")
+        of_objects = ("wanted", "boxes", "table", "in_front")
         return replace(self, **{name: getattr(self, name)[chosen] for name in of_objects})
 
     def crop(self, index: int) -> Tensor:
@@ -162,6 +161,11 @@ class OcclusionCrops:
         u0, v0, u1, v1 = self.wanted[index].tolist()
         v, u = torch.meshgrid(torch.arange(v0, v1), torch.arange(u0, u1), indexing="ij")
         return self.at(torch.tensor(index), torch.stack([u, v], dim=-1).to(self.wanted.device))
+
+
+def _rows(values: Tensor, index: Tensor) -> Tensor:
+    """`values[index]`, rows (..., W) of values (R, W) at an index (...), in a third of the time."""
+    return values.index_select(0, index.reshape(-1)).view(*index.shape, values.shape[1])
 
 
 def _common(a: Tensor, b: Tensor) -> Tensor:

@@ -154,12 +154,15 @@ def car_regions(
 ) -> tuple[Tensor, Tensor]:
     """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
     extents = scene_extents(d) if extents is None else extents
-    sizes = frames.sizes[d.frame_index]
-    margins = {"margin_px": config.region_margin_px, "margin_share": config.region_margin_share}
-    left = region_boxes(d.box_2d, extents.left.boxes, sizes, join=True, **margins)
     # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
-    nowhere = torch.full_like(d.box_2d, torch.nan)
-    right = region_boxes(nowhere, extents.right.boxes, sizes, join=False, **margins)
+    left, right = region_boxes(
+        torch.cat([d.box_2d, torch.full_like(d.box_2d, torch.nan)]),
+        torch.cat([extents.left.boxes, extents.right.boxes]),
+        frames.sizes[d.frame_index].repeat(2, 1),
+        join=True,
+        margin_px=config.region_margin_px,
+        margin_share=config.region_margin_share,
+    ).tensor_split(2)
     return left * d.has_mask_left[:, None], right
 
 
