@@ -19,7 +19,7 @@ import torch
 
 from directshape_torch.batch.timing import peak_memory_mb
 from directshape_torch.benchmark.presets import make_refiner
-from directshape_torch.benchmark.workloads import load_scenes, with_cars
+from directshape_torch.benchmark.workloads import first_scene, with_cars
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     if args.threads is not None:
         torch.set_num_threads(args.threads)
-    frames = load_scenes(args.data, args.frames)[0].frames
+    frames = first_scene(args.data, args.frames).frames
     print(json.dumps(asdict(probe(make_refiner(args.preset, args.mode), frames))))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -53,16 +53,25 @@ def load_scenes(data_root: Path | None, max_frames: int | None = None) -> tuple[
     Raises:
         InputError: the folder holds neither.
     """
+    return tuple(_scenes(data_root, max_frames))
+
+
+def first_scene(data_root: Path | None, max_frames: int | None = None) -> Scene:
+    """The first scene of `load_scenes`; the others are not read."""
+    return next(_scenes(data_root, max_frames))
+
+
+def _scenes(data_root: Path | None, max_frames: int | None) -> Iterator[Scene]:
     if data_root is None:
-        return (demo_scene(),)
-    scenes = []
-    if (data_root / "rendered").is_dir():
-        scenes.append(_scene(data_root / "rendered", "stereo", None, max_frames))
-    if (data_root / "kitti").is_dir():
-        scenes.append(_scene(data_root / "kitti", "noisy_stereo", _rig_field(data_root / "kitti"), max_frames))
-    if not scenes:
+        yield demo_scene()
+        return
+    rendered, kitti = data_root / "rendered", data_root / "kitti"
+    if not rendered.is_dir() and not kitti.is_dir():
         raise InputError("--data", "a folder that holds rendered or kitti", str(data_root), "or leave it out")
-    return tuple(scenes)
+    if rendered.is_dir():
+        yield _scene(rendered, "stereo", None, max_frames)
+    if kitti.is_dir():
+        yield _scene(kitti, "noisy_stereo", _rig_field(kitti), max_frames)
 
 
 def demo_scene() -> Scene:
