@@ -8,12 +8,10 @@ A function is marked once, `@compilable(sizes={...})`, and called like any other
 from __future__ import annotations
 
 import functools
-import importlib
 import inspect
 import logging
 import os
 import threading
-import types
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +22,14 @@ from typing import Any, Generic, Literal, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
+from directshape_torch.compiler_inputs import (
+    global_settings,
+    is_normal,
+    is_unusual_call,
+    normal,
+    outside_inference_mode,
+    shape_settings,
+)
 from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk
 from directshape_torch.errors import CompilationError
 
@@ -96,7 +102,8 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
     "on" compiles always, "off" never. "auto" compiles once the cars that are known to be ahead (`cars_ahead`) make up
     for it; where nobody knows, once the cars refined so far would have, so that at most twice the best possible time is
     spent. Code that is on disk from an earlier process is loaded for far fewer cars. Without a working compiler "auto"
-    stays plain and says so once in the log. Forked processes stay plain.
+    stays plain and says so once in the log. Forked processes stay plain. Inference mode becomes `no_grad` inside: its
+    tensors would be one more compilation of everything.
 
     Args:
         mode: the setting.
@@ -120,7 +127,8 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
     job = _job.get()
     token = _region.set(_Region(mode, _process.cars + num_cars if job is None else max(job.cars_ahead, num_cars)))
     try:
-        yield
+        with outside_inference_mode():
+            yield
     finally:
         _region.reset(token)
         with _process.lock:
@@ -170,7 +178,7 @@ class Compilable(Generic[_P, _R]):
         if torch.compiler.is_compiling():
             return self.plain(*args, **kwargs)
         region = _region.get()
-        if region is None or region.mode == "off" or _process.forked or _is_transformed():
+        if region is None or region.mode == "off" or _process.forked or is_unusual_call():
             return self.plain(*args, **kwargs)
         values = self._signature.bind(*args, **kwargs).args if kwargs else args
         variant = self._variant(values)
@@ -178,7 +186,7 @@ class Compilable(Generic[_P, _R]):
         if variant is None or not (known or self._may_compile(variant, region)):
             return self.plain(*args, **kwargs)
         # Always the same kind of tensor: memory layout, parameters and gradients that are off make no further variants.
-        values = tuple(value if _is_normal(value) else _normal(value) for value in values)
+        values = tuple(value if is_normal(value) else normal(value) for value in values)
         with torch.no_grad():
             if not known or self._compiled is None:
                 return self._first_call(variant, region, values)
@@ -188,7 +196,7 @@ class Compilable(Generic[_P, _R]):
     def _variant(self, values: tuple[object, ...]) -> tuple[object, ...] | None:
         """What a compilation holds for, or None where the plain form is called for."""
         grad = torch.is_grad_enabled()
-        variant: list[object] = [torch.is_inference_mode_enabled()]
+        variant: list[object] = [global_settings()]
         for value, varying in zip(values, self._varying, strict=False):
             if not isinstance(value, Tensor):
                 variant.append(value)
@@ -208,7 +216,7 @@ class Compilable(Generic[_P, _R]):
             return True
         if _process.given_up or region.cars < CARS_WORTH_LOADING:
             return False
-        if region.cars < CARS_WORTH_COMPILING and not is_on_disk(self.plain, variant):
+        if region.cars < CARS_WORTH_COMPILING and not is_on_disk(self.plain, variant[1:]):
             return False
         problem = compiler_problem()
         if problem is not None:
@@ -229,7 +237,7 @@ class Compilable(Generic[_P, _R]):
                 _give_up(f"{self.plain.__qualname__} could not be compiled: {reason}")
                 return self.plain(*values)  # type: ignore[call-arg]
             self._variants.add(variant)
-        note_on_disk(self.plain, variant)
+        note_on_disk(self.plain, variant[1:])
         return result
 
     def _compile(self, values: tuple[Any, ...]) -> _R:
@@ -246,7 +254,7 @@ class Compilable(Generic[_P, _R]):
         # Two sizes that are equal by accident in this call must not have to be equal in the next one.
         with (
             warnings.catch_warnings(),
-            _shape_settings().patch(use_duck_shape=False),
+            shape_settings().patch(use_duck_shape=False),
             torch._dynamo.config.patch(recompile_limit=_MAX_VARIANTS),
         ):
             warnings.simplefilter("ignore")
@@ -261,8 +269,8 @@ def compilable(
 
     Inside a `compiling` region it is compiled once for all values of the named sizes; each combination of the other
     sizes, dtypes, devices and values of arguments that are not tensors is a compilation of its own. Calls with
-    gradients, in float64, inside a functorch transform or forward-mode region, inside the user's own `torch.compile` or
-    with a named size below 2 take the plain form.
+    gradients, in float64, inside a functorch transform, a forward-mode region, autocast or the user's own
+    `torch.compile`, or with a named size below 2 take the plain form.
 
     Args:
         sizes: dimensions of the arguments, by name, whose sizes vary from call to call.
@@ -279,23 +287,6 @@ def compilable(
         return Compilable(function, sizes)
 
     return mark
-
-
-def _is_normal(value: object) -> bool:
-    return type(value) is Tensor and not value.requires_grad and value.is_contiguous()
-
-
-def _normal(value: object) -> object:
-    return value.detach().contiguous() if isinstance(value, Tensor) else value
-
-
-def _shape_settings() -> types.ModuleType:
-    return importlib.import_module("torch.fx.experimental._config")
-
-
-def _is_transformed() -> bool:
-    """Inside jacfwd, vmap, ... or a region of forward-mode differentiation."""
-    return bool(torch._C._are_functorch_transforms_active()) or torch.autograd.forward_ad._current_level >= 0
 
 
 def _require_compiler() -> None:

@@ -102,6 +102,23 @@ def test_layout_parameters_keywords_and_gradient_mode_make_no_further_variant(ne
 
 
 @needs_compiler
+def test_inference_mode_makes_no_further_variant(nearest) -> None:
+    expected = _nearest(*_inputs(40, 3))[0]
+    with compiling("on", 3):
+        nearest(*_inputs(40, 3))
+    with torch.inference_mode():
+        points, grid, car = _inputs(40, 3)
+        assert points.is_inference()
+        with compiling("on", 3):
+            values = [nearest(points, grid, car)[0], nearest(points + 0, grid, car + 0)[0]]
+            assert not torch.is_grad_enabled()
+        assert torch.is_inference_mode_enabled()
+    for value in values:
+        torch.testing.assert_close(value, expected)
+    assert counters["stats"]["unique_graphs"] == 1
+
+
+@needs_compiler
 def test_it_is_repeatable_to_the_bit(nearest) -> None:
     inputs = _inputs(1000, 3)
     with compiling("on", 3):
@@ -167,7 +184,7 @@ def test_outside_a_region_it_is_plain(nearest) -> None:
     assert nearest.num_variants == 0
 
 
-def test_gradients_double_precision_and_transforms_stay_plain(nearest) -> None:
+def test_gradients_double_precision_transforms_and_autocast_stay_plain(nearest) -> None:
     points, grid, car = _inputs(10, 3)
     attached = points.clone().requires_grad_()
     with compiling("on", 3) if compiler_problem() is None else compiling("auto", 3):
@@ -180,6 +197,8 @@ def test_gradients_double_precision_and_transforms_stay_plain(nearest) -> None:
             dual = torch.autograd.forward_ad.make_dual(points, torch.ones_like(points))
             tangent = torch.autograd.forward_ad.unpack_dual(nearest(dual, grid, car)[0]).tangent
         assert torch.equal(tangent, torch.full((10,), 2.0))
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            nearest(points, grid, car)
     assert nearest.num_variants == 0
 
 
