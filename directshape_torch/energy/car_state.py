@@ -30,6 +30,6 @@ def retract(state: CarState, delta: Tensor, max_code: float = torch.inf) -> CarS
         >>> retract(state, torch.tensor([[1.0, 0, 0, 0, 0, 0, 0.5, 9.0]]), max_code=3.0).code
         tensor([[0.5000, 3.0000]])
     """
-    delta = delta.to(state.code.dtype)
-    T_obj_cam = se3.exp(delta[:, :6]) @ state.T_obj_cam
-    return CarState(T_obj_cam, (state.code + delta[:, 6:]).clamp(-max_code, max_code))
+    twist, code_step = torch.split_with_sizes(delta.to(state.code.dtype), [6, delta.shape[1] - 6], dim=1)
+    T_obj_cam = torch.bmm(se3.exp(twist), state.T_obj_cam)
+    return CarState(T_obj_cam, (state.code + code_step).clamp(-max_code, max_code))

@@ -55,18 +55,14 @@ def _exp_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`sin(a)/a`, `(1 - cos a)/a^2` and `(a - sin a)/a^3` as smooth functions of `a^2`."""
     t = angle_squared
     small = t < _SMALL_ANGLE_SQUARED
-    safe = torch.where(small, torch.ones_like(t), t)
+    safe = torch.where(small, 1.0, t)
     angle = safe.sqrt()
-    sine = torch.sin(angle)
     half = torch.sin(0.5 * angle)
-    a = torch.where(small, 1 - t / 6 * (1 - t / 20 * (1 - t / 42 * (1 - t / 72))), sine / angle)
-    b = torch.where(small, 0.5 * (1 - t / 12 * (1 - t / 30 * (1 - t / 56 * (1 - t / 90)))), 2 * half * half / safe)
-    c = torch.where(
-        small,
-        (1 - t / 20 * (1 - t / 42 * (1 - t / 72 * (1 - t / 110)))) / 6,
-        (angle - sine) / (safe * angle),
-    )
-    return a, b, c
+    b_series = 1 / 2 - t * (1 / 24 - t * (1 / 720 - t * (1 / 40320 - t / 3628800)))
+    c_series = 1 / 6 - t * (1 / 120 - t * (1 / 5040 - t * (1 / 362880 - t / 39916800)))
+    b = torch.where(small, b_series, 2 * half * half / safe)
+    c = torch.where(small, c_series, (angle - torch.sin(angle)) / (safe * angle))
+    return 1 - t * c, b, c
 
 
 def exp(twist: Tensor) -> Tensor:
@@ -82,14 +78,16 @@ def exp(twist: Tensor) -> Tensor:
         >>> exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3]
         tensor([1., 2., 3.])
     """
-    v, omega = twist[..., :3], twist[..., 3:]
-    a, b, c = (x[..., None, None] for x in _exp_coefficients((omega * omega).sum(-1)))
-    W = hat(omega)
-    W2 = W @ W
-    identity = torch.eye(3, dtype=twist.dtype, device=twist.device)
-    R = identity + a * W + b * W2
-    V = identity + b * W + c * W2
-    return from_rotation_translation(R, (V @ v[..., None])[..., 0])
+    v_x, v_y, v_z, x, y, z = twist.reshape(-1, 6).unbind(-1)
+    _, b, c = _exp_coefficients(x * x + y * y + z * z)
+    zero = torch.zeros_like(x)
+    rows = (zero, -z, y, v_x, z, zero, -x, v_y, -y, x, zero, v_z, zero, zero, zero, zero)
+    X = torch.stack(rows, dim=-1).view(-1, 4, 4)
+    X2 = torch.bmm(X, X)
+    # X^4 = -angle^2 X^2, hence the power series of the 4 x 4 matrix ends with its third power.
+    identity = torch.eye(4, dtype=twist.dtype, device=twist.device)
+    T = torch.addcmul(identity + X, b[:, None, None], X2).addcmul(c[:, None, None], torch.bmm(X2, X))
+    return T.view(*twist.shape[:-1], 4, 4)
 
 
 def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
@@ -100,7 +98,7 @@ def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
         tensor([1., 1., 1.])
     """
     top = torch.cat([R, t[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=R.dtype, device=R.device).expand(*top.shape[:-2], 1, 4)
+    bottom = torch.eye(4, dtype=R.dtype, device=R.device)[3:].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
 

@@ -8,6 +8,8 @@ from torch import Tensor
 # Smallest diagonal entry that damping acts on, relative to the largest: directions that the data do not see at all
 # are damped as well.
 _RELATIVE_DIAGONAL_FLOOR = 1e-9
+# Of the scaled system's factor, whose diagonal is 1 where unknowns are independent.
+_SMALLEST_PIVOT = 1e-7
 
 
 def damped_step(
@@ -16,6 +18,10 @@ def damped_step(
     damping: Tensor,  # (B,) Marquardt's mu
 ) -> tuple[Tensor, Tensor]:
     """Solve `(H + mu diag(H)) step = -g` (Marquardt) by Cholesky.
+
+    Args:
+        hessian: symmetric; the lower triangle is read.
+        gradient, damping: see above.
 
     Returns:
         The steps (B, D), zero where there is none, and `solvable` (B,): false where the system is singular or not
@@ -26,21 +32,31 @@ def damped_step(
         >>> step
         tensor([[-1., -1.]])
     """
-    diagonal = hessian.diagonal(dim1=-2, dim2=-1)
-    floor = _RELATIVE_DIAGONAL_FLOOR * diagonal.amax(dim=-1, keepdim=True)
-    damped = hessian + torch.diag_embed(damping[:, None] * torch.maximum(diagonal, floor))
-    finite = damped.isfinite().all(dim=-1).all(dim=-1) & gradient.isfinite().all(dim=-1)
+    diagonal = hessian.diagonal(dim1=1, dim2=2)
+    floored = torch.maximum(diagonal, _RELATIVE_DIAGONAL_FLOOR * diagonal.amax(dim=1, keepdim=True))
+    # Jacobi scaling: metres, radians and standard deviations differ by orders of magnitude in curvature. What is
+    # scaled to 1 has the damping itself on its diagonal.
+    scale = floored.rsqrt()
     identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-    # Jacobi scaling: metres, radians and standard deviations differ by orders of magnitude in curvature.
-    scale = torch.where(diagonal > 0, diagonal, torch.ones_like(diagonal)).rsqrt()
-    scaled = torch.where(finite[:, None, None], scale[:, :, None] * damped * scale[:, None, :], identity)
+    scaled = torch.addcmul(hessian * scale[:, :, None] * scale[:, None], damping[:, None, None], identity)
     factor, info = torch.linalg.cholesky_ex(scaled)
-    well_conditioned = factor.diagonal(dim1=-2, dim2=-1).amin(dim=-1) > 1e-7
-    solvable = finite & (info == 0) & well_conditioned
-    factor = torch.where(solvable[:, None, None], factor, identity)
-    right = torch.where(solvable[:, None], -gradient * scale, torch.zeros_like(gradient))
-    step = scale * torch.cholesky_solve(right[..., None], factor)[..., 0]
-    return torch.where(solvable[:, None], step, torch.zeros_like(step)), solvable
+    # Whatever is not finite makes the factor so, or ends it early: a comparison with NaN is false.
+    regular = (factor.diagonal(dim1=1, dim2=2).amin(dim=1) > _SMALLEST_PIVOT) & (info == 0)
+    # Solved all the same where there is no factor, for a batch has no branches, and then thrown away.
+    factor = torch.where(regular[:, None, None], factor, identity)
+    step = scale * torch.cholesky_solve((scale * -gradient)[..., None], factor)[..., 0]
+    solvable = regular & is_finite(step.sum(dim=1))
+    return torch.where(solvable[:, None], step, 0.0), solvable
+
+
+def is_finite(sums: Tensor) -> Tensor:
+    """Where sums are finite, and with them everything that was added: two operations, `isfinite` is four.
+
+    Example:
+        >>> is_finite(torch.tensor([1.0, torch.inf, torch.nan]))
+        tensor([ True, False, False])
+    """
+    return (sums - sums) == 0
 
 
 def limit_step(
@@ -53,5 +69,15 @@ def limit_step(
         >>> limit_step(torch.tensor([[1.0, 4.0]]), torch.tensor([1.0, 1.0]))
         tensor([[0.2500, 1.0000]])
     """
-    excess = (step.abs() / limits).amax(dim=-1, keepdim=True)
-    return step / excess.clamp_min(1)
+    return limited_step(step, limits)[0]
+
+
+def limited_step(step: Tensor, limits: Tensor) -> tuple[Tensor, Tensor]:
+    """`limit_step`, and the size (B,) of what it returns as a share of the limits, at most 1.
+
+    Example:
+        >>> limited_step(torch.tensor([[0.1, 0.2]]), torch.tensor([1.0, 1.0]))[1]
+        tensor([0.2000])
+    """
+    size = (step.abs() / limits).amax(dim=1)
+    return step / size.clamp_min(1)[:, None], size.clamp_max(1)

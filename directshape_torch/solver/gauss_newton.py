@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
-from directshape_torch.solver.damped_solve import damped_step, limit_step
+from directshape_torch.solver.damped_solve import damped_step, is_finite, limited_step
 from directshape_torch.solver.problem import Linearisation, Problem, Stage, StateT, put_rows, take_rows, where_rows
 from directshape_torch.status import Status, is_refined
 
@@ -57,6 +57,10 @@ class Minimum(Generic[StateT]):
     trajectory: tuple[Iteration[StateT], ...] = ()
 
 
+# Of a problem that goes on; else the code of the status with which it ended.
+_RUNNING = -1
+
+
 @dataclass
 class _Progress(Generic[StateT]):
     """What changes from iteration to iteration, for the problems of one compacted batch."""
@@ -66,43 +70,47 @@ class _Progress(Generic[StateT]):
     best_cost: Tensor  # (B,)
     at_state: Linearisation
     damping: Tensor  # (B,)
-    running: Tensor  # (B,) bool
-    converged: Tensor  # (B,) bool
-    failure: Tensor  # (B,) status code or -1
+    ended: Tensor  # (B,) status code or -1
     iterations: Tensor  # (B,)
 
 
-@dataclass(frozen=True)
 class _Log(Generic[StateT]):
-    """What is kept of the iterations of one stage."""
+    """What is kept of the iterations of one stage: rows of a compacted batch, put in their places a block at a time."""
 
-    history: list[Tensor]
-    trajectory: list[Iteration[StateT]] | None
-    stage: int
+    def __init__(
+        self, history: list[Tensor], trajectory: list[Iteration[StateT]] | None, stage: int, all_states: StateT
+    ) -> None:
+        self.history, self.trajectory, self.stage, self.all_states = history, trajectory, stage, all_states
+        self.costs: list[Tensor] = []
 
     def add(
-        self,
-        all_states: StateT,
-        rows: Tensor,
-        before: tuple[StateT, Tensor],
-        accepted: Tensor,
-        improved: Tensor,
-        cost: Tensor,
+        self, rows: Tensor, before: tuple[StateT, Tensor], accepted: Tensor, improved: Tensor, cost: Tensor
     ) -> None:
-        nan = cost.new_full((len(all_states[0]),), torch.nan)
-        self.history.append(nan.index_copy(0, rows, cost))
-        if self.trajectory is not None:
-            state, damping = before
-            none = torch.zeros_like(nan, dtype=torch.bool)
-            self.trajectory.append(
-                Iteration(
-                    self.stage,
-                    put_rows(all_states, rows, state),
-                    torch.zeros_like(nan).index_copy(0, rows, damping),
-                    none.index_copy(0, rows, accepted),
-                    none.index_copy(0, rows, improved),
-                )
+        """One iteration: state and damping before it, then what came of it, all for these rows."""
+        self.costs.append(cost)
+        if self.trajectory is None:
+            return
+        state, damping = before
+        zeros = cost.new_zeros(len(self.all_states[0]))
+        none = torch.zeros_like(zeros, dtype=torch.bool)
+        self.trajectory.append(
+            Iteration(
+                self.stage,
+                put_rows(self.all_states, rows, state),
+                zeros.index_copy(0, rows, damping),
+                none.index_copy(0, rows, accepted),
+                none.index_copy(0, rows, improved),
             )
+        )
+
+    def end_block(self, rows: Tensor) -> None:
+        """The costs of a block into columns (B, iterations) of all problems."""
+        if not self.costs:
+            return
+        columns = torch.stack(self.costs, dim=1)
+        nan = columns.new_full((len(self.all_states[0]), len(self.costs)), torch.nan)
+        self.history.append(nan.index_copy(0, rows, columns))
+        self.costs = []
 
 
 def minimise(
@@ -127,22 +135,20 @@ def minimise(
         state = initial if start is None else start
         num_problems = len(initial[0])
         device = initial[0].device
-        failure = torch.full((num_problems,), -1, device=device)
-        iterations = torch.zeros(num_problems, dtype=torch.long, device=device)
-        converged = torch.zeros(num_problems, dtype=torch.bool, device=device)
+        ended = torch.full((num_problems,), _RUNNING, device=device)
+        iterations = torch.zeros_like(ended)
         history: list[Tensor] = []
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
         for stage in problem.stages():
             problem.begin_stage(stage, state)
             starts.append(state)
-            number = len(starts) - 1
-            log = _Log(history, trajectory, number)
-            state, converged, failure, done = _run_stage(problem, stage, state, failure, config, log)
+            log = _Log(history, trajectory, len(starts) - 1, state)
+            state, ended, done = _run_stage(problem, stage, state, ended, config, log)
             iterations = iterations + done
-        status = _final_status(problem, initial, state, converged, failure)
+        status = _final_status(problem, initial, state, ended)
         refined = is_refined(status)
-        columns = torch.stack(history, dim=1) if history else torch.empty(num_problems, 0, device=device)
+        columns = torch.cat(history, dim=1) if history else torch.empty(num_problems, 0, device=device)
         final = where_rows(refined, state, initial)
         return Minimum(final, state, status, iterations, columns, tuple(starts), tuple(trajectory or ()))
 
@@ -151,92 +157,107 @@ def _run_stage(
     problem: Problem[StateT],
     stage: Stage,
     state: StateT,
-    failure: Tensor,
+    ended: Tensor,
     config: SolverConfig,
     log: _Log[StateT],
-) -> tuple[StateT, Tensor, Tensor, Tensor]:
-    num_problems = len(failure)
-    converged = torch.zeros_like(failure, dtype=torch.bool)
-    iterations = torch.zeros_like(failure)
-    rows = torch.arange(num_problems, device=failure.device)
+) -> tuple[StateT, Tensor, Tensor]:
+    """States, how each problem ended, and iterations done."""
+    iterations = torch.zeros_like(ended)
+    rows = torch.arange(len(ended), device=ended.device)
     part = problem
-    progress = _begin(part, state, failure, config)
+    progress = _begin(part, state, ended, config)
+    limits = part.step_limits().to(progress.at_state.gradient)
     done = 0
     while done < stage.max_iterations and len(rows):
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
             before = (progress.state, progress.damping)
-            accepted, improved = _iterate(part, progress, config)
-            log.add(state, rows, before, accepted, improved, progress.at_state.cost)
+            accepted, improved = _iterate(part, progress, config, limits)
+            log.add(rows, before, accepted, improved, progress.at_state.cost)
             done += 1
-        # The only synchronisation of a block: which problems go on.
-        keep = progress.running
-        if not bool(keep.all()):
-            state, converged, failure, iterations = _scatter(progress, rows, state, converged, failure, iterations)
-            index = keep.nonzero()[:, 0]
+        log.end_block(rows)
+        # The only synchronisation of a block: how many problems go on.
+        keep = progress.ended < 0
+        going_on = int(keep.sum())
+        if going_on < len(rows):
+            state, ended, iterations = _scatter(progress, rows, state, ended, iterations)
+            index = torch.nonzero_static(keep, size=going_on)[:, 0]
             rows = rows[index]
             part = part.compact(keep)
             progress = _take(progress, index)
-    state, converged, failure, iterations = _scatter(progress, rows, state, converged, failure, iterations)
-    return state, converged, failure, iterations
+    return _scatter(progress, rows, state, ended, iterations)
 
 
-def _begin(problem: Problem[StateT], state: StateT, failure: Tensor, config: SolverConfig) -> _Progress[StateT]:
+def _begin(problem: Problem[StateT], state: StateT, ended: Tensor, config: SolverConfig) -> _Progress[StateT]:
     at_state = problem.linearise(state)
-    finite = _is_finite(at_state)
-    code = torch.full_like(failure, Status.non_finite.code)
-    failure = torch.where((failure < 0) & ~finite, code, failure)
+    # Of the stage before only failures count: what has converged there goes on.
+    failed = (ended >= 0) & (ended != Status.converged.code)
+    fresh = torch.where(_is_finite(at_state), _RUNNING, Status.non_finite.code)
     return _Progress(
         state=state,
         best_state=state,
         best_cost=at_state.cost,
         at_state=at_state,
         damping=torch.full_like(at_state.cost, config.initial_damping),
-        running=failure < 0,
-        converged=torch.zeros_like(finite),
-        failure=failure,
-        iterations=torch.zeros_like(failure),
+        ended=torch.where(failed, ended, fresh),
+        iterations=torch.zeros_like(ended),
     )
 
 
-def _iterate(problem: Problem[StateT], p: _Progress[StateT], config: SolverConfig) -> tuple[Tensor, Tensor]:
+def _iterate(
+    problem: Problem[StateT], p: _Progress[StateT], config: SolverConfig, limits: Tensor
+) -> tuple[Tensor, Tensor]:
     """One iteration of a batch; which steps were accepted and which of them made the best state."""
     step, solvable = damped_step(p.at_state.hessian, p.at_state.gradient, p.damping)
-    step = limit_step(step, problem.step_limits().to(step))
+    step, size = limited_step(step, limits)
     candidate = problem.retract(p.state, step)
     at_candidate = problem.linearise(candidate)
-    finite = _is_finite(at_candidate)
+    running = p.ended < 0
+    usable = running & solvable
     decrease = p.at_state.cost - at_candidate.cost
-    lower = finite & (decrease >= 0)
-    accepted = p.running & solvable & (finite if config.accept_every_step else lower)
+    takeable = usable & _is_finite(at_candidate)
+    downhill = takeable & (decrease >= 0)
+    accepted = takeable if config.accept_every_step else downhill
     problem.follow(accepted)
     # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.
-    hopeless = ~solvable & ((p.damping == 0) | (p.damping >= config.max_damping))
-    if config.accept_every_step:
-        hopeless = hopeless | (solvable & ~finite)
-    singular = torch.full_like(p.failure, Status.singular.code)
-    broken = torch.where(solvable, torch.full_like(p.failure, Status.non_finite.code), singular)
-    p.failure = torch.where(p.running & hopeless, broken, p.failure)
-    small_step = (step.abs() / problem.step_limits().to(step)).amax(dim=-1) < config.step_tolerance
+    at_limit = p.damping >= config.max_damping
+    p.iterations = p.iterations + running
     small_decrease = decrease <= config.cost_tolerance * p.at_state.cost.abs()
-    settled = accepted & (small_step | (small_decrease & lower))
-    stuck = p.running & solvable & ~accepted & ((p.damping >= config.max_damping) | small_step)
-    p.iterations = p.iterations + p.running.long()
+    if config.accept_every_step:
+        small_decrease = small_decrease & downhill
+    settled = usable & ((size < config.step_tolerance) | torch.where(accepted, small_decrease, at_limit))
+    p.ended = torch.where(settled, Status.converged.code, p.ended)
+    hopeless = running & ~solvable
+    if config.initial_damping > 0:
+        hopeless = hopeless & at_limit
+    p.ended = torch.where(hopeless, Status.singular.code, p.ended)
+    if config.accept_every_step:
+        p.ended = torch.where(usable & ~takeable, Status.non_finite.code, p.ended)
+    improved = _move(p, candidate, at_candidate, accepted, config)
+    return accepted, improved
+
+
+def _move(
+    p: _Progress[StateT], candidate: StateT, at_candidate: Linearisation, accepted: Tensor, config: SolverConfig
+) -> Tensor:
+    """To the candidates where they are accepted; returns where that made the best state."""
     p.state = where_rows(accepted, candidate, p.state)
     p.at_state = where_rows(accepted, at_candidate, p.at_state)
+    if config.initial_damping > 0:
+        smaller = (p.damping * config.damping_decrease).clamp_min(config.min_damping)
+        larger = (p.damping * config.damping_increase).clamp_max(config.max_damping)
+        p.damping = torch.where(accepted, smaller, larger)
+    if not config.accept_every_step:
+        # Nothing uphill is taken: the present state is the best one.
+        p.best_state, p.best_cost = p.state, p.at_state.cost
+        return accepted
     better = accepted & (at_candidate.cost <= p.best_cost)
     p.best_state = where_rows(better, candidate, p.best_state)
     p.best_cost = torch.where(better, at_candidate.cost, p.best_cost)
-    smaller = (p.damping * config.damping_decrease).clamp_min(config.min_damping)
-    larger = (p.damping * config.damping_increase).clamp_max(config.max_damping)
-    adapted = torch.where(accepted, smaller, larger)
-    p.damping = torch.where(p.damping > 0, adapted, p.damping)
-    p.converged = p.converged | settled | stuck
-    p.running = p.running & ~settled & ~stuck & (p.failure < 0)
-    return accepted, better
+    return better
 
 
 def _is_finite(at: Linearisation) -> Tensor:
-    return at.cost.isfinite() & at.gradient.isfinite().all(-1) & at.hessian.isfinite().all(-1).all(-1)
+    return is_finite(at.cost + at.gradient.sum(dim=1) + at.hessian.sum(dim=(1, 2)))
 
 
 def _take(p: _Progress[StateT], index: Tensor) -> _Progress[StateT]:
@@ -246,30 +267,24 @@ def _take(p: _Progress[StateT], index: Tensor) -> _Progress[StateT]:
         p.best_cost[index],
         take_rows(p.at_state, index),
         p.damping[index],
-        p.running[index],
-        p.converged[index],
-        p.failure[index],
+        p.ended[index],
         p.iterations[index],
     )
 
 
 def _scatter(
-    p: _Progress[StateT], rows: Tensor, state: StateT, converged: Tensor, failure: Tensor, iterations: Tensor
-) -> tuple[StateT, Tensor, Tensor, Tensor]:
+    p: _Progress[StateT], rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor
+) -> tuple[StateT, Tensor, Tensor]:
     return (
         put_rows(state, rows, p.best_state),
-        converged.index_copy(0, rows, p.converged),
-        failure.index_copy(0, rows, p.failure),
+        ended.index_copy(0, rows, p.ended),
         iterations.index_copy(0, rows, p.iterations),
     )
 
 
-def _final_status(
-    problem: Problem[StateT], initial: StateT, final: StateT, converged: Tensor, failure: Tensor
-) -> Tensor:
+def _final_status(problem: Problem[StateT], initial: StateT, final: StateT, ended: Tensor) -> Tensor:
     """Compare input and output at the final stage: nothing ends worse than it began."""
     worse = ~(problem.cost(final) <= problem.cost(initial))
-    status = torch.full_like(failure, Status.max_iterations.code)
-    status = torch.where(converged, torch.full_like(status, Status.converged.code), status)
-    status = torch.where(worse, torch.full_like(status, Status.rejected_worse.code), status)
-    return torch.where(failure >= 0, failure, status)
+    unfailed = (ended < 0) | (ended == Status.converged.code)
+    status = torch.where(ended < 0, Status.max_iterations.code, ended)
+    return torch.where(unfailed & worse, Status.rejected_worse.code, status)

@@ -108,8 +108,7 @@ def put_rows(state: StateT, index: Tensor, rows: StateT) -> StateT:
 
 def where_rows(condition: Tensor, a: StateT, b: StateT) -> StateT:
     """Rows of `a` where the condition (B,) holds, else of `b`."""
-
-    def pick(x: Tensor, y: Tensor) -> Tensor:
-        return torch.where(condition.view(-1, *[1] * (x.ndim - 1)), x, y)
-
-    return type(a)(*(pick(x, y) for x, y in zip(a, b, strict=True)))
+    conditions = [condition]
+    for _ in range(max(x.ndim for x in a) - 1):
+        conditions.append(conditions[-1][..., None])
+    return type(a)(*(torch.where(conditions[x.ndim - 1], x, y) for x, y in zip(a, b, strict=True)))
