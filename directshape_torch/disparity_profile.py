@@ -190,7 +190,7 @@ def _thinned(counts: Tensor, num_rows: int, max_pixels: int) -> tuple[Tensor, Te
     step = place * stride[:, None]
     first = torch.cumsum(counts, 0) - counts
     # An empty place repeats some row, which is not counted.
-    return (first[:, None] + step).clamp_max(num_rows - 1), (step < counts[:, None]) & (stride > 0)[:, None]
+    return (first[:, None] + step).clamp_max(num_rows - 1), step < counts[:, None]
 
 
 def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:

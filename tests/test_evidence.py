@@ -86,6 +86,20 @@ def test_expectations_agree_with_sampling() -> None:
     torch.testing.assert_close(gain[0], (at_input - at_output).mean(), rtol=2e-2, atol=0)
 
 
+def test_sigmas_are_along_and_across_the_viewing_ray() -> None:
+    """Half a metre along the ray, 2 cm across it and 0.1 rad, of cars to the left and right of the axis."""
+    _, course = course_at_truth()
+    location = se3.inverse(course.after.T_obj_cam)[:, :3, 3]
+    x, z = (location[:, [0, 2]] / location[:, [0, 2]].norm(dim=1, keepdim=True)).unbind(1)
+    assert (x.abs() > 0.05).all()
+    zero = torch.zeros_like(x)
+    axes = [[0.5 * x, zero, 0.5 * z, zero], [0.02 * z, zero, -0.02 * x, zero], [zero, zero, zero, zero + 0.1]]
+    J = torch.stack([torch.stack(row, dim=1) for row in axes], dim=2)
+    found = columns(replace(course, covariance_xyz_yaw=J @ J.mT))
+    for name, sigma in (("log_sigma_depth", 0.5), ("log_sigma_side", 0.02), ("log_sigma_yaw", 0.1)):
+        torch.testing.assert_close(found[name], torch.full((2,), math.log(sigma)).double(), rtol=1e-9, atol=1e-9)
+
+
 def test_conflict_is_what_photometry_alone_would_gain() -> None:
     """With a unit matrix and a pull of length 0.2 at a cost of 1: log(1 + 100 * 0.02)."""
     problem, course = course_at_truth()
