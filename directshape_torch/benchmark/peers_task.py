@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.benchmark.peers_energy import CarEnergy
+from directshape_torch.compilation import compiling
 from directshape_torch.config import SolverConfig
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
@@ -113,7 +114,7 @@ class OwnSolver:
         starts: Sequence[CarState] | None = None,
         max_iterations: Sequence[int] | None = None,
     ) -> None:
-        self.solver = refiner.config.solver
+        self.solver, self.compile = refiner.config.solver, refiner.config.compile
         self.problems: list[CarProblem] = []
         for number, stage in enumerate(refiner.config.stages):
             if max_iterations is not None:
@@ -129,9 +130,10 @@ class OwnSolver:
     def minima(self) -> list[Minimum[CarState]]:
         """Of the stages."""
         minima: list[Minimum[CarState]] = []
-        for number, problem in enumerate(self.problems):
-            start = self.starts[number] if number < len(self.starts) else minima[-1].state
-            minima.append(minimise(problem, start, self.solver))
+        with compiling(self.compile, num_cars=len(self.starts[0].code)):
+            for number, problem in enumerate(self.problems):
+                start = self.starts[number] if number < len(self.starts) else minima[-1].state
+                minima.append(minimise(problem, start, self.solver))
         return minima
 
     @property

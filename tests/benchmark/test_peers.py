@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -12,9 +14,10 @@ from helpers.peer_stages import street_solver
 from helpers.problems import DEFAULT
 from helpers.synthetic_scene import cached_street, disturbed
 
+from directshape_torch.benchmark import peers_task
 from directshape_torch.benchmark.peers import PeerCase, missing_libraries, timed_sides
 from directshape_torch.benchmark.peers_rows import Figures, cost_rows, ratio_rows, time_row
-from directshape_torch.benchmark.peers_task import StageRun, Trace, iterations_to, stage_tasks
+from directshape_torch.benchmark.peers_task import OwnSolver, StageRun, Trace, iterations_to, stage_tasks
 from directshape_torch.benchmark.rows import Goal
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import Repetitions
@@ -28,6 +31,20 @@ def test_stages_follow_one_another_as_in_a_refinement() -> None:
 
     assert [task.max_iterations for task in tasks] == [6, 8]
     torch.testing.assert_close(tasks[-1].target_cost, whole.cost_after.sum(dim=1).to(torch.float64), rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("mode", ["on", "off"])
+def test_our_solver_runs_in_the_mode_it_is_told(mode: Literal["on", "off"], monkeypatch: pytest.MonkeyPatch) -> None:
+    regions: list[tuple[str, int]] = []
+
+    def recorded(mode: str, num_cars: int) -> nullcontext[None]:
+        regions.append((mode, num_cars))
+        return nullcontext()
+
+    monkeypatch.setattr(peers_task, "compiling", recorded)
+    prior, scene = cached_street()
+    OwnSolver(DirectShapeRefiner(prior, replace(DEFAULT, compile=mode)), scene.frames, scene.detections).run()
+    assert regions == [(mode, 2)]
 
 
 def test_iterations_until_near_lead_near() -> None:
