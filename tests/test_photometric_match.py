@@ -9,10 +9,12 @@ import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import CONFIGS, begun_problem
 from helpers.synthetic_scene import cached_street, disturbed
+from torch import Tensor
 
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.observation.occlusion import OcclusionCrops
 from directshape_torch.photometric_match import agreement, matching_costs, seen_surface, stage_pixels
 from directshape_torch.residuals.photometric import DSO_PATTERN
 
@@ -56,6 +58,26 @@ def test_agreement_is_the_mean_over_the_usable_pixels_car_by_car() -> None:
             torch.testing.assert_close(error[car], expected, rtol=1e-9, atol=0)
             usable = rows.usable[mine][:: len(DSO_PATTERN)].double().mean()
             torch.testing.assert_close(share[car], usable, rtol=1e-12, atol=0)
+
+
+def test_pixels_that_are_hidden_in_the_right_image_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Right of the middle column something stands in front of everything."""
+    problem, term, state = begun("default")
+    assert term.hidden_right is not None
+    projected, rows = problem.project(state), torch.arange(len(stage_pixels(term).pixel_index))
+    seen, offset = seen_surface(term, projected, rows), torch.zeros(1, dtype=torch.float64)
+    free, (_, share_free) = matching_costs(term, rows, seen, offset)[0], agreement(term, projected)
+
+    def right_half(_: OcclusionCrops, object_index: Tensor, uv: Tensor) -> Tensor:
+        assert torch.equal(object_index, term.cars.detection_row[stage_pixels(term).object_index])
+        return uv[..., 0] > 80
+
+    monkeypatch.setattr(OcclusionCrops, "at", right_half)
+    found, (_, share) = matching_costs(term, rows, seen, offset)[0], agreement(term, projected)
+    expected = term.pixel_cost(projected).detach()
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    assert not torch.allclose(found, free)
+    assert (share < share_free).any()
 
 
 def test_a_car_without_pixels_agrees_with_nothing() -> None:
