@@ -84,7 +84,7 @@ def gradient_tiles(
 def _medians(magnitude: Tensor, last_row: Tensor, last_column: Tensor) -> Tensor:
     """Median (C,) of each cell (C, side, side), of its pixels inside the frame: up to its last row and column there."""
     step = torch.arange(magnitude.shape[1], device=magnitude.device)
-    outside = magnitude.new_tensor(torch.inf)
+    outside = magnitude.new_full((), torch.inf)
     rows = torch.where(step > last_row[:, None], outside, 0)
     columns = torch.where(step > last_column[:, None], outside, 0)
     return lower_medians((magnitude + (rows[:, :, None] + columns[:, None, :])).flatten(1))

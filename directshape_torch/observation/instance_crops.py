@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -63,7 +64,9 @@ def instance_crops(
     widths = crops[:, 2] - crops[:, 0]
     areas = widths * (crops[:, 3] - crops[:, 1])
     start = areas.cumsum(0) - areas
-    most, num_pixels = torch.stack([_largest(rank), areas.sum()]).tolist()
+    box_areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    pixels_up_to = [box_areas[:end].sum() for end in accumulate(len(stack) for stack in masks)]
+    most, num_pixels, *ends = torch.stack([_largest(rank), areas.sum(), *pixels_up_to]).tolist()
     num_words = most // _BITS_OF_A_WORD + 1
     word, bit = torch.div(rank, _BITS_OF_A_WORD, rounding_mode="floor"), there.long() << (rank % _BITS_OF_A_WORD)
     bits = torch.where(word[:, None] == torch.arange(num_words, device=boxes.device), bit[:, None], 0)
@@ -74,7 +77,7 @@ def instance_crops(
     run_start = corner.index_select(0, run_frame) + pixels.run_v * widths.index_select(0, run_frame)
     entry = (pixels.of_runs(run_start) + pixels.u) * num_words + pixels.of_runs(word.index_select(0, pixels.run_object))
     # Every instance has a bit of its own, so adding is setting it.
-    value = pixels.of_runs(bit.index_select(0, pixels.run_object)) * _covers(masks, pixels)
+    value = pixels.of_runs(bit.index_select(0, pixels.run_object)) * _covers(masks, pixels, ends)
     covering = torch.zeros(max(num_pixels, 1) * num_words, dtype=torch.long, device=boxes.device)
     return InstanceCrops(crops, start, covering.index_add_(0, entry, value).view(-1, num_words), bits)
 
@@ -103,19 +106,13 @@ def _boxes_around(boxes: Tensor, there: Tensor, frame_index: Tensor, num_frames:
     return torch.cat([torch.where(high > 0, low, 0), high], dim=1)
 
 
-def _covers(masks: Sequence[Tensor], pixels: RegionPixels) -> Tensor:
-    """Whether each pixel (A,) is covered by the mask whose box it lies in."""
-    masks = [stack.detach() for stack in masks if len(stack)] or list(masks[:1])
+def _covers(masks: Sequence[Tensor], pixels: RegionPixels, ends: Sequence[int]) -> Tensor:
+    """Whether each pixel (A,) is covered by the mask whose box it lies in; those of each stack end at `ends`."""
     height, width = masks[0].shape[1:]
     line = (pixels.run_object * height + pixels.run_v) * width
-    if len(masks) == 1:
-        return masks[0].flatten().index_select(0, pixels.of_runs(line) + pixels.u) > MASK_THRESHOLD
-    # Objects ascend, so the pixels of each stack are neighbours.
-    objects = torch.tensor([len(stack) for stack in masks], device=line.device).cumsum(0)
-    ends = torch.searchsorted(pixels.run, torch.searchsorted(pixels.run_object, objects).int()).tolist()
     parts, begin, first = [], 0, 0
     for stack, end in zip(masks, ends, strict=True):
         pixel = (line - first * height * width).index_select(0, pixels.run[begin:end]) + pixels.u[begin:end]
-        parts.append(stack.flatten().index_select(0, pixel) > MASK_THRESHOLD)
+        parts.append(stack.detach().flatten().index_select(0, pixel) > MASK_THRESHOLD)
         begin, first = end, first + len(stack)
     return torch.cat(parts)
