@@ -89,7 +89,11 @@ RULES = (
     Rule(_OUTCOME, _ANY, "outcome", encloses=True),
     Rule(r"refiner|admission|result|status|backward|checks|config.*|scene", _ANY, "bookkeeping"),
     Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms)", _ANY, "bookkeeping"),
-    Rule(r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)|compil.*|device_constants", _ANY, None),
+    Rule(
+        r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)|compil.*|device_constants|car_rows",
+        _ANY,
+        None,
+    ),
 )
 
 
