@@ -71,7 +71,7 @@ def run_peers_suite(settings: SuiteSettings) -> SuiteResult:
     names = (*own, *(name + _NEAR for name in own), _AUTOGRAD, *peers)
     figures = {name: Figures(name, _GOALS.get(name)) for name in names}
     notes = [f"{scene.name}, frames {', '.join(loaded.frame_id for loaded in scene.frames)}"]
-    notes += [f"{name}: not measured: {reason}" for name, reason in missing.items()]
+    notes += notes_on_missing(missing)
     notes += [f"{name}: {limits}" for name, limits in _LIMITS.items() if name in peers]
     documented: list[Row] = []
     for loaded in scene.frames:
@@ -91,8 +91,14 @@ def missing_libraries() -> dict[str, str]:
         try:
             _library(module)
         except ImportError as error:
-            missing[name] = f"{type(error).__name__}: {error}; {_CURE}"
+            missing[name] = f"{type(error).__name__}: {error}"
     return missing
+
+
+def notes_on_missing(missing: Mapping[str, str]) -> list[str]:
+    """What was not measured, why, and what to do about it."""
+    notes = [f"{name}: not measured: {reason}" for name, reason in missing.items()]
+    return [*notes, f"to measure all: {_CURE}"] if missing else []
 
 
 @dataclass

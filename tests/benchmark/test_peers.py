@@ -15,7 +15,7 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.benchmark import peers_task
-from directshape_torch.benchmark.peers import PeerCase, missing_libraries, timed_sides
+from directshape_torch.benchmark.peers import PeerCase, missing_libraries, notes_on_missing, timed_sides
 from directshape_torch.benchmark.peers_rows import Figures, cost_rows, ratio_rows, time_row
 from directshape_torch.benchmark.peers_task import OwnSolver, StageRun, Trace, iterations_to, stage_tasks
 from directshape_torch.benchmark.rows import Goal
@@ -132,8 +132,13 @@ def test_a_missing_library_is_named_with_the_error_and_the_cure(monkeypatch: pyt
         monkeypatch.setitem(sys.modules, library, None)
         monkeypatch.delitem(sys.modules, f"directshape_torch.benchmark.peers_{library}", raising=False)
     missing = missing_libraries()
+    notes = notes_on_missing(missing)
 
     assert set(missing) == {"PyPose", "Theseus", "Theseus, its own differentiation"}
     assert "pypose" in missing["PyPose"]
-    assert "ModuleNotFoundError" in missing["Theseus"]
-    assert "pip install --no-build-isolation --no-deps theseus-ai" in missing["Theseus"]
+    assert notes[1].startswith("Theseus: not measured: ModuleNotFoundError")
+    assert "pip install --no-build-isolation --no-deps theseus-ai" in notes[-1]
+
+
+def test_nothing_is_said_where_nothing_is_missing() -> None:
+    assert notes_on_missing({}) == []
