@@ -37,20 +37,15 @@ class GradientTiles:
         """Where the pixels (A,) of regions lie among all magnitudes, and their thresholds.
 
         Args:
-            pixels: of B regions.
+            pixels: of B regions, in runs that stay within a cell.
             frame_index: (B,) numbered through the stacks.
         """
         side, (_, rows, columns) = self.side_px, self.first.shape
-        run_row = torch.div(pixels.run_v, side, rounding_mode="floor")
-        run_cell = (frame_index.index_select(0, pixels.run_object) * rows + run_row) * columns
-        run_offset = (pixels.run_v - run_row * side) * side
-        position = torch.arange(columns * side, device=frame_index.device, dtype=pixels.u.dtype)
-        column = torch.div(position, side, rounding_mode="floor")
-        cell = pixels.of_runs(run_cell.to(pixels.u.dtype)) + column.index_select(0, pixels.u)
-        entry = self.first.flatten().index_select(0, cell)
-        entry += pixels.of_runs(run_offset.to(pixels.u.dtype))
-        entry += (position - column * side).index_select(0, pixels.u)
-        return entry, self.thresholds.flatten().index_select(0, cell)
+        row = torch.div(pixels.run_v, side, rounding_mode="floor")
+        column = torch.div(pixels.run_u, side, rounding_mode="floor")
+        cell = (frame_index[pixels.run_object] * rows + row) * columns + column
+        first = self.first.flatten()[cell] + (pixels.run_v - row * side) * side + pixels.run_u - column * side
+        return pixels.rising(first.int()), pixels.of_runs(self.thresholds.flatten()[cell])
 
 
 def gradient_tiles(

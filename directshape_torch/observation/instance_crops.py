@@ -75,7 +75,9 @@ def instance_crops(
     corner = start - crops[:, 1] * widths - crops[:, 0]
     run_frame = frame_index.index_select(0, pixels.run_object)
     run_start = corner.index_select(0, run_frame) + pixels.run_v * widths.index_select(0, run_frame)
-    entry = (pixels.of_runs(run_start) + pixels.u) * num_words + pixels.of_runs(word.index_select(0, pixels.run_object))
+    entry = pixels.rising(run_start + pixels.run_u)
+    if num_words > 1:
+        entry = entry * num_words + pixels.of_runs(word.index_select(0, pixels.run_object))
     # Every instance has a bit of its own, so adding is setting it.
     value = pixels.of_runs(bit.index_select(0, pixels.run_object)) * _covers(masks, pixels, ends)
     covering = torch.zeros(max(num_pixels, 1) * num_words, dtype=torch.long, device=boxes.device)
@@ -109,10 +111,10 @@ def _boxes_around(boxes: Tensor, there: Tensor, frame_index: Tensor, num_frames:
 def _covers(masks: Sequence[Tensor], pixels: RegionPixels, ends: Sequence[int]) -> Tensor:
     """Whether each pixel (A,) is covered by the mask whose box it lies in; those of each stack end at `ends`."""
     height, width = masks[0].shape[1:]
-    line = (pixels.run_object * height + pixels.run_v) * width
+    pixel = pixels.rising((pixels.run_object * height + pixels.run_v) * width + pixels.run_u)
     parts, begin, first = [], 0, 0
     for stack, end in zip(masks, ends, strict=True):
-        pixel = (line - first * height * width).index_select(0, pixels.run[begin:end]) + pixels.u[begin:end]
-        parts.append(stack.detach().flatten().index_select(0, pixel) > MASK_THRESHOLD)
+        of_stack = pixel[begin:end] - first * height * width
+        parts.append(stack.detach().flatten().index_select(0, of_stack) > MASK_THRESHOLD)
         begin, first = end, first + len(stack)
     return torch.cat(parts)

@@ -181,15 +181,13 @@ def _chosen_pixels(
     settings = sampling_settings(config)
     frame = torch.cat([detections.frame_index, detections.frame_index + len(frames)])
     tiles = gradient_tiles((frames.images_left, frames.images_right), frames.sizes, regions, frame, settings)
-    pixels = RegionPixels.of(regions)
+    pixels = RegionPixels.of(regions, settings.threshold_cell_px)
     entry, threshold = tiles.entries_and_thresholds(pixels, frame)
     magnitudes = tiles.magnitude.flatten()
     magnitude = magnitudes.detach().index_select(0, entry)
     above = magnitude.float() > threshold.float()
     index, exists = candidate_pixels(pixels, regions, magnitude, above, settings)
-    run = pixels.run.index_select(0, index)
-    object_index = pixels.run_object.index_select(0, run)
-    uv = torch.stack([pixels.u.index_select(0, index).long(), pixels.run_v.index_select(0, run)], dim=-1)
+    object_index, uv = pixels.uv_of(index)
     if hidden is not None:
         exists = exists & ~hidden.at(object_index, uv)
     kept = exists.nonzero()[:, 0]

@@ -106,7 +106,7 @@ def sample_pixels(
     """
     _check_sampling(magnitude, thresholds, regions, frame_index)
     pixels = RegionPixels.of(regions)
-    frame, u, v = frame_index[pixels.object_index], pixels.u.long(), pixels.v
+    frame, u, v = frame_index[pixels.object_index], pixels.u, pixels.v
     strength = magnitude[frame, v, u]
     above = strength.detach().float() > thresholds.float()[
         frame, torch.div(v, settings.threshold_cell_px, rounding_mode="floor"),
@@ -204,9 +204,8 @@ def _small_cells(
     of = pixels.run_object
     run_cell = start[of] + ((pixels.run_v - regions[of, 1]) / side[of]).floor().long() * columns[of]
     column_cell = (torch.arange(longest, device=regions.device) / side[:, None]).floor().long().flatten()
-    run_first = (of * longest - regions[of, 0]).to(pixels.u.dtype)
-    column = column_cell.index_select(0, pixels.of_runs(run_first) + pixels.u)
-    return pixels.of_runs(run_cell) + column, total
+    column = column_cell.index_select(0, pixels.rising((of * longest - regions[of, 0] + pixels.run_u).int()))
+    return column.add_(pixels.of_runs(run_cell)), total
 
 
 def _closeness_to_cell_centre(

@@ -66,53 +66,84 @@ def region_boxes(
 
 @dataclass(frozen=True)
 class RegionPixels:
-    """All A pixels of B regions, object by object, row-major: R runs of pixels, one for each row of a region.
+    """All A pixels of B regions, object by object, row-major: R runs of neighbouring pixels within a row.
 
     Attributes:
-        run_object, run_v: (R,) object and row of each run.
-        run, u: (A,) int32, for speed: the run of each pixel, and its column.
+        run_object, run_v, run_u: (R,) object of each run, its row and its first column.
+        run_start: (R,) number of its first pixel.
+        run: (A,) int32, for speed: the run of each pixel.
     """
 
     run_object: Tensor
     run_v: Tensor
+    run_u: Tensor
+    run_start: Tensor
     run: Tensor
-    u: Tensor
 
     def __len__(self) -> int:
-        return len(self.u)
+        return len(self.run)
 
     def of_runs(self, values: Tensor) -> Tensor:
         """Values (R,) of the runs as values (A,) of their pixels."""
         return values.index_select(0, self.run)
 
+    def rising(self, first: Tensor) -> Tensor:
+        """Integers (A,) that begin with `first` (R,) in each run and rise by one a pixel."""
+        number = torch.arange(len(self), dtype=torch.int32, device=first.device)
+        return self.of_runs(first - self.run_start.to(first.dtype)).add_(number)
+
     @property
     def object_index(self) -> Tensor:
-        """(A,) int64."""
+        """(A,)"""
         return self.of_runs(self.run_object)
 
     @property
+    def u(self) -> Tensor:
+        """(A,)"""
+        return self.rising(self.run_u)
+
+    @property
     def v(self) -> Tensor:
-        """(A,) int64."""
+        """(A,)"""
         return self.of_runs(self.run_v)
+
+    def uv_of(self, pixel: Tensor) -> tuple[Tensor, Tensor]:
+        """Object (P,) and uv (P, 2) of some of the pixels, by their numbers (P,)."""
+        run = self.run.index_select(0, pixel)
+        u = (self.run_u - self.run_start).index_select(0, run) + pixel
+        return self.run_object.index_select(0, run), torch.stack([u, self.run_v.index_select(0, run)], dim=-1)
 
     @classmethod
     def of(
         cls,
         regions: Tensor,  # (B, 4)
+        cell_px: int | None = None,
     ) -> RegionPixels:
-        """The pixels of half-open regions (u0, v0, u1, v1), with one host synchronisation."""
+        """The pixels of half-open regions (u0, v0, u1, v1), with one host synchronisation.
+
+        Args:
+            regions: (B, 4) integer.
+            cell_px: side of cells; no run crosses the border of a cell. None: a run is a whole row of its region.
+        """
         u0, v0, u1, v1 = regions.unbind(dim=1)
         widths, heights = u1 - u0, v1 - v0
-        num_runs, num_pixels = torch.stack([heights.sum(), (widths * heights).sum()]).tolist()
+        # Cells of a row, the first one and their number; without cells one of any width.
+        side = cell_px or 2**31
+        first_cell = torch.div(u0, side, rounding_mode="floor")
+        cells = torch.div(u1 - 1, side, rounding_mode="floor") - first_cell + 1
+        cells = torch.where(widths > 0, cells, 0)
+        num_runs, num_pixels = torch.stack([(cells * heights).sum(), (widths * heights).sum()]).tolist()
         number = torch.arange(len(regions), device=regions.device)
-        run_object = number.repeat_interleave(heights, output_size=num_runs)
+        run_object = number.repeat_interleave(cells * heights, output_size=num_runs)
         run_number = torch.arange(num_runs, device=regions.device)
-        run_v = run_number - (heights.cumsum(0) - heights - v0).index_select(0, run_object)
-        run_width = widths.index_select(0, run_object)
-        run = run_number.int().repeat_interleave(run_width, output_size=num_pixels)
-        before = run_width.cumsum(0) - run_width - u0.index_select(0, run_object)
-        u = torch.arange(num_pixels, dtype=torch.int32, device=regions.device) - before.int().index_select(0, run)
-        return cls(run_object, run_v, run, u)
+        in_region = run_number - ((cells * heights).cumsum(0) - cells * heights)[run_object]
+        cells = cells[run_object]
+        row = torch.div(in_region, cells, rounding_mode="floor")
+        left = (first_cell[run_object] + in_region - row * cells) * side
+        run_u = torch.maximum(left, u0[run_object])
+        length = torch.minimum(left + side, u1[run_object]) - run_u
+        run = run_number.int().repeat_interleave(length, output_size=num_pixels)
+        return cls(run_object, row + v0[run_object], run_u, length.cumsum(0) - length, run)
 
 
 def region_pixels(
@@ -132,4 +163,4 @@ def region_pixels(
         ([0, 0, 1, 1], [[5, 2], [6, 2], [0, 0], [0, 1]])
     """
     pixels = RegionPixels.of(regions)
-    return pixels.object_index, torch.stack([pixels.u.long(), pixels.v], dim=-1)
+    return pixels.object_index, torch.stack([pixels.u, pixels.v], dim=-1)
