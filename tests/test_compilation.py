@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
-from collections.abc import Iterator
+import types
 from pathlib import Path
 
 import pytest
@@ -45,18 +45,17 @@ def _inputs(num_points: int, num_cars: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.fixture(autouse=True)
-def _fresh_process(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No memory of other tests: neither of cars, nor of a compiler that failed, nor of compiled code."""
+def _fresh_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No memory of other tests: neither of cars nor of a compiler that failed."""
     monkeypatch.setattr(compilation, "_process", compilation._Process(threading.RLock()))
-    torch.compiler.reset()
     counters.clear()
-    yield
-    torch.compiler.reset()
 
 
 @pytest.fixture
 def nearest() -> Compilable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
-    return compilable(sizes=SIZES)(_nearest)
+    # Compiled code hangs on the code object, so each test has one of its own.
+    function = types.FunctionType(_nearest.__code__.replace(), _nearest.__globals__, "_nearest")
+    return compilable(sizes=SIZES)(function)
 
 
 def _no_disk(monkeypatch: pytest.MonkeyPatch, on_disk: bool = False) -> None:
