@@ -138,7 +138,7 @@ class StackedPriors:
         rows = torch.bmm(self.pose_rows, features).view(len(features), self.num_pose_rows, NUM_COLUMNS)
         squares = torch.bmm(rows.mT, rows)
         by_twist = squares[:, :RESIDUAL]
-        code = torch.cat([state.code.to(torch.float64)[..., None], self.one], dim=1)
+        code = torch.cat([state.code.to(torch.float64).unsqueeze(2), self.one], dim=1)
         slopes = torch.bmm(self.code_form, code)
         cost = 0.5 * (squares[:, RESIDUAL, RESIDUAL] + (slopes * code).sum(dim=(1, 2)))
         gradient = torch.cat([by_twist[:, :, RESIDUAL], slopes[:, :-1, 0]], dim=1)

@@ -53,16 +53,23 @@ def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | 
 
 def _exp_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`sin(a)/a`, `(1 - cos a)/a^2` and `(a - sin a)/a^3` as smooth functions of `a^2`."""
+    b, c = _higher_exp_coefficients(angle_squared)
+    return 1 - angle_squared * c, b, c
+
+
+def _higher_exp_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor]:
+    """The last two of `_exp_coefficients`."""
     t = angle_squared
     small = t < _SMALL_ANGLE_SQUARED
-    safe = torch.where(small, 1.0, t)
+    safe = t.clamp_min(_SMALL_ANGLE_SQUARED)
     angle = safe.sqrt()
     half = torch.sin(0.5 * angle)
-    b_series = 1 / 2 - t * (1 / 24 - t * (1 / 720 - t * (1 / 40320 - t / 3628800)))
-    c_series = 1 / 6 - t * (1 / 120 - t * (1 / 5040 - t * (1 / 362880 - t / 39916800)))
+    s = -t
+    b_series = (((s / 3628800 + 1 / 40320) * s + 1 / 720) * s + 1 / 24) * s + 1 / 2
+    c_series = (((s / 39916800 + 1 / 362880) * s + 1 / 5040) * s + 1 / 120) * s + 1 / 6
     b = torch.where(small, b_series, 2 * half * half / safe)
     c = torch.where(small, c_series, (angle - torch.sin(angle)) / (safe * angle))
-    return 1 - t * c, b, c
+    return b, c
 
 
 def exp(twist: Tensor) -> Tensor:
@@ -79,14 +86,14 @@ def exp(twist: Tensor) -> Tensor:
         tensor([1., 2., 3.])
     """
     v_x, v_y, v_z, x, y, z = twist.reshape(-1, 6).unbind(-1)
-    _, b, c = _exp_coefficients(x * x + y * y + z * z)
+    b, c = _higher_exp_coefficients(x * x + y * y + z * z)
     zero = torch.zeros_like(x)
     rows = (zero, -z, y, v_x, z, zero, -x, v_y, -y, x, zero, v_z, zero, zero, zero, zero)
     X = torch.stack(rows, dim=-1).view(-1, 4, 4)
     X2 = torch.bmm(X, X)
     # X^4 = -angle^2 X^2, hence the power series of the 4 x 4 matrix ends with its third power.
     identity = torch.eye(4, dtype=twist.dtype, device=twist.device)
-    T = torch.addcmul(identity + X, b[:, None, None], X2).addcmul(c[:, None, None], torch.bmm(X2, X))
+    T = torch.addcmul(identity + X, b.view(-1, 1, 1), X2).addcmul(c.view(-1, 1, 1), torch.bmm(X2, X))
     return T.view(*twist.shape[:-1], 4, 4)
 
 

@@ -38,25 +38,26 @@ def damped_step(
     # scaled to 1 has the damping itself on its diagonal.
     scale = floored.rsqrt()
     identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-    scaled = torch.addcmul(hessian * scale[:, :, None] * scale[:, None], damping[:, None, None], identity)
+    scaled = torch.addcmul(hessian * scale.unsqueeze(2) * scale.unsqueeze(1), damping.view(-1, 1, 1), identity)
     factor, info = torch.linalg.cholesky_ex(scaled)
     # Whatever is not finite makes the factor so, or ends it early: a comparison with NaN is false.
     regular = (factor.diagonal(dim1=1, dim2=2).amin(dim=1) > _SMALLEST_PIVOT) & (info == 0)
     # Solved all the same where there is no factor, for a batch has no branches, and then thrown away.
-    factor = torch.where(regular[:, None, None], factor, identity)
-    step = scale * torch.cholesky_solve((scale * -gradient)[..., None], factor)[..., 0]
+    factor = torch.where(regular.view(-1, 1, 1), factor, identity)
+    step = scale * torch.cholesky_solve((scale * -gradient).unsqueeze(2), factor).squeeze(2)
     solvable = regular & is_finite(step.sum(dim=1))
-    return torch.where(solvable[:, None], step, 0.0), solvable
+    return torch.where(solvable.unsqueeze(1), step, 0.0), solvable
 
 
 def is_finite(sums: Tensor) -> Tensor:
-    """Where sums are finite, and with them everything that was added: two operations, `isfinite` is four.
+    """Where sums are finite, and with them everything that was added: two small operations, `isfinite` is four.
 
     Example:
         >>> is_finite(torch.tensor([1.0, torch.inf, torch.nan]))
         tensor([ True, False, False])
     """
-    return (sums - sums) == 0
+    zeros = sums - sums
+    return torch.eq(zeros, zeros)
 
 
 def limit_step(
@@ -80,4 +81,4 @@ def limited_step(step: Tensor, limits: Tensor) -> tuple[Tensor, Tensor]:
         tensor([0.2000])
     """
     size = (step.abs() / limits).amax(dim=1)
-    return step / size.clamp_min(1)[:, None], size.clamp_max(1)
+    return step / size.clamp_min(1).unsqueeze(1), size.clamp_max(1)

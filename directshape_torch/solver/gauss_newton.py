@@ -215,7 +215,7 @@ def _iterate(
     usable = running & solvable
     decrease = p.at_state.cost - at_candidate.cost
     takeable = usable & _is_finite(at_candidate)
-    downhill = takeable & (decrease >= 0)
+    downhill = takeable & (at_candidate.cost <= p.at_state.cost)
     accepted = takeable if config.accept_every_step else downhill
     problem.follow(accepted)
     # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.

@@ -110,5 +110,5 @@ def where_rows(condition: Tensor, a: StateT, b: StateT) -> StateT:
     """Rows of `a` where the condition (B,) holds, else of `b`."""
     conditions = [condition]
     for _ in range(max(x.ndim for x in a) - 1):
-        conditions.append(conditions[-1][..., None])
+        conditions.append(conditions[-1].unsqueeze(-1))
     return type(a)(*(torch.where(conditions[x.ndim - 1], x, y) for x, y in zip(a, b, strict=True)))
