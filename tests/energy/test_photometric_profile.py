@@ -12,7 +12,8 @@ from helpers.problems import CONFIGS, begun_problem
 from helpers.synthetic_scene import Street, cached_street, disturbed, joined_detections, joined_frames, street
 from torch import Tensor
 
-from directshape_torch.energy import photometric_term
+from directshape_torch import photometric_match
+from directshape_torch.disparity_profile import disparity_profile
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
@@ -27,6 +28,11 @@ def photometric_of(problem: CarProblem) -> PhotometricTerm:
     return next(term for term in problem.terms if isinstance(term, PhotometricTerm))
 
 
+def curve(problem: CarProblem, state: CarState, offsets_px: Tensor) -> Tensor:
+    """Costs (B, n) of all pixels."""
+    return disparity_profile(problem, state, state, offsets_px, max_pixels=10**6).cost_after
+
+
 def begun(frames: FrameBatch, detections: Detections, config: str = "default") -> tuple[CarProblem, CarState]:
     return begun_problem(ellipsoid_prior(), frames, detections, CONFIGS[config])
 
@@ -39,9 +45,9 @@ def two_cars() -> Street:
 @pytest.mark.parametrize("config", ["default", "truncated", "paper", "normalised"])
 def test_at_no_offset_it_is_the_cost(config: str) -> None:
     problem, state = begun(two_cars().frames, disturbed(two_cars().detections), config)
-    projected, term = problem.project(state), photometric_of(problem)
-    found = term.profile(projected, torch.zeros(1))
-    torch.testing.assert_close(found[:, 0], term.cost(projected).detach(), rtol=1e-10, atol=0)
+    found = curve(problem, state, torch.zeros(1))
+    expected = photometric_of(problem).cost(problem.project(state)).detach()
+    torch.testing.assert_close(found[:, 0], expected, rtol=1e-10, atol=0)
 
 
 def _residual_inputs(level_scale: float, bias: bool) -> tuple[list[Tensor | float | int | None], Tensor]:
@@ -92,19 +98,18 @@ def test_the_batch_is_the_loop_and_padding_changes_nothing() -> None:
     frames = joined_frames([first.frames, second.frames])
     detections = joined_detections([first.detections, second.detections], (120, 160))
     problem, state = begun(frames, detections)
-    together = photometric_of(problem).profile(problem.project(state), OFFSETS)
+    together = curve(problem, state, OFFSETS)
     for scene, rows in ((first, slice(0, 2)), (second, slice(2, 3))):
         problem, state = begun(scene.frames, scene.detections)
-        alone = photometric_of(problem).profile(problem.project(state), OFFSETS)
+        alone = curve(problem, state, OFFSETS)
         torch.testing.assert_close(together[rows], alone, rtol=1e-9, atol=1e-9)
 
 
 def test_a_few_offsets_at_a_time_are_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     problem, state = begun(two_cars().frames, two_cars().detections)
-    projected, term = problem.project(state), photometric_of(problem)
-    together = term.profile(projected, OFFSETS)
-    monkeypatch.setattr(photometric_term, "_PROFILE_RESIDUALS", 1)
-    assert torch.equal(together, term.profile(projected, OFFSETS))
+    together = curve(problem, state, OFFSETS)
+    monkeypatch.setattr(photometric_match, "_RESIDUALS_AT_ONCE", 1)
+    assert torch.equal(together, curve(problem, state, OFFSETS))
 
 
 def test_a_car_without_pixels_has_no_cost_and_touches_no_other() -> None:
@@ -112,7 +117,7 @@ def test_a_car_without_pixels_has_no_cost_and_touches_no_other() -> None:
     masks = scene.detections.mask_left.clone()
     masks[0] = 0
     problem, state = begun(scene.frames, replace(scene.detections, mask_left=masks))
-    found = photometric_of(problem).profile(problem.project(state), OFFSETS)
+    found = curve(problem, state, OFFSETS)
     assert found[0].isnan().all()
     assert found[1].isfinite().all()
 
@@ -122,4 +127,4 @@ def test_no_cars() -> None:
     problem, state = begun(scene.frames, scene.detections)
     none = problem.compact(torch.zeros(2, dtype=torch.bool))
     empty = CarState(*(part[:0] for part in state))
-    assert photometric_of(none).profile(none.project(empty), OFFSETS).shape == (0, 13)
+    assert curve(none, empty, OFFSETS).shape == (0, 13)
