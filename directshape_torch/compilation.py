@@ -28,7 +28,6 @@ from directshape_torch.compiler_inputs import (
     is_unusual_call,
     normal,
     outside_inference_mode,
-    shape_settings,
 )
 from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk
 from directshape_torch.errors import CompilationError
@@ -251,10 +250,8 @@ class Compilable(Generic[_P, _R]):
             for dim in varying:
                 torch._dynamo.mark_dynamic(value, dim)
         _logger.info("compiling %s", self.plain.__qualname__)
-        # Two sizes that are equal by accident in this call must not have to be equal in the next one.
         with (
             warnings.catch_warnings(),
-            shape_settings().patch(use_duck_shape=False),
             torch._dynamo.config.patch(recompile_limit=_MAX_VARIANTS),
         ):
             warnings.simplefilter("ignore")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import types
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -48,8 +46,3 @@ def outside_inference_mode() -> Iterator[None]:
         return
     with torch.inference_mode(False), torch.no_grad():
         yield
-
-
-def shape_settings() -> types.ModuleType:
-    """The compiler's settings for sizes that vary."""
-    return importlib.import_module("torch.fx.experimental._config")
