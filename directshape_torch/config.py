@@ -40,6 +40,8 @@ class SolverConfig:
         max_step_translation_m, max_step_rotation_rad, max_step_code: trust region; the whole step is scaled.
         max_code: bound of |code|, in standard deviations.
         jacobian: "analytic" (hand-derived) or "autograd" (forward mode, several times slower): the same steps.
+        rays: "tracked" (each ray follows its closest point and its surface from iteration to iteration) or "marched"
+            (each ray is sampled anew at each state: the slow reference).
     """
 
     initial_damping: float = 1e-2
@@ -56,6 +58,7 @@ class SolverConfig:
     max_step_code: float = 1.0
     max_code: float = 3.0
     jacobian: Literal["analytic", "autograd"] = "analytic"
+    rays: Literal["tracked", "marched"] = "tracked"
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from directshape_torch.admission import check_fit, refusals, without_empty_masks
 from directshape_torch.backward import attached_state
+from directshape_torch.compilation import compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
@@ -19,6 +20,7 @@ from directshape_torch.energy.direct_terms import stacked_weights
 from directshape_torch.energy.method import method_terms
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
+from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.outcome import Outcome, assemble, outcome_of, without_distrusted
 from directshape_torch.result import RefinementResult
@@ -89,7 +91,11 @@ class DirectShapeRefiner(nn.Module):
         check_fit(frames, detections, self.prior)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
         # Half precision cannot hold pixel coordinates: under autocast everything here stays in the inputs' precision.
-        with torch.set_grad_enabled(differentiate), torch.autocast(frames.images_left.device.type, enabled=False):
+        with (
+            torch.set_grad_enabled(differentiate),
+            torch.autocast(frames.images_left.device.type, enabled=False),
+            compiling(self.config.compile, len(detections)),
+        ):
             return self._refine(frames, detections, term_weights)
 
     def _refine(
@@ -124,8 +130,9 @@ class DirectShapeRefiner(nn.Module):
 
     def _observe(self, frames: FrameBatch, detections: Detections) -> _Seen:
         """What the images show of all cars; stereo points for the methods that use them."""
-        detections = without_empty_masks(detections)
-        pixels = pack_pixels(frames, detections, self.config.sampling)
+        extents = scene_extents(detections)
+        detections = without_empty_masks(detections, extents)
+        pixels = pack_pixels(frames, detections, self.config.sampling, extents)
         if self.config.method == "direct":
             return _Seen(pixels, None)
         cloud = self.config.point_cloud

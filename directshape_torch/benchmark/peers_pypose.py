@@ -58,12 +58,12 @@ class LieModel(nn.Module):
     def __init__(self, energy: CarEnergy, start: CarState) -> None:
         super().__init__()
         self.energy = energy
-        self.pose = pypose.Parameter(pypose.mat2SE3(start.T_obj_cam.to(torch.float64), check=False))
+        self.motion = pypose.Parameter(pypose.mat2SE3(start.T_obj_cam.to(torch.float64), check=False))
         self.code = nn.Parameter(start.code.to(torch.float64, copy=True))
 
     def forward(self, _: None) -> Tensor:
         max_code = self.energy.problem.config.solver.max_code
-        state = CarState(self.pose.matrix(), self.code.clamp(-max_code, max_code))
+        state = CarState(self.motion.matrix(), self.code.clamp(-max_code, max_code))
         if torch.is_grad_enabled():
             at = CarState(*(x.detach() for x in state))
             return self.energy.differentiable_residuals(state, at)[:, None]

@@ -49,10 +49,10 @@ class CarRows:
         return torch.cat([packed, packed.new_full((1, *packed.shape[1:]), empty)])[self.index]
 
 
-def state_of(pose: Any, code: Any, max_code: float) -> CarState:
+def state_of(motion: Any, code: Any, max_code: float) -> CarState:
     """The state in Theseus' variables: SE3 (B, 3, 4) `T_cam_obj`, which it moves on the object's side as we do."""
-    last_row = pose.tensor.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(pose.tensor), 1, 4)
-    T_cam_obj = torch.cat([pose.tensor, last_row], dim=1)
+    last_row = motion.tensor.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(motion.tensor), 1, 4)
+    T_cam_obj = torch.cat([motion.tensor, last_row], dim=1)
     return CarState(se3.inverse(T_cam_obj), code.tensor.clamp(-max_code, max_code))
 
 
@@ -60,8 +60,8 @@ def theseus_variables(state: CarState) -> tuple[Any, Any]:
     """Pose `T_cam_obj` and code as Theseus' variables, float64."""
     tensors = tensors_of(state)
     # A rotation that was computed in single precision is none to its checks.
-    pose = theseus.SE3(tensor=tensors["pose"], name="pose", disable_checks=True)
-    return pose, theseus.Vector(tensor=tensors["code"], name="code")
+    motion = theseus.SE3(tensor=tensors["pose"], name="pose", disable_checks=True)
+    return motion, theseus.Vector(tensor=tensors["code"], name="code")
 
 
 def tensors_of(state: CarState) -> dict[str, Tensor]:
@@ -78,10 +78,10 @@ def unit_weight() -> Any:
 class BatchedCost(theseus.CostFunction):
     """Residuals (B, M) of all cars with Jacobians by `CarEnergy.jacobian`."""
 
-    def __init__(self, energy: CarEnergy, rows: CarRows, pose: Any, code: Any, name: str | None = None) -> None:
+    def __init__(self, energy: CarEnergy, rows: CarRows, motion: Any, code: Any, name: str | None = None) -> None:
         super().__init__(unit_weight(), name=name)
         self.energy, self.rows = energy, rows
-        self.pose, self.code = pose, code
+        self.motion, self.code = motion, code
         self.register_optim_vars(["pose", "code"])
 
     def dim(self) -> int:
@@ -96,13 +96,13 @@ class BatchedCost(theseus.CostFunction):
         return [-J[..., :6], J[..., 6:]], self.error()
 
     def _state(self) -> CarState:
-        return state_of(self.pose, self.code, self.energy.problem.config.solver.max_code)
+        return state_of(self.motion, self.code, self.energy.problem.config.solver.max_code)
 
     def _copy_impl(self, new_name: str | None = None) -> BatchedCost:
-        return BatchedCost(self.energy, self.rows, self.pose.copy(), self.code.copy(), new_name)
+        return BatchedCost(self.energy, self.rows, self.motion.copy(), self.code.copy(), new_name)
 
 
-def autodiff_cost(energy: CarEnergy, single: list[CarEnergy], rows: CarRows, pose: Any, code: Any) -> Any:
+def autodiff_cost(energy: CarEnergy, single: list[CarEnergy], rows: CarRows, motion: Any, code: Any) -> Any:
     """The same residuals, to be differentiated by Theseus.
 
     Args:
@@ -115,8 +115,8 @@ def autodiff_cost(energy: CarEnergy, single: list[CarEnergy], rows: CarRows, pos
     num_places = rows.index.shape[1]
 
     def error(optim_vars: tuple[Any, ...], aux_vars: tuple[Any, ...]) -> Tensor:
-        pose, code = optim_vars
-        state = state_of(pose, code, max_code)
+        motion, code = optim_vars
+        state = state_of(motion, code, max_code)
         if not torch.is_grad_enabled():
             return rows(energy.residuals(state), _EMPTY_RESIDUAL)
         at = CarState(*(x.detach() for x in state))
@@ -126,7 +126,7 @@ def autodiff_cost(energy: CarEnergy, single: list[CarEnergy], rows: CarRows, pos
 
     number = torch.arange(energy.num_cars, dtype=torch.float64, device=rows.index.device)[:, None]
     return _LoopedAutoDiffCost(
-        [pose, code],
+        [motion, code],
         error,
         num_places,
         cost_weight=unit_weight(),
@@ -213,13 +213,13 @@ class _TheseusStage:
         self.task = task
         self.energy = CarEnergy(task.problem, task.start)
         self.energies = [self.energy]
-        self.pose, self.code = theseus_variables(task.start)
+        self.motion, self.code = theseus_variables(task.start)
         rows = CarRows(self.energy)
         if form == "batched":
-            cost: Any = BatchedCost(self.energy, rows, self.pose, self.code, name="residuals")
+            cost: Any = BatchedCost(self.energy, rows, self.motion, self.code, name="residuals")
         else:
             self.energies += single_car_energies(task)
-            cost = autodiff_cost(self.energy, self.energies[1:], rows, self.pose, self.code)
+            cost = autodiff_cost(self.energy, self.energies[1:], rows, self.motion, self.code)
         objective = theseus.Objective(dtype=torch.float64)
         objective.add(RobustCost(cost, self.energy, rows, name="energy"))
         optimizer = SettlingLevenbergMarquardt(objective, max_iterations=task.max_iterations)
@@ -259,4 +259,4 @@ class _TheseusStage:
         return StageRun(state, torch.full((len(state.code),), len(seconds)), traces)
 
     def _state(self) -> CarState:
-        return state_of(self.pose, self.code, self.task.solver.max_code)
+        return state_of(self.motion, self.code, self.task.solver.max_code)

@@ -13,9 +13,13 @@ from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.method import method_stages
 from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
 from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.energy.tracked_energy import TrackedEnergy
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.problem import Linearisation, Stage, Unknowns
+
+# Projections kept: of the input, of the present stage's first state, of the end.
+_REMEMBERED = 3
 
 
 class CarProblem:
@@ -46,6 +50,8 @@ class CarProblem:
         self.config = config
         self.term_weights = term_weights
         self.unknowns = unknowns
+        self._tracked: TrackedEnergy | None = None
+        self._projections: list[ProjectedState] = []
 
     def stages(self) -> list[Stage]:
         return method_stages(self.config)
@@ -54,9 +60,13 @@ class CarProblem:
         self.unknowns = stage.unknowns
         projected = self.project(state)
         self.terms = [term.at_stage(stage, projected) for term in self.terms]
+        # What is differentiated afterwards is `linearise_differentiably`, so its root must be found.
+        if self.config.solver.rays == "tracked" and self.config.backward.mode == "none":
+            self._tracked = TrackedEnergy.of_terms(self.terms, projected, self.term_weights)
 
     def follow(self, accepted: Tensor) -> None:
-        """Nothing is tracked from iteration to iteration."""
+        if self._tracked is not None:
+            self._tracked.follow(accepted)
 
     def project(
         self,
@@ -66,7 +76,23 @@ class CarProblem:
         root_iterations: int = ROOT_ITERATIONS,
         moving_depths: bool = False,
     ) -> ProjectedState:
-        """Everything that the terms share at a state; the options are those of `ProjectedState`."""
+        """Everything that the terms share at a state; the options are those of `ProjectedState`.
+
+        Without options the same state (the very tensors) gives the same projection, with all that it has computed.
+        """
+        plain = frozen is None and root_iterations == ROOT_ITERATIONS and not moving_depths
+        if not plain or torch.is_grad_enabled():
+            return self._new_projection(state, frozen, root_iterations, moving_depths)
+        for known in self._projections:
+            if all(mine is theirs for mine, theirs in zip(known.state, state, strict=True)):
+                return known
+        projected = self._new_projection(state, None, ROOT_ITERATIONS, False)
+        self._projections = [projected, *self._projections[: _REMEMBERED - 1]]
+        return projected
+
+    def _new_projection(
+        self, state: CarState, frozen: ProjectedState | None, root_iterations: int, moving_depths: bool
+    ) -> ProjectedState:
         return ProjectedState(
             self.prior,
             state,
@@ -88,7 +114,12 @@ class CarProblem:
         return costs if self.term_weights is None else costs * self.term_weights.to(torch.float64)
 
     def linearise(self, state: CarState) -> Linearisation:
-        return self._without_held(_total(self.linearise_terms(state)))
+        if self._tracked is None:
+            return self._without_held(_total(self.linearise_terms(state)))
+        if self.config.solver.jacobian == "autograd":
+            return self._without_held(_total(self._tracked.linearise_by_autograd(self, state)))
+        projected = self._new_projection(state, None, ROOT_ITERATIONS, False)
+        return self._without_held(_total(self._tracked.linearise(projected)))
 
     def linearise_terms(self, state: CarState, with_fisher: bool = False) -> list[TermLinearisation]:
         """The linearisation of each term by itself."""
@@ -145,7 +176,7 @@ class CarProblem:
         return torch.tensor(limits, dtype=torch.float64, device=self.left.uv.device)
 
     def compact(self, keep: Tensor) -> CarProblem:
-        return CarProblem(
+        part = CarProblem(
             self.prior,
             [term.of_objects(keep) for term in self.terms],
             self.left.of_objects(keep),
@@ -154,6 +185,8 @@ class CarProblem:
             None if self.term_weights is None else self.term_weights[keep],
             self.unknowns,
         )
+        part._tracked = None if self._tracked is None else self._tracked.of_objects(keep)
+        return part
 
 
 def _total(parts: Sequence[TermLinearisation]) -> Linearisation:

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from directshape_torch.checks import check_shape
-from directshape_torch.config import PriorConfig, RefinerConfig
+from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.photometric_pixels import GreyPair
 from directshape_torch.energy.photometric_term import PhotometricTerm
-from directshape_torch.energy.prior_terms import PriorTerm
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.prior_terms import prior_terms
 from directshape_torch.energy.silhouette_term import silhouette_term
 from directshape_torch.energy.term import Term
 from directshape_torch.errors import InputError
 from directshape_torch.image.gradients import grey_levels
 from directshape_torch.observation.packing import Observation
-from directshape_torch.residuals.priors import (
-    PriorResidual,
-    dimensions_prior,
-    height_prior,
-    pose_prior,
-    shape_prior,
-    tilt_prior_cosine,
-    tilt_prior_normal,
-)
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 
@@ -58,61 +47,6 @@ def direct_terms(
     if config.photometric.weight > 0:
         terms.append(_photometric_term(config, frames, detections, cars, observation))
     return terms + prior_terms(config, prior, cars)
-
-
-def prior_terms(config: RefinerConfig, prior: ShapePrior, cars: CarBatch) -> list[Term]:
-    """Shape, height, tilt, dimensions, and pose where its sigma is known; those of weight zero left out."""
-    p = config.priors
-
-    def shape(_: CarBatch, at: ProjectedState) -> PriorResidual:
-        return shape_prior(at.state.code)
-
-    def height(cars: CarBatch, at: ProjectedState) -> PriorResidual:
-        T, num_codes = at.state.T_obj_cam, at.state.code.shape[1]
-        return height_prior(T, cars.ground_normal_cam, cars.ground_offset, num_codes)
-
-    def tilt(cars: CarBatch, at: ProjectedState) -> PriorResidual:
-        form = tilt_prior_normal if p.tilt_form == "normal" else tilt_prior_cosine
-        return form(at.state.T_obj_cam, cars.ground_normal_cam, at.state.code.shape[1])
-
-    def dimensions(cars: CarBatch, at: ProjectedState) -> PriorResidual:
-        code = at.state.code
-        sigma = torch.tensor(p.dimensions_sigma_m, dtype=code.dtype, device=code.device)
-        return dimensions_prior(prior.dimensions_and_derivative(code), cars.detector_hwl, sigma)
-
-    def detector_pose(cars: CarBatch, at: ProjectedState) -> PriorResidual:
-        sigma = detector_pose_sigma(p, cars)
-        return pose_prior(at.state.T_obj_cam, cars.detector_T_cam_obj, sigma, at.state.code.shape[1])
-
-    all_terms = [
-        PriorTerm("shape", p.shape_weight, cars, shape),
-        PriorTerm("height", p.height_weight, cars, height),
-        PriorTerm("tilt", p.tilt_weight, cars, tilt),
-        PriorTerm("dimensions", p.dimensions_weight, cars, dimensions),
-    ]
-    if cars.detector_pose_sigma is not None or any(_pose_sigmas(p)):
-        all_terms.append(PriorTerm("pose", p.pose_weight, cars, detector_pose))
-    return [term for term in all_terms if term.weight > 0]
-
-
-def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
-    """Standard deviations (B, 4) of the input poses, see `Detections.pose_sigma`; infinite where nobody knows them."""
-    if cars.detector_pose_sigma is not None:
-        return cars.detector_pose_sigma
-    along_share, *constant = _pose_sigmas(config)
-    origin = cars.detector_T_cam_obj[:, :3, 3]
-    sigma = origin.new_tensor([s if s > 0 else math.inf for s in constant]).repeat(len(origin), 1)
-    if along_share > 0:
-        # constant[0], for infinity stands for nothing known here.
-        distance = torch.hypot(origin[:, 0], origin[:, 2])
-        sigma[:, 0] = torch.sqrt((along_share * distance) ** 2 + constant[0] ** 2)
-    return sigma
-
-
-def _pose_sigmas(p: PriorConfig) -> tuple[float, float, float, float, float]:
-    """Along the ray as a share of the distance, then metres, metres, metres and radians; 0 for not known."""
-    metres = p.pose_sigma_along_m, p.pose_sigma_across_m, p.pose_sigma_vertical_m
-    return p.pose_sigma_along_share, *metres, math.radians(p.pose_sigma_yaw_deg)
 
 
 def _photometric_term(

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.direct_terms import prior_terms
 from directshape_torch.energy.point_cloud_term import point_cloud_term
+from directshape_torch.energy.prior_terms import prior_terms
 from directshape_torch.energy.term import Term
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.stereo_matching.car_points import PointSamples

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from directshape_torch.energy.car_batch import CarBatch
@@ -23,8 +22,8 @@ class GreyPair:
     scale: float  # level pixels per full-resolution pixel
 
     def halved(self) -> GreyPair:
-        both = halve(torch.stack([self.left, self.right], dim=1))
-        return GreyPair(both[:, 0], both[:, 1], halve_sizes(self.sizes), 0.5 * self.scale)
+        left, right = (halve(image[:, None])[:, 0] for image in (self.left, self.right))
+        return GreyPair(left, right, halve_sizes(self.sizes), 0.5 * self.scale)
 
 
 class PixelSet(NamedTuple):

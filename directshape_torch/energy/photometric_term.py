@@ -84,13 +84,13 @@ class PhotometricTerm:
         plain = photometric_residual(*trial._residual_inputs(depth))
         usable = trial._is_usable(on_surface, plain.inside, plain.uv_right)
         fixed = self._fix(candidates[usable], images)
-        left, right = fixed.intensity_left, (plain.residual + trial._require().intensity_left)[usable]
+        left, right = fixed.intensity_left, (plain.residual + trial.pixel_set.intensity_left)[usable]
         matched = matched_brightness(self.config.brightness, left, right, fixed.neighbour_weight, fixed.segments)
         return replace(self, fixed=fixed._replace(intensity_left=matched))
 
     def cost(self, projected: ProjectedState) -> Tensor:
-        fixed = self._require()
-        return fixed.segments.sum(self.pixel_cost(projected)) * self._weight()
+        fixed = self.pixel_set
+        return fixed.segments.sum(self.pixel_cost(projected)) * self.weight()
 
     def pixel_cost(self, projected: ProjectedState) -> Tensor:
         """Weighted Huber norm (Q,), summed over the neighbourhood, of each pixel of the set; differentiable."""
@@ -114,7 +114,7 @@ class PhotometricTerm:
         J = torch.where(usable[:, None], residual.J_residual_depth, torch.zeros_like(residual.J_residual_depth))
         first = (weight * norm.gradient_weight * J).sum(dim=1)
         second = (weight * norm.hessian_weight * J * J).sum(dim=1)
-        gradient, hessian = self._require().segments.accumulate(depth.J_depth_state, first, second)
+        gradient, hessian = self.pixel_set.segments.accumulate(depth.J_depth_state, first, second)
         return self._linearisation(self._weighted_cost(norm.rho, usable), gradient, hessian)
 
     def accumulate(self, rows: ResidualRows, J: Tensor, with_fisher: bool = False) -> TermLinearisation:
@@ -122,7 +122,7 @@ class PhotometricTerm:
         usable = rows.usable[::neighbours]
         norm, weight = self._norm_and_weight(rows.value.reshape(-1, neighbours), usable)
         J = J.reshape(-1, neighbours, J.shape[-1])
-        segments = self._require().segments
+        segments = self.pixel_set.segments
         first, second = weight * norm.gradient_weight, weight * norm.hessian_weight
         parts = [segments.accumulate(J[:, n], first[:, n], second[:, n]) for n in range(neighbours)]
         gradient, hessian = (torch.stack(sums).sum(dim=0) for sums in zip(*parts, strict=True))
@@ -130,12 +130,12 @@ class PhotometricTerm:
 
     def _rows(self, residual: Tensor, usable: Tensor) -> ResidualRows:
         neighbours = residual.shape[1]
-        object_index = self._require().object_index.repeat_interleave(neighbours)
+        object_index = self.pixel_set.object_index.repeat_interleave(neighbours)
         return ResidualRows(residual.flatten(), object_index, usable.repeat_interleave(neighbours))
 
     def _depth_and_residual(self, projected: ProjectedState) -> tuple[SurfaceDepth, PhotometricResidual, Tensor]:
         """Depth with its hand-derived Jacobian, residuals there, and which pixels (Q,) of the set are usable."""
-        rays, root = projected.left.surface(self._require().pixel_index)
+        rays, root = projected.left.surface(self.pixel_set.pixel_index)
         points = rays.at(root.depth)
         at = projected.shape.value_and_derivatives(points, rays.object_index)
         depth = depth_state_jacobian(points, at, rays.direction_obj, self.config.min_ray_cosine)
@@ -145,12 +145,12 @@ class PhotometricTerm:
     def _norm_and_weight(self, residual: Tensor, usable: Tensor) -> tuple[robust.RobustValue, Tensor]:
         """Robust norm and weight (Q, N) of each neighbourhood pixel, zero where it is not usable."""
         norm = robust.RobustValue(*(torch.where(usable[:, None], x, torch.zeros_like(x)) for x in self._norm(residual)))
-        fixed = self._require()
+        fixed = self.pixel_set
         weight = torch.where(usable, fixed.gradient_weight, torch.zeros_like(fixed.gradient_weight))
         return norm, weight[:, None] * fixed.neighbour_weight
 
     def _linearisation(self, pixel_cost: Tensor, gradient: Tensor, hessian: Tensor) -> TermLinearisation:
-        fixed, c = self._require(), self._weight()
+        fixed, c = self.pixel_set, self.weight()
         # The neighbourhoods of neighbouring samples overlap: a pixel counts once, with its neighbourhood's mean.
         per_pixel = fixed.segments.counts.to(torch.float64) / self.config.huber_grey_levels**2 / self.config.weight
         fisher = (c * per_pixel)[:, None, None] * hessian
@@ -159,7 +159,7 @@ class PhotometricTerm:
 
     def agreement(self, projected: ProjectedState) -> tuple[Tensor, Tensor]:
         """Mean absolute residual (B,) in grey levels of the usable pixels, and their share (B,) of the pixel set."""
-        fixed = self._require()
+        fixed = self.pixel_set
         usable, residual = self._usable_and_residual(projected)
         weight = fixed.neighbour_weight * usable[:, None]
         total = fixed.segments.sum(weight.sum(dim=1))
@@ -176,12 +176,12 @@ class PhotometricTerm:
         The hits are those of the state, moved along their rays, so that only the warp is evaluated for each offset. At
         offset 0 it is `cost`.
         """
-        fixed = self._require()
+        fixed = self.pixel_set
         depth, on_surface = self._surface(projected)
         # A few offsets at a time where the pixels are dense, so that memory stays that of the other evaluations.
         at_once = max(1, _PROFILE_RESIDUALS // max(1, fixed.intensity_left.numel()))
         parts = [self._costs_at(depth, on_surface, part) for part in torch.split(offsets_px.to(depth), at_once)]
-        costs = fixed.segments.sum(torch.cat(parts).mT) * self._weight()[:, None]
+        costs = fixed.segments.sum(torch.cat(parts).mT) * self.weight()[:, None]
         return costs.masked_fill((fixed.segments.counts == 0)[:, None], torch.nan)
 
     def _costs_at(self, depth: Tensor, on_surface: Tensor, offsets_px: Tensor) -> Tensor:
@@ -192,7 +192,7 @@ class PhotometricTerm:
 
     def support(self) -> Tensor:
         """Pixels (B,) of the stage's pixel set, float64."""
-        return self._require().segments.counts.to(torch.float64)
+        return self.pixel_set.segments.counts.to(torch.float64)
 
     def of_objects(self, keep: Tensor) -> PhotometricTerm:
         pixels = self.pixels.of_objects(keep)
@@ -207,7 +207,7 @@ class PhotometricTerm:
 
     def thinned(self, max_pixels: int) -> PhotometricTerm:
         """The term with at most so many pixels of each car: every second, third, ..., and none packed beside them."""
-        fixed = self._require()
+        fixed = self.pixel_set
         counts, number = fixed.segments.counts, fixed.object_index
         rank = torch.arange(len(number), device=counts.device) - (torch.cumsum(counts, 0) - counts)[number]
         stride = (counts + max_pixels - 1) // max_pixels
@@ -216,20 +216,23 @@ class PhotometricTerm:
         pixels = self.pixels.select(fixed.pixel_index[chosen])
         return replace(self, pixels=pixels, fixed=fixed.select(chosen, rows, pixels.object_index, len(counts)))
 
-    def _require(self) -> PixelSet:
+    @property
+    def pixel_set(self) -> PixelSet:
+        """The pixels of the stage that has begun."""
         if self.fixed is None:
             raise RuntimeError(
                 "the photometric term has no pixel set before a stage begins: call at_stage or begin_stage first"
             )
         return self.fixed
 
-    def _weight(self) -> Tensor:
-        fixed = self._require()
+    def weight(self) -> Tensor:
+        """Factor (B,) of the sum over the neighbours of each car, float64."""
+        fixed = self.pixel_set
         return self.config.weight / fixed.segments.sum(fixed.neighbour_weight.sum(dim=1)).clamp_min(1)
 
     def _weighted_cost(self, rho: Tensor, usable: Tensor) -> Tensor:
         """Cost (..., Q) of each pixel of the set from the norms (..., Q, N) of its neighbourhood."""
-        fixed = self._require()
+        fixed = self.pixel_set
         rho = torch.where(usable[..., None], rho, self._lost_cost())
         return (rho * fixed.neighbour_weight).sum(dim=-1) * fixed.gradient_weight
 
@@ -269,12 +272,12 @@ class PhotometricTerm:
 
     def _patch_inputs(self, residual: Tensor) -> tuple[Tensor, Tensor, Tensor, PatchForm, float]:
         """Arguments of `patch_residual`, in its order."""
-        fixed, config = self._require(), self.config
+        fixed, config = self.pixel_set, self.config
         form, floor = config.patch, config.contrast_floor_grey_levels
         return residual, fixed.intensity_left, fixed.neighbour_weight, form, floor
 
     def _residual_inputs(self, depth: Tensor) -> _ResidualInputs:
-        fixed = self._require()
+        fixed = self.pixel_set
         cars = self.cars
         return _ResidualInputs(
             fixed.images.right,
@@ -296,7 +299,7 @@ class PhotometricTerm:
         usable = on_surface & inside
         if self.hidden_right is None:
             return usable
-        crop = self.cars.detection_row[self._require().object_index]
+        crop = self.cars.detection_row[self.pixel_set.object_index]
         return usable & ~self.hidden_right.at(crop, uv_right.detach())
 
     def _usable_and_residual(
@@ -308,7 +311,7 @@ class PhotometricTerm:
 
     def _surface(self, projected: ProjectedState, attached: bool = False) -> tuple[Tensor, Tensor]:
         """Depth (Q,) of the surface under each pixel of the set, and where (Q,) there is one that is not grazing."""
-        rays, root = projected.left.surface(self._require().pixel_index)
+        rays, root = projected.left.surface(self.pixel_set.pixel_index)
         depth = root.depth.detach()
         at = projected.shape.value_and_derivatives(rays.at(depth).detach(), rays.object_index)
         _, grazing = surface_slope(at.gradient.detach(), rays.direction_obj.detach(), self.config.min_ray_cosine)

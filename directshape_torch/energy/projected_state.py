@@ -45,7 +45,8 @@ class ProjectedView:
         root_iterations: int = ROOT_ITERATIONS,
         moving_depths: bool = False,
     ):
-        self._shape, self._bounds, self._samples = shape, bounds_obj, samples
+        self._shape, self._samples = shape, samples
+        self.bounds_obj = bounds_obj
         self._frozen, self._root_iterations, self._moving_depths = frozen, root_iterations, moving_depths
         T = state.T_obj_cam[pixels.object_index]
         R, t = T[:, :3, :3], T[:, :3, 3]
@@ -57,15 +58,27 @@ class ProjectedView:
     def march(self) -> RayMarch:
         if self._frozen is not None:
             return self._frozen.march
-        return march(self._shape, self.rays, self._bounds, self._samples)
+        return march(self._shape, self.rays, self.bounds_obj, self._samples)
 
     @cached_property
     def closest_depth(self) -> Tensor:
         if self._frozen is not None:
             return self._frozen.closest_depth
         if self._moving_depths:
-            return attached_closest_depth(self._shape, self.rays, self._bounds, self.march)
+            return attached_closest_depth(self._shape, self.rays, self.bounds_obj, self.march)
         return closest_approach_depth(self.march)
+
+    @cached_property
+    def closest_sdf(self) -> Tensor:
+        """Signed distance (P,) at the closest approach, a constant."""
+        depth = self.closest_depth.detach()
+        return self._shape.value(self.rays.at(depth).detach(), self.rays.object_index).detach()
+
+    @cached_property
+    def _entry(self) -> Root:
+        """Where every ray enters the shape, a constant."""
+        closest = self.closest_depth.detach()
+        return first_crossing(self._shape, self.rays, self.march, closest, self._root_iterations)
 
     def surface(self, rows: Tensor) -> tuple[ObjectRays, Root]:
         """Where some of the rays (Q,) enter the shape."""
@@ -73,8 +86,7 @@ class ProjectedView:
         if self._frozen is not None:
             root = self._frozen.surface(rows)[1]
             return rays, root._replace(depth=polished_depth(self._shape, rays, root, self._root_iterations))
-        marched = RayMarch(*(x[rows] for x in self.march))
-        root = first_crossing(self._shape, rays, marched, self.closest_depth[rows].detach(), self._root_iterations)
+        root = Root(*(x[rows] for x in self._entry))
         if self._moving_depths:
             root = root._replace(depth=attached_depth(self._shape, rays, root.depth, root.found))
         return rays, root

@@ -53,11 +53,11 @@ class SilhouetteTerm:
         return replace(self, zeta=zeta[self.pixels.object_index])
 
     def cost(self, projected: ProjectedState) -> Tensor:
-        return self.segments.sum(self.pixel_residual(projected)) * self._weight()
+        return self.segments.sum(self.pixel_residual(projected)) * self.weight()
 
     def pixel_residual(self, projected: ProjectedState) -> Tensor:
         """Residual (P,) of every pixel, differentiable with the sample depths frozen."""
-        view = self._view(projected)
+        view = self.view(projected)
         if self.config.form == "product":
             marched = view.march
             num_samples = marched.depths.shape[1]
@@ -75,8 +75,14 @@ class SilhouetteTerm:
         residual = silhouette_residual(projection, self.foreground)
         return torch.where(view.march.crosses_bounds, residual, self._residual_of_a_miss())
 
+    def residual_at(self, view: ProjectedView) -> Tensor:
+        """Residual (P,) of every pixel at the closest approach that the view knows, a constant."""
+        projection = project_closest_approach(view.closest_sdf, self.zeta, self.config.saturation)
+        residual = silhouette_residual(projection, self.foreground)
+        return torch.where(view.march.crosses_bounds, residual, self._residual_of_a_miss())
+
     def residuals(self, projected: ProjectedState) -> ResidualRows:
-        usable = self._view(projected).march.crosses_bounds
+        usable = self.view(projected).march.crosses_bounds
         return ResidualRows(self.pixel_residual(projected), self.pixels.object_index, usable)
 
     def jacobian(self, projected: ProjectedState) -> Tensor:
@@ -91,13 +97,13 @@ class SilhouetteTerm:
         fisher = torch.zeros_like(hessian)
         if with_fisher:
             fisher = self.segments.accumulate(J, norm.gradient_weight, torch.ones_like(rows.value))[1]
-        weight = self._weight()
+        weight = self.weight()
         cost = self.segments.sum(norm.rho) * weight
         return TermLinearisation(cost, weight[:, None] * gradient, weight[:, None, None] * hessian, fisher)
 
     def _rows(self, projected: ProjectedState) -> tuple[ResidualRows, Tensor]:
         """Residuals and their hand-derived Jacobian from one pass."""
-        view = self._view(projected)
+        view = self.view(projected)
         form = self._rows_product if self.config.form == "product" else self._rows_closest_approach
         residual, J = form(projected.shape, view)
         crosses = view.march.crosses_bounds
@@ -117,10 +123,12 @@ class SilhouetteTerm:
             zeta=self.zeta[rows],
         )
 
-    def _view(self, projected: ProjectedState) -> ProjectedView:
+    def view(self, projected: ProjectedState) -> ProjectedView:
+        """The rays of this side."""
         return projected.left if self.side == "left" else projected.right
 
-    def _weight(self) -> Tensor:
+    def weight(self) -> Tensor:
+        """Factor (B,) of the sum of the residuals of each car, float64."""
         return self.config.weight / self.segments.counts.clamp_min(1).to(torch.float64)
 
     def _residual_of_a_miss(self) -> Tensor:

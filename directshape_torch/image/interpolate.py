@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -40,16 +42,47 @@ def bilinear_with_gradient(
         (tensor([3.5000]), tensor([[ 2., 10.]]), tensor([True]))
     """
     _check(images, frame_index, uv)
+    last_row, last_column = (None, None) if sizes is None else (sizes - 1).unbind(-1)
     height, width = images.shape[1:]
-    u, inside_u, column, right = _cell(uv[..., 0], width, None if sizes is None else sizes[:, 1][frame_index])
-    v, inside_v, row, below = _cell(uv[..., 1], height, None if sizes is None else sizes[:, 0][frame_index])
+    at = bilinear_patch(
+        images.reshape(-1),
+        frame_index * (height * width),
+        width,
+        uv[..., 0],
+        uv[..., 1],
+        width - 1 if last_column is None else last_column[frame_index],
+        height - 1 if last_row is None else last_row[frame_index],
+    )
+    return at.value, torch.stack([at.d_u, at.d_v], dim=-1), at.inside
 
-    corner = (frame_index * height + row) * width + column
-    flat = images.reshape(-1)
-    step_down = below * width
-    upper_left, upper_right = _take(flat, corner), _take(flat, corner + right)
+
+class BilinearPatch(NamedTuple):
+    """A lookup with its derivatives by the two coordinates."""
+
+    value: Tensor  # (...)
+    d_u: Tensor  # (...) per pixel
+    d_v: Tensor  # (...) per pixel
+    inside: Tensor  # (...) bool
+
+
+def bilinear_patch(
+    pixels: Tensor,  # (A,) of images behind one another
+    first_pixel: Tensor,  # broadcastable to (...): of the image of each point
+    row_step: Tensor | int,  # pixels from one row to the next
+    u: Tensor,  # (...)
+    v: Tensor,  # (...)
+    last_column: Tensor | int,  # broadcastable to (...): of the image of each point
+    last_row: Tensor | int,
+) -> BilinearPatch:
+    """`bilinear_with_gradient` with the coordinates apart, the images in a row, and nothing checked."""
+    u, inside_u, column, right = _cell(u, last_column)
+    v, inside_v, row, below = _cell(v, last_row)
+
+    corner = first_pixel + row * row_step + column
+    step_down = below * row_step
+    upper_left, upper_right = _take(pixels, corner), _take(pixels, corner + right)
     corner = corner + step_down
-    lower_left, lower_right = _take(flat, corner), _take(flat, corner + right)
+    lower_left, lower_right = _take(pixels, corner), _take(pixels, corner + right)
 
     upper_slope = upper_right - upper_left
     lower_slope = lower_right - lower_left
@@ -58,17 +91,14 @@ def bilinear_with_gradient(
     d_v = lower - upper
     value = upper + v * d_v
     d_u = upper_slope + v * (lower_slope - upper_slope)
-    gradient = torch.stack([d_u * inside_u, d_v * inside_v], dim=-1)
-    return value, gradient, inside_u & inside_v
+    return BilinearPatch(value, d_u * inside_u, d_v * inside_v, inside_u & inside_v)
 
 
 def _cell(
     coordinate: Tensor,  # (...)
-    full_length: int,
-    length: Tensor | None,  # (...)
+    last: Tensor | int,  # broadcastable to (...)
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | int]:
     """Fraction within the cell, whether inside, first index of the cell, step to its second (0 where there is none)."""
-    last: Tensor | int = full_length - 1 if length is None else length - 1
     inside = (coordinate >= 0) & (coordinate <= last)
     # `where` and not `clamp`: its derivative outside is 0 by the same rule as `inside`, and NaN cannot pass.
     clamped = torch.where(inside, coordinate, (coordinate > 0) * last)

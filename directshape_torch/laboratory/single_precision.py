@@ -15,8 +15,7 @@ from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.direct_terms import prior_terms
-from directshape_torch.energy.prior_terms import PriorTerm
+from directshape_torch.energy.prior_terms import PriorTerm, prior_terms
 from directshape_torch.energy.term import Term
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.comparison import FLAT_SHARE, quantile

@@ -50,7 +50,7 @@ def depth_state_jacobian(
     slope, grazing = surface_slope(at.gradient, direction_obj, min_cosine)
     safe_slope = torch.where(grazing, torch.ones_like(slope), slope)
     d_depth_sdf = torch.where(grazing, torch.zeros_like(slope), -1 / safe_slope)
-    return SurfaceDepth(d_depth_sdf[:, None] * sdf_state_jacobian(points_obj, at), grazing)
+    return SurfaceDepth(d_depth_sdf[..., None] * sdf_state_jacobian(points_obj, at), grazing)
 
 
 class PhotometricResidual(NamedTuple):

@@ -10,6 +10,18 @@ from torch import Tensor
 _BLOCK = 64
 
 
+def sum_over_blocks(
+    per_block: Tensor,  # (M, ...)
+    object_blocks: Tensor,  # (B, 2^n) block numbers of each object; M stands for an empty place
+) -> Tensor:
+    """Sums (B, ...) over the blocks of each object, pairwise: empty places change no bit."""
+    padded = torch.cat([per_block, per_block.new_zeros(1, *per_block.shape[1:])])
+    part = padded[object_blocks]
+    while part.shape[1] > 1:
+        part = part[:, 0::2] + part[:, 1::2]
+    return part[:, 0]
+
+
 @dataclass(frozen=True)
 class Segments:
     """Rows of several objects, sorted by object, cut into blocks of equal size for batched products.
@@ -60,17 +72,9 @@ class Segments:
         padded = torch.cat([rows, rows.new_zeros(1, *rows.shape[1:])])
         return padded[self.block_rows].to(torch.float64)
 
-    def _over_blocks(self, per_block: Tensor) -> Tensor:
-        """Sums (B, ...) of the blocks (M, ...) of each object, pairwise: empty places change no bit."""
-        padded = torch.cat([per_block, per_block.new_zeros(1, *per_block.shape[1:])])
-        part = padded[self.object_blocks]
-        while part.shape[1] > 1:
-            part = part[:, 0::2] + part[:, 1::2]
-        return part[:, 0]
-
     def sum(self, values: Tensor) -> Tensor:
         """Sum (B,) of values (P,) over the rows of each object, float64; differentiable."""
-        return self._over_blocks(self._blocks(values).sum(dim=1))
+        return sum_over_blocks(self._blocks(values).sum(dim=1), self.object_blocks)
 
     def accumulate(
         self,
@@ -82,4 +86,5 @@ class Segments:
         J = self._blocks(rows)
         weighted = J * self._blocks(hessian_weight)[..., None]
         gradient = (self._blocks(gradient_weight)[:, None] @ J)[:, 0]
-        return self._over_blocks(gradient), self._over_blocks(weighted.transpose(1, 2) @ J)
+        hessian = weighted.transpose(1, 2) @ J
+        return sum_over_blocks(gradient, self.object_blocks), sum_over_blocks(hessian, self.object_blocks)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.derivatives import moved, tangent_of
-from helpers.problems import CONFIGS, DEFAULT, begun_problem
+from helpers.problems import CONFIGS, begun_problem
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.energy.autograd_jacobian import rows_by_autograd
@@ -48,7 +48,7 @@ def test_a_whole_refinement_has_the_same_iterates(config: str) -> None:
     detections = disturbed(scene.detections)
     results = {}
     for jacobian in ("analytic", "autograd"):
-        settings = replace(CONFIGS[config], solver=replace(DEFAULT.solver, jacobian=jacobian))
+        settings = replace(CONFIGS[config], solver=replace(CONFIGS[config].solver, jacobian=jacobian))
         results[jacobian] = DirectShapeRefiner(prior, settings)(scene.frames, detections)
     by_hand, automatic = results["analytic"], results["autograd"]
     assert by_hand.status == automatic.status

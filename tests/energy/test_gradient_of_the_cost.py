@@ -132,7 +132,7 @@ def test_silhouette_step_is_the_papers() -> None:
 
 
 def test_total_is_the_sum_of_the_terms() -> None:
-    problem, state = _case("typical", "default")
+    problem, state = _case("typical", "paper")
     parts = problem.linearise_terms(state)
     total = problem.linearise(state)
     torch.testing.assert_close(total.cost, sum(p.cost for p in parts))

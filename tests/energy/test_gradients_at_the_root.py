@@ -22,7 +22,14 @@ from directshape_torch.solver.differentiate import implicit_state, unrolled_stat
 from directshape_torch.solver.gauss_newton import Iteration, Minimum, minimise
 from directshape_torch.solver.problem import take_rows
 
-SOLVER = replace(DEFAULT.solver, cost_tolerance=0.0, step_tolerance=1e-9, accept_every_step=True, initial_damping=0.0)
+SOLVER = replace(
+    DEFAULT.solver,
+    cost_tolerance=0.0,
+    step_tolerance=1e-9,
+    accept_every_step=True,
+    initial_damping=0.0,
+    rays="marched",
+)
 CONFIG: RefinerConfig = replace(DEFAULT, stages=(StageConfig(2.0, 1, 10), StageConfig(1.0, 0, 40)), solver=SOLVER)
 ROWS = torch.tensor([0])  # the other car has a kink at its root
 

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.direct_terms import detector_pose_sigma
-from directshape_torch.energy.prior_terms import PriorTerm
+from directshape_torch.energy.prior_terms import PriorTerm, detector_pose_sigma
 from directshape_torch.errors import InputError
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult

@@ -29,6 +29,7 @@ DEFAULT = replace(
 )
 PAPER = replace(
     DEFAULT,
+    solver=replace(DEFAULT.solver, rays="marched"),
     silhouette=replace(DEFAULT.silhouette, form="product"),
     photometric=replace(DEFAULT.photometric, pixel_set="hit", brightness="none", truncated=False),
     priors=replace(DEFAULT.priors, tilt_form="cosine", tilt_weight=1e7, dimensions_weight=0.0),

@@ -21,7 +21,14 @@ SETTLED = replace(
     stages=(StageConfig(2.0, 1, 10), StageConfig(1.0, 0, 40)),
     # What a stage fixes at its start, the state that the gain comes from among it, is constant for gradients alone.
     photometric=replace(DEFAULT.photometric, brightness="none"),
-    solver=replace(DEFAULT.solver, cost_tolerance=0.0, step_tolerance=1e-9, accept_every_step=True, initial_damping=0),
+    solver=replace(
+        DEFAULT.solver,
+        cost_tolerance=0.0,
+        step_tolerance=1e-9,
+        accept_every_step=True,
+        initial_damping=0,
+        rays="marched",  # as every refinement that is differentiated
+    ),
 )
 
 

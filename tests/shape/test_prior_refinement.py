@@ -68,7 +68,7 @@ def test_gradients_through_the_refinement_reach_the_tensors_of_the_prior(
         LIGHT,
         stages=(StageConfig(1.0, 0, 2),),
         photometric=replace(LIGHT.photometric, brightness="none"),
-        solver=replace(LIGHT.solver, accept_every_step=True, initial_damping=0.0),
+        solver=replace(LIGHT.solver, accept_every_step=True, initial_damping=0.0, rays="marched"),
         backward=BackwardConfig(mode="unroll", unroll_iterations=2),
     )
 

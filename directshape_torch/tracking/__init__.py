@@ -1,0 +1,1 @@
+"""Following the cars' rays from iteration to iteration: the fast form of the silhouette and photometric terms."""
