@@ -97,7 +97,8 @@ def test_sigmas_are_along_and_across_the_viewing_ray() -> None:
     J = torch.stack([torch.stack(row, dim=1) for row in axes], dim=2)
     found = columns(replace(course, covariance_xyz_yaw=J @ J.mT))
     for name, sigma in (("log_sigma_depth", 0.5), ("log_sigma_side", 0.02), ("log_sigma_yaw", 0.1)):
-        torch.testing.assert_close(found[name], torch.full((2,), math.log(sigma)).double(), rtol=1e-9, atol=1e-9)
+        expected = torch.full((2,), math.log(sigma), dtype=torch.float64)
+        torch.testing.assert_close(found[name], expected, rtol=1e-9, atol=1e-9)
 
 
 def test_conflict_is_what_photometry_alone_would_gain() -> None:
