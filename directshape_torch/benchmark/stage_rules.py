@@ -82,6 +82,13 @@ RULES = (
     Rule(r"residuals\.photometric", r"depth_state_jacobian|surface_slope", "ray depth"),
     Rule(r"(energy|residuals)\.photometric.*|energy\.brightness", _ANY, "warp"),
     Rule(r"(energy|residuals)\.(prior|stacked_priors|pose_rows|point_cloud).*", _ANY, "priors"),
+    Rule(r"tracking\.blocks", r"weighted_products|sums", "normal equations"),
+    Rule(r"tracking\.(silhouette|photometric)", r"accumulate", "normal equations"),
+    Rule(r"tracking\.silhouette", r"_residual_and_jacobian", "silhouette Jacobian"),
+    Rule(r"tracking\.silhouette", _ANY, "silhouette value"),
+    Rule(r"tracking\.photometric", r"surface_under|depth_of_state", "ray depth"),
+    Rule(r"tracking\.photometric", _ANY, "warp"),
+    Rule(r"energy\.tracked_.*", _ANY, "bookkeeping"),
     Rule(r"solver\.normal_equations", _ANY, "normal equations"),
     Rule(r"solver\.damped_solve", _ANY, "solve"),
     Rule(r"energy\.car_state|energy\.car_problem", r"retract", "solve"),
@@ -89,11 +96,8 @@ RULES = (
     Rule(_OUTCOME, _ANY, "outcome", encloses=True),
     Rule(r"refiner|admission|result|status|backward|checks|config.*|scene", _ANY, "bookkeeping"),
     Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms)", _ANY, "bookkeeping"),
-    Rule(
-        r"geometry\..*|image\..*|shape\..*|residuals\.(robust|state_chain)|compil.*|device_constants|car_rows",
-        _ANY,
-        None,
-    ),
+    Rule(r"geometry\..*|image\..*|shape\..*|tracking\.(blocks|field|rays)", _ANY, None),
+    Rule(r"residuals\.(robust|state_chain)|compil.*|device_constants|car_rows", _ANY, None),
 )
 
 
