@@ -50,7 +50,7 @@ class SolverConfig:
     min_damping: float = 1e-7
     max_damping: float = 1e5
     accept_every_step: bool = False
-    cost_tolerance: float = 1e-4
+    cost_tolerance: float = 1e-3
     step_tolerance: float = 1e-3
     block_iterations: int = 4
     max_step_translation_m: float = 0.5

@@ -52,12 +52,14 @@ class CarProblem:
         self.unknowns = unknowns
         self._tracked: TrackedEnergy | None = None
         self._projections: list[ProjectedState] = []
+        self._costs: list[tuple[ProjectedState, Tensor]] = []  # of the present stage
 
     def stages(self) -> list[Stage]:
         return method_stages(self.config)
 
     def begin_stage(self, stage: Stage, state: CarState) -> None:
         self.unknowns = stage.unknowns
+        self._costs = []
         projected = self.project(state)
         self.terms = [term.at_stage(stage, projected) for term in self.terms]
         # What is differentiated afterwards is `linearise_differentiably`, so its root must be found.
@@ -110,6 +112,16 @@ class CarProblem:
     def term_costs(self, state: CarState) -> Tensor:
         """Cost (B, T) of each term; differentiable by autograd."""
         projected = self.project(state)
+        if torch.is_grad_enabled():
+            return self._new_costs(projected)
+        for known, costs in self._costs:
+            if known is projected:
+                return costs
+        costs = self._new_costs(projected)
+        self._costs = [(projected, costs), *self._costs[:1]]
+        return costs
+
+    def _new_costs(self, projected: ProjectedState) -> Tensor:
         costs = torch.stack([term.cost(projected) for term in self.terms], dim=1)
         return costs if self.term_weights is None else costs * self.term_weights.to(torch.float64)
 

@@ -83,8 +83,11 @@ class PhotometricTerm:
         depth, on_surface = trial._surface(projected)
         plain = photometric_residual(*trial._residual_inputs(depth))
         usable = trial._is_usable(on_surface, plain.inside, plain.uv_right)
-        fixed = self._fix(candidates[usable], images)
-        left, right = fixed.intensity_left, (plain.residual + trial.pixel_set.intensity_left)[usable]
+        chosen = usable.nonzero()[:, 0]
+        tried = trial.pixel_set
+        count = len(self.cars.frame_index)
+        fixed = tried.select(chosen, tried.pixel_index[chosen], tried.object_index[chosen], count)
+        left, right = fixed.intensity_left, (plain.residual + tried.intensity_left)[chosen]
         matched = matched_brightness(self.config.brightness, left, right, fixed.neighbour_weight, fixed.segments)
         return replace(self, fixed=fixed._replace(intensity_left=matched))
 
@@ -94,7 +97,7 @@ class PhotometricTerm:
 
     def pixel_cost(self, projected: ProjectedState) -> Tensor:
         """Weighted Huber norm (Q,), summed over the neighbourhood, of each pixel of the set; differentiable."""
-        usable, residual = self._usable_and_residual(projected, attached=True)
+        usable, residual = self._usable_and_residual(projected, attached=torch.is_grad_enabled())
         return self._weighted_cost(self._norm(residual.residual).rho, usable)
 
     def residuals(self, projected: ProjectedState) -> ResidualRows:
@@ -137,7 +140,7 @@ class PhotometricTerm:
         """Depth with its hand-derived Jacobian, residuals there, and which pixels (Q,) of the set are usable."""
         rays, root = projected.left.surface(self.pixel_set.pixel_index)
         points = rays.at(root.depth)
-        at = projected.shape.value_and_derivatives(points, rays.object_index)
+        at = projected.left.at_surface(self.pixel_set.pixel_index, rays, root.depth)
         depth = depth_state_jacobian(points, at, rays.direction_obj, self.config.min_ray_cosine)
         residual = self._residual(root.depth)
         return depth, residual, self._is_usable(root.found & ~depth.grazing, residual.inside, residual.uv_right)
@@ -313,7 +316,7 @@ class PhotometricTerm:
         """Depth (Q,) of the surface under each pixel of the set, and where (Q,) there is one that is not grazing."""
         rays, root = projected.left.surface(self.pixel_set.pixel_index)
         depth = root.depth.detach()
-        at = projected.shape.value_and_derivatives(rays.at(depth).detach(), rays.object_index)
+        at = projected.left.at_surface(self.pixel_set.pixel_index, rays, depth)
         _, grazing = surface_slope(at.gradient.detach(), rays.direction_obj.detach(), self.config.min_ray_cosine)
         on_surface = root.found & ~grazing
         return attached_depth(projected.shape, rays, depth, on_surface) if attached else depth, on_surface

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
 from directshape_torch.energy.car_state import CarState
@@ -19,7 +20,7 @@ from directshape_torch.shape.raycast import (
     march,
     polished_depth,
 )
-from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
+from directshape_torch.shape.shape_prior import BoundShape, SdfDerivatives, ShapePrior
 
 # Superlinear from a bracket of one sample distance: 8 reach float32's and nearly float64's precision.
 ROOT_ITERATIONS = 8
@@ -78,7 +79,16 @@ class ProjectedView:
     def _entry(self) -> Root:
         """Where every ray enters the shape, a constant."""
         closest = self.closest_depth.detach()
-        return first_crossing(self._shape, self.rays, self.march, closest, self._root_iterations)
+        return first_crossing(self._shape, self.rays, self.march, closest, self._root_iterations, self.closest_sdf)
+
+    @cached_property
+    def _at_entry(self) -> SdfDerivatives:
+        """The field where the rays enter, a constant; zero for those that do not."""
+        entering = self._entry.found.nonzero()[:, 0]
+        rays = self.rays.select(entering)
+        at = self._shape.value_and_derivatives(rays.at(self._entry.depth[entering]), rays.object_index)
+        count = len(self._entry.found)
+        return SdfDerivatives(*(x.new_zeros(count, *x.shape[1:]).index_copy(0, entering, x).detach() for x in at))
 
     def surface(self, rows: Tensor) -> tuple[ObjectRays, Root]:
         """Where some of the rays (Q,) enter the shape."""
@@ -90,6 +100,12 @@ class ProjectedView:
         if self._moving_depths:
             root = root._replace(depth=attached_depth(self._shape, rays, root.depth, root.found))
         return rays, root
+
+    def at_surface(self, rows: Tensor, rays: ObjectRays, depth: Tensor) -> SdfDerivatives:
+        """The field at the points of `surface`: looked up once for all terms where nothing is differentiated."""
+        if self._frozen is None and not self._moving_depths and not torch.is_grad_enabled():
+            return SdfDerivatives(*(x[rows] for x in self._at_entry))
+        return self._shape.value_and_derivatives(rays.at(depth), rays.object_index)
 
 
 class ProjectedState:
@@ -133,5 +149,16 @@ class ProjectedState:
                 moving_depths=moving_depths,
             )
 
-        self.left: ProjectedView = view(left, None if frozen is None else frozen.left)
-        self.right: ProjectedView = view(right, None if frozen is None else frozen.right)
+        self._view = view
+        self._pixels = left, right
+        self._frozen = frozen
+
+    @cached_property
+    def left(self) -> ProjectedView:
+        """The rays of the left image."""
+        return self._view(self._pixels[0], None if self._frozen is None else self._frozen.left)
+
+    @cached_property
+    def right(self) -> ProjectedView:
+        """The rays of the right image."""
+        return self._view(self._pixels[1], None if self._frozen is None else self._frozen.right)

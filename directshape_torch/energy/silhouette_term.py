@@ -53,6 +53,8 @@ class SilhouetteTerm:
         return replace(self, zeta=zeta[self.pixels.object_index])
 
     def cost(self, projected: ProjectedState) -> Tensor:
+        if self.config.form == "closest_approach" and not torch.is_grad_enabled():
+            return self.segments.sum(self.residual_at(self.view(projected))) * self.weight()
         return self.segments.sum(self.pixel_residual(projected)) * self.weight()
 
     def pixel_residual(self, projected: ProjectedState) -> Tensor:

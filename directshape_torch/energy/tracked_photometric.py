@@ -177,5 +177,5 @@ def _hidden(term: PhotometricTerm, owner: Tensor) -> tuple[Tensor, Tensor, Tenso
 def _hits(term: PhotometricTerm, projected: ProjectedState, packed: PackedBlocks) -> Hits:
     rays, root = projected.left.surface(term.pixel_set.pixel_index)
     points = rays.at(root.depth)
-    normal = projected.shape.value_and_derivatives(points, rays.object_index).gradient
+    normal = projected.left.at_surface(term.pixel_set.pixel_index, rays, root.depth).gradient
     return Hits(*(x[packed.rows].movedim(-1, 0).contiguous() for x in (points, normal)))

@@ -135,13 +135,19 @@ def _vertex_offset(sdf: Tensor, best: Tensor, num_samples: int) -> Tensor:
 
 @torch.no_grad()
 def first_crossing(
-    shape: BoundShape, rays: ObjectRays, marched: RayMarch, closest_depth: Tensor, num_iterations: int = 8
+    shape: BoundShape,
+    rays: ObjectRays,
+    marched: RayMarch,
+    closest_depth: Tensor,
+    num_iterations: int = 8,
+    closest_sdf: Tensor | None = None,
 ) -> Root:
     """First depth at which the signed distance falls below zero, by bracketing and Illinois' false position.
 
     The refined point of closest approach counts as a sample too, so thin parts between two samples are not missed.
     """
-    closest_sdf = shape.value(rays.at(closest_depth), rays.object_index)
+    if closest_sdf is None:
+        closest_sdf = shape.value(rays.at(closest_depth), rays.object_index)
     depth, order = torch.cat([marched.depths, closest_depth[:, None]], dim=1).sort(dim=1)
     sdf = torch.cat([marched.sdf, closest_sdf[:, None]], dim=1).gather(1, order)
     inside = sdf < 0
