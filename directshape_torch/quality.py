@@ -91,7 +91,9 @@ def _agreement(problem: CarProblem, state: CarState) -> Agreement:
 def _mask_ious(projected: ProjectedState, left: PixelSamples, right: PixelSamples) -> Tensor:
     """Overlap (2, B) of shape and mask over the pixels of the left and the right image."""
     views, count = (projected.left, projected.right), len(projected.state.code)
-    covered = (torch.cat([view.closest_sdf for view in views]) < 0) & torch.cat([view.march.crosses_bounds for view in views])
+    covered = (torch.cat([view.closest_sdf for view in views]) < 0) & torch.cat(
+        [view.march.crosses_bounds for view in views]
+    )
     masked = torch.cat([left.foreground, right.foreground]) > 0.5
     car = torch.cat([left.object_index, right.object_index + count])
     nothing = torch.zeros(2 * count, dtype=torch.long, device=car.device)
