@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,13 +16,18 @@ from directshape_torch.batch.options import RefineOptions, RunObserver, SilentOb
 from directshape_torch.batch.run_record import RunRecord
 from directshape_torch.batch.run_summary import RunSummary, find_warnings
 from directshape_torch.batch.timing import RunTimings, write_timings
+from directshape_torch.compilation import cars_ahead
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.run_manifest import RunManifest, hash_files
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
+
+# Detection files that tell how many cars are ahead.
+_FRAMES_COUNTED = 50
 
 
 def refine_dataset(
@@ -83,8 +89,9 @@ class _Run:
         todo = [frame_id for frame_id in self.dataset.frame_ids if frame_id not in set(resumed)]
         self.observer.started(todo)
         try:
-            for batch in _batches(todo, self.options.batch_frames):
-                self._refine([ready for ready in map(self._read, batch) if ready is not None])
+            with cars_ahead(expected_cars(self.dataset, todo)):
+                for batch in _batches(todo, self.options.batch_frames):
+                    self._refine([ready for ready in map(self._read, batch) if ready is not None])
         finally:
             # Also when the user interrupts: what is finished need not be done again.
             self.record.write()
@@ -138,6 +145,18 @@ class _Run:
         failed = {frame_id: entry["reason"] for frame_id, entry in frames.items() if entry["state"] == "failed"}
         warnings = find_warnings(frames, sorted(self.dataset.classes))
         return RunSummary(frames, tuple(resumed), failed, warnings, self.timings)
+
+
+def expected_cars(dataset: KittiStereoDataset, frame_ids: Sequence[str]) -> int:
+    """About how many cars frames have, from the detection files of some of them: whether compiling will pay."""
+    looked_at = frame_ids[:: max(1, len(frame_ids) // _FRAMES_COUNTED)]
+    count = 0
+    for frame_id in looked_at:
+        # A file that cannot be read is reported when its turn comes.
+        with contextlib.suppress(DirectShapeError, OSError):
+            objects = read_objects(dataset.detection_path(frame_id))
+            count += sum(found.type in dataset.classes for found in objects)
+    return round(count * len(frame_ids) / max(1, len(looked_at)))
 
 
 def run_manifest(dataset: KittiStereoDataset, refiner: DirectShapeRefiner, prior_sha256: str) -> RunManifest:

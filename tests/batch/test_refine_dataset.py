@@ -14,9 +14,10 @@ import pytest
 import torch
 from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN, write_data_set
 
+from directshape_torch import compilation
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RefineOptions, SilentObserver
-from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
+from directshape_torch.batch.refine_dataset import expected_cars, refine_dataset, run_manifest
 from directshape_torch.batch.run_record import RunRecord
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.config import RefinerConfig
@@ -27,6 +28,7 @@ from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 # The model of trust does not know toys that have not converged.
@@ -337,6 +339,28 @@ def test_a_field_of_another_rig_fails_its_frames(source: Path, tmp_path: Path) -
     assert list(summary.failed) == list(FRAMES)
     assert "1242" in summary.failed["000000"]
     assert not (tmp_path / "data").exists()
+
+
+def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert expected_cars(dataset(root), FRAMES) == 2 * len(FRAMES)
+    assert expected_cars(dataset(root), FRAMES[:1] * 400) == 800
+    (root / "detections" / "data" / "000002.txt").write_text("damaged")
+    assert expected_cars(dataset(root), FRAMES) == 2 * (len(FRAMES) - 1)
+    counts = []
+
+    class Watched(DirectShapeRefiner):
+        def forward(self, *args: Any, **kwargs: Any) -> RefinementResult:
+            job = compilation._job.get()
+            counts.append(None if job is None else job.cars_ahead)
+            return super().forward(*args, **kwargs)
+
+    monkeypatch.setattr("directshape_torch.batch.refine_dataset.expected_cars", lambda *_: 5000)
+    watched = Watched(PCAShapePrior.load(root / "prior.npz"), load_config(None, FEW_STEPS))
+    refine_dataset(dataset(root), watched, tmp_path)
+    assert counts == [5000, 4998]
+    assert compilation._job.get() is None
 
 
 def test_options_are_checked() -> None:
