@@ -1,8 +1,10 @@
 """Suite `peers`: one refinement, from the same states and of the same energy, by our solver and by other libraries.
 
-All solvers get the residuals, weights and norms of `CarEnergy`, the iterations, damping and tolerance of our own
-solver, and each stage begins where ours begins it. PyPose and Theseus are wanted for this comparison alone; what is not
-installed is left out with a note.
+The other libraries get the residuals, weights and norms of `CarEnergy`, which marches every ray at every state, the
+iterations, damping and tolerance of our own solver, and each stage begins where ours begins it. Ours runs as it is
+shipped, with rays that are followed; its row with marched rays says how much of a ratio is due to that. Costs are
+always those of the marched energy. PyPose and Theseus are wanted for this comparison alone; what is not installed is
+left out with a note.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from directshape_torch.benchmark.peers_task import (
     StageTask,
     stage_tasks,
     with_jacobian,
+    with_marched_rays,
 )
 from directshape_torch.benchmark.presets import available_modes, make_refiner
 from directshape_torch.benchmark.rows import Goal, Row, SuiteResult
@@ -36,6 +39,7 @@ _FRAMES = 2
 _ROUNDS = 3
 
 _AUTOGRAD, _PYPOSE, _THESEUS = "ours, autograd", "PyPose", "Theseus"
+_MARCHED = "ours, marched rays, eager"
 _AUTODIFF = "Theseus, its own differentiation"
 _NEAR = ", until near its cost"
 _LIBRARY_MODULES = {_PYPOSE: "peers_pypose", _THESEUS: "peers_theseus", _AUTODIFF: "peers_theseus"}
@@ -60,7 +64,7 @@ def run_peers(settings: SuiteSettings) -> list[Row]:
 
 
 def run_peers_suite(settings: SuiteSettings) -> SuiteResult:
-    """Our solver with analytic and with forward-mode Jacobians, PyPose's and Theseus' Levenberg-Marquardt.
+    """Our solver with analytic and forward-mode Jacobians and with marched rays, PyPose's and Theseus' solvers.
 
     Times are of the minimisation alone: what the images show of the cars is prepared before, for all of them.
     """
@@ -68,7 +72,7 @@ def run_peers_suite(settings: SuiteSettings) -> SuiteResult:
     scene = load_scenes(settings.data_root, 1 if settings.quick else _FRAMES)[0]
     peers = [name for name in _LIBRARY_MODULES if name not in missing]
     own = [f"ours, {mode}" for mode in available_modes()]
-    names = (*own, *(name + _NEAR for name in own), _AUTOGRAD, *peers)
+    names = (*own, *(name + _NEAR for name in own), _AUTOGRAD, _MARCHED, *peers)
     figures = {name: Figures(name, _GOALS.get(name)) for name in names}
     notes = [f"{scene.name}, frames {', '.join(loaded.frame_id for loaded in scene.frames)}"]
     notes += notes_on_missing(missing)
@@ -164,6 +168,7 @@ def prepare_case(loaded: LoadedFrame, names: list[str]) -> PeerCase:
 
     makers: dict[str, Callable[[], StageSolver]] = {
         _AUTOGRAD: lambda: own(with_jacobian(eager, "autograd")),
+        _MARCHED: lambda: own(with_marched_rays(eager)),
         _PYPOSE: lambda: _library("peers_pypose").PyPoseSolver(tasks),
         _THESEUS: lambda: _library("peers_theseus").TheseusSolver(tasks),
         _AUTODIFF: lambda: _library("peers_theseus").TheseusSolver(tasks, "autodiff"),

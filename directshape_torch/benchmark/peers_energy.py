@@ -1,4 +1,11 @@
-"""The energy of cars as residuals and weighted robust norms: what a solver of another library is given to minimise."""
+"""The energy of cars as residuals and weighted robust norms: what a solver of another library is given to minimise.
+
+It is the energy as it is defined, `CarProblem.cost`: every ray is marched anew at every state. Following the rays from
+iteration to iteration (`solver.rays: tracked`) is our own solver's way to evaluate nearly the same sums in a fraction
+of the time; a library that asks for residuals at any state it likes cannot be given it. By default our solver
+therefore runs as it is shipped, tracked, and all final costs, its own too, are those of the marched energy; the suite
+`peers` has our solver with marched rays as a row of its own, so that both parts of a ratio can be told apart.
+"""
 
 from __future__ import annotations
 

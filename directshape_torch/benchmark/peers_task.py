@@ -66,7 +66,7 @@ class StageTask:
         start: where our own solver begins the stage.
         max_iterations: of the stage.
         solver: damping and tolerances of the own solver.
-        target_cost: (B,) where our own solver ends.
+        target_cost: (B,) where our own solver ends, by the energy with marched rays, whichever it went by.
         near_iterations: of our own solver until the costs of all cars stay near that.
     """
 
@@ -155,6 +155,12 @@ def single_car_energies(task: StageTask) -> list[CarEnergy]:
 def with_jacobian(refiner: DirectShapeRefiner, jacobian: Literal["analytic", "autograd"]) -> DirectShapeRefiner:
     """The refiner with another way to its Jacobians."""
     solver = replace(refiner.config.solver, jacobian=jacobian)
+    return DirectShapeRefiner(refiner.prior, replace(refiner.config, solver=solver))
+
+
+def with_marched_rays(refiner: DirectShapeRefiner) -> DirectShapeRefiner:
+    """The refiner that evaluates the very energy that other libraries are given, with every ray marched anew."""
+    solver = replace(refiner.config.solver, rays="marched")
     return DirectShapeRefiner(refiner.prior, replace(refiner.config, solver=solver))
 
 

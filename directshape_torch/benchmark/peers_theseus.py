@@ -60,14 +60,14 @@ def theseus_variables(state: CarState) -> tuple[Any, Any]:
     """Pose `T_cam_obj` and code as Theseus' variables, float64."""
     tensors = tensors_of(state)
     # A rotation that was computed in single precision is none to its checks.
-    motion = theseus.SE3(tensor=tensors["pose"], name="pose", disable_checks=True)
+    motion = theseus.SE3(tensor=tensors["motion"], name="motion", disable_checks=True)
     return motion, theseus.Vector(tensor=tensors["code"], name="code")
 
 
 def tensors_of(state: CarState) -> dict[str, Tensor]:
     """Values of the variables, by name."""
     T_cam_obj = se3.inverse(state.T_obj_cam.to(torch.float64))
-    return {"pose": T_cam_obj[:, :3].contiguous(), "code": state.code.to(torch.float64, copy=True)}
+    return {"motion": T_cam_obj[:, :3].contiguous(), "code": state.code.to(torch.float64, copy=True)}
 
 
 def unit_weight() -> Any:
@@ -82,7 +82,7 @@ class BatchedCost(theseus.CostFunction):
         super().__init__(unit_weight(), name=name)
         self.energy, self.rows = energy, rows
         self.motion, self.code = motion, code
-        self.register_optim_vars(["pose", "code"])
+        self.register_optim_vars(["motion", "code"])
 
     def dim(self) -> int:
         return self.rows.index.shape[1]
@@ -109,7 +109,7 @@ def autodiff_cost(energy: CarEnergy, single: list[CarEnergy], rows: CarRows, mot
         energy: of all cars, for the errors.
         single: of each car, for the loop over them.
         rows: of all cars.
-        pose, code: variables.
+        motion, code: variables.
     """
     max_code = energy.problem.config.solver.max_code
     num_places = rows.index.shape[1]

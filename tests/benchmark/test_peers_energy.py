@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers.derivatives import moved, relative_error
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.problems import DEFAULT, TRUNCATED, begun_problem
+from helpers.problems import DEFAULT, MARCHED, TRUNCATED, begun_problem
 from helpers.synthetic_scene import cached_street, disturbed
 from torch import Tensor
 
@@ -76,7 +76,8 @@ def test_the_jacobian_is_the_hand_derived_one(place: str) -> None:
 
 @pytest.mark.parametrize("place", STEPS)
 def test_reweighted_sums_are_our_normal_equations(place: str) -> None:
-    problem, state = begun()
+    """Of the energy with marched rays, which is what other libraries are given."""
+    problem, state = begun(config=MARCHED)
     there = state_at(state, place)
     energy = CarEnergy(problem, state)
     residual, J = energy.residuals(there), energy.jacobian(there)
@@ -88,6 +89,20 @@ def test_reweighted_sums_are_our_normal_equations(place: str) -> None:
         weighted = J[own] * weight[own, None]
         assert relative_error(weighted.mT @ residual[own], at.gradient[car]) < 1e-9
         assert relative_error(weighted.mT @ J[own], at.hessian[car]) < 1e-9
+
+
+@pytest.mark.parametrize("stage", [0, 1])
+@pytest.mark.parametrize("place", STEPS)
+def test_the_energy_is_the_marched_one_however_our_solver_goes(stage: int, place: str) -> None:
+    """To the bit: following rays must not leak into what other libraries are given, nor into the costs reported."""
+    both = []
+    for config in (DEFAULT, MARCHED):
+        problem, state = begun(stage, config)
+        energy = CarEnergy(problem, state)
+        there = state_at(state, place)
+        both.append((energy.residuals(there), energy.jacobian(there), energy.cost(there)))
+    for tracked, marched in zip(*both, strict=True):
+        assert torch.equal(tracked, marched)
 
 
 def test_the_slope_is_that_of_the_norm() -> None:

@@ -27,9 +27,9 @@ DEFAULT = replace(
     # The model of trust knows full-size images of real cars; what the solver finds on toys is to be seen as it is.
     acceptance=AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0),
 )
+MARCHED = replace(DEFAULT, solver=replace(DEFAULT.solver, rays="marched"))
 PAPER = replace(
-    DEFAULT,
-    solver=replace(DEFAULT.solver, rays="marched"),
+    MARCHED,
     silhouette=replace(DEFAULT.silhouette, form="product"),
     photometric=replace(DEFAULT.photometric, pixel_set="hit", brightness="none", truncated=False),
     priors=replace(DEFAULT.priors, tilt_form="cosine", tilt_weight=1e7, dimensions_weight=0.0),
