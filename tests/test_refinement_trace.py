@@ -1,0 +1,98 @@
+"""The trace against the refiner itself: same ends, same costs, complete states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.config_files import load_config
+from directshape_torch.geometry import se3
+from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import Detections
+
+_SEARCH = "search.disparity_offsets_px=[-2,2]"
+
+
+@pytest.fixture(scope="module")
+def demo_frame() -> LoadedFrame:
+    data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
+    return data.load(data.frame_ids[0])
+
+
+def _with_lost_car(detections: Detections) -> Detections:
+    """The first car has no pose, so it takes no part."""
+    T_cam_obj = detections.T_cam_obj.clone()
+    T_cam_obj[0, :3, 3] = torch.nan
+    return replace(detections, T_cam_obj=T_cam_obj)
+
+
+@pytest.fixture(scope="module", params=[[], ["method=geometric"], [_SEARCH]], ids=["direct", "geometric", "search"])
+def trace(request: pytest.FixtureRequest, demo_frame: LoadedFrame) -> RefinementTrace:
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", *request.param]))
+    return trace_refinement(refiner, demo_frame.frame, _with_lost_car(demo_frame.detections))
+
+
+def test_ends_of_the_trace_are_input_and_result(trace: RefinementTrace, demo_frame: LoadedFrame) -> None:
+    refined = trace.result.refined
+    assert refined[1:].any()
+    assert torch.equal(trace.T_cam_obj[-1][refined], trace.result.T_cam_obj[refined])
+    assert torch.equal(trace.codes[-1][refined], trace.result.code[refined])
+    expected = se3.inverse(demo_frame.detections.T_cam_obj)
+    assert torch.equal(trace.states[0].T_obj_cam[1:], expected[1:])
+
+
+def test_costs_at_the_ends_are_those_of_the_result(trace: RefinementTrace) -> None:
+    result, refined = trace.result, trace.result.refined
+    torch.testing.assert_close(trace.costs[0], result.cost_before, rtol=0, atol=0, equal_nan=True)
+    torch.testing.assert_close(trace.costs[-1][refined], result.cost_after[refined], rtol=1e-6, atol=1e-9)
+
+
+def test_car_without_pose_takes_no_part(trace: RefinementTrace) -> None:
+    assert trace.place_of(0) == -1
+    assert trace.place_of(1) == 0
+    assert not trace.accepted[:, 0].any()
+    assert trace.costs[:, 0].isnan().all()
+
+
+def test_cars_move_where_a_step_was_accepted_and_nowhere_else(trace: RefinementTrace) -> None:
+    for car in trace.rows.tolist():
+        for k in range(1, len(trace)):
+            same = all(torch.equal(a[car], b[car]) for a, b in zip(trace.states[k], trace.states[k - 1], strict=True))
+            assert same or trace.accepted[k, car] or trace.stage[k] == -1
+        assert trace.steps_of(car)[0] == 0
+        assert trace.steps_of(car)[-1] == len(trace) - 1
+
+
+def test_number_of_states_is_that_of_the_iterations(trace: RefinementTrace) -> None:
+    iterations = [s for s in trace.stage if s >= 0]
+    assert len(iterations) == trace.result.cost_history.shape[1]
+    assert iterations == sorted(iterations)
+    assert len(trace.accepted) == len(trace.costs) == len(trace)
+
+
+def test_search_adds_the_start_that_it_chose(demo_frame: LoadedFrame) -> None:
+    config = load_config("fast", ["compile=off", _SEARCH, "stages=[{max_iterations: 1}]"])
+    trace = trace_refinement(DirectShapeRefiner(config=config), demo_frame.frame, demo_frame.detections)
+    assert trace.stage == (-1, -1, 0)
+
+
+def test_no_cars_at_all(demo_frame: LoadedFrame) -> None:
+    T_cam_obj = torch.full_like(demo_frame.detections.T_cam_obj, torch.nan)
+    T_cam_obj[:, :3, :3] = torch.eye(3)
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off"]))
+    trace = trace_refinement(refiner, demo_frame.frame, replace(demo_frame.detections, T_cam_obj=T_cam_obj))
+    assert len(trace) == len(trace.costs) == 1
+    assert len(trace.rows) == 0
+
+
+def test_without_photometry_leaves_the_refiner_alone() -> None:
+    refiner = DirectShapeRefiner()
+    silhouettes = without_photometry(refiner)
+    assert refiner.config.photometric.weight > 0
+    assert silhouettes.config == replace(refiner.config, photometric=replace(refiner.config.photometric, weight=0.0))
+    assert silhouettes.prior is refiner.prior
