@@ -16,6 +16,9 @@ from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.mask_matching import MaskMatches, match_masks, project_boxes, without_duplicates
 from directshape_torch.scene import Detections, Occluders, StereoCamera
 
+# For each input line the instance that its file gives it in either image, -1 for none.
+GivenMasks = Mapping[Side, Sequence[int]]
+
 
 @dataclass(frozen=True)
 class MatchingSummary:
@@ -38,8 +41,17 @@ def build_detections(
     camera: StereoCamera,  # of one frame
     size_hw: tuple[int, int],
     classes: Collection[str],
+    given: GivenMasks | None = None,
 ) -> tuple[Detections, tuple[int, ...], MatchingSummary]:
     """The objects to refine, with masks matched one to one; all other instances become occluders.
+
+    Args:
+        objects: every line of the detection file.
+        masks: instances of both images.
+        camera: places the boxes in the images.
+        size_hw: of the images.
+        classes: types to refine.
+        given: which instance belongs to which line, where that is known; None: matched by overlap.
 
     Returns:
         The detections; for each input line the index of its detection or -1; and what was matched.
@@ -51,7 +63,10 @@ def build_detections(
     T_cam_obj = poses_cam(chosen, camera.t_cam_ref[0])
     dimensions_hwl = torch.tensor([o.hwl for o in chosen], dtype=dtype).reshape(-1, 3)
     by_side: dict[Side, list[InstanceMask]] = {side: [m for m in masks if m.side == side] for side in SIDES}
-    matches = _match_sides(chosen, by_side, camera, size_hw)
+    if given is None:
+        matches = _match_sides(chosen, by_side, camera, size_hw)
+    else:
+        matches = _given_matches(np.array(rows), by_side, given)
     others = [o for o in objects if o.type not in classes and o.has_box_3d]
     depths = _known_depths(others, by_side, matches, camera, size_hw)
     stacked = {side: _stack(by_side[side], matches[side], size_hw, dtype) for side in SIDES}
@@ -85,6 +100,21 @@ def _match_sides(
     moved = _moved_to_right(by_side["left"], left, projected_left, projected_right)
     right = match_masks(projected_right, by_side["right"], moved, eligible=eligible["right"])
     return {"left": left, "right": right}
+
+
+def _given_matches(
+    rows: NDArray[np.int64],  # the detection of each input line, or -1
+    by_side: dict[Side, list[InstanceMask]],
+    given: GivenMasks,
+) -> dict[Side, MaskMatches]:
+    """Matches by the instance numbers that the input gives; an instance whose mask is empty is none."""
+    matches: dict[Side, MaskMatches] = {}
+    for side in SIDES:
+        place = {mask.instance_id: index for index, mask in enumerate(by_side[side])}
+        wanted = [number for number, row in zip(given[side], rows, strict=True) if row >= 0]
+        index = np.array([place.get(number, -1) for number in wanted], dtype=np.int64)
+        matches[side] = MaskMatches(index, (index >= 0).astype(np.float64))
+    return matches
 
 
 def _moved_to_right(

@@ -16,6 +16,7 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIGNATURE = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
 _CURE = "copy or download the file again"
+IMAGE_ENDINGS = ("png", "jpg", "jpeg")
 
 
 def read_rgb(path: Path | str) -> NDArray[np.uint8]:
@@ -46,7 +47,7 @@ def read_single_channel(path: Path | str) -> NDArray[Any]:
 
 def find_image(folder: Path, stem: str) -> Path:
     """The image `stem` with one of the endings png, jpg, jpeg in `folder`; the png path if there is none."""
-    candidates = [folder / f"{stem}.{ending}" for ending in ("png", "jpg", "jpeg")]
+    candidates = [folder / f"{stem}.{ending}" for ending in IMAGE_ENDINGS]
     return next((path for path in candidates if path.is_file()), candidates[0])
 
 

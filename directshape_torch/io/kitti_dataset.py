@@ -1,65 +1,22 @@
-"""Stereo frames in KITTI's folder layout, with detections and masks, as the tensors a refinement takes."""
+"""Stereo frames in KITTI's object layout, with detections and masks, as the tensors a refinement takes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.ground_plane import plane_ref_to_cam
-from directshape_torch.io.disparity_files import read_disparity
-from directshape_torch.io.frame_detections import MatchingSummary, build_detections
-from directshape_torch.io.ground_plane_files import read_plane
-from directshape_torch.io.image_files import find_image, read_rgb
-from directshape_torch.io.instance_masks import MaskSource, file_of_frame, mask_source
-from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
-from directshape_torch.io.kitti_labels import KittiObject, read_objects
-from directshape_torch.io.text_files import read_lines
-from directshape_torch.scene import Detections, FrameBatch, GroundPlane, StereoCamera
+from directshape_torch.io.instance_masks import MaskSource
+from directshape_torch.io.kitti_layout import KittiObjectLayout
+from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
+from directshape_torch.io.stereo_files import DEFAULT_CAMERA_HEIGHT_M, FileStereoDataset
 
-DEFAULT_CAMERA_HEIGHT_M = 1.65
-GroundSource = Literal["auto", "file", "stereo", "camera_height"]
+__all__ = ["DEFAULT_CAMERA_HEIGHT_M", "GroundSource", "KittiStereoDataset", "LoadedFrame"]
 
 
-@dataclass(frozen=True)
-class LoadedFrame:
-    """One frame of a data set, ready for a refinement.
-
-    Attributes:
-        frame: a batch of one frame.
-        detections: the B objects to refine, with masks.
-        input_objects: every line of the detection file, in its order.
-        refined_rows: for each input line the index of its detection, or -1 for lines to copy as they are.
-        labels: the ground truth, or None where there is no label file.
-        matching: which masks were found for the detections, for reports.
-    """
-
-    frame: FrameBatch
-    detections: Detections
-    input_objects: list[KittiObject]
-    refined_rows: tuple[int, ...]
-    labels: list[KittiObject] | None
-    matching: MatchingSummary
-
-    @property
-    def frame_id(self) -> str:
-        return self.frame.frame_ids[0]
-
-    @property
-    def row_of_detection(self) -> tuple[int, ...]:
-        """For each detection the index of its input line."""
-        return tuple(row for row, detection in enumerate(self.refined_rows) if detection >= 0)
-
-
-class KittiStereoDataset:
+class KittiStereoDataset(FileStereoDataset):
     """Frames of `root/training` (image_2, image_3, calib, label_2, planes) with a detector's results and masks.
 
     Args:
@@ -97,176 +54,17 @@ class KittiStereoDataset:
         disparity_dir: Path | str | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        if ground not in get_args(GroundSource):
-            raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
-        self.training = _existing_folder(Path(root) / "training", "holds no folder 'training' in KITTI's layout")
-        self.detections_dir = _existing_folder(Path(detections_dir), "is no folder of detections")
-        self.masks = mask_source(masks) if isinstance(masks, (str, Path)) else masks
-        self.classes = frozenset(classes)
-        self.ground = ground
-        self.camera_height_m = camera_height_m
-        self.disparity_field = disparity_field
-        self.disparity_dir = (
-            None if disparity_dir is None else _existing_folder(Path(disparity_dir), "is no folder of disparity maps")
-        )
-        self.dtype = dtype
-        self.frame_ids = self._choose_frames(split, frames)
-
-    def __len__(self) -> int:
-        return len(self.frame_ids)
-
-    def load(self, frame_id: str) -> LoadedFrame:
-        """Read everything of one frame.
-
-        Raises:
-            DataFormatError: a file is missing or damaged; names file and reason.
-        """
-        left, right = self._read_images(frame_id)
-        camera = self._read_camera(frame_id)
-        ground = self._ground(frame_id, left, right, camera)
-        height, width = left.shape[:2]
-        frame = FrameBatch(
-            images_left=_to_tensor(left, self.dtype),
-            images_right=_to_tensor(right, self.dtype),
-            sizes=torch.tensor([[height, width]]),
-            camera=camera,
+        layout = KittiObjectLayout(root, detections_dir)
+        super().__init__(
+            layout,
+            masks,
+            split=split,
+            frames=frames,
+            classes=classes,
             ground=ground,
-            frame_ids=(frame_id,),
-            disparity=self._disparity(frame_id, (height, width)),
+            camera_height_m=camera_height_m,
+            disparity_field=disparity_field,
+            disparity_dir=disparity_dir,
+            dtype=dtype,
         )
-        objects = read_objects(self.detection_path(frame_id))
-        masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
-        detections, rows, matching = build_detections(objects, masks, camera, (height, width), self.classes)
-        return LoadedFrame(frame, detections, objects, rows, self._labels(frame_id), matching)
-
-    def input_files(self, frame_id: str) -> dict[str, Path]:
-        """The files that `load` reads for a frame and that bear on its result, by their role."""
-        files = {
-            "image_left": find_image(self.training / "image_2", frame_id),
-            "image_right": find_image(self.training / "image_3", frame_id),
-            "calibration": self.training / "calib" / f"{frame_id}.txt",
-            "detections": self.detection_path(frame_id),
-        }
-        if self.disparity_dir is not None:
-            files["disparity"] = self._disparity_path(self.disparity_dir, frame_id)
-        plane = self._plane_path(frame_id)
-        if self.ground in ("auto", "file") and plane.is_file():
-            files["ground_plane"] = plane
-        if self.masks is not None:
-            files |= {f"masks_{index}": path for index, path in enumerate(self.masks.files(frame_id))}
-        return files
-
-    def detection_path(self, frame_id: str) -> Path:
-        """The detection file of a frame."""
-        return file_of_frame(self.detections_dir, f"{frame_id}.txt")
-
-    def _choose_frames(self, split: Path | str | None, frames: Iterable[str | int] | None) -> tuple[str, ...]:
-        if split is not None:
-            known = list(dict.fromkeys(line.text for line in read_lines(split)))
-        else:
-            folder = self.detections_dir / "data"
-            known = sorted(path.stem for path in (folder if folder.is_dir() else self.detections_dir).glob("*.txt"))
-        if frames is not None:
-            names = (f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames)
-            # A frame that is named twice is one frame.
-            wanted = list(dict.fromkeys(names))
-            missing = [frame for frame in wanted if frame not in set(known)]
-            if missing:
-                where = split if split is not None else self.detections_dir
-                raise InputError("frames", f"ids that occur in {where}", ", ".join(missing[:5]))
-            known = wanted
-        if not known:
-            raise InputError("frames", f"at least one detection file NNNNNN.txt in {self.detections_dir}", "none")
-        return tuple(known)
-
-    def _read_images(self, frame_id: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        left_path, right_path = (find_image(self.training / name, frame_id) for name in ("image_2", "image_3"))
-        left, right = read_rgb(left_path), read_rgb(right_path)
-        if left.shape != right.shape:
-            raise DataFormatError(
-                right_path,
-                f"has {right.shape[1]} x {right.shape[0]} pixels, the left image {left.shape[1]} x {left.shape[0]}",
-                cure="give the rectified pair of one frame",
-            )
-        return left, right
-
-    def _read_camera(self, frame_id: str) -> StereoCamera:
-        calibration = read_calibration(self.training / "calib" / f"{frame_id}.txt")
-        return to_stereo_camera([calibration], self.disparity_field, self.dtype)
-
-    def _disparity(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
-        if self.disparity_dir is None:
-            return None
-        disparity = read_disparity(self._disparity_path(self.disparity_dir, frame_id), size_hw)
-        return torch.from_numpy(disparity)[None].to(self.dtype)
-
-    @staticmethod
-    def _disparity_path(folder: Path, frame_id: str) -> Path:
-        """Submissions to KITTI Stereo 2015 call the first pair of a scene `NNNNNN_10`."""
-        first_pair = folder / f"{frame_id}_10.png"
-        return first_pair if first_pair.is_file() else folder / f"{frame_id}.png"
-
-    def _labels(self, frame_id: str) -> list[KittiObject] | None:
-        path = self.training / "label_2" / f"{frame_id}.txt"
-        return read_objects(path, with_score=False) if path.is_file() else None
-
-    def _plane_path(self, frame_id: str) -> Path:
-        return self.training / "planes" / f"{frame_id}.txt"
-
-    def _ground(
-        self, frame_id: str, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
-    ) -> GroundPlane:
-        """The plane of the first source that has one, of those that `self.ground` allows.
-
-        Plane files are commonly made from raw disparity and share its bias, so with a disparity field "auto" asks the
-        corrected stereo pair first.
-        """
-        orders: dict[GroundSource, tuple[GroundSource, ...]] = {
-            "auto": ("file", "stereo") if self.disparity_field is None else ("stereo", "file"),
-            "file": ("file",),
-            "stereo": ("stereo",),
-            "camera_height": (),
-        }
-        for source in orders[self.ground]:
-            plane_cam = (
-                self._plane_from_file(frame_id, camera)
-                if source == "file"
-                else self._plane_from_stereo(left, right, camera)
-            )
-            if plane_cam is not None:
-                return _ground_plane(plane_cam, source, self.dtype)
-        return GroundPlane.from_camera_height(self.camera_height_m).to(dtype=self.dtype)
-
-    def _plane_from_file(self, frame_id: str, camera: StereoCamera) -> Tensor | None:
-        path = self._plane_path(frame_id)
-        if self.ground == "auto" and not path.is_file():
-            return None
-        plane_ref = torch.from_numpy(read_plane(path))
-        offset_cam = plane_ref_to_cam(plane_ref[:3], plane_ref[3], camera.t_cam_ref[0].double())
-        return torch.cat([plane_ref[:3], offset_cam[None]])
-
-    def _plane_from_stereo(
-        self, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
-    ) -> Tensor | None:
-        from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
-
-        plane = estimate_ground_plane(left, right, camera)
-        if plane is None:
-            return None
-        normal, offset = (torch.as_tensor(part, dtype=torch.float64).reshape(-1) for part in plane)
-        return torch.cat([normal, offset])
-
-
-def _ground_plane(plane_cam: Tensor, source: str, dtype: torch.dtype) -> GroundPlane:
-    return GroundPlane(plane_cam[None, :3].to(dtype), plane_cam[None, 3].to(dtype).reshape(1), (source,))
-
-
-def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
-    """(1, 3, H, W) in [0, 1] from uint8 (H, W, 3)."""
-    return torch.from_numpy(rgb).permute(2, 0, 1)[None].to(dtype).contiguous() / 255
-
-
-def _existing_folder(path: Path, problem: str) -> Path:
-    if not path.is_dir():
-        raise DataFormatError(path.parent if path.name == "training" else path, problem, cure="check the path")
-    return path
+        self.training = layout.training

@@ -1,0 +1,104 @@
+"""Where the parts of a frame are: the only thing in which the layouts of stereo data sets differ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError
+from directshape_torch.io.frame_detections import GivenMasks
+from directshape_torch.io.image_files import IMAGE_ENDINGS
+from directshape_torch.io.instance_masks import MaskSource
+from directshape_torch.io.kitti_calibration import KittiCalibration
+from directshape_torch.io.kitti_labels import KittiObject
+
+DISPARITY_ENDING = ".png"
+
+
+class FrameLayout(Protocol):
+    """Finds and reads the files of a frame, all but images and masks, whose readers the layouts share."""
+
+    @property
+    def detections_dir(self) -> Path:
+        """The folder that detections are read from."""
+        ...
+
+    @property
+    def detection_file_name(self) -> str:
+        """What detection files are called, for messages."""
+        ...
+
+    def frame_ids(self) -> list[str]:
+        """All frames that have detections, sorted."""
+        ...
+
+    def frame_id(self, number: int) -> str:
+        """The name of the frame of that number."""
+        ...
+
+    def images(self, frame_id: str) -> tuple[Path, Path]:
+        """Left and right image."""
+        ...
+
+    def calibration_path(self, frame_id: str) -> Path: ...
+
+    def calibration(self, frame_id: str) -> KittiCalibration: ...
+
+    def plane_path(self, frame_id: str) -> Path | None:
+        """The file with the ground plane of a frame, or None where it has none."""
+        ...
+
+    def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
+        """The plane (a, b, c, d) of that file, see `read_plane`.
+
+        Raises:
+            DataFormatError: there is none, or it is damaged.
+        """
+        ...
+
+    def detection_path(self, frame_id: str) -> Path: ...
+
+    def objects(self, frame_id: str) -> list[KittiObject]:
+        """The detections of a frame."""
+        ...
+
+    def labels(self, frame_id: str) -> list[KittiObject] | None:
+        """The ground truth of a frame, or None."""
+        ...
+
+    def disparity_path(self, folder: Path, frame_id: str) -> Path:
+        """The disparity map of a frame in a folder of such maps."""
+        ...
+
+    def masks(self) -> MaskSource | None:
+        """Masks that come with the layout itself, used where no others are given."""
+        ...
+
+    def given_masks(self, frame_id: str) -> GivenMasks | None:
+        """Which instance belongs to which detection where the layout's own masks say so; None: matched by overlap."""
+        ...
+
+
+def existing_folder(path: Path, problem: str, cure: str = "check the path") -> Path:
+    """The path itself.
+
+    Raises:
+        DataFormatError: it is no folder.
+    """
+    if not path.is_dir():
+        raise DataFormatError(path, problem, cure=cure)
+    return path
+
+
+def image_stems(folder: Path) -> list[str]:
+    """Names without ending of the images in a folder, sorted."""
+    return sorted({path.stem for path in folder.glob("*") if path.suffix.lstrip(".") in IMAGE_ENDINGS})
+
+
+def first_disparity(folder: Path, stem: str) -> Path:
+    """`NNNNNN_10.png`, as submissions to KITTI Stereo 2015 call the first pair of a scene, else `NNNNNN.png`."""
+    first_pair = folder / f"{stem}_10{DISPARITY_ENDING}"
+    return first_pair if first_pair.is_file() else folder / f"{stem}{DISPARITY_ENDING}"

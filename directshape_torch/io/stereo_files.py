@@ -1,0 +1,229 @@
+"""Stereo frames from files of any layout, with detections and masks, as the tensors a refinement takes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.ground_plane import plane_ref_to_cam
+from directshape_torch.io.disparity_files import read_disparity
+from directshape_torch.io.frame_detections import build_detections
+from directshape_torch.io.frame_layout import FrameLayout, existing_folder
+from directshape_torch.io.image_files import read_rgb
+from directshape_torch.io.instance_masks import MaskSource, mask_source
+from directshape_torch.io.kitti_calibration import to_stereo_camera
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
+from directshape_torch.io.text_files import read_lines
+from directshape_torch.scene import FrameBatch, GroundPlane, StereoCamera
+
+DEFAULT_CAMERA_HEIGHT_M = 1.65
+
+
+class FileStereoDataset:
+    """Frames whose files a layout finds; a `StereoDataset`.
+
+    Args:
+        layout: where the parts of a frame are.
+        masks: folder of masks (see `mask_source`), a `MaskSource`, or None: those of the layout, if it has any.
+        split: file with one frame id a line; default every frame that has detections.
+        frames: ids of the frames to use, of those.
+        classes: object types to refine; other lines are copied.
+        ground: where ground planes come from: "auto" is file, else stereo, else camera height; with a disparity
+            field stereo comes first, for plane files share the bias of the disparities they were made from.
+        camera_height_m: height of the camera above a level ground, the last resort.
+        disparity_field: residual disparity of the rig, or None.
+        disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with the disparity maps of any stereo method, for the
+            methods that fit a point cloud; None: they match the images themselves.
+        dtype: of the tensors.
+
+    Raises:
+        DataFormatError: a folder or the split file is missing.
+        InputError: no frames, frames without a detection file, or an unknown `ground`.
+    """
+
+    def __init__(
+        self,
+        layout: FrameLayout,
+        masks: Path | str | MaskSource | None = None,
+        *,
+        split: Path | str | None = None,
+        frames: Iterable[str | int] | None = None,
+        classes: Sequence[str] = ("Car",),
+        ground: GroundSource = "auto",
+        camera_height_m: float = DEFAULT_CAMERA_HEIGHT_M,
+        disparity_field: DisparityField | None = None,
+        disparity_dir: Path | str | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        if ground not in get_args(GroundSource):
+            raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
+        self.layout = layout
+        # Masks from elsewhere know nothing of the layout's own links between masks and detections.
+        self._own_masks = masks is None
+        self.masks = (
+            mask_source(masks) if isinstance(masks, (str, Path)) else layout.masks() if masks is None else masks
+        )
+        self.classes = frozenset(classes)
+        self.ground: GroundSource = ground
+        self.camera_height_m = camera_height_m
+        self.disparity_field = disparity_field
+        self.disparity_dir = (
+            None if disparity_dir is None else existing_folder(Path(disparity_dir), "is no folder of disparity maps")
+        )
+        self.dtype = dtype
+        self.frame_ids = self._choose_frames(split, frames)
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    @property
+    def detections_dir(self) -> Path:
+        """The folder that detections are read from."""
+        return self.layout.detections_dir
+
+    def load(self, frame_id: str) -> LoadedFrame:
+        """Read everything of one frame.
+
+        Raises:
+            DataFormatError: a file is missing or damaged; names file and reason.
+        """
+        left, right = self._read_images(frame_id)
+        camera = to_stereo_camera([self.layout.calibration(frame_id)], self.disparity_field, self.dtype)
+        ground = self._ground(frame_id, left, right, camera)
+        height, width = left.shape[:2]
+        frame = FrameBatch(
+            images_left=_to_tensor(left, self.dtype),
+            images_right=_to_tensor(right, self.dtype),
+            sizes=torch.tensor([[height, width]]),
+            camera=camera,
+            ground=ground,
+            frame_ids=(frame_id,),
+            disparity=self._disparity(frame_id, (height, width)),
+        )
+        objects = self.objects(frame_id)
+        masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
+        given = self.layout.given_masks(frame_id) if self._own_masks else None
+        detections, rows, matching = build_detections(objects, masks, camera, (height, width), self.classes, given)
+        return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), matching)
+
+    def objects(self, frame_id: str) -> list[KittiObject]:
+        """The detections of a frame alone, without its images."""
+        return self.layout.objects(frame_id)
+
+    def detection_path(self, frame_id: str) -> Path:
+        """The file that holds the detections of a frame."""
+        return self.layout.detection_path(frame_id)
+
+    def input_files(self, frame_id: str) -> dict[str, Path]:
+        """The files that `load` reads for a frame and that bear on its result, by their role."""
+        left, right = self.layout.images(frame_id)
+        files = {
+            "image_left": left,
+            "image_right": right,
+            "calibration": self.layout.calibration_path(frame_id),
+            "detections": self.detection_path(frame_id),
+        }
+        if self.disparity_dir is not None:
+            files["disparity"] = self.layout.disparity_path(self.disparity_dir, frame_id)
+        plane = self.layout.plane_path(frame_id)
+        if self.ground in ("auto", "file") and plane is not None:
+            files["ground_plane"] = plane
+        if self.masks is not None:
+            files |= {f"masks_{index}": path for index, path in enumerate(self.masks.files(frame_id))}
+        return files
+
+    def _choose_frames(self, split: Path | str | None, frames: Iterable[str | int] | None) -> tuple[str, ...]:
+        if split is not None:
+            known = list(dict.fromkeys(line.text for line in read_lines(split)))
+        else:
+            known = self.layout.frame_ids()
+        if frames is not None:
+            names = (self.layout.frame_id(frame) if isinstance(frame, int) else frame for frame in frames)
+            # A frame that is named twice is one frame.
+            wanted = list(dict.fromkeys(names))
+            missing = [frame for frame in wanted if frame not in set(known)]
+            if missing:
+                where = split if split is not None else self.detections_dir
+                raise InputError("frames", f"ids that occur in {where}", ", ".join(missing[:5]))
+            known = wanted
+        if not known:
+            wanted_file = self.layout.detection_file_name
+            raise InputError("frames", f"at least one detection file {wanted_file} in {self.detections_dir}", "none")
+        return tuple(known)
+
+    def _read_images(self, frame_id: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        left_path, right_path = self.layout.images(frame_id)
+        left, right = read_rgb(left_path), read_rgb(right_path)
+        if left.shape != right.shape:
+            raise DataFormatError(
+                right_path,
+                f"has {right.shape[1]} x {right.shape[0]} pixels, the left image {left.shape[1]} x {left.shape[0]}",
+                cure="give the rectified pair of one frame",
+            )
+        return left, right
+
+    def _disparity(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
+        if self.disparity_dir is None:
+            return None
+        disparity = read_disparity(self.layout.disparity_path(self.disparity_dir, frame_id), size_hw)
+        return torch.from_numpy(disparity)[None].to(self.dtype)
+
+    def _ground(
+        self, frame_id: str, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
+    ) -> GroundPlane:
+        """The plane of the first source that has one, of those that `self.ground` allows.
+
+        Plane files are commonly made from raw disparity and share its bias, so with a disparity field "auto" asks the
+        corrected stereo pair first.
+        """
+        orders: dict[GroundSource, tuple[GroundSource, ...]] = {
+            "auto": ("file", "stereo") if self.disparity_field is None else ("stereo", "file"),
+            "file": ("file",),
+            "stereo": ("stereo",),
+            "camera_height": (),
+        }
+        for source in orders[self.ground]:
+            plane_cam = (
+                self._plane_from_file(frame_id, camera)
+                if source == "file"
+                else self._plane_from_stereo(left, right, camera)
+            )
+            if plane_cam is not None:
+                return _ground_plane(plane_cam, source, self.dtype)
+        return GroundPlane.from_camera_height(self.camera_height_m).to(dtype=self.dtype)
+
+    def _plane_from_file(self, frame_id: str, camera: StereoCamera) -> Tensor | None:
+        if self.ground == "auto" and self.layout.plane_path(frame_id) is None:
+            return None
+        plane_ref = torch.from_numpy(self.layout.plane_ref(frame_id))
+        offset_cam = plane_ref_to_cam(plane_ref[:3], plane_ref[3], camera.t_cam_ref[0].double())
+        return torch.cat([plane_ref[:3], offset_cam[None]])
+
+    def _plane_from_stereo(
+        self, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
+    ) -> Tensor | None:
+        from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
+
+        plane = estimate_ground_plane(left, right, camera)
+        if plane is None:
+            return None
+        normal, offset = (torch.as_tensor(part, dtype=torch.float64).reshape(-1) for part in plane)
+        return torch.cat([normal, offset])
+
+
+def _ground_plane(plane_cam: Tensor, source: str, dtype: torch.dtype) -> GroundPlane:
+    return GroundPlane(plane_cam[None, :3].to(dtype), plane_cam[None, 3].to(dtype).reshape(1), (source,))
+
+
+def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
+    """(1, 3, H, W) in [0, 1] from uint8 (H, W, 3)."""
+    return torch.from_numpy(rgb).permute(2, 0, 1)[None].to(dtype).contiguous() / 255
