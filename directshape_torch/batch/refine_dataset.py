@@ -20,9 +20,8 @@ from directshape_torch.compilation import cars_ahead
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
-from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.run_manifest import RunManifest, hash_files
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 
@@ -31,7 +30,7 @@ _FRAMES_COUNTED = 50
 
 
 def refine_dataset(
-    dataset: KittiStereoDataset,
+    dataset: StereoDataset,
     refiner: DirectShapeRefiner,
     out_dir: Path | str,
     options: RefineOptions | None = None,
@@ -72,7 +71,7 @@ class _Run:
 
     def __init__(
         self,
-        dataset: KittiStereoDataset,
+        dataset: StereoDataset,
         refiner: DirectShapeRefiner,
         out_dir: Path,
         options: RefineOptions,
@@ -147,19 +146,19 @@ class _Run:
         return RunSummary(frames, tuple(resumed), failed, warnings, self.timings)
 
 
-def expected_cars(dataset: KittiStereoDataset, frame_ids: Sequence[str]) -> int:
+def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
     """About how many cars frames have, from the detection files of some of them: whether compiling will pay."""
     looked_at = frame_ids[:: max(1, len(frame_ids) // _FRAMES_COUNTED)]
     count = 0
     for frame_id in looked_at:
         # A file that cannot be read is reported when its turn comes.
         with contextlib.suppress(DirectShapeError, OSError):
-            objects = read_objects(dataset.detection_path(frame_id))
+            objects = dataset.objects(frame_id)
             count += sum(found.type in dataset.classes for found in objects)
     return round(count * len(frame_ids) / max(1, len(looked_at)))
 
 
-def run_manifest(dataset: KittiStereoDataset, refiner: DirectShapeRefiner, prior_sha256: str) -> RunManifest:
+def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha256: str) -> RunManifest:
     """What the results of a run depend on, besides the files of each frame.
 
     Device, batch size and kinds of outputs are left out: they do not change what is computed.
@@ -183,7 +182,7 @@ def package_version() -> str:
         return "not installed"
 
 
-def _check_out_dir(dataset: KittiStereoDataset, out_dir: Path) -> None:
+def _check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
     written = (out_dir / "data").resolve()
     for read in (dataset.detections_dir, dataset.detections_dir / "data"):
         if written == read.resolve():

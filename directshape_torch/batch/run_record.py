@@ -10,7 +10,6 @@ from typing import Any
 
 from directshape_torch.batch.frame_outputs import overlay_path
 from directshape_torch.errors import DataFormatError, ResumeError
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.run_manifest import (
     RunManifest,
@@ -20,6 +19,7 @@ from directshape_torch.io.run_manifest import (
     read_manifest,
     write_manifest,
 )
+from directshape_torch.io.stereo_dataset import StereoDataset
 
 # The file grows with the data set: writing it after every frame would cost the square of their number.
 _SECONDS_BETWEEN_WRITES = 5.0
@@ -42,7 +42,7 @@ class RunRecord:
         self.manifest = self._continued(manifest)
         self.write()
 
-    def finished_frames(self, dataset: KittiStereoDataset, outputs: Sequence[str]) -> list[str]:
+    def finished_frames(self, dataset: StereoDataset, outputs: Sequence[str]) -> list[str]:
         """Frames of the data set that need no work: done, with all the outputs, from the files as they are now.
 
         Raises:
@@ -100,7 +100,7 @@ class RunRecord:
         files += [self.out_dir / name for name in entry.get("mesh_files", ()) if f"meshes_{name[-3:]}" in outputs]
         return set(outputs) <= set(entry["outputs"]) and all(file.is_file() for file in files)
 
-    def _check_inputs(self, dataset: KittiStereoDataset, frame_id: str) -> None:
+    def _check_inputs(self, dataset: StereoDataset, frame_id: str) -> None:
         try:
             hashes = hash_files(dataset.input_files(frame_id))
         except DataFormatError as error:
