@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from directshape_torch.energy.car_problem import CarProblem, sum_of
+from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.term import TermLinearisation
+from directshape_torch.energy.term import TermLinearisation, sum_of
 
 
 def tangent_covariance(problem: CarProblem, state: CarState) -> Tensor:

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from directshape_torch.device_constants import constant_like
 from directshape_torch.disparity_profile import DisparityProfile
-from directshape_torch.energy.car_problem import CarProblem, sum_of
+from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.prior_terms import PriorTerm
-from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.energy.term import Term, TermLinearisation, sum_of
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.shape.shape_prior import DimensionsDerivative

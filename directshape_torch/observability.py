@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.car_rows import kept, placed
-from directshape_torch.energy.car_problem import sum_of
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.prior_terms import PriorTerm
-from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.energy.term import Term, TermLinearisation, sum_of
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.shape.shape_prior import ShapePrior

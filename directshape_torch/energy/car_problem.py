@@ -12,11 +12,13 @@ from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.method import method_stages
 from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
-from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.energy.stage_rules import moving_unknowns, step_limits, without_held
+from directshape_torch.energy.term import Term, TermLinearisation, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy
+from directshape_torch.energy.tracked_problem import TrackedProblem
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.problem import Linearisation, Stage, Unknowns
+from directshape_torch.solver.problem import Linearisation, Stage, StageProblem, Unknowns
 
 # Projections kept: of the input, of the present stage's first state, of the end.
 _REMEMBERED = 3
@@ -57,14 +59,18 @@ class CarProblem:
     def stages(self) -> list[Stage]:
         return method_stages(self.config)
 
-    def begin_stage(self, stage: Stage, state: CarState) -> None:
+    def begin_stage(self, stage: Stage, state: CarState) -> StageProblem[CarState]:
         self.unknowns = stage.unknowns
         self._costs = []
         projected = self.project(state)
         self.terms = [term.at_stage(stage, projected) for term in self.terms]
         # What is differentiated afterwards is `linearise_differentiably`, so its root must be found.
-        if self.config.solver.rays == "tracked" and self.config.backward.mode == "none":
-            self._tracked = TrackedEnergy.of_terms(self.terms, projected, self.term_weights)
+        if self.config.solver.rays == "marched" or self.config.backward.mode != "none":
+            return self
+        self._tracked = TrackedEnergy.of_terms(self.terms, projected, self.term_weights)
+        if self._tracked.others or self.config.solver.jacobian == "autograd":
+            return self
+        return TrackedProblem(self.prior, self._tracked, self.config.solver, self.unknowns)
 
     def follow(self, accepted: Tensor) -> None:
         if self._tracked is not None:
@@ -127,11 +133,12 @@ class CarProblem:
 
     def linearise(self, state: CarState) -> Linearisation:
         if self._tracked is None:
-            return self._without_held(_total(self.linearise_terms(state)))
+            return self._without_held(total_of(self.linearise_terms(state)))
         if self.config.solver.jacobian == "autograd":
-            return self._without_held(_total(self._tracked.linearise_by_autograd(self, state)))
+            return self._without_held(total_of(self._tracked.linearise_by_autograd(self, state)))
         projected = self._new_projection(state, None, ROOT_ITERATIONS, False)
-        return self._without_held(_total(self._tracked.linearise(projected)))
+        parts = self._tracked.linearise(projected.shape, state) + self._tracked.linearise_others(projected)
+        return self._without_held(total_of(parts))
 
     def linearise_terms(self, state: CarState, with_fisher: bool = False) -> list[TermLinearisation]:
         """The linearisation of each term by itself."""
@@ -145,27 +152,16 @@ class CarProblem:
     def linearise_differentiably(self, state: CarState) -> Linearisation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
         projected = self.project(state, moving_depths=True)
-        return self._without_held(_total(self._weighted([term.linearise(projected) for term in self.terms])))
+        return self._without_held(total_of(self._weighted([term.linearise(projected) for term in self.terms])))
 
     def free_unknowns(self, state: CarState) -> Tensor:
         """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
         free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
         free = torch.cat([free_pose, state.code.abs() < self.config.solver.max_code], dim=1)
-        return free & self._moving(state.code)
-
-    def _moving(self, code: Tensor) -> Tensor:
-        """Unknowns (D,) that the stage moves."""
-        is_pose = torch.arange(6 + code.shape[1], device=code.device) < 6
-        return is_pose if self.unknowns == "pose" else ~is_pose if self.unknowns == "shape" else is_pose | ~is_pose
+        return free & moving_unknowns(self.unknowns, state.code)
 
     def _without_held(self, at: Linearisation) -> Linearisation:
-        """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
-        if self.unknowns == "both":
-            return at
-        moving = self._moving(at.gradient[:, 6:])
-        identity = torch.eye(len(moving), dtype=at.hessian.dtype, device=at.hessian.device)
-        hessian = torch.where(moving[:, None] & moving, at.hessian, identity)
-        return Linearisation(at.cost, torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian)
+        return without_held(at, self.unknowns)
 
     def _weighted(self, parts: list[TermLinearisation]) -> list[TermLinearisation]:
         if self.term_weights is None:
@@ -182,12 +178,10 @@ class CarProblem:
         return retract(state, step, self.config.solver.max_code)
 
     def step_limits(self) -> Tensor:
-        s = self.config.solver
-        limits = [s.max_step_translation_m] * 3 + [s.max_step_rotation_rad] * 3
-        limits += [s.max_step_code] * self.prior.num_codes
-        return torch.tensor(limits, dtype=torch.float64, device=self.left.uv.device)
+        return step_limits(self.config.solver, self.prior.num_codes, self.left.uv.device)
 
-    def compact(self, keep: Tensor) -> CarProblem:
+    def compact(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarProblem:
+        """The problem of the cars where `keep` (B,) holds; `numbers` of them, where the host knows."""
         part = CarProblem(
             self.prior,
             [term.of_objects(keep) for term in self.terms],
@@ -197,16 +191,5 @@ class CarProblem:
             None if self.term_weights is None else self.term_weights[keep],
             self.unknowns,
         )
-        part._tracked = None if self._tracked is None else self._tracked.of_objects(keep)
+        part._tracked = None if self._tracked is None else self._tracked.of_objects(keep, numbers)
         return part
-
-
-def _total(parts: Sequence[TermLinearisation]) -> Linearisation:
-    return Linearisation(
-        sum_of([p.cost for p in parts]), sum_of([p.gradient for p in parts]), sum_of([p.hessian for p in parts])
-    )
-
-
-def sum_of(tensors: Sequence[Tensor]) -> Tensor:
-    """Sum of tensors of one shape, in order."""
-    return torch.stack(list(tensors)).sum(dim=0)

@@ -37,8 +37,7 @@ from directshape_torch.shape.raycast import attached_depth
 from directshape_torch.solver.normal_equations import Segments
 from directshape_torch.solver.problem import Stage
 
-# Of a profile at once: 8 MB in single precision.
-_PROFILE_RESIDUALS = 2_000_000
+_CENTRE = DSO_PATTERN.index((0, 0))
 
 
 class _ResidualInputs(NamedTuple):
@@ -76,18 +75,19 @@ class PhotometricTerm:
 
     def at_stage(self, stage: Stage, projected: ProjectedState) -> PhotometricTerm:
         images = self.pyramid[stage.image_level]
-        candidates = torch.arange(len(self.pixels), device=self.pixels.uv.device)
+        rows = torch.arange(len(self.pixels), device=self.pixels.uv.device)
+        candidates = self._surface(projected, rows)[1]
         if self.config.pixel_set == "hit_and_mask":
-            candidates = candidates[self.pixels.foreground > 0.5]
-        trial = replace(self, fixed=self._fix(candidates, images))
-        depth, on_surface = trial._surface(projected)
-        plain = photometric_residual(*trial._residual_inputs(depth))
-        usable = trial._is_usable(on_surface, plain.inside, plain.uv_right)
-        chosen = usable.nonzero()[:, 0]
+            candidates = candidates & (self.pixels.foreground > 0.5)
+        trial = replace(self, fixed=self._fix(candidates.nonzero()[:, 0], images))
         tried = trial.pixel_set
+        depth, on_surface = trial._surface(projected, tried.pixel_index)
+        usable, difference = trial._compared(depth, on_surface)
+        chosen = usable.nonzero()[:, 0]
         count = len(self.cars.frame_index)
         fixed = tried.select(chosen, tried.pixel_index[chosen], tried.object_index[chosen], count)
-        left, right = fixed.intensity_left, (plain.residual + tried.intensity_left)[chosen]
+        left = fixed.intensity_left
+        right = difference[chosen] + left
         matched = matched_brightness(self.config.brightness, left, right, fixed.neighbour_weight, fixed.segments)
         return replace(self, fixed=fixed._replace(intensity_left=matched))
 
@@ -97,8 +97,17 @@ class PhotometricTerm:
 
     def pixel_cost(self, projected: ProjectedState) -> Tensor:
         """Weighted Huber norm (Q,), summed over the neighbourhood, of each pixel of the set; differentiable."""
-        usable, residual = self._usable_and_residual(projected, attached=torch.is_grad_enabled())
-        return self._weighted_cost(self._norm(residual.residual).rho, usable)
+        if torch.is_grad_enabled():
+            usable, at = self._usable_and_residual(projected, attached=True)
+            return self._weighted_cost(self._norm(at.residual).rho, usable)
+        usable, difference = self._compared(*self._surface(projected, self.pixel_set.pixel_index))
+        residual = patch_residual(*self._patch_inputs(difference))
+        return self._weighted_cost(self._norm(residual).rho, usable)
+
+    def _compared(self, depth: Tensor, on_surface: Tensor) -> tuple[Tensor, Tensor]:
+        """Which pixels (Q,) of the set are usable, and right minus left (Q, N): values alone, without derivatives."""
+        here = disparity_residuals(*self._residual_inputs(depth), depth.new_zeros(1))
+        return self._is_usable(on_surface, here.inside[0], here.uv_right[0]), here.residual[0]
 
     def residuals(self, projected: ProjectedState) -> ResidualRows:
         """All neighbourhood pixels of all pixels, R = Q N, the neighbours of one pixel side by side."""
@@ -160,39 +169,6 @@ class PhotometricTerm:
         cost = fixed.segments.sum(pixel_cost) * c
         return TermLinearisation(cost, c[:, None] * gradient, c[:, None, None] * hessian, fisher)
 
-    def agreement(self, projected: ProjectedState) -> tuple[Tensor, Tensor]:
-        """Mean absolute residual (B,) in grey levels of the usable pixels, and their share (B,) of the pixel set."""
-        fixed = self.pixel_set
-        usable, residual = self._usable_and_residual(projected)
-        weight = fixed.neighbour_weight * usable[:, None]
-        total = fixed.segments.sum(weight.sum(dim=1))
-        error = fixed.segments.sum((weight * residual.residual.abs()).sum(dim=1))
-        nothing = torch.full_like(total, torch.nan)
-        count = fixed.segments.counts.to(torch.float64)
-        share = fixed.segments.sum(usable.to(weight.dtype)) / count.clamp_min(1)
-        return torch.where(total > 0, error / total.clamp_min(1), nothing), torch.where(count > 0, share, nothing)
-
-    @torch.no_grad()
-    def profile(self, projected: ProjectedState, offsets_px: Tensor) -> Tensor:
-        """Costs (B, n) as if the visible surface had other disparities, by offsets (n,); NaN for cars without pixels.
-
-        The hits are those of the state, moved along their rays, so that only the warp is evaluated for each offset. At
-        offset 0 it is `cost`.
-        """
-        fixed = self.pixel_set
-        depth, on_surface = self._surface(projected)
-        # A few offsets at a time where the pixels are dense, so that memory stays that of the other evaluations.
-        at_once = max(1, _PROFILE_RESIDUALS // max(1, fixed.intensity_left.numel()))
-        parts = [self._costs_at(depth, on_surface, part) for part in torch.split(offsets_px.to(depth), at_once)]
-        costs = fixed.segments.sum(torch.cat(parts).mT) * self.weight()[:, None]
-        return costs.masked_fill((fixed.segments.counts == 0)[:, None], torch.nan)
-
-    def _costs_at(self, depth: Tensor, on_surface: Tensor, offsets_px: Tensor) -> Tensor:
-        """Weighted Huber norms (n, Q) at offsets (n,) of the disparity."""
-        moved = disparity_residuals(*self._residual_inputs(depth), offsets_px)
-        usable = self._is_usable(on_surface, moved.inside, moved.uv_right)
-        return self._weighted_cost(self._norm(patch_residual(*self._patch_inputs(moved.residual))).rho, usable)
-
     def support(self) -> Tensor:
         """Pixels (B,) of the stage's pixel set, float64."""
         return self.pixel_set.segments.counts.to(torch.float64)
@@ -207,17 +183,6 @@ class PhotometricTerm:
         chosen = kept_pixel[self.fixed.pixel_index]
         rows = new_row[self.fixed.pixel_index[chosen]]
         return replace(reduced, fixed=self.fixed.select(chosen, rows, pixels.object_index[rows], int(keep.sum())))
-
-    def thinned(self, max_pixels: int) -> PhotometricTerm:
-        """The term with at most so many pixels of each car: every second, third, ..., and none packed beside them."""
-        fixed = self.pixel_set
-        counts, number = fixed.segments.counts, fixed.object_index
-        rank = torch.arange(len(number), device=counts.device) - (torch.cumsum(counts, 0) - counts)[number]
-        stride = (counts + max_pixels - 1) // max_pixels
-        chosen = (rank % stride[number].clamp_min(1) == 0).nonzero()[:, 0]
-        rows = torch.arange(len(chosen), device=counts.device)
-        pixels = self.pixels.select(fixed.pixel_index[chosen])
-        return replace(self, pixels=pixels, fixed=fixed.select(chosen, rows, pixels.object_index, len(counts)))
 
     @property
     def pixel_set(self) -> PixelSet:
@@ -294,7 +259,7 @@ class PhotometricTerm:
             cars.T_right_cam[fixed.object_index],
             self.pixels.bias_px[fixed.pixel_index],
             self.pixels.vertical_px[fixed.pixel_index],
-            DSO_PATTERN.index((0, 0)),
+            _CENTRE,
         )
 
     def _is_usable(self, on_surface: Tensor, inside: Tensor, uv_right: Tensor) -> Tensor:
@@ -308,15 +273,17 @@ class PhotometricTerm:
     def _usable_and_residual(
         self, projected: ProjectedState, attached: bool = False
     ) -> tuple[Tensor, PhotometricResidual]:
-        depth, on_surface = self._surface(projected, attached)
+        rows = self.pixel_set.pixel_index
+        depth, on_surface = self._surface(projected, rows)
+        if attached:
+            depth = attached_depth(projected.shape, projected.left.surface(rows)[0], depth, on_surface)
         residual = self._residual(depth)
         return self._is_usable(on_surface, residual.inside, residual.uv_right), residual
 
-    def _surface(self, projected: ProjectedState, attached: bool = False) -> tuple[Tensor, Tensor]:
-        """Depth (Q,) of the surface under each pixel of the set, and where (Q,) there is one that is not grazing."""
-        rays, root = projected.left.surface(self.pixel_set.pixel_index)
+    def _surface(self, projected: ProjectedState, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Depth (Q,) of the surface under packed pixels `rows`, and where (Q,) there is one that is not grazing."""
+        rays, root = projected.left.surface(rows)
         depth = root.depth.detach()
-        at = projected.left.at_surface(self.pixel_set.pixel_index, rays, depth)
+        at = projected.left.at_surface(rows, rays, depth)
         _, grazing = surface_slope(at.gradient.detach(), rays.direction_obj.detach(), self.config.min_ray_cosine)
-        on_surface = root.found & ~grazing
-        return attached_depth(projected.shape, rays, depth, on_surface) if attached else depth, on_surface
+        return depth, root.found & ~grazing

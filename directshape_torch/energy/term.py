@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, Self
 
+import torch
 from torch import Tensor
 
 from directshape_torch.energy.projected_state import ProjectedState
-from directshape_torch.solver.problem import Stage
+from directshape_torch.solver.problem import Linearisation, Stage
 
 
 class TermLinearisation(NamedTuple):
@@ -71,3 +73,15 @@ class Term(Protocol):
     def of_objects(self, keep: Tensor) -> Self:
         """The term of those cars where `keep` (B,) holds."""
         ...
+
+
+def total_of(parts: Sequence[TermLinearisation]) -> Linearisation:
+    """What the solver sees of the terms of an energy."""
+    return Linearisation(
+        sum_of([p.cost for p in parts]), sum_of([p.gradient for p in parts]), sum_of([p.hessian for p in parts])
+    )
+
+
+def sum_of(tensors: Sequence[Tensor]) -> Tensor:
+    """Sum of tensors of one shape, in order."""
+    return torch.stack(list(tensors)).sum(dim=0)

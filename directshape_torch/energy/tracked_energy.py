@@ -17,7 +17,7 @@ from directshape_torch.energy.stacked_priors import StackedPriors
 from directshape_torch.energy.term import ResidualRows, Term, TermLinearisation
 from directshape_torch.energy.tracked_photometric import TrackedPhotometric
 from directshape_torch.energy.tracked_silhouettes import TrackedSilhouettes
-from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
 from directshape_torch.tracking.field import block_field
 
 
@@ -64,13 +64,15 @@ class TrackedEnergy:
     def _tracked(self) -> list[TrackedSilhouettes | TrackedPhotometric]:
         return [t for t in (self.silhouettes, self.photometric) if t is not None]
 
-    def linearise(self, projected: ProjectedState) -> list[TermLinearisation]:
-        """The parts of the energy at a state, with hand-derived Jacobians."""
-        field = block_field(projected.shape)
-        parts = [tracked.linearise(field, projected.state.T_obj_cam) for tracked in self._tracked]
-        if self.priors is not None:
-            parts.append(self.priors.linearise(projected.state))
-        return parts + [_scaled(t.linearise(projected), w) for t, w in zip(self.others, self.factors, strict=True)]
+    def linearise(self, shape: BoundShape, state: CarState) -> list[TermLinearisation]:
+        """The tracked terms and the priors at a state with these shapes, with hand-derived Jacobians."""
+        field = block_field(shape)
+        parts = [tracked.linearise(field, state.T_obj_cam) for tracked in self._tracked]
+        return parts if self.priors is None else [*parts, self.priors.linearise(state)]
+
+    def linearise_others(self, projected: ProjectedState) -> list[TermLinearisation]:
+        """The terms that are not tracked, at a projected state."""
+        return [_scaled(t.linearise(projected), w) for t, w in zip(self.others, self.factors, strict=True)]
 
     def linearise_by_autograd(self, projector: _Projector, state: CarState) -> list[TermLinearisation]:
         """The same with Jacobians by forward-mode differentiation: D tangents at once, batched over the cars."""
@@ -103,11 +105,12 @@ class TrackedEnergy:
         for tracked in self._tracked:
             tracked.follow(accepted)
 
-    def of_objects(self, keep: Tensor) -> TrackedEnergy:
-        """Those of the objects where `keep` (B,) holds."""
+    def of_objects(self, keep: Tensor, numbers: Sequence[int] | None = None) -> TrackedEnergy:
+        """Those of the objects where `keep` (B,) holds; `numbers` of them, or the host asks for them."""
+        kept = keep.nonzero()[:, 0].tolist() if numbers is None else numbers
         return TrackedEnergy(
-            None if self.silhouettes is None else self.silhouettes.of_objects(keep),
-            None if self.photometric is None else self.photometric.of_objects(keep),
+            None if self.silhouettes is None else self.silhouettes.of_objects(keep, kept),
+            None if self.photometric is None else self.photometric.of_objects(keep, kept),
             None if self.priors is None else self.priors.of_objects(keep),
             [term.of_objects(keep) for term in self.others],
             [None if w is None else w[keep] for w in self.factors],

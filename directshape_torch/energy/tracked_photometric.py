@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -101,10 +102,9 @@ class TrackedPhotometric:
             moves = accepted[self.blocks.owner][:, None]
             self.hits = Hits(*(torch.where(moves, new, old) for new, old in zip(self.latest, self.hits, strict=True)))
 
-    def of_objects(self, keep: Tensor) -> TrackedPhotometric:
-        """Those of the objects where `keep` (B,) holds."""
-        kept = keep[self.blocks.owner].nonzero()[:, 0]
-        blocks = self.blocks.of_objects(keep, kept)
+    def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> TrackedPhotometric:
+        """Those of the objects where `keep` (B,) holds: `numbers` of them, as the host knows them."""
+        blocks, kept = self.blocks.of_objects(keep, numbers)
         rows, hits = self.rows.select(kept, blocks.owner), Hits(*(x[:, kept] for x in self.hits))
         return TrackedPhotometric(blocks, rows, self.settings, self.weight[kept], hits)
 

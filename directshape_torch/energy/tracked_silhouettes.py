@@ -106,10 +106,9 @@ class TrackedSilhouettes:
         if self.latest is not None:
             self.anchor_obj = torch.where(accepted[self.blocks.owner][:, None], self.latest, self.anchor_obj)
 
-    def of_objects(self, keep: Tensor) -> TrackedSilhouettes:
-        """Those of the objects where `keep` (B,) holds."""
-        kept = keep[self.blocks.owner].nonzero()[:, 0]
-        blocks = self.blocks.of_objects(keep, kept)
+    def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> TrackedSilhouettes:
+        """Those of the objects where `keep` (B,) holds: `numbers` of them, as the host knows them."""
+        blocks, kept = self.blocks.of_objects(keep, numbers)
         rows = self.rows.select(kept, blocks.owner)
         return TrackedSilhouettes(blocks, rows, self.weight[kept], self.constant[keep], self.anchor_obj[:, kept])
 

@@ -10,7 +10,16 @@ from torch import Tensor
 
 from directshape_torch.config import SolverConfig
 from directshape_torch.solver.damped_solve import damped_step, is_finite, limited_step
-from directshape_torch.solver.problem import Linearisation, Problem, Stage, StateT, put_rows, take_rows, where_rows
+from directshape_torch.solver.problem import (
+    Linearisation,
+    Problem,
+    Stage,
+    StageProblem,
+    StateT,
+    put_rows,
+    take_rows,
+    where_rows,
+)
 from directshape_torch.status import Status, is_refined
 
 
@@ -141,10 +150,10 @@ def minimise(
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
         for stage in problem.stages():
-            problem.begin_stage(stage, state)
+            part = problem.begin_stage(stage, state)
             starts.append(state)
             log = _Log(history, trajectory, len(starts) - 1, state)
-            state, ended, done = _run_stage(problem, stage, state, ended, config, log)
+            state, ended, done = _run_stage(part, stage, state, ended, config, log)
             iterations = iterations + done
         status = _final_status(problem, initial, state, ended)
         refined = is_refined(status)
@@ -154,7 +163,7 @@ def minimise(
 
 
 def _run_stage(
-    problem: Problem[StateT],
+    part: StageProblem[StateT],
     stage: Stage,
     state: StateT,
     ended: Tensor,
@@ -164,7 +173,6 @@ def _run_stage(
     """States, how each problem ended, and iterations done."""
     iterations = torch.zeros_like(ended)
     rows = torch.arange(len(ended), device=ended.device)
-    part = problem
     progress = _begin(part, state, ended, config)
     limits = part.step_limits().to(progress.at_state.gradient)
     done = 0
@@ -175,19 +183,24 @@ def _run_stage(
             log.add(rows, before, accepted, improved, progress.at_state.cost)
             done += 1
         log.end_block(rows)
-        # The only synchronisation of a block: how many problems go on.
+        # The only synchronisation of a block: which problems go on.
         keep = progress.ended < 0
-        going_on = int(keep.sum())
-        if going_on < len(rows):
+        numbers = _places(keep)
+        if len(numbers) < len(rows):
             state, ended, iterations = _scatter(progress, rows, state, ended, iterations)
-            index = torch.nonzero_static(keep, size=going_on)[:, 0]
+            index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
             rows = rows[index]
-            part = part.compact(keep)
+            part = part.compact(keep, numbers)
             progress = _take(progress, index)
     return _scatter(progress, rows, state, ended, iterations)
 
 
-def _begin(problem: Problem[StateT], state: StateT, ended: Tensor, config: SolverConfig) -> _Progress[StateT]:
+def _places(keep: Tensor) -> list[int]:
+    """Where (B,) holds, read by the host."""
+    return [place for place, holds in enumerate(keep.tolist()) if holds]
+
+
+def _begin(problem: StageProblem[StateT], state: StateT, ended: Tensor, config: SolverConfig) -> _Progress[StateT]:
     at_state = problem.linearise(state)
     # Of the stage before only failures count: what has converged there goes on.
     failed = (ended >= 0) & (ended != Status.converged.code)
@@ -204,7 +217,7 @@ def _begin(problem: Problem[StateT], state: StateT, ended: Tensor, config: Solve
 
 
 def _iterate(
-    problem: Problem[StateT], p: _Progress[StateT], config: SolverConfig, limits: Tensor
+    problem: StageProblem[StateT], p: _Progress[StateT], config: SolverConfig, limits: Tensor
 ) -> tuple[Tensor, Tensor]:
     """One iteration of a batch; which steps were accepted and which of them made the best state."""
     step, solvable = damped_step(p.at_state.hessian, p.at_state.gradient, p.damping)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, Self, TypeVar
+from typing import Literal, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -47,18 +47,8 @@ class Stage:
 StateT = TypeVar("StateT", bound=tuple[Tensor, ...])
 
 
-class Problem(Protocol[StateT]):
-    """B problems that share nothing but the batch."""
-
-    def stages(self) -> Sequence[Stage]: ...
-
-    def begin_stage(self, stage: Stage, state: StateT) -> None:
-        """Fix everything that must not change while costs are compared."""
-        ...
-
-    def cost(self, state: StateT) -> Tensor:
-        """Cost (B,) of a state in the present stage."""
-        ...
+class StageProblem(Protocol[StateT]):
+    """What the iterations of a stage see of B problems, and of fewer and fewer of them."""
 
     def linearise(self, state: StateT) -> Linearisation:
         """Cost, gradient and Gauss-Newton matrix in the present stage."""
@@ -79,8 +69,30 @@ class Problem(Protocol[StateT]):
         """Largest trusted step of each unknown, (D,)."""
         ...
 
-    def compact(self, keep: Tensor) -> Self:
-        """The same problems without those where `keep` (B,) is false."""
+    def compact(self, keep: Tensor, numbers: Sequence[int]) -> StageProblem[StateT]:
+        """The same problems without those where `keep` (B,) is false; `numbers` of the others, which the host knows."""
+        ...
+
+
+class Problem(Protocol[StateT]):
+    """B problems that share nothing but the batch."""
+
+    def stages(self) -> Sequence[Stage]: ...
+
+    def begin_stage(self, stage: Stage, state: StateT) -> StageProblem[StateT]:
+        """Fix everything that must not change while costs are compared; what the stage's iterations work on."""
+        ...
+
+    def cost(self, state: StateT) -> Tensor:
+        """Cost (B,) of a state in the present stage."""
+        ...
+
+    def retract(self, state: StateT, step: Tensor) -> StateT:
+        """The state moved by tangent vectors (B, D): the only place where a state changes."""
+        ...
+
+    def step_limits(self) -> Tensor:
+        """Largest trusted step of each unknown, (D,)."""
         ...
 
 

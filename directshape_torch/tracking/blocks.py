@@ -6,6 +6,7 @@ block's rows have a fixed shape, and an object that leaves the batch takes its b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,11 +18,13 @@ from directshape_torch.solver.normal_equations import Segments, sum_over_blocks
 class Blocks(NamedTuple):
     """M blocks of B objects.
 
-    An object's blocks need not lie side by side. `of_object` is (B, W), W a power of two, M standing for no block.
+    An object's blocks need not lie side by side. `of_object` is (B, W), W a power of two, M standing for no block. The
+    host knows how many blocks each object has, so that leaving objects out makes it wait for nothing.
     """
 
     owner: Tensor  # (M,) object of each block
     of_object: Tensor  # (B, W) blocks of each object, in order
+    counts: tuple[int, ...]  # (B,) of each object
 
     @classmethod
     def join(cls, parts: list[Blocks]) -> Blocks:
@@ -37,15 +40,23 @@ class Blocks(NamedTuple):
             place = torch.where(inside, part.of_object + before, total)
             places.append(torch.nn.functional.pad(place, (0, width - place.shape[1]), value=total))
             before += len(part.owner)
-        return cls(torch.cat([part.owner for part in parts]), torch.cat(places, dim=1))
+        counts = tuple(map(sum, zip(*(part.counts for part in parts), strict=True)))
+        return cls(torch.cat([part.owner for part in parts]), torch.cat(places, dim=1), counts)
 
-    def of_objects(self, keep: Tensor, kept_blocks: Tensor) -> Blocks:
-        """The blocks of the objects where `keep` (B,) holds, `kept_blocks` (R,) of them, renumbered."""
+    def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> tuple[Blocks, Tensor]:
+        """The blocks of the objects where `keep` (B,) holds, renumbered, and which (R,) of the blocks they are.
+
+        Args:
+            keep: (B,) bool.
+            numbers: where it holds, as the host knows it.
+        """
+        counts = tuple(self.counts[number] for number in numbers)
+        objects = torch.nonzero_static(keep, size=len(counts))[:, 0]
+        kept = torch.nonzero_static(keep[self.owner], size=sum(counts))[:, 0]
         new_object = torch.cumsum(keep.long(), 0) - 1
-        count = len(self.owner)
-        new_block = torch.full((count + 1,), len(kept_blocks), dtype=torch.long, device=self.owner.device)
-        new_block[kept_blocks] = torch.arange(len(kept_blocks), device=self.owner.device)
-        return Blocks(new_object[self.owner[kept_blocks]], new_block[self.of_object[keep]])
+        new_block = torch.full((len(self.owner) + 1,), len(kept), dtype=torch.long, device=kept.device)
+        new_block.index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
+        return Blocks(new_object[self.owner[kept]], new_block[self.of_object[objects]], counts), kept
 
     def sums(self, weight: Tensor, cost: Tensor, products: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Weighted sums over the blocks of each object.
@@ -87,7 +98,8 @@ class PackedBlocks(NamedTuple):
         # An empty place must not bring another object's numbers, which may be NaN, nor an index out of range.
         rows = torch.where(filled, segments.block_rows, segments.block_rows[:, :1])
         owner = object_index[rows[:, 0]]
-        return cls(Blocks(owner, segments.object_blocks), rows, filled)
+        counts = tuple(torch.bincount(owner, minlength=num_objects).tolist())
+        return cls(Blocks(owner, segments.object_blocks, counts), rows, filled)
 
 
 def weighted_products(

@@ -38,8 +38,9 @@ class ResidualProblem:
     def stages(self) -> list[Stage]:
         return self._stages
 
-    def begin_stage(self, stage: Stage, state: Vector) -> None:
+    def begin_stage(self, stage: Stage, state: Vector) -> ResidualProblem:
         self.begun.append(stage)
+        return self
 
     def cost(self, state: Vector) -> Tensor:
         r = self.residual(state.x, self.identity)
@@ -68,7 +69,7 @@ class ResidualProblem:
     def step_limits(self) -> Tensor:
         return torch.full((self.num_unknowns,), self.limit, dtype=torch.float64)
 
-    def compact(self, keep: Tensor) -> ResidualProblem:
+    def compact(self, keep: Tensor, numbers: Sequence[int]) -> ResidualProblem:
         self.compactions.append(int(keep.sum()))
         part = ResidualProblem(self.residual, self.identity[keep], self.num_unknowns, self._stages, self.limit)
         part.compactions, part.evaluated, part.followed = self.compactions, self.evaluated, self.followed

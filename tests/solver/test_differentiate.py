@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -35,8 +36,9 @@ class Curved:
     def stages(self) -> list[Stage]:
         return self._stages
 
-    def begin_stage(self, stage: Stage, state: Vector) -> None:
+    def begin_stage(self, stage: Stage, state: Vector) -> Curved:
         self.scale = stage.contour_width_px
+        return self
 
     def residual(self, x: Tensor, theta: Tensor) -> Tensor:
         a, b, c = theta.unbind(-1)
@@ -84,7 +86,7 @@ class Curved:
     def step_limits(self) -> Tensor:
         return torch.ones(2, dtype=torch.float64)
 
-    def compact(self, keep: Tensor) -> Curved:
+    def compact(self, keep: Tensor, numbers: Sequence[int]) -> Curved:
         part = Curved(self.theta[keep], self._stages, self.bound)
         part.scale = self.scale
         return part

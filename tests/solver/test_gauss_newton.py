@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -161,7 +162,7 @@ def test_a_problem_that_can_only_get_worse_keeps_its_input() -> None:
         def retract(self, state: Vector, step: Tensor) -> Vector:
             return Vector(state.x - step)
 
-        def compact(self, keep: Tensor) -> ResidualProblem:
+        def compact(self, keep: Tensor, numbers: Sequence[int]) -> ResidualProblem:
             return Uphill(self.residual, self.identity[keep], 2, self.stages(), self.limit)
 
     base = rosenbrock(2)

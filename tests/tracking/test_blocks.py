@@ -103,8 +103,10 @@ def test_joined_blocks_add_what_their_parts_give() -> None:
 
 def test_one_part_joined_is_itself() -> None:
     blocks = PackedBlocks.of_sorted(index_of(LEFT), 4).blocks
-    for joined, own in zip(Blocks.join([blocks]), blocks, strict=True):
-        assert torch.equal(joined, own)
+    joined = Blocks.join([blocks])
+    assert torch.equal(joined.owner, blocks.owner)
+    assert torch.equal(joined.of_object, blocks.of_object)
+    assert joined.counts == blocks.counts
 
 
 @pytest.mark.parametrize("keep", [[0, 1, 2, 3], [0, 3], [1], [2, 3], []])
@@ -114,8 +116,9 @@ def test_objects_that_leave_take_their_blocks_along(keep: list[int]) -> None:
     weight = weights(4)
     kept = torch.zeros(4, dtype=torch.bool)
     kept[keep] = True
-    chosen = kept[blocks.owner].nonzero()[:, 0]
-    fewer = blocks.of_objects(kept, chosen)
+    fewer, chosen = blocks.of_objects(kept, keep)
+    assert torch.equal(chosen, kept[blocks.owner].nonzero()[:, 0])
+    assert fewer.counts == tuple(torch.bincount(fewer.owner, minlength=len(keep)).tolist())
     assert [keep[b] for b in fewer.owner.tolist()] == blocks.owner[chosen].tolist()
     generator = torch.Generator().manual_seed(1)
     count = len(blocks.owner)
