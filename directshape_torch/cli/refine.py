@@ -1,4 +1,4 @@
-"""`directshape refine`: all frames of a data set in KITTI's layout."""
+"""`directshape refine`: all frames of a data set."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from directshape_torch.cli.data_options import add_data_options, dataset_of
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
     import torch
 
-    from directshape_torch.io.instance_masks import MaskSource
-    from directshape_torch.io.kitti_dataset import KittiStereoDataset
     from directshape_torch.refiner import DirectShapeRefiner
 
 _DESCRIPTION = """
@@ -25,36 +24,10 @@ settings continues where the first stopped. Exit code: 0 all frames done, 1 some
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command and its options."""
     parser = subparsers.add_parser("refine", help="refine the cars of a data set", description=_DESCRIPTION)
-    _add_inputs(parser.add_argument_group("input"))
+    add_data_options(parser.add_argument_group("input"))
     _add_outputs(parser.add_argument_group("output"))
     _add_settings(parser.add_argument_group("settings"))
     parser.set_defaults(run=run)
-
-
-def _add_inputs(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/image_2 ..")
-    group.add_argument("--detections", type=Path, required=True, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data")
-    group.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
-    group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
-    group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
-    group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
-    group.add_argument("--frames", nargs="+", metavar="ID", type=_frame_id, help="only these frames, e.g. 107 7322")
-    group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
-    group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
-    group.add_argument(
-        "--disparity",
-        type=Path,
-        metavar="DIR",
-        help="disparity maps NNNNNN.png of any stereo method (KITTI's 16 bits), for --method geometric or combined",
-    )
-    group.add_argument(
-        "--ground",
-        choices=("auto", "file", "stereo", "camera_height"),
-        default="auto",
-        help="where ground planes come from (default: file, else stereo, else camera height; with --stereo-bias: "
-        "stereo, else file, else camera height)",
-    )
-    group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
 
 
 def _add_outputs(group: argparse._ArgumentGroup) -> None:
@@ -93,11 +66,6 @@ def add_config_option(group: argparse._ActionsContainer) -> None:
     )
 
 
-def _frame_id(word: str) -> str:
-    """KITTI's names of frames have six digits; shorter numbers are filled up."""
-    return word.zfill(6) if word.isdigit() else word
-
-
 def run(args: argparse.Namespace) -> int:
     """Refine, write, report; returns the exit code.
 
@@ -115,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device)
     _check_disparity_is_used(args.disparity, refiner.config.method)
     with ProgressBar() as progress:
-        summary = refine_dataset(_make_dataset(args), refiner, args.out, options, progress)
+        summary = refine_dataset(dataset_of(args), refiner, args.out, options, progress)
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
@@ -174,34 +142,3 @@ def find_device(name: str) -> torch.device:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError("--device", "a device of this machine", f"{name!r} ({reason})", "try cpu") from error
     return device
-
-
-def _make_dataset(args: argparse.Namespace) -> KittiStereoDataset:
-    from directshape_torch.geometry.disparity_field import DisparityField
-    from directshape_torch.io.kitti_dataset import KittiStereoDataset
-
-    return KittiStereoDataset(
-        args.data,
-        args.detections,
-        _mask_source(args),
-        split=args.split,
-        frames=args.frames,
-        classes=args.classes,
-        ground=args.ground,
-        camera_height_m=args.camera_height,
-        disparity_field=None if args.stereo_bias is None else DisparityField.load(args.stereo_bias),
-        disparity_dir=args.disparity,
-    )
-
-
-def _mask_source(args: argparse.Namespace) -> MaskSource:
-    from directshape_torch.io.instance_masks import CocoFileMasks, mask_source
-
-    files = (args.masks_left, args.masks_right)
-    if (args.masks is None) == (files == (None, None)):
-        raise InputError(
-            "--masks",
-            "either a folder (--masks DIR) or COCO files (--masks-left FILE, --masks-right FILE)",
-            "neither" if args.masks is None else "both",
-        )
-    return CocoFileMasks(*files) if args.masks is None else mask_source(args.masks)

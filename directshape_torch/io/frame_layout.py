@@ -73,8 +73,8 @@ class FrameLayout(Protocol):
         """The disparity map of a frame in a folder of such maps."""
         ...
 
-    def masks(self) -> MaskSource | None:
-        """Masks that come with the layout itself, used where no others are given."""
+    def masks(self, directory: Path | None) -> MaskSource | None:
+        """The reader of a folder of masks; None: of those that come with the layout itself, if there are any."""
         ...
 
     def given_masks(self, frame_id: str) -> GivenMasks | None:

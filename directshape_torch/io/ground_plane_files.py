@@ -30,15 +30,23 @@ def read_plane(path: Path | str) -> NDArray[np.float64]:
     lines = read_lines(path)
     if not lines:
         raise DataFormatError(path, "is empty", cure=_CURE)
-    plane = _four_numbers(path, lines[-1])
+    return upright_plane(path, _four_numbers(path, lines[-1]), lines[-1])
+
+
+def upright_plane(path: Path | str, plane: NDArray[np.float64], line: Line | None = None) -> NDArray[np.float64]:
+    """A plane (a, b, c, d) normalised and with its normal up (b < 0).
+
+    Raises:
+        DataFormatError: the plane leans by more than 60 degrees; names the file and the line, if there is one.
+    """
     length = float(np.linalg.norm(plane[:3]))
     # A ground that leans by more than 60 degrees is a mistake in the order or the frame of the coefficients.
     if not abs(plane[1]) > 0.5 * length:
         raise DataFormatError(
             path,
             "the normal is not near the vertical y axis",
-            line_number=lines[-1].number,
-            line=lines[-1].text,
+            line_number=None if line is None else line.number,
+            line=" ".join(map(str, plane)) if line is None else line.text,
             cure=_CURE,
         )
     return np.asarray(plane / (-np.sign(plane[1]) * length))

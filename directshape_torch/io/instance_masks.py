@@ -106,10 +106,12 @@ class InstancePngMasks:
     Attributes:
         directory: the folder that holds both.
         car_ids: classes that are cars.
+        folders: names of the two; `instance_02` and `instance_03` in the layout of tracking sequences.
     """
 
     directory: Path
     car_ids: frozenset[int] = PNG_CAR_IDS
+    folders: tuple[str, str] = ("instance_2", "instance_3")
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         masks: list[InstanceMask] = []
@@ -120,7 +122,7 @@ class InstancePngMasks:
         return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
-        return tuple(find_image(self.directory / folder, frame_id) for folder in ("instance_2", "instance_3"))
+        return tuple(find_image(self.directory / folder, frame_id) for folder in self.folders)
 
     def _instances(self, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask]:
         for value in np.unique(ids).tolist():
@@ -182,7 +184,8 @@ class CocoFileMasks:
 
 
 def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> MaskSource:
-    """The reader that fits a folder of masks: instance PNG if it holds `instance_2`, else one json a frame.
+    """The reader that fits a folder of masks: instance PNG if it holds `instance_2` (or `instance_02`), else one json
+    a frame.
 
     Raises:
         DataFormatError: it is no folder.
@@ -190,8 +193,9 @@ def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> 
     directory = Path(directory)
     if not directory.is_dir():
         raise DataFormatError(directory, "is not a folder of masks", cure="give the folder of NNNNNN.json files")
-    if (directory / "instance_2").is_dir():
-        return InstancePngMasks(directory, PNG_CAR_IDS if car_ids is None else frozenset(car_ids))
+    for folders in (("instance_2", "instance_3"), ("instance_02", "instance_03")):
+        if (directory / folders[0]).is_dir():
+            return InstancePngMasks(directory, PNG_CAR_IDS if car_ids is None else frozenset(car_ids), folders)
     return FrameJsonMasks(directory, COCO_CAR_IDS if car_ids is None else frozenset(car_ids))
 
 
@@ -295,7 +299,7 @@ def _file_box(entry: Mapping[str, Any]) -> tuple[float, float, float, float] | N
 
 
 def _frame_number(frame_id: str) -> int:
-    try:
-        return int(frame_id)
-    except ValueError as error:
-        raise InputError("frame_id", "a number, as COCO's image_id is one", repr(frame_id)) from error
+    # `int` would take 000046_10 for 4610.
+    if not frame_id.isdecimal():
+        raise InputError("frame_id", "a number, as COCO's image_id is one", repr(frame_id), "give one file a frame")
+    return int(frame_id)

@@ -12,7 +12,7 @@ from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.frame_layout import existing_folder, first_disparity
 from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.image_files import find_image
-from directshape_torch.io.instance_masks import MaskSource, file_of_frame
+from directshape_torch.io.instance_masks import MaskSource, file_of_frame, mask_source
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 
@@ -87,9 +87,9 @@ class KittiObjectLayout:
         """The map of the first pair of a scene, or of the frame."""
         return first_disparity(folder, frame_id)
 
-    def masks(self) -> MaskSource | None:
-        """None: masks are always given apart."""
-        return None
+    def masks(self, directory: Path | None) -> MaskSource | None:
+        """See `mask_source`; no masks come with the layout itself."""
+        return None if directory is None else mask_source(directory)
 
     def given_masks(self, frame_id: str) -> GivenMasks | None:
         """None: masks are matched by overlap."""

@@ -18,7 +18,7 @@ from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.io.frame_detections import build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
 from directshape_torch.io.image_files import read_rgb
-from directshape_torch.io.instance_masks import MaskSource, mask_source
+from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
@@ -69,9 +69,10 @@ class FileStereoDataset:
         self.layout = layout
         # Masks from elsewhere know nothing of the layout's own links between masks and detections.
         self._own_masks = masks is None
-        self.masks = (
-            mask_source(masks) if isinstance(masks, (str, Path)) else layout.masks() if masks is None else masks
-        )
+        if masks is None or isinstance(masks, (str, Path)):
+            self.masks = layout.masks(None if masks is None else Path(masks))
+        else:
+            self.masks = masks
         self.classes = frozenset(classes)
         self.ground: GroundSource = ground
         self.camera_height_m = camera_height_m

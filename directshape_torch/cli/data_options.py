@@ -1,0 +1,100 @@
+"""The options that say which data a command works on, shared by the commands that read stereo frames."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from directshape_torch.errors import InputError
+
+if TYPE_CHECKING:
+    from directshape_torch.io.instance_masks import MaskSource
+    from directshape_torch.io.stereo_dataset import StereoDataset
+
+# As in io/open_dataset.py, which is not imported for it loads PyTorch; a test holds the two together.
+LAYOUTS = ("kitti", "raw", "tracking", "stereo2015", "folder")
+
+
+def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = True) -> None:
+    """`--data`, `--layout`, `--detections`, masks, choice of frames and classes, ground, the rig's correction."""
+    group.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder of the data set")
+    group.add_argument(
+        "--layout",
+        choices=LAYOUTS,
+        default="kitti",
+        help="of the files below ROOT (docs/inputs.md): KITTI's object benchmark (default), a raw drive or day of "
+        "drives, a tracking sequence or all of them, Stereo 2015, or a plain folder with JSON",
+    )
+    group.add_argument(
+        "--detections", type=Path, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data (folder: default ROOT/frames)"
+    )
+    group.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
+    group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
+    group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
+    group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
+    group.add_argument("--frames", nargs="+", metavar="ID", type=_frame_id, help="only these frames, e.g. 107 7322")
+    group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
+    group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
+    if with_disparity:
+        group.add_argument(
+            "--disparity",
+            type=Path,
+            metavar="DIR",
+            help="disparity maps NNNNNN.png of any stereo method (KITTI's 16 bits), for --method geometric or combined",
+        )
+    group.add_argument(
+        "--ground",
+        choices=("auto", "file", "stereo", "camera_height"),
+        default="auto",
+        help="where ground planes come from (default: file, else stereo, else camera height; with --stereo-bias: "
+        "stereo, else file, else camera height)",
+    )
+    group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
+
+
+def dataset_of(args: argparse.Namespace) -> StereoDataset:
+    """The data set that the options describe.
+
+    Raises:
+        DataFormatError: a folder or file is missing or not laid out so.
+        InputError: options that contradict each other, or no frames.
+    """
+    from directshape_torch.geometry.disparity_field import DisparityField
+    from directshape_torch.io.open_dataset import open_dataset
+
+    return open_dataset(
+        args.layout,
+        args.data,
+        args.detections,
+        _mask_source(args),
+        split=args.split,
+        frames=args.frames,
+        classes=args.classes,
+        ground=args.ground,
+        camera_height_m=args.camera_height,
+        disparity_field=None if args.stereo_bias is None else DisparityField.load(args.stereo_bias),
+        disparity_dir=getattr(args, "disparity", None),
+    )
+
+
+def _frame_id(word: str) -> int | str:
+    """Numbers name frames in each layout's own way, with leading zeros or without; anything else is a whole name."""
+    return int(word) if word.isdecimal() else word
+
+
+def _mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
+    from directshape_torch.io.instance_masks import CocoFileMasks
+
+    files = (args.masks_left, args.masks_right)
+    given = (args.masks is not None) + (files != (None, None))
+    if given == 2 or (given == 0 and args.layout != "folder"):
+        raise InputError(
+            "--masks",
+            "either a folder (--masks DIR) or COCO files (--masks-left FILE, --masks-right FILE)",
+            "both" if given else "neither",
+        )
+    if files != (None, None):
+        return CocoFileMasks(*files)
+    masks: Path | None = args.masks
+    return masks
