@@ -10,9 +10,10 @@ from tqdm import tqdm
 
 
 class ProgressBar:
-    """Counts frames and tells of those that fail, while `refine_dataset` runs."""
+    """Counts frames and tells of those that fail, while `refine_dataset` runs or an export."""
 
-    def __init__(self) -> None:
+    def __init__(self, task: str = "refine") -> None:
+        self._task = task
         self._bar: tqdm[NoReturn] | None = None
         self._num_failed = 0
 
@@ -26,7 +27,7 @@ class ProgressBar:
     def started(self, frame_ids: Sequence[str]) -> None:
         """Show the bar; nothing where there is nothing to do."""
         if frame_ids:
-            self._bar = tqdm(total=len(frame_ids), unit="frame", desc="refine", file=sys.stderr)
+            self._bar = tqdm(total=len(frame_ids), unit="frame", desc=self._task, file=sys.stderr)
 
     def finished(self, frame_id: str, failure: str | None) -> None:
         """Advance; print the reason of a failure above the bar."""

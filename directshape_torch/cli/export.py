@@ -1,0 +1,141 @@
+"""`directshape export`: a finished run in the formats of other programs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from directshape_torch.cli.data_options import LAYOUTS
+from directshape_torch.errors import InputError
+
+if TYPE_CHECKING:
+    from directshape_torch.export.frame_source import ExportInputs
+    from directshape_torch.export.run_folder import RunFolder
+    from directshape_torch.geometry.disparity_field import DisparityField
+    from directshape_torch.io.stereo_dataset import StereoDataset
+    from directshape_torch.shape.shape_prior import ShapePrior
+
+_FORMATS = ("glb", "ply", "points", "kitti", "coco3d", "nuscenes")
+
+_DESCRIPTION = """
+Write the finished frames of an output folder of 'directshape refine' for other programs: surfaces as GLB or PLY and
+points as PLY, coloured by the left image, and boxes as KITTI, COCO-3D or nuScenes files. OUT itself is only read.
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its options."""
+    parser = subparsers.add_parser("export", help="a finished run for other programs", description=_DESCRIPTION)
+    parser.add_argument("run_folder", type=Path, metavar="OUT", help="output folder of 'refine'")
+    parser.add_argument(
+        "--format", nargs="+", required=True, choices=_FORMATS, metavar="NAME", help=", ".join(_FORMATS)
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets the files")
+    parser.add_argument("--frames", nargs="+", metavar="ID", help="only these frames (default: all that are finished)")
+    _add_inputs(parser.add_argument_group("input"))
+    _add_appearance(parser.add_argument_group("surfaces and points"))
+    parser.set_defaults(run=run)
+
+
+def _add_inputs(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--data", type=Path, metavar="ROOT", help="data set of the run, for colours; coco3d needs it")
+    group.add_argument("--layout", choices=LAYOUTS, default="kitti", help="of that data set (default: kitti)")
+    group.add_argument("--detections", type=Path, metavar="DIR", help="detections of the run (default: its results)")
+    group.add_argument("--masks", type=Path, metavar="DIR", help="masks of the run: only their pixels lend colours")
+    group.add_argument(
+        "--disparity", type=Path, metavar="DIR", help="disparity maps, for the stereo points of 'points'"
+    )
+    group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of the run, for the stereo points")
+    group.add_argument("--prior", metavar="FILE|NAME", help="shape prior of the run, where it was not a bundled one")
+
+
+def _add_appearance(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--unseen",
+        choices=("mirror", "grey"),
+        default="mirror",
+        help="what the image does not show: the colour of the car's other side where that is seen (default), or grey",
+    )
+    group.add_argument("--points", type=int, default=10_000, metavar="N", help="points a car (default: %(default)s)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Export and say where to; returns the exit code.
+
+    Raises:
+        DirectShapeError: for the main program to show.
+    """
+    from directshape_torch.cli.progress import ProgressBar
+    from directshape_torch.export.export_run import export_run
+    from directshape_torch.export.run_folder import RunFolder
+
+    folder = RunFolder(args.run_folder, args.frames)
+    inputs = _make_inputs(args, folder)
+    with ProgressBar("export") as progress:
+        export_run(folder, args.out, args.format, inputs, progress)
+    print(f"exported  {len(folder.frame_ids)} frames as {', '.join(dict.fromkeys(args.format))} to {args.out}")
+    return 0
+
+
+def _make_inputs(args: argparse.Namespace, folder: RunFolder) -> ExportInputs:
+    from directshape_torch.export.frame_source import ExportInputs
+
+    dataset = _make_dataset(args, folder)
+    return ExportInputs(_priors(args.prior), dataset, args.data, args.unseen == "mirror", args.points)
+
+
+def _priors(source: str | None) -> Mapping[str, ShapePrior]:
+    from directshape_torch.batch.content_hashes import hash_prior
+    from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
+
+    names = tuple(BUNDLED_PRIORS) if source is None else (source,)
+    return {hash_prior(prior): prior for prior in map(load_prior, names)}
+
+
+def _make_dataset(args: argparse.Namespace, folder: RunFolder) -> StereoDataset | None:
+    """The frames of the run, with the results in the place of the detections where nobody says where those are."""
+    from directshape_torch.io.open_dataset import open_dataset
+
+    field = _disparity_field(args, folder)
+    if args.data is None:
+        names = ("detections", "masks", "disparity", "stereo_bias")
+        given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]
+        if given:
+            raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
+        return None
+    # A plain folder keeps its detections beside its images.
+    own = None if args.layout == "folder" else folder.path
+    return open_dataset(
+        args.layout,
+        args.data,
+        own if args.detections is None else args.detections,
+        args.masks,
+        frames=folder.frame_ids,
+        classes=folder.classes,
+        ground=folder.setting("ground"),
+        camera_height_m=folder.setting("camera_height_m"),
+        disparity_field=field,
+        disparity_dir=args.disparity,
+    )
+
+
+def _disparity_field(args: argparse.Namespace, folder: RunFolder) -> DisparityField | None:
+    """The field that the run was made with; without it only stereo points would be wrong.
+
+    Raises:
+        InputError: it is another one, or missing where it is needed.
+    """
+    from directshape_torch.batch.content_hashes import hash_field
+    from directshape_torch.geometry.disparity_field import DisparityField
+
+    noted = folder.manifest.sha256.get("stereo_bias")
+    if args.stereo_bias is None:
+        if noted is not None and args.data is not None and "points" in args.format:
+            raise InputError("--stereo-bias", "the field that the run was made with, for stereo points", "nothing")
+        return None
+    field = DisparityField.load(args.stereo_bias)
+    if hash_field(field) != noted:
+        raise InputError("--stereo-bias", "the field that the run was made with", f"another one in {args.stereo_bias}")
+    return field

@@ -1,0 +1,94 @@
+"""What the exports of one frame are made of, read or made when the first of them asks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.export.painted_cars import PaintedFrame
+from directshape_torch.export.run_folder import RefinedFrame, RunFolder
+from directshape_torch.io.refinement_files import shapes_path
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.shape.shape_prior import ShapePrior
+
+
+@dataclass(frozen=True)
+class ExportInputs:
+    """What an export may use beside the run itself.
+
+    Attributes:
+        priors: shape priors by the hash that a run notes of them.
+        dataset: images, calibrations, masks and detections of the run's frames; None: exports without colours, and
+            none that need an image.
+        data_root: folder that names of images begin in, where a file lists them.
+        mirror: colour what the image does not show by the other side of the car.
+        points_per_car: points spread over a surface.
+    """
+
+    priors: Mapping[str, ShapePrior]
+    dataset: StereoDataset | None = None
+    data_root: Path | None = None
+    mirror: bool = True
+    points_per_car: int = 10_000
+
+    def __post_init__(self) -> None:
+        if self.points_per_car < 1:
+            raise InputError("points_per_car", "at least 1", str(self.points_per_car))
+
+
+class FrameSource:
+    """One finished frame of a run."""
+
+    def __init__(self, run: RunFolder, frame_id: str, inputs: ExportInputs) -> None:
+        self.run, self.frame_id, self.inputs = run, frame_id, inputs
+
+    @cached_property
+    def refined(self) -> RefinedFrame:
+        """Boxes, states and shapes."""
+        return self.run.read(self.frame_id)
+
+    @cached_property
+    def loaded(self) -> LoadedFrame | None:
+        """Images, calibration and masks, or None where no data set was given."""
+        return None if self.inputs.dataset is None else self.inputs.dataset.load(self.frame_id)
+
+    def with_images(self, purpose: str) -> LoadedFrame:
+        """Images, calibration and masks.
+
+        Raises:
+            InputError: no data set was given.
+        """
+        if self.loaded is None:
+            raise InputError("--data", f"the data set of the run, for {purpose}", "nothing")
+        return self.loaded
+
+    def image_path(self) -> str:
+        """The left image, from the root of the data set where that is known."""
+        dataset = self.inputs.dataset
+        if dataset is None:
+            raise InputError("--data", "the data set of the run, for the names of its images", "nothing")
+        path, root = dataset.input_files(self.frame_id)["image_left"], self.inputs.data_root
+        return path.name if root is None or not path.is_relative_to(root) else path.relative_to(root).as_posix()
+
+    @cached_property
+    def painted(self) -> PaintedFrame:
+        """Surfaces with colours."""
+        return PaintedFrame(self.refined, self.prior, self.loaded, self.inputs.mirror)
+
+    @property
+    def prior(self) -> ShapePrior:
+        """The shapes that the codes of the run belong to.
+
+        Raises:
+            DataFormatError: it was another prior.
+        """
+        sha256 = self.refined.shapes.prior_sha256
+        if sha256 not in self.inputs.priors:
+            path = shapes_path(self.run.path, self.frame_id)
+            raise DataFormatError(
+                path, f"was made with another shape prior ({sha256[:12]})", cure="name that of the run with --prior"
+            )
+        return self.inputs.priors[sha256]
