@@ -43,7 +43,11 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent(
         "ProjectedView.__init__", "moving_depths", "(-moving_depths)", "a flag, whose truth a sign leaves alone"
     ),
-    Equivalent("_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
+    Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
+    *(
+        Equivalent("_corner_values", "(nx, ny, nz, _)", after, "only the product of the three is used")
+        for after in ("(nx, nz, ny, _)", "(ny, nx, nz, _)")
+    ),
     Equivalent(
         "_quaternion",
         "row / row.norm(dim=-1, keepdim=True)",

@@ -9,7 +9,7 @@ Rules, all of them mechanical:
   `a ** 2` becomes `a`;
 - swapped axis or component: `x[..., 1]` becomes `x[..., 0]`, `x[:3]` becomes `x[3:6]`; neighbours in a list or in an
   assignment of several names change places; a transposition is dropped, or put before a matrix product; the arguments
-  of a cross product, of an interpolation and of `where` change places.
+  of a cross product, of a batched matrix product, of an interpolation and of `where` change places.
 
 Arithmetic in shapes (arguments of `new_zeros`, `expand`, ...) is no arithmetic of a Jacobian and is left alone.
 """
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 _SHAPE_MAKERS = {"new_zeros", "zeros", "expand", "reshape", "view", "view_as", "repeat", "eye", "arange", "range"}
 _ZERO_MAKERS = {"new_zeros", "zeros", "zeros_like"}
 # Which two arguments of a call change places.
-_SWAPPED_ARGUMENTS = {"cross": (0, 1), "lerp": (0, 1), "_along": (1, 2), "where": (1, 2)}
+_SWAPPED_ARGUMENTS = {"cross": (0, 1), "bmm": (0, 1), "lerp": (0, 1), "_along": (1, 2), "where": (1, 2)}
 _ARITHMETIC = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.MatMult, ast.Pow)
 
 
@@ -124,6 +124,8 @@ class _Changes:
             yield from _call_changes(node)
         elif isinstance(node, ast.Subscript):
             yield from _component_changes(node)
+        elif isinstance(node, ast.Attribute) and node.attr == "mT":
+            yield node, "swapped axes", _text(node.value)
         elif isinstance(node, ast.List | ast.Tuple) and isinstance(node.ctx, ast.Load):
             yield from _display_changes(node)
         elif isinstance(node, ast.Assign):
@@ -184,7 +186,8 @@ def _call_changes(node: ast.Call) -> Iterator[Change]:
     if swapped is not None and len(node.args) > max(swapped):
         args = list(node.args)
         args[swapped[0]], args[swapped[1]] = args[swapped[1]], args[swapped[0]]
-        yield node, "swapped arguments", _text(ast.Call(node.func, args, node.keywords))
+        if ast.dump(args[swapped[0]]) != ast.dump(args[swapped[1]]):
+            yield node, "swapped arguments", _text(ast.Call(node.func, args, node.keywords))
     if name == "transpose" and isinstance(node.func, ast.Attribute):
         yield node, "swapped axes", _text(node.func.value)
     if name[:1].isupper():  # a named tuple of results

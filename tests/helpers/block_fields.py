@@ -58,9 +58,9 @@ def paraboloid_field(centres: Tensor, curvatures: Tensor) -> QuadraticField:
     return QuadraticField(torch.zeros_like(centres), curvatures, centres, torch.zeros_like(curvatures))
 
 
-def random_rays(owner: Tensor, seed: int = 1) -> BlockRays:
+def random_rays(owner: Tensor, seed: int = 1, spread: float = 0.15) -> BlockRays:
     """Rays of unit depth about the optical axis of cameras near the origin."""
-    ray = random(3, len(owner), 64, seed=seed, scale=0.15)
+    ray = random(3, len(owner), 64, seed=seed, scale=spread)
     ray[2] = 1.0
     return BlockRays(owner, random(len(owner), 3, seed=seed + 1, scale=0.3), ray)
 

@@ -38,6 +38,9 @@ def test_products_quotients_and_powers() -> None:
     assert ("dropped factor", "a ** 2", "(a)") in changes("return a ** 2")
     assert ("swapped axes", "a @ b", "(a.mT @ b)") in changes("return a @ b")
     assert ("swapped axes", "a.transpose(1, 2)", "(a)") in changes("return a.transpose(1, 2)")
+    assert changes("return a.mT") == {("swapped axes", "a.mT", "(a)")}
+    assert changes("return bmm(a, b)") == {("swapped arguments", "bmm(a, b)", "(bmm(b, a))")}
+    assert changes("return bmm(a, a)") == set()
 
 
 def test_components_and_order() -> None:
