@@ -48,6 +48,10 @@ class ResumeError(DirectShapeError):
     """An output folder was made by another configuration, prior or input than the present run."""
 
 
+class RunInProgressError(DirectShapeError):
+    """Another process is writing to the output folder."""
+
+
 class CompilationError(DirectShapeError, RuntimeError):
     """Compiled functions were asked for (`compile: on`) where they cannot be had."""
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.kitti_dataset import LoadedFrame
-from directshape_torch.io.refinement_files import write_refinement
+from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
+from directshape_torch.io.run_manifest import hash_bytes
 from directshape_torch.result import RefinementResult
 
 
@@ -25,7 +27,7 @@ def write_frame_outputs(
     first_row: int,
     prior_sha256: str,
     options: RefineOptions,
-) -> None:
+) -> dict[str, str]:
     """Write what the options ask for; the result file comes last, so that where it exists the frame is complete.
 
     Args:
@@ -35,22 +37,28 @@ def write_frame_outputs(
         first_row: where the frame's detections begin in `result`.
         prior_sha256: of the shape prior.
         options: kinds of files.
+
+    Returns:
+        The sha256 of each file, by its path in the output folder.
     """
+    files = [result_path(out_dir, loaded.frame_id), shapes_path(out_dir, loaded.frame_id)]
     if options.meshes is not None:
         from directshape_torch.batch.mesh_files import write_car_meshes
 
-        write_car_meshes(out_dir, loaded, result, first_row, options.meshes)
+        files += write_car_meshes(out_dir, loaded, result, first_row, options.meshes)
     if options.overlays:
         from directshape_torch.visualize.overlay import overlay_of_frame
 
-        write_png(overlay_path(out_dir, loaded.frame_id), overlay_of_frame(loaded, result, first_row))
+        files.append(overlay_path(out_dir, loaded.frame_id))
+        write_png(files[-1], overlay_of_frame(loaded, result, first_row))
     write_refinement(out_dir, loaded, result, prior_sha256, first_row)
+    return {path.relative_to(out_dir).as_posix(): hash_bytes(path.read_bytes()) for path in files}
 
 
 def frame_entry(
-    loaded: LoadedFrame, result: RefinementResult, first_row: int, options: RefineOptions
+    loaded: LoadedFrame, result: RefinementResult, first_row: int, options: RefineOptions, files: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The entry of a finished frame; it lists the meshes, because which cars have one only the result knows."""
+    """The entry of a finished frame; its files are those of `write_frame_outputs`."""
     num_cars = len(loaded.detections)
     statuses = Counter(status.name for status in result.status[first_row : first_row + num_cars])
     return {
@@ -62,19 +70,9 @@ def frame_entry(
         "ground_source": loaded.frame.ground.source[0],
         "statuses": dict(statuses),
         "outputs": sorted(options.outputs),
-        "mesh_files": _mesh_files(loaded, result, first_row, options),
+        "mesh_files": sorted(name for name in files if name.startswith("meshes/")),
+        "files": dict(files),
     }
-
-
-def _mesh_files(loaded: LoadedFrame, result: RefinementResult, first_row: int, options: RefineOptions) -> list[str]:
-    """Paths in the output folder."""
-    if options.meshes is None:
-        return []
-    from directshape_torch.batch.mesh_files import car_mesh_paths
-
-    return sorted(
-        path.as_posix() for path in car_mesh_paths(Path(), loaded, result, first_row, options.meshes).values()
-    )
 
 
 def failed_entry(reason: str) -> dict[str, Any]:

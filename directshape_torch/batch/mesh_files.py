@@ -39,14 +39,16 @@ def car_mesh_paths(
 
 def write_car_meshes(
     out_dir: Path, loaded: LoadedFrame, result: RefinementResult, first_row: int, mesh_format: MeshFormat
-) -> None:
-    """Write the surface of each refined car of a frame.
+) -> list[Path]:
+    """Write the surface of each refined car of a frame, and tell the files.
 
     PLY files are in the left camera frame, metres. GLB files hold the same vertices below a node that turns them into
     glTF's axes (y up).
     """
-    for car, path in car_mesh_paths(out_dir, loaded, result, first_row, mesh_format).items():
+    paths = car_mesh_paths(out_dir, loaded, result, first_row, mesh_format)
+    for car, path in paths.items():
         write_bytes(path, mesh_bytes(result.mesh(car), mesh_format))
+    return list(paths.values())
 
 
 def mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:

@@ -35,14 +35,57 @@ class RefineOptions:
     def __post_init__(self) -> None:
         if self.meshes is not None and self.meshes not in get_args(MeshFormat):
             raise InputError("meshes", f"one of {', '.join(get_args(MeshFormat))}, or None", repr(self.meshes))
-        if self.batch_frames < 1:
-            raise InputError("batch_frames", "at least 1", str(self.batch_frames))
+        _check_at_least(1, "batch_frames", self.batch_frames)
 
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the kinds of files that each frame gets."""
         meshes = () if self.meshes is None else (f"meshes_{self.meshes}",)
         return ("data", "shapes", *meshes, *(("overlays",) if self.overlays else ()))
+
+
+@dataclass(frozen=True)
+class WorkerOptions:
+    """Who does the work of `refine_dataset`.
+
+    Attributes:
+        workers: processes that refine side by side. None: this process alone, or with `ray` as many as the cluster has
+            cores for.
+        threads: of each of them. None: this process keeps what it has, a worker gets 1.
+        ray: address of a Ray cluster ("auto", "10.0.0.7:6379", "ray://..") or "local" for a cluster of this machine
+            alone; None: processes of this machine without Ray.
+        retries: how often frames whose worker died are tried again before they count as failed.
+
+    Raises:
+        InputError: less than one worker or thread, or negative retries.
+
+    Example:
+        >>> WorkerOptions(workers=4).threads_per_worker
+        1
+        >>> WorkerOptions().in_this_process
+        True
+    """
+
+    workers: int | None = None
+    threads: int | None = None
+    ray: str | None = None
+    retries: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("workers", 1), ("threads", 1), ("retries", 0)):
+            number = getattr(self, name)
+            if number is not None:
+                _check_at_least(least, name, number)
+
+    @property
+    def in_this_process(self) -> bool:
+        """Whether no other process takes part."""
+        return self.workers is None and self.ray is None
+
+    @property
+    def threads_per_worker(self) -> int | None:
+        """The number to set, or None to leave it."""
+        return self.threads if self.in_this_process or self.threads is not None else 1
 
 
 class RunObserver(Protocol):
@@ -65,3 +108,8 @@ class SilentObserver:
 
     def finished(self, frame_id: str, failure: str | None) -> None:
         """Nothing."""
+
+
+def _check_at_least(least: int, name: str, number: int) -> None:
+    if number < least:
+        raise InputError(name, f"at least {least}", str(number))

@@ -4,29 +4,36 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+import os
+import platform
+import time
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from directshape_torch.batch.content_hashes import hash_field, hash_prior
-from directshape_torch.batch.frame_outputs import failed_entry, frame_entry, write_frame_outputs
-from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver
-from directshape_torch.batch.run_record import RunRecord
+from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
+from directshape_torch.batch.frame_outputs import failed_entry
+from directshape_torch.batch.group_refinement import GroupRefiner, GroupReport, RunJob, limit_threads
+from directshape_torch.batch.journal import FrameRecord, Journal, read_journals
+from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver, WorkerOptions
+from directshape_torch.batch.run_file import RunFile, digit_warnings, read_run_file, run_path, versions
+from directshape_torch.batch.run_lock import RunLock
+from directshape_torch.batch.run_record import RunRecord, remove_results, remove_unfinished_files
 from directshape_torch.batch.run_summary import RunSummary, find_warnings
 from directshape_torch.batch.timing import RunTimings, write_timings
-from directshape_torch.compilation import cars_ahead
+from directshape_torch.batch.workers import GroupDispatch, ThisProcess, Workers
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
-from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.run_manifest import RunManifest, hash_files
-from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.io.run_manifest import RunManifest
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 
 # Detection files that tell how many cars are ahead.
 _FRAMES_COUNTED = 50
+_TIMINGS = "timings.json"
 
 
 def refine_dataset(
@@ -35,39 +42,43 @@ def refine_dataset(
     out_dir: Path | str,
     options: RefineOptions | None = None,
     observer: RunObserver | None = None,
+    workers: WorkerOptions | None = None,
+    *,
+    fresh: bool = False,
 ) -> RunSummary:
-    """Refine all frames of a data set and write the results (docs/file_formats.md).
+    """Refine all frames of a data set and write the results (docs/file_formats.md, docs/run_on_everything.md).
 
-    A second call continues where the first stopped. Frames that cannot be read or refined are reported and do not stop
-    the others; they are tried again by the next call.
+    A second call continues where the first stopped, however it stopped. Frames that cannot be read or refined are
+    reported and do not stop the others; they are tried again by the next call. The results are the same byte for byte
+    whoever does the work, with the same number of threads and frames in a call.
 
     Args:
         dataset: the frames, in the dtype of the refiner.
         refiner: on any device.
-        out_dir: gets `data`, `shapes`, `summary.json`, `timings.json` and what the options ask for.
+        out_dir: gets `data`, `shapes`, `summary.json`, `run.json`, `timings.json` and what the options ask for.
         options: kinds of outputs and frames in a call.
         observer: is told of each frame.
+        workers: other processes, or a cluster; default this process.
+        fresh: remove what earlier runs have written there and start again.
 
     Raises:
         ResumeError: the folder holds results of another configuration, prior or input.
+        RunInProgressError: another run is writing there.
         InputError: the folder would overwrite the detections.
+        DirectShapeError: the run cannot go on: the disk is full, workers die before they finish anything.
     """
     out_dir, options = Path(out_dir), options or RefineOptions()
     _check_out_dir(dataset, out_dir)
-    run = _Run(dataset, refiner, out_dir, options, observer or SilentObserver())
-    return run.execute()
-
-
-@dataclass(frozen=True)
-class _Ready:
-    """A frame that was read, with the hashes of its files."""
-
-    loaded: LoadedFrame
-    inputs: dict[str, str]
+    with RunLock(out_dir):
+        remove_unfinished_files(out_dir)
+        if fresh:
+            remove_results(out_dir, (_TIMINGS, run_path(out_dir).name))
+        run = _Run(dataset, refiner, out_dir, options, observer or SilentObserver(), workers or WorkerOptions())
+        return run.execute()
 
 
 class _Run:
-    """One run: the things that all of its steps need."""
+    """One run, as the process that was started by the user sees it."""
 
     def __init__(
         self,
@@ -76,74 +87,141 @@ class _Run:
         out_dir: Path,
         options: RefineOptions,
         observer: RunObserver,
+        who: WorkerOptions,
     ) -> None:
-        self.dataset, self.refiner, self.out_dir = dataset, refiner, out_dir
-        self.options, self.observer = options, observer
-        self.prior_sha256 = hash_prior(refiner.prior)
-        self.record = RunRecord(out_dir, run_manifest(dataset, refiner, self.prior_sha256))
+        self.dataset, self.out_dir, self.options, self.observer, self.who = dataset, out_dir, options, observer, who
+        if who.in_this_process:
+            limit_threads(who.threads)
+        manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
+        self.record = RunRecord(out_dir, manifest)
         self.timings = RunTimings(refiner.prior.origin.device)
+        # Of all frames, also of those that are finished: after an interruption the decision must be the same.
+        num_cars = expected_cars(dataset, dataset.frame_ids)
+        prior_sha256 = manifest.sha256["prior"] or ""
+        self.job = RunJob(dataset, refiner, out_dir, options, prior_sha256, num_cars, _new_run_id())
+        before, self.file = read_run_file(out_dir), self._run_file(manifest)
+        self.digit_warnings = digit_warnings(before, self.file)
+        self.num_halved = 0
 
     def execute(self) -> RunSummary:
+        self.file.write(self.out_dir)
         resumed = self.record.finished_frames(self.dataset, self.options.outputs)
-        todo = [frame_id for frame_id in self.dataset.frame_ids if frame_id not in set(resumed)]
+        groups = frame_groups(self.dataset.frame_ids, self.options.batch_frames, resumed)
+        todo = [frame_id for group in groups for frame_id in group.frame_ids if frame_id in group.wanted]
+        self.file = self.file.refining(len(resumed), todo)
+        self.file.write(self.out_dir)
         self.observer.started(todo)
         try:
-            with cars_ahead(expected_cars(self.dataset, todo)):
-                for batch in _batches(todo, self.options.batch_frames):
-                    self._refine([ready for ready in map(self._read, batch) if ready is not None])
+            self._refine(groups)
+        except BaseException as error:
+            # What is finished stays finished. On a full disk even this fails, and the journals tell the next run.
+            with contextlib.suppress(OSError):
+                self._end(resumed, str(error) or type(error).__name__)
+            raise
+        return self._end(resumed, None)
+
+    def _refine(self, groups: Sequence[FrameGroup]) -> None:
+        if not groups:
+            return
+        start = time.perf_counter()
+        workers = self._workers()
+        dispatch = GroupDispatch(groups, workers, self.who.retries, self._finished)
+        try:
+            for report in dispatch.reports():
+                self._take_in(report)
         finally:
-            # Also when the user interrupts: what is finished need not be done again.
-            self.record.write()
-            if self.timings.calls:
-                write_timings(self.out_dir / "timings.json", self.timings)
-        return self._summary(resumed)
+            workers.close()
+            self.timings.wall_s = time.perf_counter() - start
+        self._note_lost(dispatch.lost)
 
-    def _read(self, frame_id: str) -> _Ready | None:
-        try:
-            inputs = hash_files(self.dataset.input_files(frame_id))
-            return _Ready(self.dataset.load(frame_id), inputs)
-        except (DirectShapeError, OSError) as error:
-            self._fail(frame_id, error)
-            return None
+    def _workers(self) -> Workers:
+        who, threads = self.who, self.who.threads_per_worker
+        if who.in_this_process:
+            return ThisProcess(GroupRefiner(self.job))
+        self.timings.threads = threads or 1
+        if who.ray is not None:
+            from directshape_torch.batch.ray_workers import RayWorkers
 
-    def _refine(self, batch: Sequence[_Ready]) -> None:
-        if not batch:
-            return
-        prior = self.refiner.prior.origin
-        frames, detections = collate([ready.loaded for ready in batch])
-        frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
-        try:
-            with self.timings.measure(frames.frame_ids, len(detections)):
-                result = self.refiner(frames, detections)
-        except torch.OutOfMemoryError as error:
-            size = f"{len(batch)} frames with {len(detections)} cars"
-            raise DirectShapeError(f"the device has too little memory for {size}; lower batch_frames") from error
-        first_row = 0
-        for ready in batch:
-            self._write(ready, result, first_row)
-            first_row += len(ready.loaded.detections)
+            ray_workers = RayWorkers(self.job, who)
+            self.timings.workers = ray_workers.num_workers
+            return ray_workers
+        from directshape_torch.batch.local_workers import LocalWorkers
 
-    def _write(self, ready: _Ready, result: RefinementResult, first_row: int) -> None:
-        loaded = ready.loaded
-        try:
-            write_frame_outputs(self.out_dir, loaded, result, first_row, self.prior_sha256, self.options)
-        except (DirectShapeError, OSError) as error:
-            self._fail(loaded.frame_id, error)
-            return
-        self.record.add(loaded.frame_id, ready.inputs, frame_entry(loaded, result, first_row, self.options))
-        self.observer.finished(loaded.frame_id, None)
+        self.timings.workers = who.workers or 1
+        return LocalWorkers(self.job, self.timings.workers, threads)
 
-    def _fail(self, frame_id: str, error: Exception) -> None:
-        reason = " ".join(str(error).split())
-        self.record.add(frame_id, {}, failed_entry(reason))
-        self.observer.finished(frame_id, reason)
+    def _take_in(self, report: GroupReport) -> None:
+        self.timings.add(report.calls, report.peak_memory_mb, report.peak_device_memory_mb)
+        self.num_halved += report.num_halved
+        for record in report.records:
+            self.observer.finished(record.frame_id, record.failure)
+        if report.stopped is not None:
+            raise DirectShapeError(report.stopped)
+
+    def _finished(self, frame_ids: Collection[str]) -> Collection[str]:
+        """Which frames this run's journals know to have ended; for the group of a worker that died."""
+        records = read_journals(self.out_dir, self.job.run_id).records
+        ended = [record for record in records if record.frame_id in frame_ids]
+        for record in ended:
+            self.observer.finished(record.frame_id, record.failure)
+        return [record.frame_id for record in ended]
+
+    def _note_lost(self, lost: dict[str, str]) -> None:
+        journal = Journal(self.out_dir, self.job.run_id)
+        for frame_id, reason in lost.items():
+            journal.add(FrameRecord(frame_id, {}, failed_entry(reason)))
+            self.observer.finished(frame_id, reason)
+
+    def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
+        """Write what is known at the end of the run, whatever end that is."""
+        self.record.take_in_journals()
+        if self.timings.calls:
+            write_timings(self.out_dir / _TIMINGS, self.timings)
+        summary = self._summary(resumed)
+        num_done = len(summary.frames) - len(summary.failed)
+        self.file.ended(num_done, summary.failed, reason).write(self.out_dir)
+        return summary
 
     def _summary(self, resumed: Sequence[str]) -> RunSummary:
         entries = self.record.manifest.frames
-        frames = {frame_id: entries[frame_id] for frame_id in self.dataset.frame_ids}
+        frames = {frame_id: entries[frame_id] for frame_id in self.dataset.frame_ids if frame_id in entries}
         failed = {frame_id: entry["reason"] for frame_id, entry in frames.items() if entry["state"] == "failed"}
-        warnings = find_warnings(frames, sorted(self.dataset.classes))
+        warnings = (*find_warnings(frames, sorted(self.dataset.classes)), *self._own_warnings())
         return RunSummary(frames, tuple(resumed), failed, warnings, self.timings)
+
+    def _own_warnings(self) -> list[str]:
+        found = list(self.digit_warnings) if self.timings.calls and self.file.num_resumed else []
+        if remade := self.record.remade:
+            found.append(f"files of {len(remade)} finished frames were damaged or gone and made again: {_some(remade)}")
+        if self.num_halved:
+            found.append(
+                f"{self.num_halved} calls did not work with all of their frames and were halved: the last digits of "
+                "their results may differ from those of a run that has the memory"
+            )
+        return found
+
+    def _run_file(self, manifest: RunManifest) -> RunFile:
+        who = self.who
+        work: dict[str, Any] = {
+            "where": "this process" if who.in_this_process else who.ray or "processes",
+            "workers": 1 if who.in_this_process else who.workers,
+            "threads": who.threads_per_worker or torch.get_num_threads(),
+            "device": self.timings.device.type,
+            "batch_frames": self.options.batch_frames,
+            "outputs": list(self.options.outputs),
+        }
+        settings = {"config": manifest.config, "sha256": manifest.sha256}
+        machine = f"{platform.system()} {platform.machine()}"
+        num_frames = len(self.dataset.frame_ids)
+        return RunFile(self.job.run_id, "checking", time.time(), versions(), machine, settings, work, num_frames)
+
+
+def _new_run_id() -> str:
+    return f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{os.urandom(3).hex()}"
+
+
+def _some(frame_ids: Sequence[str]) -> str:
+    return ", ".join(frame_ids[:5]) + (" .." if len(frame_ids) > 5 else "")
 
 
 def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
@@ -189,7 +267,3 @@ def _check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
             raise InputError(
                 "out", "a folder other than that of the detections", str(out_dir), "it would overwrite its own input"
             )
-
-
-def _batches(items: Sequence[str], size: int) -> Iterator[Sequence[str]]:
-    return (items[first : first + size] for first in range(0, len(items), size))

@@ -1,36 +1,46 @@
-"""`summary.json` while a run goes on: what may be skipped, what happened, written now and then and at the end."""
+"""What an output folder knows of its frames: from the summary of earlier runs and the journals of those cut off."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from directshape_torch.batch.frame_outputs import overlay_path
+from directshape_torch.batch.journal import FrameRecord, journal_folder, read_journals, remove_journals
 from directshape_torch.errors import DataFormatError, ResumeError
+from directshape_torch.io.image_files import read_file_bytes
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.run_manifest import (
     RunManifest,
     check_inputs,
     check_resume,
+    hash_bytes,
     hash_files,
     read_manifest,
     write_manifest,
 )
 from directshape_torch.io.stereo_dataset import StereoDataset
 
-# The file grows with the data set: writing it after every frame would cost the square of their number.
-_SECONDS_BETWEEN_WRITES = 5.0
+# Hashing waits for the disk most of the time, and for a network's even longer.
+_READING_THREADS = 8
+_OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays")
 
 
 class RunRecord:
-    """The manifest of an output folder, continued from an earlier run where there was one.
+    """The manifest of an output folder, continued from earlier runs where there were any.
 
     Args:
         out_dir: the output folder.
         manifest: settings and hashes of this run, without frames.
+
+    Attributes:
+        manifest: with the frames of earlier runs.
+        remade: frames whose files have been removed or damaged since they were finished, after `finished_frames`.
+        num_damaged_lines: of the journals of runs that were cut off.
 
     Raises:
         ResumeError: the folder holds results of other settings, or results without a summary.
@@ -38,50 +48,69 @@ class RunRecord:
 
     def __init__(self, out_dir: Path, manifest: RunManifest) -> None:
         self.out_dir = out_dir
-        self.path = out_dir / "summary.json"
-        self.manifest = self._continued(manifest)
-        self.write()
+        self.path = summary_path(out_dir)
+        self.remade: list[str] = []
+        self.num_damaged_lines = 0
+        previous = read_manifest(self.path)
+        if previous is None:
+            self._check_empty()
+            # Of a summary that somebody removed together with the results.
+            remove_journals(out_dir)
+            self.manifest = manifest
+            self.write()
+            return
+        check_resume(previous, manifest)
+        self.manifest = RunManifest(
+            manifest.package_version, manifest.config, manifest.sha256, previous.inputs, previous.frames
+        )
+        self._add_journals()
 
     def finished_frames(self, dataset: StereoDataset, outputs: Sequence[str]) -> list[str]:
-        """Frames of the data set that need no work: done, with all the outputs, from the files as they are now.
+        """Frames of the data set that need no work: done, with all the outputs whole, from the files as they are now.
 
         Raises:
             ResumeError: the files of a finished frame have changed since, or are gone.
         """
-        finished = []
-        for frame_id in dataset.frame_ids:
-            if not self.manifest.is_done(frame_id):
-                continue
-            self._check_inputs(dataset, frame_id)
-            if self._has_outputs(frame_id, outputs):
-                finished.append(frame_id)
-        return finished
+        done = [frame_id for frame_id in dataset.frame_ids if self.manifest.is_done(frame_id)]
+        with ThreadPoolExecutor(_READING_THREADS) as threads:
+            for _ in threads.map(partial(self._check_inputs, dataset), done):
+                pass
+            whole = list(threads.map(partial(self._has_outputs, outputs), done))
+        had_outputs = [set(outputs) <= set(self.manifest.frames[frame_id]["outputs"]) for frame_id in done]
+        self.remade = [
+            frame_id for frame_id, had, is_whole in zip(done, had_outputs, whole, strict=True) if had and not is_whole
+        ]
+        return [frame_id for frame_id, is_whole in zip(done, whole, strict=True) if is_whole]
 
-    def add(self, frame_id: str, inputs: dict[str, str], entry: dict[str, Any]) -> None:
+    def add(self, record: FrameRecord) -> None:
         """Note how a frame ended; outputs of an earlier run that are still valid stay listed."""
-        earlier = self.manifest.frames.get(frame_id, {})
-        if entry["state"] == "done" and self.manifest.is_done(frame_id):
+        earlier, entry = self.manifest.frames.get(record.frame_id, {}), record.entry
+        if entry["state"] == "done" and self.manifest.is_done(record.frame_id):
             lists = ("outputs", "mesh_files")
             entry = {**entry, **{name: sorted({*earlier.get(name, ()), *entry[name]}) for name in lists}}
-        self.manifest.inputs[frame_id] = inputs
-        self.manifest.frames[frame_id] = entry
-        if time.monotonic() - self._written_at > _SECONDS_BETWEEN_WRITES:
-            # On a full disk the frames go on, each to its own error; the write at the end is the one that counts.
-            with suppress(OSError):
-                self.write()
+            entry["files"] = {**earlier.get("files", {}), **entry["files"]}
+        self.manifest.inputs[record.frame_id] = record.inputs
+        self.manifest.frames[record.frame_id] = entry
+
+    def take_in_journals(self) -> None:
+        """Add what was noted since, write `summary.json`, and only then forget the journals.
+
+        Raises:
+            OSError: it could not be written; the journals are still there for the next run.
+        """
+        self._add_journals()
+        self.write()
+        remove_journals(self.out_dir)
 
     def write(self) -> None:
         """Write `summary.json`."""
         write_manifest(self.path, self.manifest)
-        self._written_at = time.monotonic()
 
-    def _continued(self, manifest: RunManifest) -> RunManifest:
-        previous = read_manifest(self.path)
-        if previous is None:
-            self._check_empty()
-            return manifest
-        check_resume(previous, manifest)
-        return RunManifest(manifest.package_version, manifest.config, manifest.sha256, previous.inputs, previous.frames)
+    def _add_journals(self) -> None:
+        journals = read_journals(self.out_dir)
+        self.num_damaged_lines = journals.num_damaged
+        for record in journals.records:
+            self.add(record)
 
     def _check_empty(self) -> None:
         for name in ("data", "shapes"):
@@ -92,13 +121,20 @@ class RunRecord:
                     "unknown; choose another output folder, or remove this one to start again"
                 )
 
-    def _has_outputs(self, frame_id: str, outputs: Sequence[str]) -> bool:
-        """Whether the outputs were written, and nobody has removed them since."""
+    def _has_outputs(self, outputs: Sequence[str], frame_id: str) -> bool:
+        """Whether the outputs were written, and nobody has removed or changed them since."""
         paths = {"data": result_path, "shapes": shapes_path, "overlays": overlay_path}
         entry = self.manifest.frames[frame_id]
         files = [path(self.out_dir, frame_id) for name, path in paths.items() if name in outputs]
         files += [self.out_dir / name for name in entry.get("mesh_files", ()) if f"meshes_{name[-3:]}" in outputs]
-        return set(outputs) <= set(entry["outputs"]) and all(file.is_file() for file in files)
+        return set(outputs) <= set(entry["outputs"]) and all(self._is_whole(file, entry) for file in files)
+
+    def _is_whole(self, file: Path, entry: dict[str, Any]) -> bool:
+        """Runs of earlier versions left no checksums: of their files only the existence can be told."""
+        if not file.is_file():
+            return False
+        expected = entry.get("files", {}).get(file.relative_to(self.out_dir).as_posix())
+        return expected is None or hash_bytes(read_file_bytes(file)) == expected
 
     def _check_inputs(self, dataset: StereoDataset, frame_id: str) -> None:
         try:
@@ -108,3 +144,43 @@ class RunRecord:
                 f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}"
             ) from error
         check_inputs(self.manifest, frame_id, hashes)
+
+
+def summary_path(out_dir: Path) -> Path:
+    """The summary of an output folder."""
+    return out_dir / "summary.json"
+
+
+def remove_unfinished_files(out_dir: Path) -> None:
+    """Remove temporary files of processes that were killed while they wrote; only for who holds the folder's lock."""
+    for folder in (out_dir, journal_folder(out_dir), *(out_dir / name for name in _OUTPUT_FOLDERS)):
+        for path in folder.glob(".*.tmp"):
+            path.unlink(missing_ok=True)
+
+
+def remove_results(out_dir: Path, others: Iterable[str]) -> None:
+    """Remove what runs have written into a folder, and nothing else: the files their records name.
+
+    Args:
+        out_dir: the output folder.
+        others: further files of runs, beside the summary.
+
+    Raises:
+        DataFormatError: the folder has a summary that cannot be read, so nobody knows which files are results.
+    """
+    previous = read_manifest(summary_path(out_dir))
+    if previous is None:
+        return
+    records = [FrameRecord(frame_id, {}, entry) for frame_id, entry in previous.frames.items()]
+    for record in [*records, *read_journals(out_dir).records]:
+        paths = (path(out_dir, record.frame_id) for path in (result_path, shapes_path, overlay_path))
+        for path in (*paths, *(out_dir / name for name in record.entry.get("mesh_files", ()))):
+            # A path that was smuggled into the summary does not lead out of the folder.
+            if path.resolve().is_relative_to(out_dir.resolve()):
+                path.unlink(missing_ok=True)
+    remove_journals(out_dir)
+    for name in (*others, summary_path(out_dir).name):
+        (out_dir / name).unlink(missing_ok=True)
+    for name in _OUTPUT_FOLDERS:
+        with suppress(OSError):  # files of somebody else stay, and their folder with them
+            (out_dir / name).rmdir()

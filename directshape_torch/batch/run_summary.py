@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from directshape_torch.batch.timing import RunTimings, device_name, peak_device_memory_mb, peak_memory_mb
+from directshape_torch.batch.timing import RunTimings, device_name, peak_memory_mb
 from directshape_torch.status import Status
 
 
@@ -103,7 +103,11 @@ def _timing_lines(timings: RunTimings) -> list[str]:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "
         where = device_name(timings.device)
         lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only, {where})")
-    host, device = peak_memory_mb(), peak_device_memory_mb(timings.device)
-    sizes = [f"{host:.0f} MB"] if host is not None else []
+    if timings.workers > 1 and timings.wall_s:
+        rate = timings.num_frames / timings.wall_s
+        lines.append(f"rate     {rate:.2f} frames a second by {timings.workers} workers (everything included)")
+    host, device = timings.peak_mb or peak_memory_mb(), timings.peak_device_mb
+    each = " a worker" if timings.workers > 1 else ""
+    sizes = [f"{host:.0f} MB{each}"] if host is not None else []
     sizes += [f"{device:.0f} MB on the device"] if device is not None else []
     return [*lines, f"memory   {', '.join(sizes)} at most"] if sizes else lines

@@ -32,10 +32,20 @@ class RunTimings:
     Attributes:
         device: where the refiner ran.
         calls: one entry a call.
+        workers: processes that refined side by side.
+        threads: of each.
+        wall_s: seconds from the first frame to the last, reading and writing included.
+        peak_mb: the largest resident memory of any of these processes, MB, where the system tells.
+        peak_device_mb: the largest memory of tensors on a graphics card, MB.
     """
 
     device: torch.device
     calls: list[CallTiming] = field(default_factory=list)
+    workers: int = 1
+    threads: int = field(default_factory=torch.get_num_threads)
+    wall_s: float = 0.0
+    peak_mb: float | None = None
+    peak_device_mb: float | None = None
 
     @contextmanager
     def measure(self, frame_ids: Sequence[str], num_cars: int) -> Iterator[None]:
@@ -45,6 +55,12 @@ class RunTimings:
         yield
         _wait_for(self.device)
         self.calls.append(CallTiming(tuple(frame_ids), num_cars, time.perf_counter() - start))
+
+    def add(self, calls: Sequence[CallTiming], peak_mb: float | None, peak_device_mb: float | None) -> None:
+        """Take in what a worker says."""
+        self.calls += calls
+        self.peak_mb = _larger(self.peak_mb, peak_mb)
+        self.peak_device_mb = _larger(self.peak_device_mb, peak_device_mb)
 
     @property
     def num_frames(self) -> int:
@@ -74,9 +90,11 @@ def write_timings(path: Path, timings: RunTimings) -> None:
     content = {
         "schema_version": TIMINGS_SCHEMA_VERSION,
         "device": device_name(timings.device),
-        "threads": torch.get_num_threads(),
-        "peak_memory_mb": peak_memory_mb(),
-        "peak_device_memory_mb": peak_device_memory_mb(timings.device),
+        "workers": timings.workers,
+        "threads": timings.threads,
+        "peak_memory_mb": timings.peak_mb,
+        "peak_device_memory_mb": timings.peak_device_mb,
+        "wall_s": _rounded(timings.wall_s),
         "ms_per_car": _rounded(timings.ms_per_car),
         "ms_per_frame": _rounded(timings.ms_per_frame),
         "calls": [
@@ -111,6 +129,11 @@ def peak_device_memory_mb(device: torch.device) -> float | None:
 def _wait_for(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+def _larger(first: float | None, second: float | None) -> float | None:
+    known = [value for value in (first, second) if value is not None]
+    return max(known) if known else None
 
 
 def _rounded(number: float | None) -> float | None:

@@ -1,0 +1,44 @@
+"""Which frames are refined together: decided by the data set alone, not by who does the work or what is left of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+
+@dataclass(frozen=True)
+class FrameGroup:
+    """Frames of one call of the refiner.
+
+    Attributes:
+        frame_ids: all of them; the last digits of a result depend on its company.
+        wanted: those whose files are to be written; the others are finished already.
+    """
+
+    frame_ids: tuple[str, ...]
+    wanted: frozenset[str]
+
+    def without(self, finished: Collection[str]) -> FrameGroup:
+        """The same call, with less to write."""
+        return replace(self, wanted=self.wanted.difference(finished))
+
+    def halves(self) -> tuple[FrameGroup, ...]:
+        """Two calls, without one that has nothing to write."""
+        middle = (len(self.frame_ids) + 1) // 2
+        parts = (self.frame_ids[:middle], self.frame_ids[middle:])
+        return tuple(FrameGroup(part, self.wanted.intersection(part)) for part in parts if self.wanted & set(part))
+
+
+def frame_groups(frame_ids: Sequence[str], size: int, finished: Collection[str]) -> list[FrameGroup]:
+    """The calls of a run.
+
+    A group of which some frames are finished is refined as a whole again, so that the others get the bytes that they
+    would have got without the interruption.
+
+    Example:
+        >>> [group.frame_ids for group in frame_groups("abcde", 2, finished={"a", "b", "c"})]
+        [('c', 'd'), ('e',)]
+    """
+    finished = frozenset(finished)
+    groups = (tuple(frame_ids[first : first + size]) for first in range(0, len(frame_ids), size))
+    return [FrameGroup(ids, frozenset(ids) - finished) for ids in groups if not finished.issuperset(ids)]

@@ -1,0 +1,264 @@
+"""The work itself, the same in every process: read a group of frames, refine it, write its files, note it down."""
+
+from __future__ import annotations
+
+import errno
+import gc
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from directshape_torch.batch.frame_groups import FrameGroup
+from directshape_torch.batch.frame_outputs import failed_entry, frame_entry, write_frame_outputs
+from directshape_torch.batch.journal import FrameRecord, Journal
+from directshape_torch.batch.options import RefineOptions
+from directshape_torch.batch.timing import CallTiming, RunTimings, peak_device_memory_mb, peak_memory_mb
+from directshape_torch.compilation import cars_ahead
+from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.io.run_manifest import hash_files
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+
+
+class _OutputLostError(DirectShapeError):
+    """The output folder takes nothing more."""
+
+
+# What is true of every frame: going on would only fail them one after another.
+_STOPS_THE_RUN = (CompilationError, MissingDependencyError, _OutputLostError)
+_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+@dataclass(frozen=True)
+class RunJob:
+    """All that a process needs for its share of a run.
+
+    Attributes:
+        dataset: the frames.
+        refiner: on its device.
+        out_dir: the output folder.
+        options: kinds of outputs.
+        prior_sha256: of the shape prior.
+        expected_cars: about how many the whole run has, from which every process draws the same conclusion whether to
+            compile.
+        run_id: names the run's journals.
+    """
+
+    dataset: StereoDataset
+    refiner: DirectShapeRefiner
+    out_dir: Path
+    options: RefineOptions
+    prior_sha256: str
+    expected_cars: int
+    run_id: str
+
+
+@dataclass
+class GroupReport:
+    """What became of a group.
+
+    Attributes:
+        records: of its frames, in the order in which they ended.
+        calls: of the refiner.
+        num_halved: calls that did not work and were tried again with half of the frames.
+        peak_memory_mb: of the process so far, where the system tells.
+        peak_device_memory_mb: of the graphics card so far.
+        stopped: why no other frame could be refined either, or None.
+    """
+
+    records: list[FrameRecord] = field(default_factory=list)
+    calls: list[CallTiming] = field(default_factory=list)
+    num_halved: int = 0
+    peak_memory_mb: float | None = None
+    peak_device_memory_mb: float | None = None
+    stopped: str | None = None
+
+    def has(self, frame_id: str) -> bool:
+        """Whether a frame has ended."""
+        return any(record.frame_id == frame_id for record in self.records)
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """A frame that was read, with the hashes of its files."""
+
+    loaded: LoadedFrame
+    inputs: dict[str, str]
+
+
+class GroupRefiner:
+    """Refines groups of frames in this process."""
+
+    def __init__(self, job: RunJob) -> None:
+        self._job = job
+        self._journal = Journal(job.out_dir, job.run_id)
+
+    def refine(self, group: FrameGroup) -> GroupReport:
+        """Refine a group; errors of a frame are in its record, those of the whole run in `stopped`."""
+        step = _GroupStep(self._job, self._journal, group)
+        try:
+            step.refine(group.frame_ids)
+        except _STOPS_THE_RUN as error:
+            step.report.stopped = _reason(error)
+        device = self._job.refiner.prior.origin.device
+        step.report.peak_memory_mb, step.report.peak_device_memory_mb = peak_memory_mb(), peak_device_memory_mb(device)
+        return step.report
+
+
+class _GroupStep:
+    """One group on its way."""
+
+    def __init__(self, job: RunJob, journal: Journal, group: FrameGroup) -> None:
+        self.job, self.journal, self.group = job, journal, group
+        self.report = GroupReport()
+
+    def refine(self, frame_ids: Sequence[str]) -> None:
+        """Together, or by halves where that does not work, down to the frame that is the cause."""
+        frame_ids = [frame_id for frame_id in frame_ids if not self.report.has(frame_id)]
+        if self.group.wanted.isdisjoint(frame_ids):
+            return
+        problem = self._attempt(frame_ids)
+        if problem is None:
+            return
+        # Only now, when the traceback and with it the tensors of the call are gone.
+        _free_memory(self.job.refiner.prior.origin.device)
+        if len(frame_ids) == 1:
+            self._fail(frame_ids[0], problem)
+            return
+        self.report.num_halved += 1
+        for half in FrameGroup(tuple(frame_ids), self.group.wanted.intersection(frame_ids)).halves():
+            self.refine(half.frame_ids)
+
+    def _attempt(self, frame_ids: Sequence[str]) -> str | None:
+        """Why these frames cannot be refined together, or None where each of them has ended."""
+        try:
+            batch = [ready for ready in map(self._read, frame_ids) if ready is not None]
+            result = self._call(batch) if batch else None
+        except _STOPS_THE_RUN:
+            raise
+        # Whatever a frame of a hundred thousand brings to light: it is reported, and the others go on.
+        except Exception as error:
+            return _with_memory_advice(error, len(frame_ids))
+        first_row = 0
+        for ready in batch:
+            assert result is not None, "frames were read and not refined"
+            if ready.loaded.frame_id in self.group.wanted:
+                self._write(ready, result, first_row)
+            first_row += len(ready.loaded.detections)
+        return None
+
+    def _read(self, frame_id: str) -> _Ready | None:
+        try:
+            inputs = hash_files(self.job.dataset.input_files(frame_id))
+            return _Ready(self.job.dataset.load(frame_id), inputs)
+        except (DirectShapeError, OSError) as error:
+            if isinstance(error, _STOPS_THE_RUN):
+                raise
+            self._fail(frame_id, _reason(error))
+            return None
+
+    def _call(self, batch: Sequence[_Ready]) -> RefinementResult:
+        prior = self.job.refiner.prior.origin
+        frames, detections = collate([ready.loaded for ready in batch])
+        frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
+        timings = RunTimings(prior.device, self.report.calls)
+        # Said anew before each call, so that it does not matter which calls this process had before.
+        with cars_ahead(self.job.expected_cars), timings.measure(frames.frame_ids, len(detections)):
+            result: RefinementResult = self.job.refiner(frames, detections)
+        return result
+
+    def _write(self, ready: _Ready, result: RefinementResult, first_row: int) -> None:
+        loaded, job = ready.loaded, self.job
+        try:
+            files = write_frame_outputs(job.out_dir, loaded, result, first_row, job.prior_sha256, job.options)
+        except (DirectShapeError, OSError) as error:
+            if isinstance(error, _STOPS_THE_RUN):
+                raise
+            if isinstance(error, OSError) and error.errno in _DISK_IS_FULL:
+                raise self._lost(error) from error
+            self._fail(loaded.frame_id, _reason(error))
+            return
+        entry = frame_entry(loaded, result, first_row, job.options, files)
+        self._note(FrameRecord(loaded.frame_id, ready.inputs, entry))
+
+    def _fail(self, frame_id: str, reason: str) -> None:
+        # A finished frame that was only to keep the others company stays finished.
+        if frame_id in self.group.wanted:
+            self._note(FrameRecord(frame_id, {}, failed_entry(reason)))
+
+    def _note(self, record: FrameRecord) -> None:
+        try:
+            self.journal.add(record)
+        except OSError as error:
+            raise self._lost(error) from error
+        self.report.records.append(record)
+
+    def _lost(self, error: OSError) -> _OutputLostError:
+        return _OutputLostError(
+            f"cannot write to {self.job.out_dir} any more ({error.strerror or error}): make room there and run the "
+            "same command again; what is finished stays finished"
+        )
+
+
+def load_job(content: bytes) -> GroupRefiner:
+    """A worker's own copy of the job, from `dump_job`."""
+    import pickle
+
+    job: RunJob = pickle.loads(content)
+    return GroupRefiner(job)
+
+
+def dump_job(job: RunJob) -> bytes:
+    """A job for workers, as multiprocessing would send it, but as bytes: tensors are copied and not shared.
+
+    Raises:
+        DirectShapeError: the data set or the refiner cannot be sent to another process.
+    """
+    import pickle
+
+    try:
+        return pickle.dumps(job)
+    except (pickle.PicklingError, TypeError, AttributeError) as error:
+        raise DirectShapeError(f"the job cannot be sent to other processes: {error}") from error
+
+
+def limit_threads(threads: int | None) -> None:
+    """Set the number of threads of PyTorch and OpenCV in this process; None leaves them."""
+    if threads is None:
+        return
+    import cv2
+
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+
+
+def _reason(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, (DirectShapeError, OSError)) and text else f"{type(error).__name__}: {text}"
+
+
+def _with_memory_advice(error: Exception, num_frames: int) -> str:
+    if not is_out_of_memory(error):
+        return _reason(error)
+    what = "1 frame" if num_frames == 1 else f"{num_frames} frames"
+    return f"too little memory for {what} in a call ({_reason(error)[:200]})"
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether memory was lacking; on the CPU PyTorch and OpenCV have no class of exception for that."""
+    if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
+        return True
+    text = str(error)
+    return any(sign in text for sign in ("can't allocate memory", "Insufficient memory", "CUDA out of memory"))
+
+
+def _free_memory(device: torch.device) -> None:
+    gc.collect()
+    with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
+        if device.type == "cuda":
+            torch.cuda.empty_cache()

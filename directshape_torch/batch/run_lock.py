@@ -1,0 +1,112 @@
+"""One run at a time in an output folder: a locked file that names its owner."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Self
+
+from directshape_torch.errors import RunInProgressError
+
+try:
+    import fcntl
+except ImportError:  # only Unix has it; elsewhere nothing is locked, but the owner is named
+    fcntl = None  # type: ignore[assignment]
+
+
+@dataclass(frozen=True)
+class LockOwner:
+    """The process that runs in a folder.
+
+    Attributes:
+        host: name of its machine.
+        pid: number of the process there.
+        started_at: seconds since 1970.
+    """
+
+    host: str
+    pid: int
+    started_at: float
+
+    @property
+    def is_alive(self) -> bool | None:
+        """Whether the process runs; None where it is on another machine."""
+        if self.host != platform.node():
+            return None
+        try:
+            os.kill(self.pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:  # it runs, but is somebody else's
+            return True
+        return True
+
+    def __str__(self) -> str:
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.started_at))
+        return f"process {self.pid} on {self.host}, since {since}"
+
+
+class RunLock:
+    """Holds the folder while the body runs; the operating system lets go of it however the process ends.
+
+    Raises:
+        RunInProgressError: another process holds it.
+    """
+
+    def __init__(self, out_dir: Path) -> None:
+        self.path = lock_path(out_dir)
+        self._file: IO[str] | None = None
+
+    def __enter__(self) -> Self:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        while self._file is None:
+            self._file = self._locked()
+        self._file.truncate(0)
+        json.dump({"host": platform.node(), "pid": os.getpid(), "started_at": time.time()}, self._file)
+        self._file.flush()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # Removed before it is let go of, so that nobody locks a file that is about to vanish.
+        self.path.unlink(missing_ok=True)
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _locked(self) -> IO[str] | None:
+        """The file, held; None where its last owner removed it in between."""
+        # Not "w": that would empty the file of a run that holds it.
+        file = self.path.open("a+", encoding="utf-8")
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.fstat(file.fileno()).st_ino == self.path.stat().st_ino:
+                return file
+        except BlockingIOError as error:
+            file.close()
+            owner = read_lock_owner(self.path.parent)
+            raise RunInProgressError(
+                f"{self.path.parent}: another run is writing here ({owner or 'its owner is not known'}); wait for it, "
+                "stop it, or choose another output folder ('directshape status' shows how far it is)"
+            ) from error
+        except FileNotFoundError:
+            pass
+        file.close()
+        return None
+
+
+def lock_path(out_dir: Path) -> Path:
+    """The file that is locked."""
+    return out_dir / ".run.lock"
+
+
+def read_lock_owner(out_dir: Path) -> LockOwner | None:
+    """Who runs in the folder, or did when it was killed; None where nobody is named."""
+    with suppress(OSError, ValueError, TypeError):
+        return LockOwner(**json.loads(lock_path(out_dir).read_text(encoding="utf-8")))
+    return None
