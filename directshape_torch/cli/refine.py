@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """
 Refine the rough 3D boxes of a detector: poses, boxes and shapes of all cars of all frames. A second run with the same
-settings continues where the first stopped. Exit code: 0 all frames done, 1 some frames failed, 2 wrong usage or input.
+settings continues where the first stopped, however it stopped; 'directshape status' tells how far it is. Exit code: 0
+all frames done, 1 some frames failed, 2 wrong usage or input, or a run that could not go on.
 """
 
 
@@ -27,6 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_data_options(parser.add_argument_group("input"))
     _add_outputs(parser.add_argument_group("output"))
     _add_settings(parser.add_argument_group("settings"))
+    _add_workers(parser.add_argument_group("workers (docs/run_on_everything.md)"))
     parser.set_defaults(run=run)
 
 
@@ -34,6 +36,11 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
     group.add_argument("--meshes", choices=("ply", "glb"), help="write the surface of each refined car")
     group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
+    again = group.add_mutually_exclusive_group()
+    again.add_argument("--resume", action="store_false", dest="fresh", help="go on where DIR was left (the default)")
+    again.add_argument(
+        "--fresh", action="store_true", help="remove the results that runs have left in DIR, start again"
+    )
 
 
 def _add_settings(group: argparse._ArgumentGroup) -> None:
@@ -55,8 +62,26 @@ def _add_settings(group: argparse._ArgumentGroup) -> None:
         "--prior", metavar="FILE|NAME", help="shape prior of any kind, or the bundled pca (default) or neural"
     )
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
-    group.add_argument("--threads", type=int, metavar="N", help="of the CPU; 1 is by far the best on a busy machine")
     group.add_argument("--batch-frames", type=int, default=1, metavar="N", help="frames in one call (default: 1)")
+
+
+def _add_workers(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--workers", type=int, metavar="N", help="processes side by side; default: this one alone")
+    group.add_argument(
+        "--threads",
+        "--threads-per-worker",
+        type=int,
+        metavar="N",
+        help="of the CPU, for each worker (default: 1; without workers PyTorch's); 1 is by far the best on a busy machine",
+    )
+    group.add_argument(
+        "--ray",
+        metavar="ADDRESS|local",
+        help="workers on a Ray cluster: auto, HOST:PORT, ray://HOST:PORT, or one of this machine alone (extra ray)",
+    )
+    group.add_argument(
+        "--retries", type=int, default=1, metavar="N", help="for frames whose worker died (default: %(default)s)"
+    )
 
 
 def add_config_option(group: argparse._ActionsContainer) -> None:
@@ -72,18 +97,18 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         DirectShapeError: wrong input, or an output folder of another run; for the main program to show.
     """
-    from directshape_torch.batch.options import RefineOptions
+    from directshape_torch.batch.options import RefineOptions, WorkerOptions
     from directshape_torch.batch.refine_dataset import refine_dataset
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.progress import ProgressBar
 
-    _limit_threads(args.threads)
+    workers = WorkerOptions(args.workers, args.threads, args.ray, args.retries)
     options = RefineOptions(args.meshes, args.overlays, args.batch_frames)
     chosen = [] if args.method is None else [f"method={args.method}"]
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device)
     _check_disparity_is_used(args.disparity, refiner.config.method)
     with ProgressBar() as progress:
-        summary = refine_dataset(dataset_of(args), refiner, args.out, options, progress)
+        summary = refine_dataset(dataset_of(args), refiner, args.out, options, progress, workers, fresh=args.fresh)
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
@@ -94,17 +119,6 @@ def run(args: argparse.Namespace) -> int:
 def _check_disparity_is_used(folder: Path | None, method: str) -> None:
     if folder is not None and method == "direct":
         raise InputError("--disparity", "a method that uses it", "direct", "add --method geometric or combined")
-
-
-def _limit_threads(num_threads: int | None) -> None:
-    """PyTorch's threads wait for each other by spinning, so on a busy machine two are many times slower than one."""
-    import torch
-
-    if num_threads is None:
-        return
-    if num_threads < 1:
-        raise InputError("--threads", "at least 1", str(num_threads))
-    torch.set_num_threads(num_threads)
 
 
 def make_refiner(config: str | None, overrides: list[str], prior: Path | str | None, device: str) -> DirectShapeRefiner:

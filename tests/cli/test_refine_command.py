@@ -156,7 +156,7 @@ def test_threads_are_those_asked_for(source: Path, tmp_path: Path, capsys: pytes
     finally:
         torch.set_num_threads(before)
     assert main(command(source, tmp_path, "--threads", "0")) == 2
-    assert "--threads: expected at least 1, got 0" in capsys.readouterr().err
+    assert "threads: expected at least 1, got 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
