@@ -62,7 +62,7 @@ def srgb_to_linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
     Example:
         >>> srgb_to_linear(np.array([0, 188, 255], dtype=np.uint8)).tolist()
-        [0, 32913, 65535]
+        [0, 32957, 65535]
     """
     s = rgb.astype(np.float64) / 255
     linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,100 @@
+"""`directshape export` as a user types it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.finished_run import FinishedRun, make_run
+
+from directshape_torch.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    return make_run(tmp_path_factory.mktemp("run"))
+
+
+def command(run: FinishedRun, out: Path, *words: str | Path) -> list[str]:
+    return [str(word) for word in ("export", run.out, "--prior", run.root / "prior.npz", "--out", out, *words)]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_writes_the_formats_and_only_reads_the_run(
+    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(finished.out)
+    formats = ("--format", "glb", "kitti", "coco3d", "nuscenes", "--frames", "1")
+    data = ("--data", finished.root, "--masks", finished.root / "masks")
+    assert main(command(finished, tmp_path, *formats, *data)) == 0
+    assert capsys.readouterr().out == f"exported  1 frames as glb, kitti, coco3d, nuscenes to {tmp_path}\n"
+    assert sorted(contents(tmp_path)) == [
+        "coco3d.json",
+        "glb/000001.glb",
+        "kitti/data/000001.txt",
+        "kitti/json/000001.json",
+        "nuscenes.json",
+    ]
+    assert contents(finished.out) == before
+
+
+def test_the_detections_need_not_be_named(finished: FinishedRun, tmp_path: Path) -> None:
+    """The results have the same lines and 2D boxes, so the same masks are found for them."""
+    data = ("--format", "glb", "--data", finished.root, "--masks", finished.root / "masks")
+    assert main(command(finished, tmp_path / "a", *data)) == 0
+    assert main(command(finished, tmp_path / "b", *data, "--detections", finished.root / "detections")) == 0
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_masks_and_grey_change_the_colours(finished: FinishedRun, tmp_path: Path) -> None:
+    data = ("--format", "ply", "--data", finished.root)
+    assert main(command(finished, tmp_path / "plain", *data)) == 0
+    assert main(command(finished, tmp_path / "masks", *data, "--masks", finished.root / "masks")) == 0
+    assert main(command(finished, tmp_path / "grey", *data, "--unseen", "grey")) == 0
+    found = [contents(tmp_path / name)["ply/000000_1.ply"] for name in ("plain", "masks", "grey")]
+    assert len(set(found)) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--format", "coco3d"), "--data: expected the data set of the run, for the sizes"),
+        (("--format", "ply", "--masks", "x"), "--data: expected the data set of the run, because of --masks"),
+        (("--format", "ply", "--frames", "7"), "frames: expected finished frames of"),
+        (("--format", "points", "--points", "0"), "points_per_car: expected at least 1, got 0"),
+        (("--format", "ply", "--prior", "pca"), "was made with another shape prior"),
+    ],
+)
+def test_wrong_use_is_named(
+    finished: FinishedRun,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    message: str,
+) -> None:
+    assert main(command(finished, tmp_path, *words)) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_folder_without_a_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", str(tmp_path), "--format", "kitti", "--out", str(tmp_path / "out")]) == 2
+    assert "holds no summary.json of a run" in capsys.readouterr().err
+
+
+def test_another_rigs_field_is_refused(
+    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import torch
+
+    from directshape_torch.geometry.disparity_field import DisparityField
+
+    camera = finished.inputs().dataset.load("000000").frame.camera
+    rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
+    hull = torch.tensor([[0.0, 0.0], [159.0, 0.0], [159.0, 119.0]])
+    DisparityField(torch.zeros(10), hull_uv=hull, size_wh=(160, 120), **rig).save(tmp_path / "bias.json")
+    words = ("--format", "points", "--data", finished.root, "--stereo-bias", tmp_path / "bias.json")
+    assert main(command(finished, tmp_path / "out", *words)) == 2
+    assert "--stereo-bias: expected the field that the run was made with" in capsys.readouterr().err

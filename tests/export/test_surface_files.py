@@ -1,0 +1,266 @@
+"""GLB and PLY files, read back by libraries that did not write them, hold the shapes of the run and its image."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers.finished_run import FinishedRun
+from numpy.typing import NDArray
+from plyfile import PlyData
+
+from directshape_torch.export.export_run import export_run
+from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
+from directshape_torch.export.run_folder import RunFolder
+from directshape_torch.io.disparity_files import write_disparity
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+
+Floats = NDArray[np.float64]
+LINES = (1, 3)
+
+
+@pytest.fixture(scope="module")
+def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("surfaces")
+    export_run(finished.folder, folder, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
+    return folder
+
+
+class Glb:
+    """A binary glTF file as pygltflib reads it."""
+
+    def __init__(self, path: Path) -> None:
+        from pygltflib import GLTF2
+
+        self.gltf = GLTF2().load(str(path))
+        self.nodes = {node.name: node for node in self.gltf.nodes if node.mesh is not None}
+
+    def attribute(self, name: str, attribute: str) -> NDArray[np.generic]:
+        primitive = self.gltf.meshes[self.nodes[name].mesh].primitives[0]
+        accessors = {**vars(primitive.attributes), "indices": primitive.indices}
+        accessor = self.gltf.accessors[accessors[attribute]]
+        view = self.gltf.bufferViews[accessor.bufferView]
+        kind = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor.componentType]
+        width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor.type]
+        content = self.gltf.binary_blob()[view.byteOffset + (accessor.byteOffset or 0) :]
+        array = np.frombuffer(content, kind, accessor.count * width).reshape(-1, width)
+        assert accessor.normalized == (attribute == "COLOR_0")
+        return array
+
+    def matrix(self, name: str) -> Floats:
+        """Node to world; glTF stores columns first."""
+        return np.array(self.nodes[name].matrix).reshape(4, 4).T
+
+    def extras(self, name: str) -> dict[str, object]:
+        return dict(self.gltf.meshes[self.nodes[name].mesh].extras)
+
+
+@functools.cache
+def glb(path: Path) -> Glb:
+    return Glb(path)
+
+
+def state(run: FinishedRun, frame_id: str) -> dict[str, NDArray[np.generic]]:
+    with np.load(run.out / "shapes" / f"{frame_id}.npz", allow_pickle=False) as file:
+        return dict(file)
+
+
+def distances(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> Floats:
+    """How far points are from the surface that the npz describes, by the signed distance field itself."""
+    arrays = state(run, frame_id)
+    T = arrays["T_cam_obj"][car].astype(np.float64)
+    points_obj = (points_cam - T[:3, 3]) @ T[:3, :3]
+    shape = run.prior.bind(torch.from_numpy(arrays["codes"][car : car + 1]).to(run.prior.origin))
+    points = torch.from_numpy(points_obj).to(run.prior.origin)
+    return shape.value(points, torch.zeros(len(points), dtype=torch.int64)).numpy()
+
+
+def extents(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> Floats:
+    """Height, width, length of points along the axes of the car."""
+    R = state(run, frame_id)["T_cam_obj"][car][:3, :3].astype(np.float64)
+    length, height, width = np.ptp(points_cam @ R, axis=0)
+    return np.array([height, width, length])
+
+
+def srgb(linear: NDArray[np.generic]) -> Floats:
+    """16 bits of glTF's linear colours as the bytes of an image."""
+    c = linear.astype(np.float64) / 65535
+    return 255 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.maximum(c, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def image_at(run: FinishedRun, frame_id: str, points_cam: Floats) -> Floats:
+    """The left image where points appear, by OpenCV's interpolation."""
+    P2 = np.array((run.root / f"training/calib/{frame_id}.txt").read_text().split("\n")[0].split()[1:], float)
+    uv = points_cam @ P2.reshape(3, 4)[:, :3].T
+    uv = (uv[:, :2] / uv[:, 2:]).astype(np.float32)[:, None]
+    bgr = cv2.imread(str(run.root / f"training/image_2/{frame_id}.png"))
+    return cv2.remap(bgr, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)[:, 0, ::-1].astype(np.float64)
+
+
+@pytest.mark.parametrize("car", [0, 1])
+def test_glb_surface_is_the_zero_level_of_the_npz(finished: FinishedRun, exported: Path, car: int) -> None:
+    file, name = glb(exported / "glb" / "000000.glb"), f"car_{LINES[car]}"
+    points = file.attribute(name, "POSITION").astype(np.float64)
+    assert np.abs(distances(finished, "000000", car, points)).max() < 0.02
+    np.testing.assert_allclose(
+        extents(finished, "000000", car, points), state(finished, "000000")["boxes_hwl"][car], atol=1e-3
+    )
+    faces = file.attribute(name, "indices").reshape(-1, 3).astype(np.int64)
+    # Each edge of a closed surface belongs to two triangles, once in each direction.
+    edges = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    assert set(map(tuple, edges)) == set(map(tuple, edges[:, ::-1]))
+    a, b, c = points[faces].transpose(1, 0, 2)
+    volume = (np.cross(a, b) * c).sum() / 6
+    height, width, length = state(finished, "000000")["boxes_hwl"][car]
+    assert volume == pytest.approx(np.pi / 6 * height * width * length, rel=0.1)
+
+
+def test_glb_stands_upright_and_looks_along_minus_z(exported: Path) -> None:
+    file = glb(exported / "glb" / "000000.glb")
+    for name in ("car_1", "car_3", "ground"):
+        np.testing.assert_array_equal(file.matrix(name), np.diag([1.0, -1.0, -1.0, 1.0]))
+    points = file.attribute("car_1", "POSITION") @ file.matrix("car_1")[:3, :3].T
+    ground = file.attribute("ground", "POSITION") @ file.matrix("ground")[:3, :3].T
+    assert points[:, 1].min() > ground[:, 1].max() - 0.3
+    assert points[:, 2].max() < 0
+
+
+def test_glb_normals_point_outward(finished: FinishedRun, exported: Path) -> None:
+    file = glb(exported / "glb" / "000000.glb")
+    points, normals = (file.attribute("car_1", one).astype(np.float64) for one in ("POSITION", "NORMAL"))
+    outside = distances(finished, "000000", 0, points + 0.05 * normals)
+    assert (outside > distances(finished, "000000", 0, points)).mean() > 0.999
+
+
+def test_glb_shows_the_image_where_it_is_seen(finished: FinishedRun, exported: Path) -> None:
+    file = glb(exported / "glb" / "000000.glb")
+    colours = file.attribute("car_1", "COLOR_0")
+    source = file.attribute("car_1", "_COLOR_SOURCE")[:, 0]
+    points = file.attribute("car_1", "POSITION").astype(np.float64)
+    assert set(np.unique(source)) == {NEUTRAL, MIRRORED, SEEN}
+    seen = source == SEEN
+    np.testing.assert_allclose(srgb(colours[seen, :3]), image_at(finished, "000000", points[seen]), atol=1.01)
+    np.testing.assert_allclose(srgb(colours[source == NEUTRAL, :3]) - NEUTRAL_RGB, 0, atol=0.01)
+    assert (colours[:, 3] == 65535).all()
+    # What is seen is turned towards the camera; what is mirrored is not.
+    normals = file.attribute("car_1", "NORMAL").astype(np.float64)
+    towards = -(points * normals).sum(1) > 0
+    assert towards[seen].all()
+    assert towards[source == MIRRORED].mean() < 0.4
+
+
+def test_mirrored_colours_are_those_of_the_other_side(finished: FinishedRun, exported: Path) -> None:
+    file = glb(exported / "glb" / "000000.glb")
+    colours = file.attribute("car_1", "COLOR_0")[:, :3].astype(np.int64)
+    source = file.attribute("car_1", "_COLOR_SOURCE")[:, 0]
+    T = state(finished, "000000")["T_cam_obj"][0].astype(np.float64)
+    points_obj = (file.attribute("car_1", "POSITION") - T[:3, 3]) @ T[:3, :3]
+    seen, mirrored = np.flatnonzero(source == SEEN), np.flatnonzero(source == MIRRORED)[::37]
+    assert len(mirrored) > 20
+    for vertex in mirrored:
+        x, y, z = points_obj[vertex]
+        way = np.linalg.norm(points_obj[seen] - [x, y, -z], axis=1)
+        # By the distance, not the vertex: the two sides of a symmetric mesh have vertices that are equally far.
+        nearest = seen[way < way.min() + 1e-4]
+        assert way.min() <= 0.12
+        assert (colours[nearest] == colours[vertex]).all(axis=1).any()
+
+
+def test_glb_carries_what_is_known_of_a_car(finished: FinishedRun, exported: Path) -> None:
+    extras = glb(exported / "glb" / "000001.glb").extras("car_3")
+    arrays = state(finished, "000001")
+    assert extras["line"] == 3
+    assert extras["status"] == arrays["statuses"][1]
+    np.testing.assert_allclose(extras["dimensions_hwl_m"], arrays["boxes_hwl"][1])
+
+
+@pytest.mark.parametrize("car", [0, 1])
+def test_ply_surface_is_the_zero_level_of_the_npz(finished: FinishedRun, exported: Path, car: int) -> None:
+    ply = PlyData.read(str(exported / "ply" / f"000001_{LINES[car]}.ply"))
+    vertex = ply["vertex"]
+    points, normals = (
+        np.stack([vertex[name] for name in names], 1).astype(float) for names in ("xyz", ("nx", "ny", "nz"))
+    )
+    assert np.abs(distances(finished, "000001", car, points)).max() < 0.02
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
+    faces = np.stack(ply["face"]["vertex_indices"])
+    assert faces.max() == len(points) - 1
+    seen = vertex["color_source"] == SEEN
+    rgb = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    np.testing.assert_allclose(rgb[seen], image_at(finished, "000001", points[seen]), atol=1.01)
+    assert seen.any()
+
+
+def test_points_lie_evenly_on_the_surface(finished: FinishedRun, exported: Path) -> None:
+    vertex = PlyData.read(str(exported / "points" / "000000_1.ply"))["vertex"]
+    assert vertex.count == 3000
+    points, normals = (
+        np.stack([vertex[name] for name in names], 1).astype(float) for names in ("xyz", ("nx", "ny", "nz"))
+    )
+    assert np.abs(distances(finished, "000000", 0, points)).max() < 0.02
+    outside = distances(finished, "000000", 0, points + 0.05 * normals)
+    assert (outside > distances(finished, "000000", 0, points)).mean() > 0.999
+    # The two halves of a symmetric surface have equal areas: 1500 points each, give or take four standard deviations.
+    T = state(finished, "000000")["T_cam_obj"][0].astype(np.float64)
+    left = ((points - T[:3, 3]) @ T[:3, 2] > 0).sum()
+    assert abs(left - 1500) < 110
+    seen = vertex["color_source"] == SEEN
+    rgb = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    np.testing.assert_allclose(rgb[seen], image_at(finished, "000000", points[seen]), atol=1.01)
+    assert 0.1 < seen.mean() < 0.5
+
+
+def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp_path: Path) -> None:
+    """A map of constant disparity puts every point of a mask at the depth f b / d."""
+    write_disparity(tmp_path / "maps" / "000000.png", np.full((120, 160), 10.0))
+    dataset = KittiStereoDataset(
+        finished.root,
+        finished.root / "detections",
+        finished.root / "masks",
+        frames=["000000"],
+        disparity_dir=tmp_path / "maps",
+    )
+    export_run(RunFolder(finished.out, [0]), tmp_path, ["points"], replace(finished.inputs(), dataset=dataset))
+    vertex = PlyData.read(str(tmp_path / "points" / "000000_1_stereo.ply"))["vertex"]
+    points = np.stack([vertex[name] for name in "xyz"], 1).astype(float)
+    loaded = dataset.load("000000")
+    # z_right = z + 0.004, so that the disparity is f 0.53 / z to first order.
+    np.testing.assert_allclose(points[:, 2], 150 * 0.53 / 10, rtol=5e-3)
+    mask = loaded.detections.mask_left[0].numpy() > 0.5
+    u, v = (np.rint(points[:, k] / points[:, 2] * 150 + c).astype(int) for k, c in ((0, 77), (1, 50)))
+    assert mask[v, u].all()
+    assert len(points) > 0.5 * mask.sum()
+    rgb = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
+    bgr = cv2.imread(str(finished.root / "training/image_2/000000.png"))
+    np.testing.assert_allclose(rgb, bgr[v, u][:, ::-1], atol=1)
+
+
+def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path) -> None:
+    export_run(finished.folder, tmp_path, ["glb", "ply", "points"], finished.inputs(with_images=False))
+    file = glb(tmp_path / "glb" / "000000.glb")
+    assert set(file.nodes) == {"car_1", "car_3"}
+    assert (file.attribute("car_1", "_COLOR_SOURCE") == NEUTRAL).all()
+    assert len(np.unique(file.attribute("car_1", "COLOR_0"), axis=0)) == 1
+    assert sorted(path.name for path in (tmp_path / "points").iterdir()) == [
+        f"{frame}_{line}.ply" for frame in ("000000", "000001") for line in LINES
+    ]
+
+
+def test_unseen_parts_stay_grey_where_mirroring_is_off(finished: FinishedRun, tmp_path: Path) -> None:
+    export_run(finished.folder, tmp_path, ["ply"], finished.inputs(mirror=False))
+    vertex = PlyData.read(str(tmp_path / "ply" / "000000_1.ply"))["vertex"]
+    assert set(np.unique(vertex["color_source"])) == {NEUTRAL, SEEN}
+
+
+def test_equal_runs_give_equal_bytes(finished: FinishedRun, exported: Path, tmp_path: Path) -> None:
+    export_run(finished.folder, tmp_path, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
+    names = sorted(path.relative_to(exported) for path in exported.rglob("*.*"))
+    assert len(names) > 10
+    for name in names:
+        assert (exported / name).read_bytes() == (tmp_path / name).read_bytes(), name
