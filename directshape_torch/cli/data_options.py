@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 LAYOUTS = ("kitti", "raw", "tracking", "stereo2015", "folder")
 
 
-def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = True) -> None:
+def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = True, required: bool = True) -> None:
     """`--data`, `--layout`, `--detections`, masks, choice of frames and classes, ground, the rig's correction."""
-    group.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder of the data set")
+    group.add_argument("--data", type=Path, required=required, metavar="ROOT", help="folder of the data set")
     group.add_argument(
         "--layout",
         choices=LAYOUTS,
@@ -33,7 +33,7 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
     group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
     group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
-    group.add_argument("--frames", nargs="+", metavar="ID", type=_frame_id, help="only these frames, e.g. 107 7322")
+    group.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
     group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
     group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
     if with_disparity:
@@ -78,7 +78,7 @@ def dataset_of(args: argparse.Namespace) -> StereoDataset:
     )
 
 
-def _frame_id(word: str) -> int | str:
+def frame_id_of(word: str) -> int | str:
     """Numbers name frames in each layout's own way, with leading zeros or without; anything else is a whole name."""
     return int(word) if word.isdecimal() else word
 

@@ -13,7 +13,19 @@ EXIT_WRONG_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 # Each module has `add_parser(subparsers)` and `run(args) -> int`, and imports what is heavy inside `run`.
-COMMANDS = ("refine", "demo", "compare", "evaluate", "evaluate_shape", "build_prior", "calibrate_stereo", "export")
+COMMANDS = (
+    "refine",
+    "status",
+    "demo",
+    "compare",
+    "report",
+    "evaluate",
+    "evaluate_shape",
+    "build_prior",
+    "calibrate_stereo",
+    "export",
+    "inspect",
+)
 
 _DESCRIPTION = "Refine pose and shape of cars in stereo frames by differentiable rendering of signed distance fields."
 

@@ -1,13 +1,20 @@
-"""Figures of matplotlib as PNG files, drawn without a window system."""
+"""Figures of matplotlib as PNG files and animations, drawn without a window system."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from directshape_torch.errors import MissingDependencyError
+import numpy as np
+from numpy.typing import NDArray
 
-_DOTS_PER_INCH = 110
+from directshape_torch.errors import InputError, MissingDependencyError
+from directshape_torch.io import atomic_files
+
+_DOTS_PER_INCH, _ANIMATION_DOTS_PER_INCH = 110, 80
+_GIF_COLOURS = 255
 
 
 def new_figure(width_inches: float, height_inches: float, purpose: str) -> Any:
@@ -43,3 +50,55 @@ def figure_png(figure: Any) -> bytes:
     # Without the software's version, which would make the bytes differ.
     figure.savefig(content, format="png", dpi=_DOTS_PER_INCH, metadata={"Software": None})
     return content.getvalue()
+
+
+def figure_picture(figure: Any) -> NDArray[np.uint8]:
+    """A figure of `new_figure` as pixels (h, w, 3), RGB, for animations.
+
+    Example:
+        >>> figure_picture(new_figure(2, 1, "an example")).shape
+        (80, 160, 3)
+    """
+    figure.set_dpi(_ANIMATION_DOTS_PER_INCH)
+    figure.canvas.draw()
+    return np.array(figure.canvas.buffer_rgba(), dtype=np.uint8)[..., :3]
+
+
+def write_animation(path: Path | str, frames: Sequence[NDArray[np.uint8]], seconds: Sequence[float]) -> None:
+    """Write an animated GIF that repeats for ever.
+
+    Args:
+        path: of the file.
+        frames: (h, w, 3) pictures of one size, RGB.
+        seconds: how long each is shown; GIF counts in hundredths.
+
+    Raises:
+        InputError: no frames, frames of several sizes, or not one duration each.
+        MissingDependencyError: Pillow is not installed.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "blink.gif"
+        >>> write_animation(path, [np.full((8, 8, 3), level, np.uint8) for level in (0, 255)], [0.5, 0.5])
+        >>> path.read_bytes()[:6]
+        b'GIF89a'
+    """
+    if not frames or len({frame.shape for frame in frames}) != 1:
+        shapes = ", ".join(str(frame.shape) for frame in frames) or "none"
+        raise InputError("frames", "at least one picture, all of one size", shapes)
+    if len(seconds) != len(frames):
+        raise InputError("seconds", f"one for each of {len(frames)} frames", f"{len(seconds)}")
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingDependencyError("pillow", "plot", "writing an animation") from error
+    # One palette for all frames, or colours that stay would flicker.
+    together = Image.fromarray(np.concatenate([*frames]))
+    palette = together.quantize(_GIF_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    pictures = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
+    content = io.BytesIO()
+    durations = [round(1000 * s) for s in seconds]
+    pictures[0].save(
+        content, format="GIF", save_all=True, append_images=pictures[1:], duration=durations, loop=0, optimize=False
+    )
+    atomic_files.write_bytes(path, content.getvalue())

@@ -44,7 +44,13 @@ def prior_picture(prior: PCAShapePrior, num_sigma: float = 2.0) -> Image:
     return np.pad(np.concatenate(rows), ((8, 8), (8, 8), (0, 0)), constant_values=255)
 
 
-def shaded_view(vertices_obj: Array, faces: NDArray[Any], azimuth_deg: float, elevation_deg: float) -> Image:
+def shaded_view(
+    vertices_obj: Array,
+    faces: NDArray[Any],
+    azimuth_deg: float,
+    elevation_deg: float,
+    paint_bgr: Array = _PAINT_BGR,
+) -> Image:
     """Orthographic picture of a closed mesh with outward faces, (H, W, 3) uint8; far faces are painted first.
 
     Args:
@@ -52,6 +58,7 @@ def shaded_view(vertices_obj: Array, faces: NDArray[Any], azimuth_deg: float, el
         faces: (F, 3).
         azimuth_deg: 0 looks at the car's side, its front to the right of the picture.
         elevation_deg: of the viewer above the ground.
+        paint_bgr: (3,) or (F, 3) colours of all faces or of each, 0..255.
 
     Raises:
         InputError: no faces.
@@ -67,10 +74,11 @@ def shaded_view(vertices_obj: Array, faces: NDArray[Any], azimuth_deg: float, el
     brightness = 0.35 + 0.65 * np.clip(smooth @ (_TOWARDS_LIGHT / np.linalg.norm(_TOWARDS_LIGHT)), 0.0, 1.0)
     pixels = corners[:, :, :2] * _PIXELS_PER_METRE + [0.5 * _TILE_WIDTH, 0.5 * _TILE_HEIGHT]
     image = np.full((_TILE_HEIGHT, _TILE_WIDTH, 3), 255, dtype=np.uint8)
+    colours = np.broadcast_to(paint_bgr, (len(faces), 3)) * brightness[:, None]
     fixed_point = np.round(pixels * 16).astype(np.int32)
     for k in np.argsort(-corners[:, :, 2].mean(axis=1), kind="stable"):
         if normals[k, 2] < 0:
-            cv2.fillConvexPoly(image, fixed_point[k], (_PAINT_BGR * brightness[k]).tolist(), shift=4)
+            cv2.fillConvexPoly(image, fixed_point[k], colours[k].tolist(), shift=4)
     return image
 
 

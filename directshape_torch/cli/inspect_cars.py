@@ -1,0 +1,103 @@
+"""The part of `directshape inspect` that refines a frame, says what became of each car, and has it drawn."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from directshape_torch.cli.inspect_truth import points_of_car, true_points
+from directshape_torch.errors import InputError
+from directshape_torch.evaluation.matching import match_to_labels
+from directshape_torch.geometry.box3d import box_corners
+from directshape_torch.io.atomic_files import write_png
+from directshape_torch.io.kitti_labels import poses_cam
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.visualize.inspection.car_figures import write_car_figures
+from directshape_torch.visualize.inspection.car_view import CarView
+from directshape_torch.visualize.inspection.point_figure import stereo_points
+from directshape_torch.visualize.overlay import overlay_of_frame
+
+
+def inspect_frame(
+    loaded: LoadedFrame, refiner: DirectShapeRefiner, rows: Sequence[int], root: Path, out_dir: Path
+) -> None:
+    """Refine all cars of a frame and draw some: `FRAME.png`, and a folder `FRAME_LINE` a car.
+
+    Args:
+        loaded: the frame, on the CPU.
+        refiner: on the CPU too.
+        rows: of the detections to draw. A single one must be a car that can be refined.
+        root: folder of the data set, for scans and other truth.
+        out_dir: made where it is missing.
+
+    Raises:
+        InputError: the single car was not refined; says why.
+    """
+    trace = trace_refinement(refiner, loaded.frame, loaded.detections)
+    _report(loaded, trace, rows)
+    write_png(out_dir / f"{loaded.frame_id}.png", overlay_of_frame(loaded, trace.result))
+    drawn = [row for row in rows if trace.place_of(row) >= 0]
+    silhouettes = _silhouette_trace(refiner, loaded) if drawn else None
+    clouds = stereo_points(loaded.frame, loaded.detections, refiner.config.point_cloud) if drawn else []
+    truth, known = true_corners_cam(loaded), true_points(root, loaded)
+    for row in tqdm(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
+        line = line_of(loaded, row)
+        centre_cam = trace.T_cam_obj[-1][row, :3, 3]
+        points = points_of_car(known, loaded, row, centre_cam)
+        view = CarView(loaded, trace, row, truth[row], points, clouds[row])
+        by_silhouettes = None
+        if silhouettes is not None and silhouettes.place_of(row) >= 0:
+            by_silhouettes = CarView(loaded, silhouettes, row, truth[row], points)
+        write_car_figures(out_dir / f"{loaded.frame_id}_{line}", view, by_silhouettes)
+
+
+def _silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
+    """The drift is one between the paper's terms: other methods, and settings without one of the two, have none."""
+    config = refiner.config
+    if config.method != "direct" or not (config.photometric.weight > 0 and config.silhouette.weight > 0):
+        return None
+    return trace_refinement(without_photometry(refiner), loaded.frame, loaded.detections)
+
+
+def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int]) -> None:
+    """A line a car: how it ended, its cost before and after."""
+    result = trace.result
+    for row in rows:
+        status = result.status[row]
+        name = f"frame {loaded.frame_id} car {line_of(loaded, row)}"
+        if trace.place_of(row) < 0:
+            if len(rows) == 1:
+                raise InputError("--car", "a car that can be refined", f"{status.name} ({status.value})")
+            print(f"{name}: not refined, {status.name}: {status.value}")
+            continue
+        before, after = (float(costs[row].sum()) for costs in (result.cost_before, trace.costs[-1]))
+        moved = int(trace.accepted[:, row].sum())
+        print(f"{name}: {status.name}, cost {before:.2f} -> {after:.2f} in {moved} steps")
+
+
+def line_of(loaded: LoadedFrame, row: int) -> int:
+    """Number of the line of a detection in its file."""
+    return loaded.input_objects[loaded.row_of_detection[row]].line_number
+
+
+def true_corners_cam(loaded: LoadedFrame) -> list[NDArray[np.float64] | None]:
+    """Corners (8, 3) of the labelled box of each detection, or None."""
+    labels = loaded.labels or []
+    partners = match_to_labels([loaded.input_objects[row] for row in loaded.row_of_detection], labels)
+    found: list[NDArray[np.float64] | None] = []
+    for partner in partners:
+        if partner < 0:
+            found.append(None)
+            continue
+        label = [labels[partner]]
+        hwl = loaded.frame.camera.t_cam_ref.new_tensor([label[0].hwl]).double()
+        T_cam_obj = poses_cam(label, loaded.frame.camera.t_cam_ref[0].double())
+        found.append(np.asarray(box_corners(T_cam_obj, hwl)[0]))
+    return found

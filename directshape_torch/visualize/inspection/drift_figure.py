@@ -1,0 +1,95 @@
+"""The drift of a refinement by silhouettes alone beside the full one (paper, figure of the projection's drift)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.io.figure_files import new_figure
+from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
+from directshape_torch.visualize.inspection.panels import (
+    MASK_INK,
+    draw_footprint,
+    draw_lines,
+    iteration_inks,
+    show_birds_eye,
+    show_crop,
+    write_figure,
+)
+
+_SIZE_INCHES = (14.5, 5.6)
+_INKS = {"silhouettes alone": "crimson", "all terms": "royalblue"}
+
+
+def distance_course(view: CarView) -> NDArray[np.float64]:
+    """How far the middle of the car's footprint lies from the true one after each iteration, metres.
+
+    From the input's own, where there is no truth.
+    """
+    reference = view.centre_cam(0)
+    if view.truth_corners_cam is not None:
+        reference = footprint_of_corners(view.truth_corners_cam).mean(axis=0)
+    return np.array([np.linalg.norm(view.centre_cam(k) - reference) for k in range(len(view.trace))])
+
+
+def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) -> None:
+    """Write the figure as PNG: a row each, seen from above, then the contours of three states, then the distances.
+
+    Args:
+        path: of the picture.
+        full: a car refined with all terms.
+        silhouettes: the same car refined without photometry.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure(*_SIZE_INCHES, "drawing the drift")
+    figure.suptitle(full.title)
+    left, right = figure.subfigures(1, 2, width_ratios=[4, 1.1])
+    axes = left.subplots(2, 4, width_ratios=[1.1, 1, 1, 1])
+    views = dict(zip(_INKS, (silhouettes, full), strict=True))
+    all_footprints = [v.footprint(k) for v in views.values() for k in v.steps]
+    for row, (name, view) in zip(axes, views.items(), strict=True):
+        _draw_from_above(row[0], name, view, all_footprints)
+        _draw_contours(row[1:], view)
+    _draw_distances(right.subplots(), views)
+    write_figure(path, figure)
+
+
+def _draw_from_above(axes: Any, name: str, view: CarView, others: list[Any]) -> None:
+    show_birds_eye(axes, view, others)
+    for number, ink in zip(view.steps, iteration_inks(len(view.steps)), strict=True):
+        draw_footprint(axes, view.footprint(number), ink, linewidth=1.1)
+    axes.set_title(name, fontsize=10, color=_INKS[name])
+
+
+def _draw_contours(row: Any, view: CarView) -> None:
+    inks = iteration_inks(len(view.steps))
+    for axes, place in zip(row, three_places(len(view.steps)), strict=True):
+        title = f"iteration {view.steps[place]}"
+        show_crop(axes, view.image("left"), view.window("left"), title)
+        draw_lines(axes, view.mask_lines("left"), MASK_INK, linewidth=1.3, linestyle=":")
+        draw_lines(axes, view.contours("left", view.steps[place]), inks[place], linewidth=1.8)
+
+
+def three_places(count: int) -> tuple[int, int, int]:
+    """The first, an early and the last of so many states; most is done in the first few steps.
+
+    Example:
+        >>> three_places(12), three_places(2)
+        ((0, 3, 11), (0, 0, 1))
+    """
+    return 0, min(count // 4, count - 2) if count > 1 else 0, count - 1
+
+
+def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:
+    for name, view in views.items():
+        axes.plot(distance_course(view), color=_INKS[name], label=name)
+    is_truth = next(iter(views.values())).truth_corners_cam is not None
+    axes.set(xlabel="iteration", ylabel=f"distance to the {'true' if is_truth else 'input'} centre [m]")
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)

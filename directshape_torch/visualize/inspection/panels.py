@@ -1,0 +1,87 @@
+"""Parts that several figures of the inspection share: image crops, lines, colours of the iterations, files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.io import atomic_files
+from directshape_torch.io.figure_files import figure_png
+from directshape_torch.visualize.drawing import Picture
+from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
+from directshape_torch.visualize.inspection.shape_in_image import Window
+
+Array = NDArray[np.float64]
+Ink = Any  # whatever matplotlib takes for a colour
+
+DETECTOR_INK, TRUTH_INK, MASK_INK, BEFORE_INK, AFTER_INK = "darkorange", "limegreen", "white", "darkorange", "royalblue"
+_BIRDS_EYE_MARGIN_M = 0.7
+
+
+def write_figure(path: Path | str, figure: Any) -> None:
+    """Write a figure of `new_figure` as PNG."""
+    atomic_files.write_bytes(path, figure_png(figure))
+
+
+def iteration_inks(count: int) -> list[Ink]:
+    """Colours from dark (the first) to bright (the last)."""
+    from matplotlib import colormaps
+
+    return [tuple(colour) for colour in colormaps["plasma"](np.linspace(0.0, 0.92, max(count, 1)))]
+
+
+def show_crop(axes: Any, image: Picture, window: Window, title: str = "", *, dimmed: bool = False) -> None:
+    """A window of an image whose axes are its pixels; grey and pale where something is to be drawn over it."""
+    u0, v0, u1, v1 = window
+    part = image[v0:v1, u0:u1]
+    if dimmed:
+        part = np.repeat(part.mean(axis=2, keepdims=True) * 0.55 + 20, 3, axis=2).astype(np.uint8)
+    axes.imshow(part, extent=(u0 - 0.5, u1 - 0.5, v1 - 0.5, v0 - 0.5), interpolation="nearest")
+    axes.set(xlim=(u0 - 0.5, u1 - 0.5), ylim=(v1 - 0.5, v0 - 0.5), xticks=[], yticks=[])
+    axes.set_title(title, fontsize=9)
+
+
+def draw_lines(axes: Any, lines: Iterable[Array], ink: Ink, label: str | None = None, **style: Any) -> None:
+    """Lines (n, 2) as one entry of the legend."""
+    for line in lines:
+        axes.plot(line[:, 0], line[:, 1], color=ink, label=label, **style)
+        label = None
+
+
+def draw_footprint(axes: Any, corners: Array, ink: Ink, label: str | None = None, **style: Any) -> None:
+    """A box seen from above, (4, 2) with the front first, and a stroke from its middle to its front."""
+    closed = np.concatenate([corners, corners[:1]])
+    axes.plot(closed[:, 0], closed[:, 1], color=ink, label=label, **style)
+    stroke = np.stack([corners.mean(axis=0), corners[:2].mean(axis=0)])
+    axes.plot(stroke[:, 0], stroke[:, 1], color=ink, **style)
+
+
+def show_birds_eye(axes: Any, view: CarView, others: Sequence[Array] = ()) -> None:
+    """Axes over the ground around a car: scan points, the detection's box and the true one.
+
+    Args:
+        axes: of matplotlib.
+        view: the car.
+        others: (4, 2) further footprints that must fit in.
+    """
+    footprints = [view.footprint(k) for k in (0, len(view.trace) - 1)]
+    footprints += [footprint_of_corners(view.detector_corners_cam), *others]
+    if view.truth_corners_cam is not None:
+        footprints.append(footprint_of_corners(view.truth_corners_cam))
+    corners = np.concatenate(footprints)
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    half = np.ptp(corners, axis=0).max() / 2 + _BIRDS_EYE_MARGIN_M
+    if view.known_points is not None:
+        points = view.known_points.points_cam
+        axes.plot(points[:, 0], points[:, 2], ".", color="0.6", markersize=2, label=view.known_points.name, zorder=0)
+    if view.truth_corners_cam is not None:
+        truth = footprint_of_corners(view.truth_corners_cam)
+        draw_footprint(axes, truth, TRUTH_INK, "ground truth", linewidth=2.5)
+    axes.set_aspect("equal")
+    axes.set(xlim=middle[0] + np.array([-half, half]), ylim=middle[1] + np.array([-half, half]))
+    axes.set(xlabel="x [m]", ylabel="z [m]")
+    axes.grid(alpha=0.3)

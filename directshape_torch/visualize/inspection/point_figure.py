@@ -1,0 +1,132 @@
+"""Points on a car: from dense stereo, from the refined shape, and true ones (paper, figure of the point clouds)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.config import PointCloudConfig
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.io.figure_files import new_figure
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.stereo_matching.car_points import car_points
+from directshape_torch.stereo_matching.dense_disparity import with_disparity
+from directshape_torch.visualize.inspection.car_view import CarView
+from directshape_torch.visualize.inspection.field_views import COLOURS, distance_at, distance_scale
+from directshape_torch.visualize.inspection.panels import AFTER_INK, write_figure
+
+Array = NDArray[np.float64]
+
+_PANEL_INCHES = (3.7, 4.4)
+_LIMIT_M = 0.3
+_ROOM_M = 0.9
+_MOST_POINTS = 20_000
+_OURS = "refined shape"
+
+
+class PointSet(NamedTuple):
+    """Points of a car with a name, in its refined object frame."""
+
+    name: str
+    points_obj: Array  # (P, 3) metres
+    distance_m: Array  # (P,) signed distance to the refined shape; NaN outside of the region where that is known
+
+
+def point_sets(view: CarView) -> list[PointSet]:
+    """Dense stereo, the refined shape under the pixels of the car's mask, and known points: those that there are."""
+    clouds = [] if view.stereo_points_cam is None else [("dense stereo", view.stereo_points_cam)]
+    clouds.append((_OURS, shape_points_cam(view)))
+    if view.known_points is not None:
+        points = view.known_points
+        clouds.append((points.name, points.points_cam[points.of_car]))
+    return [_point_set(view, name, points_cam) for name, points_cam in clouds]
+
+
+def stereo_points(frame: FrameBatch, detections: Detections, config: PointCloudConfig) -> list[Array]:
+    """Points (P, 3) of every car by the matcher that the settings name, or by the disparity that the frame brings.
+
+    Raises:
+        MissingDependencyError: the matcher is not installed.
+    """
+    settings = replace(config, max_points=_MOST_POINTS)
+    points = car_points(with_disparity(frame, settings.matcher), detections, settings)
+    points_cam, car = points.points_cam.double().cpu().numpy(), points.object_index.cpu().numpy()
+    return [points_cam[car == number] for number in range(len(detections))]
+
+
+def shape_points_cam(view: CarView) -> Array:
+    """(P, 3) where the pixels of the car's left mask see the refined shape."""
+    grid, seen = view.seen("left", len(view.trace) - 1)
+    uv = grid.uv(view.loaded.frame.images_left).cpu()
+    depth = seen.depth.flatten()
+    u, v = uv.round().long().unbind(1)
+    mask = view.loaded.detections.mask_left[view.car].cpu()
+    height, width = mask.shape
+    wanted = depth.isfinite() & (mask[v.clamp_max(height - 1), u.clamp_max(width - 1)] > 0.5)
+    rays = rays_from_pixels(uv, view.loaded.frame.camera.K_left[0].cpu())
+    return np.asarray((depth[:, None] * rays)[wanted].double())
+
+
+def write_point_figure(path: Path | str, view: CarView) -> None:
+    """Write the figure as PNG: from the side and from above, in the car's refined frame, front to the right.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    sets = point_sets(view)
+    figure = new_figure(_PANEL_INCHES[0] * len(sets) + 0.5, _PANEL_INCHES[1], "drawing point clouds")
+    figure.suptitle(view.title)
+    axes = figure.subplots(2, len(sets), squeeze=False, sharex="row", sharey="row")
+    values = view.prior.values(view.state(len(view.trace) - 1).code)[0]
+    origin, spacing = view.prior.origin.double().cpu().numpy(), view.prior.spacing_m
+    for column, points in enumerate(sets):
+        axes[0, column].set_title(f"{points.name}: {len(points.points_obj)} points", fontsize=9)
+        # The least value across an axis is below zero where the shape is seen along it.
+        for row, (across, vertical) in enumerate(((2, 1), (1, 2))):
+            outline = values.amin(dim=across).double().cpu().numpy()
+            places = [origin[k] + spacing * np.arange(n) for k, n in zip((0, vertical), outline.shape, strict=True)]
+            axes[row, column].contour(*places, outline.T, levels=[0.0], colors=["black"], linewidths=1.0)
+            _scatter(axes[row, column], points, vertical)
+            _frame(axes[row, column], places, "y, down [m]" if vertical == 1 else "z, left [m]", column == 0)
+    if len(sets) > 1:
+        scale = distance_scale(_LIMIT_M)
+        figure.colorbar(scale, ax=axes, label="signed distance to the refined shape [m]", shrink=0.8, extend="both")
+    write_figure(path, figure)
+
+
+def _point_set(view: CarView, name: str, points_cam: Array) -> PointSet:
+    state = view.state(len(view.trace) - 1)
+    T_obj_cam = state.T_obj_cam[0].double().cpu().numpy()
+    points_obj = points_cam @ T_obj_cam[:3, :3].T + T_obj_cam[:3, 3]
+    low, high = view.prior.bounds_obj.double().cpu().numpy()
+    distance = distance_at(view.prior, view.prior.values(state.code)[0], points_obj)
+    within = ((points_obj >= low) & (points_obj <= high)).all(axis=1)
+    return PointSet(name, points_obj, np.where(within, distance, np.nan))
+
+
+def _scatter(axes: Any, points: PointSet, vertical: int) -> None:
+    away = np.isnan(points.distance_m)
+    p = points.points_obj
+    axes.plot(p[away, 0], p[away, vertical], ".", color="0.7", markersize=1.5)
+    size = float(np.clip(9000 / max(len(p), 1), 1.0, 9.0))
+    if points.name == _OURS:
+        axes.plot(p[:, 0], p[:, vertical], ".", color=AFTER_INK, markersize=size**0.5)
+        return
+    c, limits = points.distance_m[~away], {"vmin": -_LIMIT_M, "vmax": _LIMIT_M}
+    axes.scatter(p[~away, 0], p[~away, vertical], c=c, s=size, cmap=COLOURS, **limits)
+
+
+def _frame(axes: Any, places: list[Array], label: str, is_first: bool) -> None:
+    # Points far behind the car would make it a speck: they lie beyond the frame.
+    room = _ROOM_M
+    axes.set(xlim=(places[0][0] - room, places[0][-1] + room), aspect="equal", xlabel="x, forward [m]")
+    low, high = places[1][0], places[1][-1]
+    axes.set_ylim((high + 0.2, low - 0.2) if "down" in label else (low - room, high + room))
+    if is_first:
+        axes.set_ylabel(label)
+    axes.set_facecolor("0.93")
+    axes.grid(alpha=0.4)

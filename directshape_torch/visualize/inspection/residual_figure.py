@@ -1,0 +1,79 @@
+"""Silhouette residuals of both images and photometric residuals, at the input and at the end (paper, both panels)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from directshape_torch.io.figure_files import new_figure
+from directshape_torch.observation.occlusion import Side
+from directshape_torch.visualize.inspection.car_view import CarView
+from directshape_torch.visualize.inspection.panels import draw_lines, show_crop, write_figure
+from directshape_torch.visualize.inspection.residual_values import (
+    PixelResiduals,
+    photometric_residuals,
+    silhouette_residuals,
+)
+
+_PANEL_INCHES = 3.6
+_SIZE_INCHES = (3 * _PANEL_INCHES + 0.4, 6.0)
+# -log 0.01: what a pixel pays whose mask is certain and wrong.
+_WORST_SILHOUETTE = 4.6
+_CONTOUR_INK = "cyan"
+# Of the largest dot, by area.
+_LEAST_DOT = 0.2
+
+
+def write_residual_figure(path: Path | str, view: CarView) -> None:
+    """Write the figure as PNG: the input above, the end below; the shape's outline is drawn over its residuals.
+
+    Lost pixels, those that cannot be compared with the right image, are crosses.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure(*_SIZE_INCHES, "drawing residuals")
+    figure.suptitle(view.title)
+    axes = figure.subplots(2, 3)
+    grey_levels = view.trace.problem.config.photometric.lost_grey_levels
+    for row, (number, name) in enumerate(((0, "before"), (len(view.trace) - 1, "after"))):
+        sides: tuple[Side, Side] = ("left", "right")
+        for column, side in enumerate(sides):
+            values = silhouette_residuals(view.trace, view.car, number, side)
+            title = f"{name}: silhouette {side}, mean {_mean(values)}"
+            _backdrop(axes[row, column], view, side, number, title)
+            silhouette = _dots(axes[row, column], values, "inferno", (0, _WORST_SILHOUETTE))
+        values = photometric_residuals(view.trace, view.car, number)
+        title = f"{name}: photometric, mean |r| {_mean(values)}, lost {int(values.lost.sum())}"
+        _backdrop(axes[row, 2], view, "left", number, title)
+        photometric = _dots(axes[row, 2], values, "RdBu_r", (-2 * grey_levels, 2 * grey_levels))
+    bars = {"orientation": "horizontal", "aspect": 40, "shrink": 0.7}
+    figure.colorbar(silhouette, ax=axes[:, :2], label="silhouette residual", **bars)
+    figure.colorbar(photometric, ax=axes[:, 2], label="right less left [grey levels]", extend="both", **bars)
+    write_figure(path, figure)
+
+
+def _mean(values: PixelResiduals) -> str:
+    counted = np.abs(values.value[~values.lost])
+    return f"{counted.mean():.2f}" if len(counted) else "-"
+
+
+def _backdrop(axes: Any, view: CarView, side: Side, number: int, title: str) -> None:
+    show_crop(axes, view.image(side), view.window(side), title, dimmed=True)
+    draw_lines(axes, view.contours(side, number), _CONTOUR_INK, linewidth=0.8)
+
+
+def _dots(axes: Any, values: PixelResiduals, colours: str, limits: tuple[float, float]) -> Any:
+    (u0, u1), (v1, v0) = axes.get_xlim(), axes.get_ylim()
+    # As large as the samples lie apart.
+    apart_px = ((u1 - u0) * (v1 - v0) / max(len(values.uv), 1)) ** 0.5
+    points_per_px = 72 * _PANEL_INCHES * 0.9 / max(u1 - u0, (v1 - v0) * 1.5)
+    size = float(np.clip(0.7 * apart_px * points_per_px, 1.5, 7)) ** 2
+    lost, kept = values.uv[values.lost], values.uv[~values.lost]
+    axes.scatter(lost[:, 0], lost[:, 1], s=size, marker="x", color="0.75", linewidths=0.6)
+    value = values.value[~values.lost]
+    # What costs nothing leaves the image to be seen.
+    sizes = size * np.clip(np.abs(value) / limits[1], _LEAST_DOT, 1)
+    return axes.scatter(kept[:, 0], kept[:, 1], c=value, s=sizes, cmap=colours, vmin=limits[0], vmax=limits[1])
