@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.observation.portions import pixels_at_once, portions
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections
 
@@ -70,7 +71,7 @@ def scene_extents(detections: Detections) -> SceneExtents:
 
 
 def mask_extents(masks: Sequence[Tensor], present: Sequence[Tensor]) -> list[MaskExtents]:
-    """Extents of several stacks of masks, with two host synchronisations in all.
+    """Extents of several stacks of masks, with one host synchronisation in all.
 
     Args:
         masks: stacks (I, H, W) of foreground probabilities or bool; I may differ.
@@ -87,17 +88,17 @@ def mask_extents(masks: Sequence[Tensor], present: Sequence[Tensor]) -> list[Mas
         if stack.ndim != 3 or len(stack) != len(exists):
             raise InputError("masks", f"shape ({len(exists)}, H, W)", f"{tuple(stack.shape)}")
     stacks = [_comparable(stack) for stack in masks]
-    # `~(x <= t)` is also true for NaN, which the maximum hands on.
-    in_rows = [
-        ~(stack.amax(dim=2) <= MASK_THRESHOLD) & exists[:, None] for stack, exists in zip(stacks, present, strict=True)
+    spans, unknown = [], []
+    for stack, exists in zip(stacks, present, strict=True):
+        highest = stack.amax(dim=2)
+        spans.append(torch.stack(_first_and_end((highest > MASK_THRESHOLD) & exists[:, None]), dim=1))
+        unknown.append((highest != highest).any())
+    rows = iter(torch.cat([*(span.flatten() for span in spans), torch.stack(unknown).long()]).tolist())
+    spans_on_host = [[(next(rows), next(rows)) for _ in stack] for stack in stacks]
+    return [
+        _plain_extents(stack, exists) if next(rows) else _extents(stack, span, tops_and_bottoms)
+        for stack, exists, span, tops_and_bottoms in zip(stacks, present, spans, spans_on_host, strict=True)
     ]
-    counts = torch.stack([rows.sum() for rows in in_rows]).tolist()
-    rows = torch.cat([rows.flatten() for rows in in_rows]).nonzero()[:, 0]
-    extents, first = [], 0
-    for stack, of_stack in zip(stacks, torch.split_with_sizes(rows, counts), strict=True):
-        extents.append(_extents_of_rows(stack, of_stack - first))
-        first += stack.shape[0] * stack.shape[1]
-    return extents
 
 
 def _comparable(masks: Tensor) -> Tensor:
@@ -105,22 +106,33 @@ def _comparable(masks: Tensor) -> Tensor:
     return masks.view(torch.uint8) if masks.dtype == torch.bool else masks.detach()
 
 
-def _extents_of_rows(
-    masks: Tensor,  # (I, H, W)
-    rows: Tensor,  # (R,) row-major among I * H, ascending
+def _extents(
+    masks: Tensor,  # (I, H, W) without NaN
+    span: Tensor,  # (I, 2) first row with foreground and the one behind the last; 0, 0 without any
+    tops_and_bottoms: Sequence[tuple[int, int]],  # the same on the host
 ) -> MaskExtents:
-    count, height, width = masks.shape
-    number = torch.div(rows, height, rounding_mode="floor")
-    lines = masks.flatten(0, 1).index_select(0, rows)
-    flags = torch.empty(lines.shape, dtype=torch.float32, device=lines.device)
-    # Floating-point flags: comparing into them and summing them up is many times faster than with bool ones.
-    covered = torch.gt(lines, MASK_THRESHOLD, out=flags)
-    in_columns = torch.zeros(count, width, dtype=torch.float32, device=rows.device).index_add_(0, number, covered) > 0
-    in_rows = torch.zeros(count, height, dtype=torch.bool, device=rows.device)
-    in_rows.flatten()[rows] = covered.sum(dim=1) > 0
-    background = torch.le(lines, MASK_THRESHOLD, out=flags).sum(dim=1).long()
-    areas = torch.zeros(count, dtype=torch.long, device=rows.device).index_add_(0, number, width - background)
-    (u0, u1), (v0, v1) = _first_and_end(in_columns), _first_and_end(in_rows)
+    """Extents from the rows that have foreground: neighbours in the stack together, in the rows of them all."""
+    count, _, width = masks.shape
+    foreground = torch.zeros(count, width, dtype=torch.float32, device=masks.device)
+    amounts = [(bottom - top) * width for top, bottom in tops_and_bottoms]
+    for part in portions(amounts, pixels_at_once(masks.device)):
+        tops, bottoms = zip(*(rows for rows in tops_and_bottoms[part] if rows[1] or not any(amounts[part])), strict=True)
+        window = masks[part, min(tops) : max(bottoms)]
+        # Floating-point flags: comparing into them and summing them up is many times faster than with bool ones.
+        background = torch.le(window, MASK_THRESHOLD, out=torch.empty(window.shape, device=masks.device))
+        torch.sub(window.shape[1], background.sum(dim=1), out=foreground[part])
+    # Absent masks had their share of the rows of others.
+    foreground *= span[:, 1:] > 0
+    u0, u1 = _first_and_end(foreground > 0)
+    boxes = torch.stack([u0, span[:, 0], u1, span[:, 1]], dim=1)
+    return MaskExtents(boxes, foreground.sum(dim=1, dtype=torch.float64).long())
+
+
+def _plain_extents(masks: Tensor, present: Tensor) -> MaskExtents:
+    """Extents of masks (I, H, W) with NaN, which covers nothing but has an area."""
+    covered = (masks > MASK_THRESHOLD) & present[:, None, None]
+    (u0, u1), (v0, v1) = _first_and_end(covered.any(dim=1)), _first_and_end(covered.any(dim=2))
+    areas = (~(masks <= MASK_THRESHOLD) & present[:, None, None]).sum(dim=(1, 2))
     return MaskExtents(torch.stack([u0, v0, u1, v1], dim=1), areas)
 
 
