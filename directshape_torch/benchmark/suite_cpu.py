@@ -13,6 +13,7 @@ from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import Scene, load_scenes
 from directshape_torch.compiler_state import compiler_problem
+from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
@@ -20,6 +21,7 @@ from directshape_torch.result import RefinementResult
 _SUITE = "cpu"
 _PRESETS = ("default", "fast")
 _ROUNDS = 3  # of each frame; the median over the frames needs few
+_BATCH_FRAMES = 8  # of a call by somebody who refines a data set and does not wait for single frames
 
 _GOALS_MS_PER_CAR = {("default", "compiled"): 10.0, ("default", "eager"): 50.0, ("fast", "compiled"): 4.0}
 _GOALS_MS_PER_FRAME = {("default", "compiled"): 50.0}
@@ -37,6 +39,7 @@ def run_cpu(settings: SuiteSettings) -> SuiteResult:
     notes = [] if problem is None else [f"compiled: not measured, {problem}"]
     for scene in load_scenes(settings.data_root, settings.max_frames):
         rows += _scene_rows(scene, sides, settings)
+        rows += _batch_rows(scene, sides, settings)
         notes.append(f"{scene.name}: {len(scene.frames)} frames with {scene.num_cars} cars")
     if "compiled" in available_modes():
         rows += compile_rows(settings)
@@ -68,6 +71,31 @@ def _scene_rows(scene: Scene, sides: dict[str, _Side], settings: SuiteSettings) 
     return rows + _ratio_rows(scene, times)
 
 
+def _batch_rows(scene: Scene, sides: dict[str, _Side], settings: SuiteSettings) -> list[Row]:
+    """The same frames, several in a call, so that they share what a call costs whatever is in it."""
+    repetitions = replace(settings.repetitions, warm_up=1, rounds=min(_ROUNDS, settings.repetitions.rounds))
+    batches = [scene.frames[first : first + _BATCH_FRAMES] for first in range(0, len(scene.frames), _BATCH_FRAMES)]
+    times: list[InterleavedTimes] = []
+    for number, batch in enumerate(batches):
+        settings.progress(f"cpu: {scene.name}, batch {number + 1} of {len(batches)}")
+        inputs = collate(batch)
+        times.append(
+            time_interleaved({name: partial(side.refiner, *inputs) for name, side in sides.items()}, repetitions)
+        )
+    cars = [sum(len(loaded.detections) for loaded in batch) for batch in batches]
+    rows = []
+    for name, side in sides.items():
+        key, milliseconds = (side.preset, side.mode), [1000 * batch.spread(name).median for batch in times]
+        per_car = [ms / count for ms, count in zip(milliseconds, cars, strict=True)]
+        per_frame = [ms / len(batch) for ms, batch in zip(milliseconds, batches, strict=True)]
+        several = f"{scene.name}, {name}, {_BATCH_FRAMES} frames in a call"
+        rows += [
+            _time_row(f"{several}, per car", per_car, _GOALS_MS_PER_CAR.get(key), "batches"),
+            _time_row(f"{several}, per frame", per_frame, _GOALS_MS_PER_FRAME.get(key), "batches"),
+        ]
+    return rows
+
+
 def _side_rows(scene: Scene, name: str, side: _Side, times: list[InterleavedTimes], cars: list[int]) -> list[Row]:
     key = side.preset, side.mode
     ms_per_frame = [1000 * frame.spread(name).median for frame in times]
@@ -87,10 +115,10 @@ def _side_rows(scene: Scene, name: str, side: _Side, times: list[InterleavedTime
     return rows
 
 
-def _time_row(name: str, milliseconds: list[float], goal_ms: float | None) -> Row:
+def _time_row(name: str, milliseconds: list[float], goal_ms: float | None, over: str = "frames") -> Row:
     spread = Spread.of(milliseconds)
     goal = None if goal_ms is None else Goal("at most", goal_ms)
-    note = "median and quartiles over frames"
+    note = f"median and quartiles over {over}"
     return Row(_SUITE, name, spread.median, "ms", "time", spread.low, spread.high, spread.count, goal=goal, note=note)
 
 
