@@ -8,14 +8,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from directshape_torch.observation.regions import MASK_THRESHOLD, RegionPixels
+from directshape_torch.observation.regions import MASK_THRESHOLD
 
-_BITS_OF_A_WORD = 62
-"""Instances that share an int64; the sign and one more stay out of it."""
+_BITS_OF_A_WORD = 31
+"""Instances that share an int32, whose sign stays out of it."""
+
+# So that frames in which nothing covers anything are no special case for whoever looks something up.
+_SPARE_ROWS = 2
 
 
 @dataclass(frozen=True)
@@ -25,8 +29,8 @@ class InstanceCrops:
     Attributes:
         boxes: (F, 4) integer (u0, v0, u1, v1), half open, around the instances of each frame; all 0 where none is.
         start: (F,) first row of each frame in `covering`.
-        covering: (A, W) int64, the instances that cover each pixel, row-major; never empty.
-        bits: (N, W) int64, the bit of each instance, in one of the W words.
+        covering: (A, W) int32, the instances that cover each pixel, row-major; two more rows, which nothing covers.
+        bits: (N, W) int32, the bit of each instance, in one of the W words.
     """
 
     boxes: Tensor
@@ -54,67 +58,53 @@ def instance_crops(
         >>> masks[0, 1, 1:4], masks[1, 1:3, 3:5] = 1.0, 1.0
         >>> boxes = torch.tensor([[1, 1, 4, 2], [3, 1, 5, 3]])
         >>> crops = instance_crops([masks], boxes, torch.tensor([0, 0]), num_frames=1)
-        >>> crops.covering.view(2, 4)
+        >>> crops.covering[:8].view(2, 4)
         tensor([[1, 1, 3, 2],
-                [0, 0, 2, 2]])
+                [0, 0, 2, 2]], dtype=torch.int32)
     """
-    there = boxes[:, 2] > boxes[:, 0]
-    rank = _rank_in_frame(there, frame_index, num_frames)
-    crops = _boxes_around(boxes, there, frame_index, num_frames)
-    widths = crops[:, 2] - crops[:, 0]
-    areas = widths * (crops[:, 3] - crops[:, 1])
-    start = areas.cumsum(0) - areas
-    box_areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    pixels_up_to = [box_areas[:end].sum() for end in accumulate(len(stack) for stack in masks)]
-    most, num_pixels, *ends = torch.stack([_largest(rank), areas.sum(), *pixels_up_to]).tolist()
-    num_words = most // _BITS_OF_A_WORD + 1
-    word, bit = torch.div(rank, _BITS_OF_A_WORD, rounding_mode="floor"), there.long() << (rank % _BITS_OF_A_WORD)
-    bits = torch.where(word[:, None] == torch.arange(num_words, device=boxes.device), bit[:, None], 0)
-
-    pixels = RegionPixels.of(boxes)
-    corner = start - crops[:, 1] * widths - crops[:, 0]
-    run_frame = frame_index.index_select(0, pixels.run_object)
-    run_start = corner.index_select(0, run_frame) + pixels.run_v * widths.index_select(0, run_frame)
-    entry = pixels.rising(run_start + pixels.run_u)
-    if num_words > 1:
-        entry = entry * num_words + pixels.of_runs(word.index_select(0, pixels.run_object))
-    # Every instance has a bit of its own, so adding is setting it.
-    value = pixels.of_runs(bit.index_select(0, pixels.run_object)) * _covers(masks, pixels, ends)
-    covering = torch.zeros(max(num_pixels, 1) * num_words, dtype=torch.long, device=boxes.device)
-    return InstanceCrops(crops, start, covering.index_add_(0, entry, value).view(-1, num_words), bits)
-
-
-def _largest(values: Tensor) -> Tensor:
-    return values.amax() if len(values) else values.new_zeros(())
+    places, around = _places(torch.cat([frame_index[:, None], boxes], dim=1).tolist(), num_frames)
+    width = [u1 - u0 for u0, _, u1, _ in around]
+    start = [0, *accumulate((v1 - v0) * (u1 - u0) for u0, v0, u1, v1 in around)]
+    num_words = max((place.rank for place in places), default=0) // _BITS_OF_A_WORD + 1
+    covering = torch.zeros(start[-1] + _SPARE_ROWS, num_words, dtype=torch.int32, device=boxes.device)
+    bits = [[0] * num_words for _ in boxes]
+    every_mask = [mask for stack in masks for mask in stack.detach().unbind()]
+    for place in places:
+        word, bit = divmod(place.rank, _BITS_OF_A_WORD)
+        bits[place.instance][word] = 1 << bit
+        (u0, v0, u1, v1), (left, top, _, _) = place.box, around[place.frame]
+        first = start[place.frame] + (v0 - top) * width[place.frame] + u0 - left
+        in_crop = covering.as_strided(
+            (v1 - v0, u1 - u0), (width[place.frame] * num_words, num_words), first * num_words + word
+        )
+        # Every instance has a bit of its own, so adding is setting it.
+        in_crop.add_(every_mask[place.instance][v0:v1, u0:u1] > MASK_THRESHOLD, alpha=1 << bit)
+    return InstanceCrops(
+        boxes.new_tensor(around).view(num_frames, 4),
+        boxes.new_tensor(start[:-1]),
+        covering,
+        covering.new_tensor(bits).view(len(boxes), num_words),
+    )
 
 
-def _rank_in_frame(there: Tensor, frame_index: Tensor, num_frames: int) -> Tensor:
-    """Number (N,) of each instance that is there among those of its frame; 0 for the others."""
-    by_frame = torch.argsort(frame_index, stable=True)
-    counts = torch.zeros(num_frames, dtype=torch.long, device=there.device).index_add_(0, frame_index, there.long())
-    before_frame = (counts.cumsum(0) - counts)[frame_index]
-    before = torch.empty_like(frame_index)
-    before[by_frame] = there[by_frame].long().cumsum(0) - 1
-    return (before - before_frame) * there
+class _Place(NamedTuple):
+    """Where an instance is written."""
+
+    instance: int
+    frame: int
+    box: tuple[int, int, int, int]
+    rank: int  # among those of its frame
 
 
-def _boxes_around(boxes: Tensor, there: Tensor, frame_index: Tensor, num_frames: int) -> Tensor:
-    """Box (F, 4) around the boxes (N, 4) of each frame; all 0 where none is there."""
-    number = frame_index[:, None].expand(-1, 2)
-    far = torch.iinfo(torch.long).max
-    low = boxes.new_full((num_frames, 2), far)
-    low.scatter_reduce_(0, number, torch.where(there[:, None], boxes[:, :2], far), "amin")
-    high = boxes.new_zeros(num_frames, 2).scatter_reduce_(0, number, boxes[:, 2:] * there[:, None], "amax")
-    return torch.cat([torch.where(high > 0, low, 0), high], dim=1)
-
-
-def _covers(masks: Sequence[Tensor], pixels: RegionPixels, ends: Sequence[int]) -> Tensor:
-    """Whether each pixel (A,) is covered by the mask whose box it lies in; those of each stack end at `ends`."""
-    height, width = masks[0].shape[1:]
-    pixel = pixels.rising((pixels.run_object * height + pixels.run_v) * width + pixels.run_u)
-    parts, begin, first = [], 0, 0
-    for stack, end in zip(masks, ends, strict=True):
-        of_stack = pixel[begin:end] - first * height * width
-        parts.append(stack.detach().flatten().index_select(0, of_stack) > MASK_THRESHOLD)
-        begin, first = end, first + len(stack)
-    return torch.cat(parts)
+def _places(instances: Sequence[Sequence[int]], num_frames: int) -> tuple[list[_Place], list[tuple[int, ...]]]:
+    """Places of the instances that are there, from their frames and boxes (N, 5), and the box around each frame's."""
+    around: list[tuple[int, ...]] = [(0, 0, 0, 0)] * num_frames
+    counts, places = [0] * num_frames, []
+    for number, (frame, u0, v0, u1, v1) in enumerate(instances):
+        if u1 <= u0:
+            continue
+        left, top, right, bottom = around[frame] if counts[frame] else (u0, v0, u1, v1)
+        around[frame] = (min(left, u0), min(top, v0), max(right, u1), max(bottom, v1))
+        places.append(_Place(number, frame, (u0, v0, u1, v1), counts[frame]))
+        counts[frame] += 1
+    return places, around

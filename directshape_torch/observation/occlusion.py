@@ -103,8 +103,8 @@ class OcclusionCrops:
         boxes: (B, 4) crops of the objects' frames, half open.
         table: (B, 6) integer, of each object: what its region has in common with the crop; the row of `covering` that
             pixel (0, 0) of its frame would have; the crop's width.
-        in_front: (B, W) int64, bits of the instances in front of each object.
-        covering: (A, W) int64, bits of the instances that cover each pixel, see `InstanceCrops`.
+        in_front: (B, W) int32, bits of the instances in front of each object.
+        covering: (A, W) int32, bits of the instances that cover each pixel, see `InstanceCrops`.
     """
 
     wanted: Tensor
@@ -119,7 +119,7 @@ class OcclusionCrops:
         boxes = crops.boxes[frame_index]
         width = boxes[:, 2] - boxes[:, 0]
         corner = crops.start[frame_index] - boxes[:, 1] * width - boxes[:, 0]
-        words = [torch.where(in_front, word[:, None], 0).sum(dim=0) for word in crops.bits.unbind(dim=1)]
+        words = [torch.where(in_front, word[:, None], 0).sum(dim=0, dtype=word.dtype) for word in crops.bits.unbind(1)]
         table = torch.cat([_common(wanted, boxes), corner[:, None], width[:, None]], dim=1)
         return cls(wanted, boxes, table, torch.stack(words, dim=1), crops.covering)
 
