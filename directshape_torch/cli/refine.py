@@ -72,7 +72,7 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
         "--threads-per-worker",
         type=int,
         metavar="N",
-        help="of the CPU, for each worker (default: 1; without workers PyTorch's); 1 is by far the best on a busy machine",
+        help="of the CPU, for each worker (default: 1; without workers PyTorch's); 1 is best on a busy machine",
     )
     group.add_argument(
         "--ray",
