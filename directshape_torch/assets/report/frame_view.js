@@ -1,0 +1,92 @@
+// One frame at a time: its picture, and its cars in 3D.
+
+import { element, byId } from "report/dom";
+import { carsOfFrame, frames, sceneOf } from "report/data";
+import { carName } from "report/format";
+import { framePicture } from "report/frame_picture";
+
+const shown = { before: true, after: true, truth: true };
+const picture = element("div", { id: "frame-picture" });
+const host = element("div", { class: "scene", id: "scene" });
+const choice = element("select", { id: "frame-choice", onchange: () => showFrame(Number(choice.value)) });
+const caption = element("p", { class: "quiet", role: "status", id: "frame-caption" });
+let current = null;
+let openCar = null;
+let viewer = null;
+
+// `open` shows a car in full; the dialog itself needs this module.
+export function showFrames(open) {
+  openCar = open;
+  const place = byId("frames");
+  if (!frames.detailed.length) {
+    place.append(element("p", {}, "No frame has details in this page."));
+    return;
+  }
+  choice.append(...frames.detailed.map((number) => element("option", { value: number }, frames.ids[number])));
+  place.append(controls(), caption, element("div", { class: "frame-stage" }, picture, host), viewControls());
+  // The viewer is started when it comes near, not with the page.
+  new IntersectionObserver((entries, observer) => {
+    if (!entries.some((entry) => entry.isIntersecting)) return;
+    observer.disconnect();
+    startViewer();
+  }, { rootMargin: "400px" }).observe(host);
+  showFrame(frames.detailed[0]);
+}
+
+function controls() {
+  const step = (by, text, id) => element("button", { type: "button", id, onclick: () => {
+    const position = frames.detailed.indexOf(current) + by;
+    showFrame(frames.detailed[(position + frames.detailed.length) % frames.detailed.length]);
+  } }, text);
+  const toggles = Object.keys(shown).map((name) => element("label", { class: name },
+    element("input", { type: "checkbox", id: `show-${name}`, checked: true, onchange: (event) => { shown[name] = event.target.checked; redraw(); } }),
+    name === "truth" ? "labels" : name));
+  return element("div", { class: "controls" }, step(-1, "◀ Previous", "previous-frame"), element("label", {}, "Frame", choice),
+    step(1, "Next ▶", "next-frame"), ...toggles);
+}
+
+function viewControls() {
+  const view = (name, text) => element("button", { type: "button", id: `view-${name}`, onclick: () => viewer?.lookFrom(name) }, text);
+  return element("div", { class: "controls" }, view("behind", "From behind"), view("camera", "From the camera"), view("above", "From above"),
+    element("span", { class: "quiet" }, "Drag to turn, wheel or pinch to come nearer, right button or two fingers to move; arrow keys move, with Shift they turn. Select a car to open it."));
+}
+
+async function startViewer() {
+  try {
+    const { Viewer } = await import("report/scene3d");
+    viewer = new Viewer(host, (place) => openCar(carsOfFrame(current)[place]));
+    await viewer.show(sceneOf(current), shown, `Frame ${frames.ids[current]} in 3D`);
+  } catch (error) {
+    console.warn(error);
+    host.replaceChildren(element("p", { class: "notice" }, `No 3D view: ${error.message}`));
+  }
+}
+
+export function showFrame(number) {
+  current = number;
+  choice.value = String(number);
+  redraw();
+  viewer?.lookFrom("behind");
+}
+
+function redraw() {
+  const scene = sceneOf(current), inFrame = carsOfFrame(current);
+  picture.replaceChildren(scene.image === null
+    ? element("p", { class: "quiet" }, "The image of this frame is not in the page.")
+    : framePicture(scene, inFrame, shown, openCar));
+  caption.textContent = `Frame ${frames.ids[current]}: ${inFrame.length} cars. ${groundWords(scene)}`;
+  viewer?.show(scene, shown, `Frame ${frames.ids[current]} in 3D`);
+}
+
+function groundWords(scene) {
+  return scene.ground === null
+    ? "The ground plane is not at hand; the grid is level, at the height of the cars."
+    : `Grid: 5 m, on the ground plane (from ${scene.ground_source}).`;
+}
+
+export function showCarInFrame(car) {
+  if (current !== car.frame) showFrame(car.frame);
+  byId("scene").scrollIntoView({ block: "center" });
+  if (viewer === null) startViewer().then(() => viewer?.lookAtCar(car.place, carName(car)));
+  else viewer.lookAtCar(car.place, carName(car));
+}

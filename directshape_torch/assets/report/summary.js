@@ -1,0 +1,75 @@
+// The top of the page: counts, mean errors, notes, failed frames, settings.
+
+import { element, byId } from "report/dom";
+import { run } from "report/data";
+import { change, percent } from "report/format";
+
+export function showSummary() {
+  byId("title").textContent = `Refined cars: ${run.name}`;
+  byId("subtitle").textContent = `${run.frames_done} frames, ${run.cars} cars, ${run.refined} of them refined`;
+  byId("made-by").textContent =
+    `Written by directshape_torch (results of version ${run.package_version}). 3D views by three.js, MIT licence.`;
+  byId("summary").append(...[tiles(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
+}
+
+function tiles() {
+  const failed = Object.keys(run.failed).length;
+  const entries = [
+    ["Frames done", String(run.frames_done)],
+    ["Frames failed", String(failed), failed ? "bad" : null],
+    ["Cars", String(run.cars)],
+    ["Refined", run.cars ? `${run.refined} (${percent(run.refined / run.cars)})` : "0"],
+  ];
+  const errors = run.errors;
+  if (errors !== null) {
+    entries.push(
+      [`Bird's-eye overlap, mean of ${errors.cars}`, change(errors.iou_before, errors.iou_after)],
+      ["Overlap above 0.7", shares(errors)],
+      ["Centre error, mean", `${change(errors.centre_before_m, errors.centre_after_m)} m`],
+      ["Heading error, mean", `${change(errors.yaw_before_deg, errors.yaw_after_deg, 1)}°`],
+    );
+  }
+  return element("dl", { class: "tiles" }, ...entries.map(([name, value, kind]) =>
+    element("div", { class: "tile" }, element("dt", {}, name), element("dd", { class: kind ?? null }, value))));
+}
+
+function shares(errors) {
+  const after = percent(errors["share_over_0.7_after"]);
+  return errors["share_over_0.7_before"] === null ? after : `${percent(errors["share_over_0.7_before"])} → ${after}`;
+}
+
+function notes() {
+  if (!run.notes.length) return null;
+  return element("div", { class: "notice", id: "notes" }, element("strong", {}, "What this page lacks"),
+    element("ul", {}, ...run.notes.map((note) => element("li", {}, note))));
+}
+
+function failures() {
+  const failed = Object.entries(run.failed);
+  if (!failed.length) return null;
+  return element("details", { id: "failed" }, element("summary", {}, `Failed frames (${failed.length})`),
+    factTable(failed, ["Frame", "Reason"]));
+}
+
+function statuses() {
+  if (!run.statuses.length) return null;
+  return element("details", { id: "statuses" }, element("summary", {}, "How the cars ended"),
+    factTable(run.statuses.map((status) => [status.name, `${status.count}: ${status.meaning}`]), ["Status", "Cars"]));
+}
+
+function settings() {
+  const rows = [
+    ...Object.entries(run.sha256).map(([name, hash]) => [`sha256 of ${name}`, hash ?? "none"]),
+    ...Object.entries(run.ground_sources).map(([name, count]) => [`ground from ${name}`, `${count} frames`]),
+    ...Object.entries(run.settings),
+  ];
+  return element("details", { id: "settings" }, element("summary", {}, "Settings of the run"),
+    factTable(rows, ["Setting", "Value"]));
+}
+
+export function factTable(rows, heads) {
+  return element("table", { class: "facts" },
+    element("thead", {}, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head)))),
+    element("tbody", {}, ...rows.map(([name, ...values]) =>
+      element("tr", {}, element("th", { scope: "row" }, name), ...values.map((value) => element("td", {}, value))))));
+}

@@ -1,0 +1,110 @@
+// All cars: filter, sort by any column, a hundred rows at a time.
+
+import { element, byId } from "report/dom";
+import { cars, run, hasLabels, hasErrorsBefore } from "report/data";
+import { MISSING, carName, costChange, number, percent } from "report/format";
+import { thumbnail } from "report/thumbnails";
+import { openCar } from "report/car_dialog";
+
+const ROWS_AT_ONCE = 100;
+
+const numeric = (title, value, text = (car) => number(value(car))) => ({ title, value, text, kind: "number" });
+const words = (title, value) => ({ title, value, text: value, kind: "words" });
+
+const columns = [
+  numeric("Distance [m]", (car) => car.distance_m, (car) => number(car.distance_m, 1)),
+  { title: "Status", value: (car) => car.status, text: (car) => car.status, kind: "word" },
+  ...(hasErrorsBefore ? [numeric("Overlap before", (car) => car.iou_before)] : []),
+  ...(hasLabels ? [numeric("Overlap after", (car) => car.iou_after)] : []),
+  ...(hasErrorsBefore ? [numeric("Centre error before [m]", (car) => car.centre_before_m)] : []),
+  ...(hasLabels ? [numeric("Centre error after [m]", (car) => car.centre_after_m)] : []),
+  numeric("Cost change", costChange, (car) => percent(costChange(car))),
+  numeric("Probably better", (car) => car.probability_better, (car) => percent(car.probability_better)),
+  numeric("Mask overlap", (car) => car.mask_iou),
+  numeric("Image difference [grey]", (car) => car.photometric_error_grey, (car) => number(car.photometric_error_grey, 1)),
+  numeric("Sigma of depth [m]", (car) => car.sigma_depth_m),
+  numeric("Length [m]", (car) => car.length_m),
+  numeric("Score", (car) => car.score),
+  numeric("Iterations", (car) => car.iterations, (car) => String(car.iterations)),
+  { title: "Type", value: (car) => car.type, text: (car) => car.type, kind: "word" },
+  words("Least seen", (car) => car.unseen),
+];
+const nameColumn = { title: "Car", value: (car) => `${car.frameId} ${String(car.line).padStart(4, "0")}` };
+
+const state = { column: null, descending: false, shown: ROWS_AT_ONCE, search: "", status: "" };
+const body = element("tbody", { id: "car-rows" });
+const counter = element("p", { class: "quiet", role: "status", id: "car-count" });
+const more = element("button", { type: "button", class: "more", onclick: () => { state.shown += ROWS_AT_ONCE; render(); } }, "Show more");
+const heads = new Map();
+
+export function showTable() {
+  byId("cars").append(controls(), counter,
+    element("div", { class: "scroller", tabindex: "0", role: "region", "aria-label": "Table of cars" },
+      element("table", { class: "cars" }, element("caption", { class: "quiet" }, "Select a heading to sort; select a car for its pictures, residual maps and figures."),
+        element("thead", {}, element("tr", {}, head(nameColumn),
+          element("th", { scope: "col" }, "Before"), element("th", { scope: "col" }, "After"), ...columns.map(head))), body)),
+    more);
+  render();
+}
+
+function controls() {
+  const search = element("input", { id: "search", type: "search", oninput: (event) => { state.search = event.target.value.toLowerCase(); restart(); } });
+  const choose = element("select", { id: "status-filter", onchange: (event) => { state.status = event.target.value; restart(); } },
+    element("option", { value: "" }, "all"), ...run.statuses.map((status) => element("option", { value: status.name }, status.name)));
+  return element("div", { class: "controls" },
+    element("label", {}, "Frame or type", search), element("label", {}, "Status", choose));
+}
+
+function restart() {
+  state.shown = ROWS_AT_ONCE;
+  render();
+}
+
+function head(column) {
+  const arrow = element("span", { class: "arrow", "aria-hidden": "true" });
+  const cell = element("th", { scope: "col", "aria-sort": "none" },
+    element("button", { type: "button", onclick: () => sortBy(column) }, column.title, " ", arrow));
+  heads.set(column, { cell, arrow });
+  return cell;
+}
+
+function sortBy(column) {
+  // A first click on numbers shows the largest first, on words the alphabet.
+  state.descending = state.column === column ? !state.descending : column.kind === "number";
+  state.column = column;
+  for (const [other, { cell, arrow }] of heads) {
+    const chosen = other === column;
+    cell.setAttribute("aria-sort", chosen ? (state.descending ? "descending" : "ascending") : "none");
+    arrow.textContent = chosen ? (state.descending ? "▼" : "▲") : "";
+  }
+  restart();
+}
+
+function chosenCars() {
+  const found = cars.filter((car) => (state.status === "" || car.status === state.status)
+    && (state.search === "" || `${car.frameId} ${car.type}`.toLowerCase().includes(state.search)));
+  return state.column === null ? found : found.sort((a, b) => compare(state.column.value(a), state.column.value(b)) || a.index - b.index);
+}
+
+// What is not known comes last, whichever way the rest is sorted.
+function compare(a, b) {
+  if (a === null || b === null) return (a === null) - (b === null);
+  const order = typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b;
+  return state.descending ? -order : order;
+}
+
+function render() {
+  const found = chosenCars();
+  body.replaceChildren(...found.slice(0, state.shown).map(row));
+  const shown = Math.min(state.shown, found.length);
+  counter.textContent = `${shown} of ${found.length} cars shown${found.length < cars.length ? `, ${cars.length} in all` : ""}`;
+  more.hidden = shown >= found.length;
+}
+
+function row(car) {
+  return element("tr", {},
+    element("td", { class: "name" }, element("button", { type: "button", class: "open-car", "aria-label": `Open car ${carName(car)}`, onclick: () => openCar(car) },
+      element("span", {}, car.frameId), element("span", { class: "quiet" }, `line ${car.line}`))),
+    element("td", {}, thumbnail(car, "before")), element("td", {}, thumbnail(car, "after")),
+    ...columns.map((column) => element("td", { class: column.kind }, column.text(car) || MISSING)));
+}

@@ -1,0 +1,1 @@
+"""One self-contained HTML page about a run: tables, distributions, pictures, residual maps and 3D views."""

@@ -1,0 +1,141 @@
+"""The table of cars: one row of numbers and words each, without pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.report.errors_to_labels import JudgedCar, judge_cars
+from directshape_torch.report.run_folder import FrameResult
+from directshape_torch.status import Status
+
+
+@dataclass(frozen=True)
+class CarRow:
+    """One car of the table; None for what is not known.
+
+    Attributes:
+        frame: number of its frame in the page.
+        line: its line in the detection file, from 1.
+        type: its class.
+        status: how its refinement ended.
+        refined: whether its state is a refined one.
+        distance_m: depth of the result along the optical axis.
+        score: the detector's.
+        cost_before, cost_after: sum over the terms.
+        mask_iou: overlap with the left mask, with the right one where there is no left.
+        photometric_error_grey: mean difference of the images, 0..255.
+        probability_better: calibrated.
+        sigma_depth_m: calibrated, along z.
+        iterations: of the solver.
+        length_m, width_m, height_m: of the result.
+        counts: whether its label counts in a comparison; None without a label.
+        centre_before_m, centre_after_m, yaw_before_deg, yaw_after_deg, iou_before, iou_after: against the label.
+        unseen: the direction that the view shows least, in words.
+    """
+
+    frame: int
+    line: int
+    type: str
+    status: str
+    refined: bool
+    distance_m: float | None
+    score: float | None
+    cost_before: float | None
+    cost_after: float | None
+    mask_iou: float | None
+    photometric_error_grey: float | None
+    probability_better: float | None
+    sigma_depth_m: float | None
+    iterations: int
+    length_m: float | None
+    width_m: float | None
+    height_m: float | None
+    counts: bool | None
+    centre_before_m: float | None
+    centre_after_m: float | None
+    yaw_before_deg: float | None
+    yaw_after_deg: float | None
+    iou_before: float | None
+    iou_after: float | None
+    unseen: str
+
+
+CAR_COLUMNS = tuple(entry.name for entry in fields(CarRow))
+
+
+def car_rows(
+    frame: int,
+    result: FrameResult,
+    detections: Sequence[KittiObject] | None = None,
+    labels: Sequence[KittiObject] | None = None,
+) -> list[CarRow]:
+    """The rows of a frame.
+
+    Args:
+        frame: its number in the page.
+        result: what the run left of it.
+        detections: the lines of its cars in the detection file, or None.
+        labels: its labels, or None.
+    """
+    judged = {} if labels is None else judge_cars(detections, result.cars, labels)
+    return [_row(frame, result, car, judged.get(car)) for car in range(len(result.cars))]
+
+
+def as_json(row: CarRow) -> list[Any]:
+    """The values of a row in the order of `CAR_COLUMNS`."""
+    return [getattr(row, name) for name in CAR_COLUMNS]
+
+
+def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) -> CarRow:
+    shapes, kitti = result.shapes, result.cars[car]
+    before, after = (None, None) if judged is None else (judged.before, judged.after)
+    ious = [known(array[car]) for array in (shapes.mask_iou_left, shapes.mask_iou_right)]
+    height, width, length = (known(size, 3) for size in shapes.boxes_hwl[car])
+    return CarRow(
+        frame=frame,
+        line=int(shapes.input_lines[car]),
+        type=kitti.type,
+        status=shapes.statuses[car],
+        refined=_is_refined(shapes.statuses[car]),
+        distance_m=known(shapes.T_cam_obj[car, 2, 3], 2),
+        score=known(kitti.score),
+        cost_before=known(shapes.costs_before[car].sum()),
+        cost_after=known(shapes.costs_after[car].sum()),
+        mask_iou=ious[0] if ious[0] is not None else ious[1],
+        photometric_error_grey=known(shapes.photometric_errors_grey[car], 2),
+        probability_better=known(shapes.probabilities_better[car]),
+        sigma_depth_m=known(shapes.sigmas_ref[car, 2]),
+        iterations=int(shapes.iterations[car]),
+        length_m=length,
+        width_m=width,
+        height_m=height,
+        counts=None if judged is None else judged.counts,
+        centre_before_m=None if before is None else known(before.centre_m),
+        centre_after_m=None if after is None else known(after.centre_m),
+        yaw_before_deg=None if before is None else known(before.yaw_deg, 2),
+        yaw_after_deg=None if after is None else known(after.yaw_deg, 2),
+        iou_before=None if before is None else known(before.bev_iou),
+        iou_after=None if after is None else known(after.bev_iou),
+        unseen=shapes.unseen[car],
+    )
+
+
+def known(value: float | np.floating[Any] | None, decimals: int = 4) -> float | None:
+    """A number as JSON can hold it: rounded, and None where it is not finite.
+
+    Example:
+        >>> known(0.123456), known(float("nan"))
+        (0.1235, None)
+    """
+    return None if value is None or not math.isfinite(value) else round(float(value), decimals)
+
+
+def _is_refined(status: str) -> bool:
+    """Whether a status is one of a refined state; one of a later version is taken for none."""
+    return status in Status.__members__ and Status[status].is_refined

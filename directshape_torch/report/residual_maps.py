@@ -1,0 +1,166 @@
+"""What a refinement looks at, pixel by pixel: photometric and silhouette residuals of one car, in the left image.
+
+A map is made anew from the state: all pixels of the car's window, not only the sampled ones, and without the rules by
+which the energy leaves pixels out, but for other instances that lie in front.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.geometry.stereo import warp_to_right
+from directshape_torch.image.gradients import grey_levels
+from directshape_torch.image.interpolate import bilinear_with_gradient
+from directshape_torch.report.pictures import Window
+from directshape_torch.residuals.silhouette import clamp_foreground, project_closest_approach, silhouette_residual
+from directshape_torch.scene import StereoCamera
+from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
+from directshape_torch.shape.shape_prior import ShapePrior
+
+Floats = npt.NDArray[np.floating[Any]]
+
+_SAMPLES_PER_RAY = 32
+# A near car needs no ray for each of its pixels.
+_MOST_COLUMNS = 240
+# Two exposures differ by a few percent (as in the energy); more is a wrong place.
+_GAIN_BOUNDS = (0.8, 1.25)
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """Settings of the run that bear on the maps: the silhouette's softness and bounds, and brightness."""
+
+    contour_width_px: float = 0.5
+    min_zeta_per_m: float = 4.0
+    max_zeta_per_m: float = 400.0
+    saturation: float = 16.0
+    probability_floor: float = 0.01
+    matches_brightness: bool = True
+
+
+@dataclass(frozen=True)
+class ViewedPair:
+    """A stereo pair as grey levels 0..255.
+
+    Attributes:
+        left, right: (1, H, W).
+        camera: of this one frame.
+    """
+
+    left: Tensor
+    right: Tensor | None
+    camera: StereoCamera
+
+    @classmethod
+    def of_images(
+        cls, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8] | None, camera: StereoCamera
+    ) -> ViewedPair:
+        return cls(_grey(left), None if right is None else _grey(right), camera)
+
+
+@dataclass(frozen=True)
+class ResidualMaps:
+    """Maps over a grid of (h, w) pixels of the car's window.
+
+    Attributes:
+        photometric: right minus left, grey levels; NaN where the car is not seen in both images.
+        silhouette: positive where the shape spills out of its mask, negative where it does not fill it; None without
+            a mask.
+    """
+
+    photometric: Floats | None
+    silhouette: Floats | None
+
+
+def pixel_grid(window: Window) -> Tensor:
+    """Pixels (h, w, 2) that cover a window, at most 240 columns."""
+    u0, v0, u1, v1 = window
+    step = max(1.0, (u1 - u0) / _MOST_COLUMNS)
+    u = torch.arange(u0, u1, step, dtype=torch.float32)
+    v = torch.arange(v0, v1, step, dtype=torch.float32)
+    rows, columns = torch.meshgrid(v, u, indexing="ij")
+    return torch.stack([columns, rows], dim=-1)
+
+
+@torch.no_grad()
+def residual_maps(
+    pair: ViewedPair,
+    prior: ShapePrior,
+    T_cam_obj: Floats,  # (4, 4)
+    code: Floats,  # (K,)
+    window: Window,
+    foreground: Floats | None,  # (H, W) probability of the car's mask, or None
+    hidden: npt.NDArray[np.bool_],  # (H, W) pixels of other instances
+    settings: MapSettings,
+) -> ResidualMaps:
+    """Both maps of a car in one state."""
+    grid = pixel_grid(window)
+    uv = grid.reshape(-1, 2)
+    T = torch.from_numpy(np.asarray(T_cam_obj)).to(prior.origin)
+    shape = prior.bind(torch.from_numpy(np.asarray(code))[None].to(prior.origin))
+    ray_cam = rays_from_pixels(uv, pair.camera.K_left[0])
+    rays = ObjectRays(
+        (-T[:3, :3].T @ T[:3, 3]).expand_as(ray_cam), ray_cam @ T[:3, :3], torch.zeros(len(uv), dtype=torch.int64)
+    )
+    marched = march(shape, rays, prior.bounds_obj, _SAMPLES_PER_RAY)
+    closest = closest_approach_depth(marched)
+    closest_sdf = shape.value(rays.at(closest), rays.object_index)
+    root = first_crossing(shape, rays, marched, closest, closest_sdf=closest_sdf)
+    out = torch.from_numpy(hidden)[uv[:, 1].long(), uv[:, 0].long()]
+    photometric = None
+    if pair.right is not None:
+        photometric = _photometric(pair, uv, ray_cam, root.depth, root.found & ~out, settings)
+    silhouette = None
+    if foreground is not None:
+        missed = torch.where(marched.crosses_bounds, closest_sdf, torch.full_like(closest_sdf, torch.inf))
+        p_fg = torch.from_numpy(foreground)[uv[:, 1].long(), uv[:, 0].long()].to(uv)
+        zeta = _zeta(pair.camera, float(T[2, 3]), settings)
+        silhouette = torch.where(out, torch.zeros_like(p_fg), _silhouette(missed, p_fg, zeta, settings))
+    size = grid.shape[:2]
+    return ResidualMaps(
+        None if photometric is None else photometric.reshape(size).numpy(),
+        None if silhouette is None else silhouette.reshape(size).numpy(),
+    )
+
+
+def _photometric(
+    pair: ViewedPair, uv: Tensor, ray_cam: Tensor, depth: Tensor, seen: Tensor, settings: MapSettings
+) -> Tensor:
+    """Right minus left, grey levels, NaN where not seen."""
+    camera = pair.camera
+    assert pair.right is not None, "asked for only where there is a right image"
+    rig = camera.disparity_field
+    bias, vertical = (None, None) if rig is None else (rig.bias(uv).to(uv), rig.vertical(uv).to(uv))
+    warped = warp_to_right(ray_cam, depth, camera.K_right[0], camera.T_right_cam[0], bias, vertical)
+    frame = torch.zeros(len(uv), dtype=torch.int64)
+    right, _, inside = bilinear_with_gradient(pair.right, frame, warped.uv_right)
+    left, _, _ = bilinear_with_gradient(pair.left, frame, uv)
+    seen = seen & inside & warped.in_front
+    gain = 1.0
+    if settings.matches_brightness and bool(seen.any()):
+        gain = float((right[seen].sum() / left[seen].sum().clamp_min(1)).clamp(*_GAIN_BOUNDS))
+    return torch.where(seen, right - gain * left, torch.full_like(right, torch.nan))
+
+
+def _silhouette(closest_sdf: Tensor, p_fg: Tensor, zeta: float, settings: MapSettings) -> Tensor:
+    """The residual with the sign of projection minus mask."""
+    finite = closest_sdf.nan_to_num(posinf=settings.saturation)
+    projection = project_closest_approach(finite, torch.full_like(p_fg, zeta), settings.saturation)
+    p_fg = clamp_foreground(p_fg, settings.probability_floor)
+    return silhouette_residual(projection, p_fg) * torch.sign(projection.log_hit.exp() - p_fg)
+
+
+def _zeta(camera: StereoCamera, depth_m: float, settings: MapSettings) -> float:
+    zeta = float(camera.K_left[0, 0, 0]) / (max(depth_m, 0.1) * settings.contour_width_px)
+    return min(max(zeta, settings.min_zeta_per_m), settings.max_zeta_per_m)
+
+
+def _grey(image: npt.NDArray[np.uint8]) -> Tensor:
+    return grey_levels(torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255)

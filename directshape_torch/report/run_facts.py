@@ -1,0 +1,76 @@
+"""What the top of the page says about a run: counts, settings, and what the page lacks and why."""
+
+from __future__ import annotations
+
+import statistics
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from directshape_torch.io.run_manifest import flatten
+from directshape_torch.report.car_rows import CarRow
+from directshape_torch.report.run_folder import RunFolder
+from directshape_torch.status import Status
+
+
+def run_facts(run: RunFolder, frame_ids: Sequence[str], rows: Sequence[CarRow], notes: Sequence[str]) -> dict[str, Any]:
+    """The facts as JSON.
+
+    Args:
+        run: the output folder.
+        frame_ids: the frames of the page.
+        rows: their cars.
+        notes: what the reader should know about this page.
+    """
+    manifest = run.manifest
+    return {
+        "name": run.out_dir.resolve().name,
+        "package_version": manifest.package_version,
+        "frames_done": len(frame_ids),
+        "failed": run.failed,
+        "cars": len(rows),
+        "refined": sum(row.refined for row in rows),
+        "statuses": _statuses(rows),
+        "ground_sources": dict(Counter(str(manifest.frames[name].get("ground_source")) for name in frame_ids)),
+        "sha256": dict(manifest.sha256),
+        "settings": {name: _text(value) for name, value in sorted(flatten(manifest.config).items())},
+        "errors": _mean_errors(rows),
+        "notes": list(notes),
+    }
+
+
+def _statuses(rows: Sequence[CarRow]) -> list[dict[str, Any]]:
+    """Name, number and meaning of each status that occurs, in the order of `Status`."""
+    counts = Counter(row.status for row in rows)
+    order = [name for name in Status.__members__ if name in counts]
+    order += sorted(set(counts) - set(order))
+    known = Status.__members__
+    return [{"name": n, "count": counts[n], "meaning": known[n].value if n in known else ""} for n in order]
+
+
+def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
+    """Mean errors over the cars that `directshape compare` counts; before and after over the same cars."""
+    counted = [row for row in rows if row.counts]
+    if not counted:
+        return None
+    names = ("centre_before_m", "centre_after_m", "yaw_before_deg", "yaw_after_deg", "iou_before", "iou_after")
+    columns = {name: [getattr(row, name) for row in counted] for name in names}
+    means = {name: None if None in values else statistics.fmean(values) for name, values in columns.items()}
+    for side in ("before", "after"):
+        overlaps = columns[f"iou_{side}"]
+        means[f"share_over_0.7_{side}"] = None if None in overlaps else statistics.fmean(v > 0.7 for v in overlaps)
+    return {"cars": len(counted), **means}
+
+
+def problem_notes(problems: Mapping[str, int], num_frames: int) -> list[str]:
+    """What could not be used, as sentences.
+
+    Example:
+        >>> problem_notes({"left image not found": 2}, 5)
+        ['left image not found (2 of 5 frames)']
+    """
+    return [f"{what} ({count} of {num_frames} frames)" for what, count in sorted(problems.items())]
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else str(value)
