@@ -15,13 +15,15 @@ if TYPE_CHECKING:
     from directshape_torch.export.run_folder import RunFolder
     from directshape_torch.geometry.disparity_field import DisparityField
     from directshape_torch.io.stereo_dataset import StereoDataset
+    from directshape_torch.refiner import DirectShapeRefiner
     from directshape_torch.shape.shape_prior import ShapePrior
 
-_FORMATS = ("glb", "ply", "points", "kitti", "coco3d", "nuscenes")
+_FORMATS = ("glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun")
 
 _DESCRIPTION = """
 Write the finished frames of an output folder of 'directshape refine' for other programs: surfaces as GLB or PLY and
-points as PLY, coloured by the left image, and boxes as KITTI, COCO-3D or nuScenes files. OUT itself is only read.
+points as PLY, coloured by the left image, boxes as KITTI, COCO-3D or nuScenes files, and all of it as a recording for
+Rerun's viewer. OUT itself is only read. docs/exports.md says what is in which frame.
 """
 
 
@@ -35,12 +37,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets the files")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="only these frames (default: all that are finished)")
     _add_inputs(parser.add_argument_group("input"))
-    _add_appearance(parser.add_argument_group("surfaces and points"))
+    _add_appearance(parser.add_argument_group("surfaces, points and recordings"))
     parser.set_defaults(run=run)
 
 
 def _add_inputs(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--data", type=Path, metavar="ROOT", help="data set of the run, for colours; coco3d needs it")
+    group.add_argument(
+        "--data", type=Path, metavar="ROOT", help="data set of the run, for colours; coco3d and rerun need it"
+    )
     group.add_argument("--layout", choices=LAYOUTS, default="kitti", help="of that data set (default: kitti)")
     group.add_argument("--detections", type=Path, metavar="DIR", help="detections of the run (default: its results)")
     group.add_argument("--masks", type=Path, metavar="DIR", help="masks of the run: only their pixels lend colours")
@@ -57,6 +61,11 @@ def _add_appearance(group: argparse._ArgumentGroup) -> None:
         choices=("mirror", "grey"),
         default="mirror",
         help="what the image does not show: the colour of the car's other side where that is seen (default), or grey",
+    )
+    group.add_argument(
+        "--iterations",
+        action="store_true",
+        help="rerun: refine again (--detections and --masks of the run) and record every iteration",
     )
     group.add_argument("--points", type=int, default=10_000, metavar="N", help="points a car (default: %(default)s)")
 
@@ -82,8 +91,34 @@ def run(args: argparse.Namespace) -> int:
 def _make_inputs(args: argparse.Namespace, folder: RunFolder) -> ExportInputs:
     from directshape_torch.export.frame_source import ExportInputs
 
-    dataset = _make_dataset(args, folder)
-    return ExportInputs(_priors(args.prior), dataset, args.data, args.unseen == "mirror", args.points)
+    priors, dataset = _priors(args.prior), _make_dataset(args, folder)
+    return ExportInputs(
+        priors,
+        dataset,
+        args.data,
+        has_detections=args.layout == "folder" or args.detections is not None,
+        refiner=_make_refiner(args, folder, priors) if args.iterations else None,
+        mirror=args.unseen == "mirror",
+        points_per_car=args.points,
+    )
+
+
+def _make_refiner(args: argparse.Namespace, folder: RunFolder, priors: Mapping[str, ShapePrior]) -> DirectShapeRefiner:
+    """The refiner of the run, on the processor and not compiled: a few frames are not worth it."""
+    from dataclasses import replace
+
+    from directshape_torch.config import RefinerConfig
+    from directshape_torch.config_files import config_from_mapping
+    from directshape_torch.refiner import DirectShapeRefiner
+
+    for name in ("data", "detections", "masks"):
+        if getattr(args, name) is None and (name == "data" or args.layout != "folder"):
+            raise InputError(f"--{name}", "that of the run, for --iterations", "nothing")
+    sha256 = str(folder.manifest.sha256["prior"])
+    if sha256 not in priors:
+        raise InputError("--prior", "the shape prior of the run", "another one" if args.prior else "nothing")
+    config = config_from_mapping(RefinerConfig, folder.setting("refiner"))
+    return DirectShapeRefiner(priors[sha256], replace(config, compile="off"))
 
 
 def _priors(source: str | None) -> Mapping[str, ShapePrior]:

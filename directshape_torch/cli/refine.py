@@ -36,6 +36,12 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
     group.add_argument("--meshes", choices=("ply", "glb"), help="write the surface of each refined car")
     group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
+    group.add_argument(
+        "--rerun",
+        type=Path,
+        metavar="FILE.rrd",
+        help="record frames and iterations for Rerun's viewer (extra viewer); refines a second time, for few frames",
+    )
     again = group.add_mutually_exclusive_group()
     again.add_argument("--resume", action="store_false", dest="fresh", help="go on where DIR was left (the default)")
     again.add_argument(
@@ -101,18 +107,23 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.refine_dataset import refine_dataset
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.progress import ProgressBar
+    from directshape_torch.cli.rerun_option import check_rerun, write_recording
 
+    check_rerun(args.rerun)
     workers = WorkerOptions(args.workers, args.threads, args.ray, args.retries)
     options = RefineOptions(args.meshes, args.overlays, args.batch_frames)
     chosen = [] if args.method is None else [f"method={args.method}"]
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device)
     _check_disparity_is_used(args.disparity, refiner.config.method)
+    dataset = dataset_of(args)
     with ProgressBar() as progress:
-        summary = refine_dataset(dataset_of(args), refiner, args.out, options, progress, workers, fresh=args.fresh)
+        summary = refine_dataset(dataset, refiner, args.out, options, progress, workers, fresh=args.fresh)
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
     print(f"results  {args.out}")
+    if args.rerun is not None:
+        write_recording(args.rerun, args.out, dataset, refiner)
     return summary.exit_code
 
 

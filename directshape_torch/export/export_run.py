@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
-from directshape_torch.batch.options import RunObserver, SilentObserver
+from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import InputError
 from directshape_torch.export import exporters
-from directshape_torch.export.exporters import Exporter, FramewiseExporter
-from directshape_torch.export.frame_source import ExportInputs, FrameSource
+from directshape_torch.export.exporters import Exporter, FramewiseExporter, feed
+from directshape_torch.export.frame_source import ExportInputs
+from directshape_torch.export.rerun_recording import RerunExporter
 from directshape_torch.export.run_folder import RunFolder
 
-ExportFormat = Literal["glb", "ply", "points", "kitti", "coco3d", "nuscenes"]
+ExportFormat = Literal["glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun"]
 """What `export_run` can write (docs/exports.md)."""
 
 _FRAMEWISE = {
@@ -35,33 +36,27 @@ def export_run(
 
     Args:
         run: which frames of which output folder.
-        folder: gets `glb`, `ply`, `points`, `kitti`, `coco3d.json`, `nuscenes.json`; files of an earlier export that
-            have the same names are replaced.
+        folder: gets `glb`, `ply`, `points`, `kitti`, `coco3d.json`, `nuscenes.json`, `recording.rrd`; files of an
+            earlier export that have the same names are replaced.
         formats: which of these.
         inputs: shape priors, and the images for colours.
         observer: is told of each frame.
 
     Raises:
+        MissingDependencyError: "rerun" without Rerun.
         InputError: an unknown format, or one that needs images which were not given.
         DataFormatError: a file of the run or of the data set is missing or damaged.
     """
-    observer = SilentObserver() if observer is None else observer
-    chosen = [_make(one, Path(folder), run) for one in dict.fromkeys(formats)]
-    observer.started(run.frame_ids)
-    for frame_id in run.frame_ids:
-        source = FrameSource(run, frame_id, inputs)
-        for exporter in chosen:
-            exporter.add(source)
-        observer.finished(frame_id, None)
-    for exporter in chosen:
-        exporter.finish()
+    feed([_make(one, Path(folder), run, inputs) for one in dict.fromkeys(formats)], run, inputs, observer)
 
 
-def _make(name: str, folder: Path, run: RunFolder) -> Exporter:
+def _make(name: str, folder: Path, run: RunFolder, inputs: ExportInputs) -> Exporter:
     if name in _FRAMEWISE:
         return FramewiseExporter(folder, _FRAMEWISE[name])
     if name == "coco3d":
         return exporters.Coco3dExporter(folder, run)
     if name == "nuscenes":
         return exporters.NuscenesExporter(folder)
+    if name == "rerun":
+        return RerunExporter(folder / "recording.rrd", run, inputs.refiner is not None)
     raise InputError("formats", f"of {', '.join(get_args(ExportFormat))}", repr(name))

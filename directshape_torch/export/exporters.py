@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
 
+from directshape_torch.batch.options import RunObserver, SilentObserver
 from directshape_torch.export.coco3d_file import Coco3dDataset, image_numbers
-from directshape_torch.export.frame_source import FrameSource
+from directshape_torch.export.frame_source import ExportInputs, FrameSource
 from directshape_torch.export.gltf_scene import frame_glb
 from directshape_torch.export.kitti_files import kitti_json
 from directshape_torch.export.nuscenes_file import nuscenes_results
@@ -30,6 +32,10 @@ class Exporter(Protocol):
         """Write what can only be written at the end."""
         ...
 
+    def abandon(self) -> None:
+        """A frame failed: leave nothing half-written behind."""
+        ...
+
 
 class FramewiseExporter:
     """A format with files of each frame's own.
@@ -49,6 +55,9 @@ class FramewiseExporter:
     def finish(self) -> None:
         """Nothing."""
 
+    def abandon(self) -> None:
+        """Nothing: each file is whole."""
+
 
 class Coco3dExporter:
     """All frames in one `coco3d.json`."""
@@ -66,6 +75,9 @@ class Coco3dExporter:
         """Write the file."""
         write_json(self.path, self.dataset.content)
 
+    def abandon(self) -> None:
+        """Nothing was written."""
+
 
 class NuscenesExporter:
     """All frames in one `nuscenes.json`."""
@@ -81,6 +93,32 @@ class NuscenesExporter:
     def finish(self) -> None:
         """Write the file."""
         write_json(self.path, nuscenes_results(self.frames))
+
+    def abandon(self) -> None:
+        """Nothing was written."""
+
+
+def feed(
+    exporters: Sequence[Exporter], run: RunFolder, inputs: ExportInputs, observer: RunObserver | None = None
+) -> None:
+    """Hand every frame of a run to some exporters; what is read or made of a frame serves them all.
+
+    Raises:
+        DirectShapeError: the first failure of an exporter.
+    """
+    observer = SilentObserver() if observer is None else observer
+    with ExitStack() as stack:
+        for exporter in exporters:
+            stack.callback(exporter.abandon)
+        observer.started(run.frame_ids)
+        for frame_id in run.frame_ids:
+            source = FrameSource(run, frame_id, inputs)
+            for exporter in exporters:
+                exporter.add(source)
+            observer.finished(frame_id, None)
+        stack.pop_all()
+    for exporter in exporters:
+        exporter.finish()
 
 
 def write_glb(folder: Path, source: FrameSource) -> None:

@@ -12,6 +12,7 @@ from directshape_torch.export.painted_cars import PaintedFrame
 from directshape_torch.export.run_folder import RefinedFrame, RunFolder
 from directshape_torch.io.refinement_files import shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
@@ -24,6 +25,8 @@ class ExportInputs:
         dataset: images, calibrations, masks and detections of the run's frames; None: exports without colours, and
             none that need an image.
         data_root: folder that names of images begin in, where a file lists them.
+        has_detections: whether the detections of that data set are those of the run; else its results stand for them.
+        refiner: repeats the refinement, for the iterations in a recording; then the detections must be the run's.
         mirror: colour what the image does not show by the other side of the car.
         points_per_car: points spread over a surface.
     """
@@ -31,12 +34,16 @@ class ExportInputs:
     priors: Mapping[str, ShapePrior]
     dataset: StereoDataset | None = None
     data_root: Path | None = None
+    has_detections: bool = False
+    refiner: DirectShapeRefiner | None = None
     mirror: bool = True
     points_per_car: int = 10_000
 
     def __post_init__(self) -> None:
         if self.points_per_car < 1:
             raise InputError("points_per_car", "at least 1", str(self.points_per_car))
+        if self.refiner is not None and not self.has_detections:
+            raise InputError("detections", "those of the run, to refine its frames again", "none")
 
 
 class FrameSource:
