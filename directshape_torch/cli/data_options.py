@@ -10,7 +10,7 @@ from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
     from directshape_torch.io.instance_masks import MaskSource
-    from directshape_torch.io.stereo_dataset import StereoDataset
+    from directshape_torch.io.stereo_files import FileStereoDataset
 
 # As in io/open_dataset.py, which is not imported for it loads PyTorch; a test holds the two together.
 LAYOUTS = ("kitti", "raw", "tracking", "stereo2015", "folder")
@@ -53,7 +53,7 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
 
 
-def dataset_of(args: argparse.Namespace) -> StereoDataset:
+def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
     """The data set that the options describe.
 
     Raises:

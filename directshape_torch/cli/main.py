@@ -25,6 +25,7 @@ COMMANDS = (
     "calibrate_stereo",
     "export",
     "inspect",
+    "check_data",
 )
 
 _DESCRIPTION = "Refine pose and shape of cars in stereo frames by differentiable rendering of signed distance fields."

@@ -18,7 +18,7 @@ FOLDER_SCHEMA_VERSION = 1
 _RIG_KEYS = frozenset(
     {"schema_version", "image_size_wh", "K_left", "K_right", "baseline_m", "t_right_cam_m", "comment"}
 )
-_FRAME_KEYS = frozenset({"schema_version", "objects", "labels", "ground_plane", "comment"})
+_FRAME_KEYS = frozenset({"schema_version", "objects", "labels", "ground_plane", "times_s", "comment"})
 _BOX_KEYS = ("dimensions_hwl_m", "bottom_center_m", "rotation_y_rad")
 _OBJECT_KEYS = frozenset({"class", "score", "box_2d", "mask_left", "mask_right", *_BOX_KEYS})
 
@@ -73,12 +73,14 @@ class FolderFrame:
         objects: detections, and other instances that may hide them.
         labels: the ground truth, or None.
         ground_plane_cam: (a, b, c, d), a x + b y + c z + d = 0 in the left camera frame, or None.
+        times_s: when the left and the right image were taken, seconds from any start, or None.
     """
 
     path: Path
     objects: tuple[FolderObject, ...]
     labels: tuple[FolderObject, ...] | None
     ground_plane_cam: tuple[float, ...] | None
+    times_s: tuple[float, float] | None
 
 
 def read_rig(path: Path) -> FolderRig:
@@ -110,12 +112,16 @@ def read_frame(path: Path) -> FolderFrame:
         DataFormatError: a key is missing, unknown or of the wrong form; names the entry.
     """
     content = _read_object(path, _FRAME_KEYS)
-    plane = content.get("ground_plane")
+    plane, times = content.get("ground_plane"), content.get("times_s")
+    if times is not None:
+        left_s, right_s = _numbers(path, content, "times_s", 2)
+        times = (left_s, right_s)
     return FolderFrame(
         path,
         _objects(path, content, "objects"),
         _objects(path, content, "labels") if content.get("labels") is not None else None,
         None if plane is None else _numbers(path, content, "ground_plane", 4),
+        times,
     )
 
 

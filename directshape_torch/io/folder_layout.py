@@ -125,6 +125,10 @@ class FolderLayout:
         """`folder/ID.png`."""
         return first_disparity(folder, frame_id)
 
+    def times_s(self, frame_id: str) -> tuple[float, float] | None:
+        """Those of the frame's file, where it has them."""
+        return self._frame(frame_id).times_s
+
     def masks(self, directory: Path | None) -> MaskSource | None:
         """Those of the frames' files, unless a folder of others is given."""
         return FolderMasks(self.root, self.detections_dir) if directory is None else mask_source(directory)

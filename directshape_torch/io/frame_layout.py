@@ -73,6 +73,10 @@ class FrameLayout(Protocol):
         """The disparity map of a frame in a folder of such maps."""
         ...
 
+    def times_s(self, frame_id: str) -> tuple[float, float] | None:
+        """When the left and the right image were taken, seconds from any start, or None where no file says so."""
+        ...
+
     def masks(self, directory: Path | None) -> MaskSource | None:
         """The reader of a folder of masks; None: of those that come with the layout itself, if there are any."""
         ...

@@ -25,6 +25,10 @@ _MOTS_IGNORE_CLASS = 10
 _IDS_PER_CLASS = 1000
 
 
+class MaskSizeError(DataFormatError):
+    """A mask has another size than its image."""
+
+
 @dataclass(frozen=True)
 class InstanceMask:
     """One instance in one image.
@@ -237,10 +241,10 @@ def tight_box(probability: NDArray[Any]) -> tuple[float, float, float, float] | 
 
 
 def check_size(path: Path, what: str, got_hw: Iterable[int], expected_hw: tuple[int, int]) -> None:
-    """Raise `DataFormatError` naming both sizes unless a mask has the size of its image."""
+    """Raise `MaskSizeError` naming both sizes unless a mask has the size of its image."""
     got = tuple(int(n) for n in got_hw)
     if got != tuple(expected_hw):
-        raise DataFormatError(
+        raise MaskSizeError(
             path,
             f"{what} has {got[1]} x {got[0]} pixels (width x height), its image {expected_hw[1]} x {expected_hw[0]}",
             cure="make masks at the size of the images",

@@ -87,6 +87,10 @@ class KittiObjectLayout:
         """The map of the first pair of a scene, or of the frame."""
         return first_disparity(folder, frame_id)
 
+    def times_s(self, frame_id: str) -> tuple[float, float] | None:
+        """None: no file of this layout says so."""
+        return None
+
     def masks(self, directory: Path | None) -> MaskSource | None:
         """See `mask_source`; no masks come with the layout itself."""
         return None if directory is None else mask_source(directory)

@@ -17,6 +17,7 @@ from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import FrameJsonMasks, InstanceMask, MaskSource, file_of_frame, mask_source
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
 
 
@@ -64,6 +65,7 @@ class SequenceLayout:
         self._sequences = {sequence.name: sequence for sequence in sequences}
         self._single, self._digits = single, digits
         self._tracking: dict[Path, dict[int, list[KittiObject]]] = {}
+        self._times_s: dict[Path, list[float]] = {}
 
     def frame_ids(self) -> list[str]:
         """The frames with a detection file, or all of the sequences that have one of the tracking benchmark."""
@@ -128,6 +130,15 @@ class SequenceLayout:
         sequence, stem = self._split(frame_id)
         return first_disparity(folder if self._single else folder / sequence.name, stem)
 
+    def times_s(self, frame_id: str) -> tuple[float, float] | None:
+        """From `timestamps.txt` beside the folders of images, as raw recordings have them."""
+        sequence, stem = self._split(frame_id)
+        both = [folder.parent / "timestamps.txt" for folder in (sequence.left, sequence.right)]
+        if sequence.labels is not None or not all(path.is_file() for path in both):
+            return None
+        left_s, right_s = (self._time(path, int(stem)) for path in both)
+        return left_s, right_s
+
     def masks(self, directory: Path | None) -> MaskSource | None:
         """See `mask_source` for one sequence, `SequenceMasks` for several."""
         if directory is None or self._single:
@@ -157,6 +168,14 @@ class SequenceLayout:
         if path not in self._tracking:
             self._tracking[path] = read_tracking_objects(path)
         return self._tracking[path].get(int(stem), [])
+
+    def _time(self, path: Path, number: int) -> float:
+        if path not in self._times_s:
+            self._times_s[path] = read_timestamps(path)
+        times_s = self._times_s[path]
+        if number >= len(times_s):
+            raise DataFormatError(path, f"has {len(times_s)} times, none for frame {number}", cure="one line a frame")
+        return times_s[number]
 
     def _plane_file(self, frame_id: str) -> Path:
         sequence, stem = self._split(frame_id)

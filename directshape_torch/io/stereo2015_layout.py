@@ -101,6 +101,10 @@ class Stereo2015Layout:
         """As in submissions to the benchmark, `NNNNNN_10.png`."""
         return folder / f"{frame_id}.png"
 
+    def times_s(self, frame_id: str) -> tuple[float, float] | None:
+        """None: no file of this layout says so."""
+        return None
+
     def masks(self, directory: Path | None) -> MaskSource | None:
         """See `mask_source`; no masks come with the layout itself."""
         return None if directory is None else SceneMasks(directory, mask_source(directory))

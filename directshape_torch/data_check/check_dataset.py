@@ -1,0 +1,124 @@
+"""All checks over a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from directshape_torch.data_check.car_evidence import FrameEvidence, gather_evidence
+from directshape_torch.data_check.check_box_2d import check_box_2d
+from directshape_torch.data_check.check_boxes import check_boxes
+from directshape_torch.data_check.check_calibration import check_calibration
+from directshape_torch.data_check.check_distances import DistanceRatios, check_distances, measure_distances
+from directshape_torch.data_check.check_files import check_files
+from directshape_torch.data_check.check_masks import check_masks
+from directshape_torch.data_check.check_pair import check_pair
+from directshape_torch.data_check.check_times import check_times
+from directshape_torch.data_check.finding import CheckReport, Finding, by_severity
+from directshape_torch.data_check.frame_parts import FrameParts, read_parts
+from directshape_torch.data_check.pair_matches import match_pair
+from directshape_torch.errors import InputError
+from directshape_torch.io.stereo_files import FileStereoDataset
+
+DEFAULT_MAX_FRAMES = 20
+# With these wrong, what disparities and projections show says nothing more.
+_SPOILS_PAIR = frozenset({"images_swapped", "same_image", "different_scenes", "not_rectified"})
+_SPOILS_CAMERA = frozenset({"baseline_sign", "baseline_length", "focal_length"})
+
+
+def check_dataset(
+    dataset: FileStereoDataset,
+    max_frames: int | None = DEFAULT_MAX_FRAMES,
+    tell: Callable[[str], None] = lambda _: None,
+) -> CheckReport:
+    """Look for everything that is commonly wrong with a data set.
+
+    Args:
+        dataset: of any layout.
+        max_frames: frames whose content is read, spread evenly; None: all. That files exist is asked of every frame.
+        tell: called after each frame that was read.
+
+    Raises:
+        InputError: `max_frames` below 1.
+    """
+    if max_frames is not None and max_frames < 1:
+        raise InputError("max_frames", "at least 1", str(max_frames))
+    chosen = spread(dataset.frame_ids, max_frames)
+    findings = [*check_files(dataset), *check_times(dataset, dataset.frame_ids)]
+    seen = _Seen()
+    for frame_id in chosen:
+        findings += _check_frame(dataset, frame_id, seen)
+        tell(frame_id)
+    findings += _check_cars(seen)
+    return CheckReport(by_severity(findings), len(dataset), len(chosen), seen.num_cars)
+
+
+def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
+    """At most `count` of the frames, evenly spread, the first among them.
+
+    Example:
+        >>> spread("abcdefgh", 3)
+        ('a', 'c', 'f')
+    """
+    if count is None or count >= len(frame_ids):
+        return tuple(frame_ids)
+    return tuple(frame_ids[index * len(frame_ids) // count] for index in range(count))
+
+
+@dataclass
+class _Seen:
+    """What the frames have shown so far."""
+
+    evidence: list[FrameEvidence] = field(default_factory=list)
+    ratios: list[DistanceRatios] = field(default_factory=list)
+    num_cars: int = 0
+
+
+def _check_frame(dataset: FileStereoDataset, frame_id: str, seen: _Seen) -> list[Finding]:
+    parts, findings = read_parts(dataset, frame_id)
+    where = f"frame {frame_id}"
+    if parts.calibration is not None:
+        findings += check_calibration(parts.calibration, parts.size_hw, where)
+    findings += _check_pair(parts, where)
+    seen.num_cars += len(parts.objects)
+    evidence = gather_evidence(parts)
+    if evidence is not None and not _names(findings) & _SPOILS_CAMERA:
+        seen.evidence.append(evidence)
+        if not _names(findings) & _SPOILS_PAIR and parts.left is not None and parts.right is not None:
+            seen.ratios.append(measure_distances(evidence, parts.left, parts.right))
+    return findings
+
+
+def _check_pair(parts: FrameParts, where: str) -> list[Finding]:
+    if parts.left is None or parts.right is None or parts.size_hw is None:
+        return []
+    return check_pair(match_pair(parts.left, parts.right), parts.camera, parts.size_hw, where)
+
+
+def _check_cars(seen: _Seen) -> list[Finding]:
+    """Boxes, masks and distances; each is asked only where what it rests on was found right."""
+    if not seen.num_cars:
+        return [_no_cars()]
+    of_box_2d = check_box_2d(seen.evidence)
+    if of_box_2d:
+        return of_box_2d
+    findings = check_masks(seen.evidence)
+    of_boxes = check_boxes(seen.evidence)
+    if not of_boxes:
+        findings += check_distances(seen.ratios)
+    return findings + of_boxes
+
+
+def _no_cars() -> Finding:
+    return Finding(
+        "no_cars",
+        "error",
+        "all frames",
+        "no detection of the chosen classes with a 3D box",
+        "lines of class Car (or --classes) with positive h w l and a location",
+        "check names of classes and the folder of detections",
+    )
+
+
+def _names(findings: Sequence[Finding]) -> set[str]:
+    return {finding.check for finding in findings if finding.severity == "error"}

@@ -1,0 +1,168 @@
+"""The two images against each other: swapped, the same, of different scenes, not rectified."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.data_check.finding import Finding, Severity
+from directshape_torch.data_check.pair_matches import PairMatches
+from directshape_torch.scene import StereoCamera
+
+MIN_MATCHES = 30
+# Two photographs of different places agree on fewer, by chance.
+MIN_INLIER_SHARE = 0.4
+SAME_IMAGE_PX = 0.05
+# Share of points that lie at a negative disparity by more than a pixel.
+MAX_NEGATIVE_SHARE = 0.2
+VERTICAL_WARNING_PX, VERTICAL_ERROR_PX = 0.75, 1.5
+SCATTER_WARNING_PX = 1.0
+
+
+def check_pair(
+    matches: PairMatches, camera: StereoCamera | None, size_hw: tuple[int, int], where: str
+) -> list[Finding]:
+    """What the feature matches of a pair show.
+
+    Args:
+        matches: of its two images.
+        camera: predicts where points of a rectified pair lie; without it equal rows are expected.
+        size_hw: of the images.
+        where: named in the findings.
+    """
+    if matches.num_candidates < MIN_MATCHES:
+        return [_too_few(matches, where)]
+    if len(matches) < MIN_MATCHES or len(matches) < MIN_INLIER_SHARE * matches.num_candidates:
+        return [_other_scene(matches, where)]
+    disparity = _disparity(matches, camera)
+    if float(np.median(np.hypot(disparity, matches.vertical))) < SAME_IMAGE_PX:
+        return [_same_image(where)]
+    return _check_side(disparity, where) + _check_rows(
+        matches, _row_residual(matches, disparity, camera), size_hw, where
+    )
+
+
+def _disparity(matches: PairMatches, camera: StereoCamera | None) -> NDArray[np.float64]:
+    """(N,) `u_left - u_right`, freed of the difference of the principal points."""
+    shift = 0.0 if camera is None else float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
+    return np.asarray(matches.uv_left[:, 0] - matches.uv_right[:, 0] - shift)
+
+
+def _row_residual(
+    matches: PairMatches, disparity: NDArray[np.float64], camera: StereoCamera | None
+) -> NDArray[np.float64]:
+    """(N,) `v_right - v_left` beyond what the calibration explains, pixels."""
+    if camera is None:
+        return matches.vertical
+    K_left, K_right, t = camera.K_left[0].numpy(), camera.K_right[0].numpy(), camera.T_right_cam[0, :3, 3].numpy()
+    # t_y / z with z = fx b / disparity.
+    expected = K_right[1, 2] - K_left[1, 2] + disparity * (K_right[1, 1] / K_right[0, 0]) * (t[1] / -t[0])
+    return np.asarray(matches.vertical - expected)
+
+
+def _check_side(disparity: NDArray[np.float64], where: str) -> list[Finding]:
+    negative = float(np.mean(disparity < -1.0))
+    if negative <= MAX_NEGATIVE_SHARE:
+        return []
+    median = float(np.median(disparity))
+    return [
+        Finding(
+            "images_swapped",
+            "error",
+            where,
+            f"{negative:.0%} of {len(disparity)} matched points lie farther right in the right image "
+            f"(median disparity {median:.1f} px)",
+            "disparities u_left - u_right above 0: everything lies farther left in the right image",
+            "swap the left and the right images (or were they mirrored?)",
+        )
+    ]
+
+
+def _check_rows(
+    matches: PairMatches, residual: NDArray[np.float64], size_hw: tuple[int, int], where: str
+) -> list[Finding]:
+    offset, across, down, scatter = fit_rows(matches.uv_left, residual, size_hw)
+    worst = max(abs(offset), abs(across), abs(down))
+    if worst > VERTICAL_WARNING_PX:
+        severity: Severity = "error" if worst > VERTICAL_ERROR_PX else "warning"
+        return [
+            Finding(
+                "not_rectified",
+                severity,
+                where,
+                f"rows differ by {offset:+.2f} px in the median, {across:+.2f} px more from left to right edge, "
+                f"{down:+.2f} px more from top to bottom ({len(residual)} matches)",
+                f"within {VERTICAL_WARNING_PX} px of what the calibration says",
+                "rectify the pair (cv2.stereoRectify and initUndistortRectifyMap) with the calibration that is given",
+            )
+        ]
+    if scatter <= SCATTER_WARNING_PX:
+        return []
+    return [
+        Finding(
+            "not_synchronous",
+            "warning",
+            where,
+            f"rows of matched points scatter by {scatter:.2f} px (median absolute deviation)",
+            f"at most {SCATTER_WARNING_PX} px",
+            "give images taken at the same moment, with lens distortion removed",
+        )
+    ]
+
+
+def fit_rows(
+    uv_left: NDArray[np.float64],  # (N, 2)
+    residual: NDArray[np.float64],  # (N,)
+    size_hw: tuple[int, int],
+) -> tuple[float, float, float, float]:
+    """Median of the row residual, its change over the width and over the height of the image, and what is left.
+
+    The slopes are fitted by least squares with points beyond three deviations left out, five times.
+
+    Example:
+        >>> uv = np.random.default_rng(0).uniform(0, 100, (50, 2))
+        >>> [round(value, 6) for value in fit_rows(uv, 0.02 * (uv[:, 0] - 50), (100, 100))[1:]]
+        [2.0, 0.0, 0.0]
+    """
+    height, width = size_hw
+    basis = np.column_stack([np.ones(len(residual)), uv_left[:, 0] / width - 0.5, uv_left[:, 1] / height - 0.5])
+    keep = np.ones(len(residual), dtype=bool)
+    rest = residual
+    for _ in range(5):
+        solution = np.linalg.lstsq(basis[keep], residual[keep], rcond=None)[0]
+        rest = np.abs(residual - basis @ solution)
+        keep = rest <= 3 * 1.4826 * np.median(rest) + 1e-9
+    return float(np.median(residual)), float(solution[1]), float(solution[2]), float(np.median(rest))
+
+
+def _too_few(matches: PairMatches, where: str) -> Finding:
+    return Finding(
+        "few_matches",
+        "note",
+        where,
+        f"{matches.num_candidates} feature matches between the images",
+        f"at least {MIN_MATCHES}",
+        "nothing, where the images have little texture; the pair was not checked",
+    )
+
+
+def _other_scene(matches: PairMatches, where: str) -> Finding:
+    return Finding(
+        "different_scenes",
+        "error",
+        where,
+        f"{len(matches)} of {matches.num_candidates} feature matches obey a common geometry",
+        f"at least {MIN_INLIER_SHARE:.0%} of them",
+        "check that left and right file of a frame carry the same name, and that neither is mirrored",
+    )
+
+
+def _same_image(where: str) -> Finding:
+    return Finding(
+        "same_image",
+        "error",
+        where,
+        "matched points have the same place in both images",
+        "disparity between the two images",
+        "give the right camera's images, not copies of the left ones",
+    )

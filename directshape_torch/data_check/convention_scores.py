@@ -1,0 +1,102 @@
+"""How well boxes explain the image under each convention in which they might have been written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.data_check.box_conventions import BoxConvention, all_conventions
+from directshape_torch.data_check.car_evidence import CarBoxes, FrameEvidence
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.io.kitti_labels import shift_frame
+from directshape_torch.io.mask_matching import box_iou, project_boxes
+
+# Rather the documented convention than one that explains the same a little better.
+_PENALTY_PER_DEVIATION = 0.02
+# Cars are longer than wide and wide or high; a turned box and a swapped pair of lengths project alike.
+_PENALTY_SHORT_CARS = 0.2
+# What it counts when all observation angles agree with heading and place.
+_ANGLE_WEIGHT = 0.15
+_ANGLE_TOLERANCE_RAD = 0.06
+# KITTI's number for angles that are not known, and what is no angle in radians.
+_MAX_ANGLE_RAD = 2 * np.pi + 0.01
+
+
+@dataclass(frozen=True)
+class ConventionScores:
+    """Overlaps of N projected boxes with what the image shows, for C conventions.
+
+    Attributes:
+        conventions: C, the documented one first.
+        overlap: (C, N) with the 2D box of the detection or the box of its mask, whichever fits better.
+        penalty: (C,) to be taken from the mean overlap.
+        angle_share: (C,) share of the cars whose observation angle `alpha` agrees with heading and place.
+        has_angles: whether the observation angles say anything.
+    """
+
+    conventions: tuple[BoxConvention, ...]
+    overlap: NDArray[np.float64]
+    penalty: NDArray[np.float64]
+    angle_share: NDArray[np.float64]
+    has_angles: bool
+
+    @property
+    def score_with_angles(self) -> NDArray[np.float64]:  # (C,)
+        """The same with a premium for observation angles that agree."""
+        return np.asarray(self.score + _ANGLE_WEIGHT * self.has_angles * self.angle_share)
+
+    @property
+    def score(self) -> NDArray[np.float64]:  # (C,)
+        """Mean overlap less the penalty."""
+        return np.asarray(self.overlap.mean(axis=1) - self.penalty)
+
+
+def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
+    """The scores over the cars of all frames; there must be at least one."""
+    conventions = tuple(all_conventions())
+    overlap = np.concatenate([_overlaps(frame, conventions) for frame in frames if len(frame.boxes)], axis=1)
+    hwl = np.concatenate([frame.boxes.hwl for frame in frames])
+    penalty = [_penalty(convention, hwl) for convention in conventions]
+    alpha = np.concatenate([frame.boxes.alpha for frame in frames])
+    has_angles = bool((np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0))
+    angles = np.stack([_angles_agree(convention, frames) for convention in conventions])
+    return ConventionScores(conventions, overlap, np.array(penalty), angles.mean(axis=1), has_angles)
+
+
+def _angles_agree(convention: BoxConvention, frames: Sequence[FrameEvidence]) -> NDArray[np.bool_]:  # (N,)
+    """Whether `alpha = rotation_y - atan2(x, z)`, about."""
+    agree = []
+    for boxes in (convention.to_kitti(frame.boxes) for frame in frames):
+        expected = boxes.rotation_y - np.arctan2(boxes.location[:, 0], boxes.location[:, 2])
+        difference = np.angle(np.exp(1j * (boxes.alpha - expected)))
+        agree.append(np.abs(difference) < _ANGLE_TOLERANCE_RAD)
+    return np.concatenate(agree)
+
+
+def _penalty(convention: BoxConvention, hwl: NDArray[np.float64]) -> float:
+    zero = np.zeros(len(hwl))
+    boxes = CarBoxes(np.zeros_like(hwl), hwl, zero, zero, np.zeros((len(hwl), 4)))
+    height, width, length = np.median(convention.to_kitti(boxes).hwl, axis=0)
+    short = length < max(height, width)
+    return _PENALTY_PER_DEVIATION * len(convention.deviations) + _PENALTY_SHORT_CARS * bool(short)
+
+
+def _overlaps(frame: FrameEvidence, conventions: Sequence[BoxConvention]) -> NDArray[np.float64]:  # (C, N)
+    found = [convention.to_kitti(frame.boxes) for convention in conventions]
+    T_ref_obj = pose_from_kitti(
+        torch.from_numpy(np.concatenate([boxes.location for boxes in found])),
+        torch.from_numpy(np.concatenate([boxes.rotation_y for boxes in found])),
+    )
+    hwl = torch.from_numpy(np.concatenate([boxes.hwl for boxes in found]))
+    T_cam_obj = shift_frame(T_ref_obj, frame.camera.t_cam_ref[0])
+    projected, _ = project_boxes(T_cam_obj, hwl, frame.camera, frame.size_hw)
+    per_convention = projected.reshape(len(conventions), len(frame.boxes), 4)
+    overlaps = np.zeros(per_convention.shape[:2])
+    for car, seen in enumerate(zip(frame.boxes.box_2d, frame.mask_boxes, strict=True)):
+        both = np.nan_to_num(box_iou(per_convention[:, car], np.array(seen)))
+        overlaps[:, car] = both.max(axis=1)
+    return overlaps
