@@ -63,7 +63,7 @@ function restart() {
 function head(column) {
   const arrow = element("span", { class: "arrow", "aria-hidden": "true" });
   const cell = element("th", { scope: "col", "aria-sort": "none" },
-    element("button", { type: "button", onclick: () => sortBy(column) }, column.title, " ", arrow));
+    element("button", { type: "button", onclick: () => sortBy(column) }, column.title, arrow));
   heads.set(column, { cell, arrow });
   return cell;
 }
@@ -75,7 +75,7 @@ function sortBy(column) {
   for (const [other, { cell, arrow }] of heads) {
     const chosen = other === column;
     cell.setAttribute("aria-sort", chosen ? (state.descending ? "descending" : "ascending") : "none");
-    arrow.textContent = chosen ? (state.descending ? "▼" : "▲") : "";
+    arrow.textContent = chosen ? (state.descending ? " ▼" : " ▲") : "";
   }
   restart();
 }
