@@ -71,10 +71,11 @@ def refine_dataset(
     _check_out_dir(dataset, out_dir)
     with RunLock(out_dir):
         remove_unfinished_files(out_dir)
-        if fresh:
-            remove_results(out_dir, (_TIMINGS, run_path(out_dir).name))
-        run = _Run(dataset, refiner, out_dir, options, observer or SilentObserver(), workers or WorkerOptions())
-        return run.execute()
+        is_cleared = fresh and remove_results(out_dir, (_TIMINGS, run_path(out_dir).name))
+        manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
+        record = RunRecord(out_dir, manifest, is_cleared)
+        observer, workers = observer or SilentObserver(), workers or WorkerOptions()
+        return _Run(dataset, refiner, record, options, observer, workers).execute()
 
 
 class _Run:
@@ -84,22 +85,21 @@ class _Run:
         self,
         dataset: StereoDataset,
         refiner: DirectShapeRefiner,
-        out_dir: Path,
+        record: RunRecord,
         options: RefineOptions,
         observer: RunObserver,
         who: WorkerOptions,
     ) -> None:
-        self.dataset, self.out_dir, self.options, self.observer, self.who = dataset, out_dir, options, observer, who
+        self.dataset, self.record, self.options, self.observer, self.who = dataset, record, options, observer, who
+        self.out_dir, manifest = record.out_dir, record.manifest
         if who.in_this_process:
             limit_threads(who.threads)
-        manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
-        self.record = RunRecord(out_dir, manifest)
         self.timings = RunTimings(refiner.prior.origin.device)
         # Of all frames, also of those that are finished: after an interruption the decision must be the same.
         num_cars = expected_cars(dataset, dataset.frame_ids)
         prior_sha256 = manifest.sha256["prior"] or ""
-        self.job = RunJob(dataset, refiner, out_dir, options, prior_sha256, num_cars, _new_run_id())
-        before, self.file = read_run_file(out_dir), self._run_file(manifest)
+        self.job = RunJob(dataset, refiner, self.out_dir, options, prior_sha256, num_cars, _new_run_id())
+        before, self.file = read_run_file(self.out_dir), self._run_file(manifest)
         self.digit_warnings = digit_warnings(before, self.file)
         self.num_halved = 0
 

@@ -36,6 +36,7 @@ class RunRecord:
     Args:
         out_dir: the output folder.
         manifest: settings and hashes of this run, without frames.
+        is_cleared: the results of earlier runs were just removed, and what is left is no result.
 
     Attributes:
         manifest: with the frames of earlier runs.
@@ -46,14 +47,15 @@ class RunRecord:
         ResumeError: the folder holds results of other settings, or results without a summary.
     """
 
-    def __init__(self, out_dir: Path, manifest: RunManifest) -> None:
+    def __init__(self, out_dir: Path, manifest: RunManifest, is_cleared: bool = False) -> None:
         self.out_dir = out_dir
         self.path = summary_path(out_dir)
         self.remade: list[str] = []
         self.num_damaged_lines = 0
         previous = read_manifest(self.path)
         if previous is None:
-            self._check_empty()
+            if not is_cleared:
+                self._check_empty()
             # Of a summary that somebody removed together with the results.
             remove_journals(out_dir)
             self.manifest = manifest
@@ -158,19 +160,22 @@ def remove_unfinished_files(out_dir: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def remove_results(out_dir: Path, others: Iterable[str]) -> None:
+def remove_results(out_dir: Path, others: Iterable[str]) -> bool:
     """Remove what runs have written into a folder, and nothing else: the files their records name.
 
     Args:
         out_dir: the output folder.
         others: further files of runs, beside the summary.
 
+    Returns:
+        Whether there was a summary that names them; without one nothing is removed.
+
     Raises:
         DataFormatError: the folder has a summary that cannot be read, so nobody knows which files are results.
     """
     previous = read_manifest(summary_path(out_dir))
     if previous is None:
-        return
+        return False
     records = [FrameRecord(frame_id, {}, entry) for frame_id, entry in previous.frames.items()]
     for record in [*records, *read_journals(out_dir).records]:
         paths = (path(out_dir, record.frame_id) for path in (result_path, shapes_path, overlay_path))
@@ -184,3 +189,4 @@ def remove_results(out_dir: Path, others: Iterable[str]) -> None:
     for name in _OUTPUT_FOLDERS:
         with suppress(OSError):  # files of somebody else stay, and their folder with them
             (out_dir / name).rmdir()
+    return True

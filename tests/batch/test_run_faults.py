@@ -1,0 +1,185 @@
+"""Runs that are killed, cut short, crowded out: the next run ends with the bytes of one that nothing happened to."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers.faulty_refiners import QuickRefiner
+from helpers.kitti_folder import write_data_set
+from helpers.output_folders import result_files
+
+from directshape_torch.batch.journal import journal_folder, read_journals
+from directshape_torch.batch.options import RefineOptions, WorkerOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.run_lock import RunLock
+from directshape_torch.batch.run_status import read_status
+from directshape_torch.batch.run_summary import RunSummary
+from directshape_torch.errors import DirectShapeError, RunInProgressError
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+
+FRAMES = tuple(f"{number:06d}" for number in range(6))
+TESTS = Path(__file__).parent.parent
+_PATIENCE_S = 120.0
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root, FRAMES)
+    return root
+
+
+def refine(root: Path, out: Path, options: RefineOptions | None = None, fresh: bool = False) -> RunSummary:
+    dataset = KittiStereoDataset(root, root / "detections", root / "masks")
+    return refine_dataset(dataset, QuickRefiner(root), out, options, workers=WorkerOptions(threads=1), fresh=fresh)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    refine(root, out)
+    return out
+
+
+def killed_in_the_middle(root: Path, out: Path) -> list[str]:
+    """Kill a run with two workers when it has finished a frame or two; which, and wait for its workers to go."""
+    environment = {**os.environ, "PYTHONPATH": str(TESTS), "OMP_NUM_THREADS": "1"}
+    run = subprocess.Popen(
+        [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out)], env=environment
+    )
+    try:
+        wait_until(lambda: run.poll() is not None or len(read_journals(out).records) > 0)
+        assert run.poll() is None, "the run ended before it was killed"
+        status = read_status(out)
+        assert (status.state, status.num_frames) == ("running", len(FRAMES))
+        assert status.num_left == len(FRAMES) - status.num_done > 0
+    finally:
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+    workers = [int(path.stem.rpartition("-")[2]) for path in journal_folder(out).iterdir()]
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
+    return [record.frame_id for record in read_journals(out).records]
+
+
+def wait_until(condition: object) -> None:
+    end = time.monotonic() + _PATIENCE_S
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
+def test_a_run_that_is_killed_and_damaged_goes_on_where_it_was(root: Path, tmp_path: Path, undisturbed: Path) -> None:
+    out = tmp_path / "out"
+    finished = killed_in_the_middle(root, out)
+    assert 0 < len(finished) < len(FRAMES)
+    assert read_status(out).state == "killed"
+    # Everything else that a killed process may leave: a line and a file cut short, a file nobody moved to its name.
+    journal = next(iter(journal_folder(out).iterdir()))
+    journal.write_bytes(journal.read_bytes() + b'0123456789abcdef {"frame_id": "0000')
+    (out / "data" / ".000005.txt.k3j4.tmp").write_text("Car 0.00")
+    damaged = out / "shapes" / f"{finished[0]}.npz"
+    damaged.write_bytes(damaged.read_bytes()[:1000])
+    status = read_status(out)
+    assert (status.num_done, status.num_damaged_lines) == (len(finished), 1)
+    before = {frame_id: (out / "data" / f"{frame_id}.txt").stat().st_ino for frame_id in finished}
+
+    summary = refine(root, out)
+    assert summary.exit_code == 0
+    assert sorted(summary.resumed) == sorted(finished[1:])
+    assert len(summary.timings.calls) == len(FRAMES) - len(summary.resumed)
+    assert any(
+        f"files of 1 finished frames were damaged or gone and made again: {finished[0]}" in warning
+        for warning in summary.warnings
+    )
+    for frame_id in finished[1:]:
+        assert (out / "data" / f"{frame_id}.txt").stat().st_ino == before[frame_id]
+    assert result_files(out) == result_files(undisturbed)
+    assert read_status(out).state == "finished"
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of one megabyte."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = shutil.which("mount")
+    if mount is None or not hasattr(os, "geteuid") or os.geteuid() != 0:
+        pytest.skip("only root can mount a small file system")
+    mounted = subprocess.run(
+        [mount, "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(disk)], capture_output=True, text=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip(f"no file system can be mounted here: {mounted.stderr.strip()}")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("room_kb", [20, 52, 60])
+def test_a_full_disk_stops_a_run_and_room_lets_it_go_on(
+    root: Path, small_disk: Path, undisturbed: Path, room_kb: int
+) -> None:
+    out = small_disk / "out"
+    out.mkdir()
+    free = shutil.disk_usage(small_disk).free
+    (small_disk / "filler").write_bytes(b"x" * (free - room_kb * 1024))
+    with pytest.raises((DirectShapeError, OSError), match="No space left on device"):
+        refine(root, out)
+    assert not list(out.rglob("*.tmp"))
+    (small_disk / "filler").unlink()
+    noted = [record.frame_id for record in read_journals(out).records]
+    summary = refine(root, out)
+    assert set(noted) <= set(summary.resumed)
+    assert len(summary.timings.calls) == len(FRAMES) - len(summary.resumed)
+    assert result_files(out) == result_files(undisturbed)
+
+
+def test_two_runs_at_once(root: Path, tmp_path: Path, undisturbed: Path) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    with RunLock(out), pytest.raises(RunInProgressError, match="another run is writing here"):
+        refine(root, out)
+    assert result_files(out) == result_files(undisturbed)
+    assert len(refine(root, out).resumed) == len(FRAMES)
+
+
+def test_frames_of_a_group_that_was_cut_get_the_bytes_of_the_whole_group(root: Path, tmp_path: Path) -> None:
+    options = RefineOptions(batch_frames=3)
+    refine(root, tmp_path / "whole", options)
+    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    for path in (tmp_path / "cut").glob(f"*/{FRAMES[1]}.*"):
+        path.unlink()
+    kept = (tmp_path / "cut" / "data" / f"{FRAMES[0]}.txt").stat().st_ino
+    summary = refine(root, tmp_path / "cut", options)
+    assert summary.resumed == (FRAMES[0], *FRAMES[2:])
+    assert [call.frame_ids for call in summary.timings.calls] == [FRAMES[:3]]
+    assert (tmp_path / "cut" / "data" / f"{FRAMES[0]}.txt").stat().st_ino == kept
+    assert result_files(tmp_path / "cut") == result_files(tmp_path / "whole")
+
+
+def test_a_fresh_start_removes_results_and_nothing_else(root: Path, tmp_path: Path, undisturbed: Path) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    (out / "data" / "notes.txt").write_text("mine")
+    (out / "shapes" / "000003.npz").write_bytes(b"damaged")
+    summary = refine(root, out, fresh=True)
+    assert summary.resumed == ()
+    assert len(summary.timings.calls) == len(FRAMES)
+    assert (out / "data" / "notes.txt").read_text() == "mine"
+    (out / "data" / "notes.txt").unlink()
+    assert result_files(out) == result_files(undisturbed)
+
+
+def test_other_threads_than_before_are_a_warning(root: Path, tmp_path: Path, undisturbed: Path) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    (out / "data" / "000002.txt").unlink()
+    assert any(
+        "batch_frames were 1 in the previous run and are 2 now: the last digits" in warning
+        for warning in refine(root, out, RefineOptions(batch_frames=2)).warnings
+    )

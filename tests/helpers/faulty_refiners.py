@@ -1,0 +1,83 @@
+"""Refiners that do to their process what happens in the field; classes, so that workers can be sent them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.config_files import load_config
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+FEW_STEPS = (
+    "stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]",
+    # The model of trust does not know toys that have not converged.
+    "acceptance.min_probability_not_worse=0",
+)
+
+
+def few_steps() -> RefinerConfig:
+    return load_config(None, FEW_STEPS)
+
+
+class QuickRefiner(DirectShapeRefiner):
+    """Two iterations, with the prior of a data set of `helpers.kitti_folder`."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(PCAShapePrior.load(root / "prior.npz"), few_steps())
+
+
+class DeadlyRefiner(QuickRefiner):
+    """Kills its process, as the system does when memory runs out, where one of some frames is in the call.
+
+    Args:
+        root: of the data set.
+        always: frames that kill each time.
+        once: frames that kill the first time, by a note in the folder `notes`.
+    """
+
+    def __init__(self, root: Path, notes: Path, always: Collection[str] = (), once: Collection[str] = ()) -> None:
+        super().__init__(root)
+        self.notes, self.always, self.once = notes, frozenset(always), frozenset(once)
+
+    def forward(self, frames: FrameBatch, *args: Any) -> RefinementResult:
+        for frame_id in frames.frame_ids:
+            note = self.notes / frame_id
+            if frame_id in self.always or (frame_id in self.once and not note.exists()):
+                note.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+        return super().forward(frames, *args)
+
+
+class HungryRefiner(QuickRefiner):
+    """Needs a gigabyte for a call of several frames, which its process may not have."""
+
+    def forward(self, frames: FrameBatch, *args: Any) -> RefinementResult:
+        import resource
+
+        if len(frames) > 1:
+            limits = resource.getrlimit(resource.RLIMIT_AS)
+            pages_in_use = int(Path("/proc/self/statm").read_text().split()[0])
+            resource.setrlimit(resource.RLIMIT_AS, (pages_in_use * resource.getpagesize() + 2**26, limits[1]))
+            try:
+                torch.ones(2**28)
+            finally:
+                resource.setrlimit(resource.RLIMIT_AS, limits)
+        return super().forward(frames, *args)
+
+
+class SlowRefiner(QuickRefiner):
+    """Takes its time, so that there is some to be killed in."""
+
+    def forward(self, *args: Any) -> RefinementResult:
+        time.sleep(0.5)
+        return super().forward(*args)

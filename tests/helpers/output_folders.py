@@ -1,0 +1,14 @@
+"""What a run has left in its output folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def result_files(folder: Path) -> dict[str, bytes]:
+    """All files but those that tell of the run itself, by name."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name not in ("timings.json", "run.json")
+    }

@@ -1,0 +1,20 @@
+"""A run by two slow workers, for a test that kills it: slow_run.py ROOT OUT."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from directshape_torch.batch.options import WorkerOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from helpers.faulty_refiners import SlowRefiner
+
+
+def main(root: Path, out_dir: Path) -> None:
+    dataset = KittiStereoDataset(root, root / "detections", root / "masks")
+    refine_dataset(dataset, SlowRefiner(root), out_dir, workers=WorkerOptions(workers=2))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
