@@ -27,6 +27,7 @@ _EITHER_SIGN = "a quaternion and its negative are the same rotation, and so3_log
 _BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its value nor its derivative gets anywhere"
 _IN_PAIRS = "enters as a square, or twice as a factor"
 _FOR_SPEED = "a threshold that only saves work: what it leaves out is below the rounding of the sum"
+_VALUE_UNUSED = "carried along with the derivatives, and the Jacobian does not depend on it"
 _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEIGHT, dtype=self.zeta.dtype))"
 
 EQUIVALENTS: tuple[Equivalent, ...] = (
@@ -68,6 +69,20 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         "K @ points_cam[..., None]",
         "(-(K @ points_cam[..., None]))",
         "both sides of the ratio u = h_x / h_z change sign",
+    ),
+    Equivalent(
+        "closest_depth",
+        "_SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=0)",
+        "(-(_SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=0)))",
+        "the three samples lie symmetric about the depth, so the slope changes its sign with the step",
+    ),
+    Equivalent("_residual_and_jacobian", "at.value", "(-at.value)", _VALUE_UNUSED),
+    Equivalent("surface_under", "at.value", "(-at.value)", _VALUE_UNUSED),
+    Equivalent(
+        "Blocks.join",
+        "(0, width - place.shape[1])",
+        "(width - place.shape[1], 0)",
+        "both widths are powers of two: pairs of places stay pairs, and empty places change no bit at either end",
     ),
     Equivalent("log_one_minus_exp", "-0.5", "(0.5)", _BRANCH_NOT_TAKEN),
     Equivalent("log_one_minus_exp", "-1.0", "(1.0)", _BRANCH_NOT_TAKEN),

@@ -59,9 +59,9 @@ def paraboloid_field(centres: Tensor, curvatures: Tensor) -> QuadraticField:
 
 
 def random_rays(owner: Tensor, seed: int = 1, spread: float = 0.15) -> BlockRays:
-    """Rays of unit depth about the optical axis of cameras near the origin."""
+    """Rays about the optical axis of cameras near the origin, their own depth not quite that of the left camera."""
     ray = random(3, len(owner), 64, seed=seed, scale=spread)
-    ray[2] = 1.0
+    ray[2] = 1.0 + 0.1 * ray[2]
     return BlockRays(owner, random(len(owner), 3, seed=seed + 1, scale=0.3), ray)
 
 

@@ -1,0 +1,60 @@
+"""Five cars in two frames of different sizes, one behind another: a batch in which nothing is the same for all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.solver.problem import StageProblem
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detections, joined_frames, select, street
+
+
+@lru_cache(maxsize=1)
+def five_cars() -> tuple[PCAShapePrior, FrameBatch, Detections]:
+    """Rendered once a test session in float64; the detections are disturbed. The second and third car stand partly
+    behind the first, as does the fifth behind the fourth."""
+    prior = ellipsoid_prior()
+    code = torch.tensor([[0.8, -0.5, 0.6], [-0.7, 0.4, 0.5], [0.1, 0.9, -0.6]], dtype=torch.float64)
+    y = CAMERA_HEIGHT_M
+    first = street(prior, [(-1.3, y, 8.0), (1.9, y, 12.5), (-0.2, y, 14.0)], [0.5, -1.2, 1.4], code, (112, 84), 105.0)
+    second = street(prior, [(0.6, y, 9.0), (-2.4, y, 11.0)], [-0.4, 2.6], code[:2], (96, 72), 100.0)
+    frames = joined_frames([first.frames, second.frames])
+    detections = joined_detections([first.detections, second.detections], (84, 112))
+    return prior, frames, disturbed(detections)
+
+
+def begun_stage(
+    config: RefinerConfig = DEFAULT,
+    stage: int = 1,
+    cars: list[int] | None = None,
+    term_weights: dict[str, Tensor] | None = None,
+) -> tuple[CarProblem, StageProblem[CarState], CarState]:
+    """The problem of some of the cars, what the iterations of a stage see of it, and the state where it began."""
+    prior, frames, detections = five_cars()
+    if cars is not None:
+        detections = select(detections, torch.tensor(cars, dtype=torch.long))
+    problem, state = DirectShapeRefiner(prior, config).problem(frames, detections, term_weights)
+    return problem, problem.begin_stage(problem.stages()[stage], state), state
+
+
+def with_solver(config: RefinerConfig, **changes: object) -> RefinerConfig:
+    """Other settings of the solver."""
+    return replace(config, solver=replace(config.solver, **changes))  # type: ignore[arg-type]
+
+
+def step_of(num_cars: int, motion: float, code: float, seed: int = 7) -> Tensor:
+    """A seeded step (B, 9): standard deviations in metres and radians, and of the code."""
+    generator = torch.Generator().manual_seed(seed)
+    scale = torch.tensor([motion] * 6 + [code] * 3, dtype=torch.float64)
+    return scale * torch.randn(num_cars, 9, generator=generator, dtype=torch.float64)
