@@ -49,7 +49,7 @@ def test_ends_of_the_trace_are_input_and_result(trace: RefinementTrace, demo_fra
 def test_costs_at_the_ends_are_those_of_the_result(trace: RefinementTrace) -> None:
     result, refined = trace.result, trace.result.refined
     torch.testing.assert_close(trace.costs[0], result.cost_before, rtol=0, atol=0, equal_nan=True)
-    torch.testing.assert_close(trace.costs[-1][refined], result.cost_after[refined], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(trace.costs[-1][refined], result.cost_after[refined], rtol=2e-4, atol=1e-6)
 
 
 def test_car_without_pose_takes_no_part(trace: RefinementTrace) -> None:

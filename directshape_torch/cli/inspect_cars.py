@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from directshape_torch.io.kitti_labels import poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.stereo_matching.dense_disparity import with_disparity
 from directshape_torch.visualize.inspection.car_figures import write_car_figures
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.point_figure import stereo_points
@@ -40,11 +42,13 @@ def inspect_frame(
     Raises:
         InputError: the single car was not refined; says why.
     """
+    # Matched once, for the point figure and for the methods that fit points; the others do not look at it.
+    loaded = replace(loaded, frame=with_disparity(loaded.frame, refiner.config.point_cloud.matcher))
     trace = trace_refinement(refiner, loaded.frame, loaded.detections)
     _report(loaded, trace, rows)
     write_png(out_dir / f"{loaded.frame_id}.png", overlay_of_frame(loaded, trace.result))
     drawn = [row for row in rows if trace.place_of(row) >= 0]
-    silhouettes = _silhouette_trace(refiner, loaded) if drawn else None
+    silhouettes = silhouette_trace(refiner, loaded) if drawn else None
     clouds = stereo_points(loaded.frame, loaded.detections, refiner.config.point_cloud) if drawn else []
     truth, known = true_corners_cam(loaded), true_points(root, loaded)
     for row in tqdm(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
@@ -58,8 +62,8 @@ def inspect_frame(
         write_car_figures(out_dir / f"{loaded.frame_id}_{line}", view, by_silhouettes)
 
 
-def _silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
-    """The drift is one between the paper's terms: other methods, and settings without one of the two, have none."""
+def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
+    """Of a refinement by silhouettes and priors alone; None where the refiner lacks one of the paper's terms."""
     config = refiner.config
     if config.method != "direct" or not (config.photometric.weight > 0 and config.silhouette.weight > 0):
         return None

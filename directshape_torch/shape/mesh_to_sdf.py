@@ -212,7 +212,12 @@ def _surface_points(mesh_obj: trimesh.Trimesh, step_m: float) -> list[Array]:
 
 def _solid(surface: Voxels, mesh_obj: trimesh.Trimesh, options: MeshOptions, name: str) -> Voxels:
     """What the outside cannot reach, with the narrowest closing that makes the mesh solid."""
-    hull_m3 = float(mesh_obj.convex_hull.volume)
+    from scipy.spatial import QhullError
+
+    try:
+        hull_m3 = float(mesh_obj.convex_hull.volume)
+    except QhullError as problem:
+        raise MeshError(f"{name}: is flat, or has fewer than four corners") from problem
     share = 0.0
     for closing_m in (0.25 * options.closing_m, 0.5 * options.closing_m, options.closing_m):
         solid = _fill(surface, closing_m / options.voxel_m)

@@ -101,3 +101,9 @@ def test_unreadable_files_and_options(tmp_path):
         MeshOptions(forward_axis="+x", up_axis="-x")
     with pytest.raises(InputError, match="scale: expected a positive number"):
         MeshOptions(scale=0.0)
+
+
+def test_flat_mesh_is_refused_by_name():
+    triangle = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, -1, 0]], [[0, 1, 2]], process=False)
+    with pytest.raises(MeshError, match="a sheet: is flat"):
+        mesh_to_sdf(triangle, GRID, COARSE, "a sheet")

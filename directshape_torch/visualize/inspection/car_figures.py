@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from directshape_torch.io.atomic_files import write_png
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.contour_figure import write_contour_figure
 from directshape_torch.visualize.inspection.cost_figure import write_cost_figure
@@ -14,16 +13,18 @@ from directshape_torch.visualize.inspection.iteration_animation import write_ite
 from directshape_torch.visualize.inspection.known_point_figure import write_known_point_figure
 from directshape_torch.visualize.inspection.point_figure import write_point_figure
 from directshape_torch.visualize.inspection.residual_figure import write_residual_figure
+from directshape_torch.visualize.inspection.sampling_figure import write_occlusion_picture, write_sampling_figure
 from directshape_torch.visualize.inspection.shape_figure import write_shape_figure
-from directshape_torch.visualize.observation_sheet import observation_sheet
 
 _OF_ONE_VIEW: dict[str, Callable[[Path, CarView], None]] = {
+    "sampling.png": write_sampling_figure,
+    "occlusion.png": write_occlusion_picture,
     "residuals.png": write_residual_figure,
     "iterations.png": write_contour_figure,
+    "iterations.gif": write_iteration_animation,
     "costs.png": write_cost_figure,
     "shape.png": write_shape_figure,
     "points.png": write_point_figure,
-    "iterations.gif": write_iteration_animation,
 }
 
 
@@ -38,20 +39,11 @@ def write_car_figures(folder: Path, view: CarView, silhouettes: CarView | None =
     Raises:
         MissingDependencyError: matplotlib or Pillow is not installed.
     """
-    written = []
-    detections, sampling = view.loaded.detections, view.trace.problem.config.sampling
-    if bool(detections.has_mask_left[view.car]):
-        sheet = observation_sheet(view.loaded.frame, detections, view.car, sampling)
-        folder.mkdir(parents=True, exist_ok=True)
-        write_png(folder / "observation.png", sheet)
-        written.append(folder / "observation.png")
-    for name, write in _OF_ONE_VIEW.items():
-        write(folder / name, view)
-        written.append(folder / name)
+    figures = dict(_OF_ONE_VIEW)
     if silhouettes is not None:
-        write_drift_figure(folder / "drift.png", view, silhouettes)
-        written.append(folder / "drift.png")
+        figures["drift.png"] = lambda path, full: write_drift_figure(path, full, silhouettes)
     if view.known_points is not None:
-        write_known_point_figure(folder / "scan.png", view)
-        written.append(folder / "scan.png")
-    return written
+        figures["scan.png"] = write_known_point_figure
+    for name, write in figures.items():
+        write(folder / name, view)
+    return [folder / name for name in figures]

@@ -159,6 +159,12 @@ class CarView:
         """Middle of the footprint (2,), x and z, metres."""
         return np.asarray(self.footprint(number).mean(axis=0))
 
+    def height_above_ground(self, points_cam: Array) -> Array:
+        """Height (P,) of points (P, 3) above the frame's ground plane, metres."""
+        ground = self.loaded.frame.ground
+        normal, offset = ground.normal[0].double().cpu().numpy(), float(ground.offset[0])
+        return np.asarray(points_cam @ normal + offset)
+
     def mask_lines(self, side: Side) -> list[Array]:
         """Outline of the instance mask, lines (n, 2) of pixels; none where there is no mask."""
         d = self.loaded.detections

@@ -20,6 +20,8 @@ Ink = Any  # whatever matplotlib takes for a colour
 
 DETECTOR_INK, TRUTH_INK, MASK_INK, BEFORE_INK, AFTER_INK = "darkorange", "limegreen", "white", "darkorange", "royalblue"
 _BIRDS_EYE_MARGIN_M = 0.7
+# Points of the road would cover the cars.
+_LEAST_HEIGHT_M = 0.2
 
 
 def write_figure(path: Path | str, figure: Any) -> None:
@@ -77,6 +79,7 @@ def show_birds_eye(axes: Any, view: CarView, others: Sequence[Array] = ()) -> No
     half = np.ptp(corners, axis=0).max() / 2 + _BIRDS_EYE_MARGIN_M
     if view.known_points is not None:
         points = view.known_points.points_cam
+        points = points[view.height_above_ground(points) > _LEAST_HEIGHT_M]
         axes.plot(points[:, 0], points[:, 2], ".", color="0.6", markersize=2, label=view.known_points.name, zorder=0)
     if view.truth_corners_cam is not None:
         truth = footprint_of_corners(view.truth_corners_cam)

@@ -23,11 +23,11 @@ def code_path(num_codes: int, steps_a_code: int = _STEPS_A_CODE) -> Tensor:
     """Codes (K steps, K) that go to +2, to -2 and back to the mean shape, one code after the other.
 
     Example:
-        >>> code_path(2, steps_a_code=4).round().tolist()
-        [[0.0, 0.0], [2.0, 0.0], [0.0, 0.0], [-2.0, 0.0], [0.0, 0.0], [0.0, 2.0], [0.0, 0.0], [0.0, -2.0]]
+        >>> code_path(2, steps_a_code=4).round().int().tolist()
+        [[0, 0], [2, 0], [0, 0], [-2, 0], [0, 0], [0, 2], [0, 0], [0, -2]]
     """
     angle = 2 * math.pi * torch.arange(steps_a_code) / steps_a_code
-    swing = _LARGEST * torch.sin(angle) + 0.0
+    swing = _LARGEST * torch.sin(angle)
     blocks = [swing[:, None] * torch.eye(num_codes)[k] for k in range(num_codes)]
     return torch.cat(blocks)
 

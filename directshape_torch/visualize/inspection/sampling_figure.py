@@ -1,0 +1,84 @@
+"""The sampled pixels of a car in both images, two rounds in two colours, and what hides it (paper, both figures)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.admission import without_empty_masks
+from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.io.atomic_files import write_png
+from directshape_torch.io.figure_files import new_figure
+from directshape_torch.observation.occlusion import Side, hidden_pixels
+from directshape_torch.observation.packing import car_regions, sampling_settings
+from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.visualize.inspection.car_view import CarView
+from directshape_torch.visualize.inspection.panels import draw_lines, show_crop, write_figure
+from directshape_torch.visualize.sampling_picture import PANEL_GAP_PX, occlusion_picture
+
+_SIZE_INCHES = (12.0, 5.0)
+_STRONG_INK, _FILL_INK = "lime", "red"
+_SIDES: tuple[Side, Side] = ("left", "right")
+
+
+class SampledPixels(NamedTuple):
+    """Pixels of one car in one image that its terms look at."""
+
+    uv: NDArray[np.int64]  # (P, 2)
+    above_threshold: NDArray[np.bool_]  # (P,) chosen for a strong gradient, not to fill its cell
+    num_hidden: int  # chosen pixels that a nearer instance hides: they are left out
+
+
+def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
+    """The pixels as the refinement chose them, with the round that each comes from."""
+    config = view.trace.problem.config.sampling
+    frames, detections = view.loaded.frame, without_empty_masks(view.loaded.detections)
+    left, right = car_regions(frames, detections, config)
+    images, regions = (frames.images_left, left) if side == "left" else (frames.images_right, right)
+    magnitude = gradient_magnitude(image_gradient(grey_levels(images), frames.sizes))
+    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config))
+    mine = chosen.object_index == view.car
+    uv, above = chosen.uv[mine], chosen.above_threshold[mine]
+    hidden = hidden_pixels(detections, side, chosen.object_index[mine], uv, config.occlusion_order)
+    kept = ~hidden if config.occlusion else torch.ones_like(hidden)
+    return SampledPixels(np.asarray(uv[kept].cpu()), np.asarray(above[kept].cpu()), int((~kept).sum()))
+
+
+def write_sampling_figure(path: Path | str, view: CarView) -> None:
+    """Write the figure as PNG, both images side by side.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure(*_SIZE_INCHES, "drawing sampled pixels")
+    figure.suptitle(view.title)
+    for axes, side in zip(figure.subplots(1, 2), _SIDES, strict=True):
+        pixels = sampled_pixels(view, side)
+        strong = pixels.above_threshold
+        title = f"{side}: {strong.sum()} by their gradient, {(~strong).sum()} to fill cells, {pixels.num_hidden} hidden"
+        show_crop(axes, view.image(side), view.window(side), title)
+        draw_lines(axes, view.mask_lines(side), "white", "mask", linewidth=1.0)
+        for chosen, ink, name in ((strong, _STRONG_INK, "strong gradient"), (~strong, _FILL_INK, "strongest of cell")):
+            axes.plot(*pixels.uv[chosen].T, ".", color=ink, markersize=4, label=name)
+    axes.legend(loc="lower right", fontsize=8, facecolor="0.3", labelcolor="white")
+    write_figure(path, figure)
+
+
+def write_occlusion_picture(path: Path | str, view: CarView) -> None:
+    """Write, as PNG, image, masks and occlusion mask, the left image above the right one where it has a region too."""
+    detections = without_empty_masks(view.loaded.detections)
+    config = view.trace.problem.config.sampling
+    regions = car_regions(view.loaded.frame, detections, config)
+    rows = []
+    for side, region in zip(_SIDES, regions, strict=True):
+        u0, v0, u1, v1 = region[view.car].tolist()
+        if u1 > u0 and v1 > v0:
+            order = config.occlusion_order
+            rows.append(occlusion_picture(view.loaded.frame, detections, region, view.car, side, order))
+    width = max(row.shape[1] for row in rows)
+    padded = [np.pad(row, ((0, PANEL_GAP_PX), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
+    write_png(path, np.concatenate(padded))

@@ -1,0 +1,176 @@
+"""The data behind the figures of a car against the refinement itself and against geometry by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.config_files import load_config
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.observation.packing import pack_pixels
+from directshape_torch.refinement_trace import RefinementTrace, trace_refinement
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.visualize.drawing import Surface, View, silhouette_mask
+from directshape_torch.visualize.inspection.car_view import CarView, KnownPoints
+from directshape_torch.visualize.inspection.cost_figure import costs_of_car
+from directshape_torch.visualize.inspection.drift_figure import distance_course
+from directshape_torch.visualize.inspection.known_point_figure import write_known_point_figure
+from directshape_torch.visualize.inspection.point_figure import point_sets, shape_points_cam, stereo_points
+from directshape_torch.visualize.inspection.residual_values import photometric_residuals, silhouette_residuals
+from directshape_torch.visualize.inspection.sampling_figure import sampled_pixels
+
+_CAR = 1
+
+
+@pytest.fixture(scope="module")
+def view() -> CarView:
+    data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
+    loaded = data.load(data.frame_ids[0])
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off"]))
+    return CarView(loaded, trace_refinement(refiner, loaded.frame, loaded.detections), _CAR)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_contour_points_lie_on_the_zero_level_of_the_projected_distance(view: CarView, side: str) -> None:
+    lines = view.contours(side, len(view.trace) - 1)
+    assert lines
+    uv = torch.from_numpy(np.concatenate(lines)).float()[::7]
+    # The least distance along each ray, by brute force.
+    camera = view.loaded.frame.camera
+    K = camera.K_left[0] if side == "left" else camera.K_right[0]
+    ray = torch.cat([uv, torch.ones(len(uv), 1)], dim=1) @ torch.linalg.inv(K).T
+    origin = torch.zeros(3) if side == "left" else -camera.T_right_cam[0, :3, 3]
+    state = view.state(len(view.trace) - 1)
+    centre = se3.inverse(state.T_obj_cam)[0, 2, 3]
+    depth = torch.linspace(float(centre) - 4, float(centre) + 4, 1601)
+    points_cam = origin + depth[:, None, None] * ray
+    points_obj = points_cam.reshape(-1, 3) @ state.T_obj_cam[0, :3, :3].T + state.T_obj_cam[0, :3, 3]
+    low, high = view.prior.bounds_obj
+    inside = ((points_obj > low) & (points_obj < high)).all(dim=1)
+    sdf = view.prior.bind(state.code).value(points_obj, torch.zeros(len(points_obj), dtype=torch.long))
+    least = torch.where(inside, sdf, torch.inf).view(len(depth), -1).amin(dim=0)
+    metres_per_px = float(centre) / float(K[0, 0])
+    assert least.abs().max() < 0.25 * metres_per_px
+
+
+def test_contour_encloses_what_the_projected_mesh_covers(view: CarView) -> None:
+    number = len(view.trace) - 1
+    image, K = view.image("left"), view.loaded.frame.camera.K_left[0].double().numpy()
+    mesh = view.trace.result.mesh(_CAR)
+    covered = silhouette_mask(View(image.copy(), K), Surface(mesh.vertices, mesh.faces)) > 0
+    filled = np.zeros_like(image[..., 0])
+    cv2.fillPoly(filled, [np.round(line).astype(np.int32) for line in view.contours("left", number)], 255)
+    both, either = (filled > 0) & covered, (filled > 0) | covered
+    assert both.sum() / either.sum() > 0.96
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_sampled_pixels_are_those_of_the_observation(view: CarView, side: str) -> None:
+    seen = pack_pixels(view.loaded.frame, view.loaded.detections, view.trace.problem.config.sampling)
+    pixels = seen.left if side == "left" else seen.right
+    expected = pixels.uv[pixels.object_index == _CAR].long().numpy()
+    sampled = sampled_pixels(view, side)
+    assert {tuple(uv) for uv in sampled.uv.tolist()} == {tuple(uv) for uv in expected.tolist()}
+    assert len(sampled.uv) == len(expected)
+    assert 0 < sampled.above_threshold.sum() < len(expected)
+
+
+@pytest.mark.parametrize("number", [0, -1])
+def test_residuals_of_the_pixels_make_the_costs_of_the_trace(view: CarView, number: int) -> None:
+    trace = view.trace
+    number %= len(trace)
+    costs = dict(zip(trace.result.term_names, trace.costs[number, _CAR].tolist(), strict=True))
+    for side in ("left", "right"):
+        values = silhouette_residuals(trace, _CAR, number, side).value
+        weight = trace.problem.config.silhouette.weight
+        assert weight * values.mean() == pytest.approx(costs[f"silhouette_{side}"], rel=1e-5)
+
+
+def test_photometric_residuals_fall_and_lose_fewer_pixels(view: CarView) -> None:
+    before, after = (photometric_residuals(view.trace, _CAR, k) for k in (0, len(view.trace) - 1))
+    assert np.array_equal(before.uv, after.uv)
+    assert after.lost.sum() <= before.lost.sum()
+    both = ~before.lost & ~after.lost
+    assert np.abs(after.value[both]).mean() < np.abs(before.value[both]).mean()
+    term = next(t for t in view.trace.problem.terms if t.name == "photometric")
+    assert len(after.uv) == int(term.support()[view.trace.place_of(_CAR)])
+
+
+def test_costs_end_at_those_of_the_result(view: CarView) -> None:
+    costs, result = costs_of_car(view), view.trace.result
+    assert costs["sum"][0] == pytest.approx(float(result.cost_before[_CAR].sum()), rel=1e-9)
+    assert costs["sum"][-1] == pytest.approx(float(result.cost_after[_CAR].sum()), rel=2e-4)
+    assert set(costs) == {*result.term_names, "sum"}
+
+
+def test_footprint_is_the_box_of_the_result(view: CarView) -> None:
+    boxes = view.trace.result.boxes()
+    location = boxes.location_ref[_CAR] + view.loaded.frame.camera.t_cam_ref[0]
+    T_cam_box = pose_from_kitti(location, boxes.rotation_y[_CAR])
+    _, width, length = boxes.dimensions_hwl[_CAR].tolist()
+    corners = torch.tensor([[length, 0, width], [length, 0, -width], [-length, 0, -width], [-length, 0, width]]) / 2
+    expected = (corners @ T_cam_box[:3, :3].T + T_cam_box[:3, 3])[:, [0, 2]]
+    # The refined car leans with the ground by a degree or two, the box of a result file does not.
+    np.testing.assert_allclose(view.footprint(len(view.trace) - 1), expected, atol=0.06)
+
+
+def test_distances_begin_at_the_input(view: CarView) -> None:
+    without_truth = distance_course(view)
+    assert without_truth[0] == 0
+    assert len(without_truth) == len(view.trace)
+    corners = view.detector_corners_cam + np.array([3.0, 0.0, 4.0])
+    assert distance_course(replace(view, truth_corners_cam=corners))[0] == pytest.approx(5.0, abs=0.1)
+
+
+def test_points_of_the_shape_lie_on_it_and_under_the_mask(view: CarView) -> None:
+    points = shape_points_cam(view)
+    assert len(points) > 500
+    (ours,) = [s for s in point_sets(view) if s.name == "refined shape"]
+    assert np.abs(ours.distance_m).max() < 0.01
+    K = view.loaded.frame.camera.K_left[0].double().numpy()
+    uv = points @ K.T
+    u, v = np.rint(uv[:, :2] / uv[:, 2:]).astype(int).T
+    assert view.loaded.detections.mask_left[_CAR].numpy()[v, u].mean() > 0.99
+
+
+def test_stereo_points_are_near_the_car(view: CarView) -> None:
+    clouds = stereo_points(view.loaded.frame, view.loaded.detections, view.trace.problem.config.point_cloud)
+    assert len(clouds) == len(view.loaded.detections)
+    sets = point_sets(replace(view, stereo_points_cam=clouds[_CAR]))
+    assert [s.name for s in sets] == ["dense stereo", "refined shape"]
+    assert np.nanmedian(np.abs(sets[0].distance_m)) < 0.2
+
+
+def test_known_points_are_one_of_the_sets(view: CarView) -> None:
+    points = view.footprint(len(view.trace) - 1)
+    points_cam = np.stack([points[:, 0], np.full(4, 1.5), points[:, 1]], axis=1)
+    known = KnownPoints("a scan", points_cam, np.zeros((4, 2)), np.array([True, False, True, True]))
+    sets = point_sets(replace(view, known_points=known))
+    assert (sets[-1].name, len(sets[-1].points_obj)) == ("a scan", 3)
+    np.testing.assert_allclose(np.abs(sets[-1].points_obj[:, 0]), sets[-1].points_obj[:, 0].max(), atol=0.1)
+
+
+def test_scan_figure_needs_a_scan(view: CarView, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="scan"):
+        write_known_point_figure(tmp_path / "scan.png", view)
+
+
+def test_cars_that_did_not_take_part_are_refused(view: CarView) -> None:
+    detections = view.loaded.detections
+    T_cam_obj = detections.T_cam_obj.clone()
+    T_cam_obj[_CAR, 2, 3] = torch.nan
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", "stages=[{max_iterations: 1}]"]))
+    trace: RefinementTrace = trace_refinement(refiner, view.loaded.frame, replace(detections, T_cam_obj=T_cam_obj))
+    with pytest.raises(InputError, match="non_finite"):
+        CarView(view.loaded, trace, _CAR)
+    with pytest.raises(InputError, match="no such car"):
+        CarView(view.loaded, trace, 99)

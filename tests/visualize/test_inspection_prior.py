@@ -1,0 +1,104 @@
+"""The data behind the figures of a prior: fits of known cars, colours, sections, the path of the codes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from directshape_torch.errors import InputError
+from directshape_torch.shape.load_prior import load_prior
+from directshape_torch.shape.parametric_cars import car_sdf, sample_car
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.prior_quality import fit_code
+from directshape_torch.visualize.inspection.field_views import (
+    FRONT_VIEW,
+    coloured_surface,
+    distance_at,
+    section,
+    surface_colours,
+)
+from directshape_torch.visualize.inspection.prior_animation import code_frames, code_path
+from directshape_torch.visualize.inspection.prior_fit import fit_car, grid_of
+
+
+@pytest.fixture(scope="module")
+def prior() -> PCAShapePrior:
+    return PCAShapePrior.load_bundled()
+
+
+def _car(prior: PCAShapePrior) -> torch.Tensor:
+    nodes = grid_of(prior).nodes()
+    distance = car_sdf(sample_car(123_456, "saloon"), nodes.reshape(-1, 3)).reshape(nodes.shape[:-1])
+    return torch.from_numpy(distance.astype(np.float32))
+
+
+@pytest.mark.parametrize("name", ["pca", "neural"])
+def test_fit_finds_a_shape_of_the_prior_again(name: str) -> None:
+    prior = load_prior(name)
+    code = prior.initial_code(1)
+    code[0, 0], code[0, 1] = 1.2, -0.8
+    with torch.no_grad():
+        truth = prior.values(code)[0]
+    fitted = fit_car(prior, truth, "itself")
+    assert fitted.error_cm < 0.1
+    np.testing.assert_allclose(fitted.code[:2], [1.2, -0.8], atol=0.05)
+
+
+def test_fit_of_an_unseen_car_is_the_least_squares_one(prior: PCAShapePrior) -> None:
+    truth = _car(prior)
+    fitted, expected = fit_car(prior, truth, "saloon"), fit_code(prior, truth)
+    assert expected.code.abs().max() < 3
+    np.testing.assert_allclose(fitted.code, expected.code, atol=0.02)
+    assert fitted.error_cm == pytest.approx(expected.mean_error_cm, rel=0.01)
+
+
+def test_codes_stay_within_three_deviations(prior: PCAShapePrior) -> None:
+    code = prior.initial_code(1)
+    code[0, 0] = 6.0
+    assert fit_car(prior, prior.values(code)[0], "giant").code.abs().max() <= 3
+
+
+def test_fit_refuses_another_grid_and_a_field_without_surface(prior: PCAShapePrior) -> None:
+    with pytest.raises(InputError, match="truth"):
+        fit_car(prior, torch.zeros(3, 3, 3), "small")
+    with pytest.raises(InputError, match="near the surface"):
+        fit_car(prior, torch.full_like(prior.mean, 5.0), "nothing")
+
+
+def test_colours_tell_outside_from_inside_and_zero_is_pale() -> None:
+    outside, zero, inside = surface_colours(np.array([0.2, 0.0, -0.2]), 0.2)
+    assert outside[0] > outside[2] + 50
+    assert inside[2] > inside[0] + 50
+    assert zero.min() > 235
+
+
+def test_a_shape_has_no_distance_to_itself(prior: PCAShapePrior) -> None:
+    picture = coloured_surface(prior, prior.mean, prior.mean, FRONT_VIEW, 0.25).astype(int)
+    painted = picture[(picture < 250).any(axis=2)]
+    assert len(painted) > 5000
+    # All grey: shades of one pale colour.
+    assert (painted.max(axis=1) - painted.min(axis=1)).max() < 12
+
+
+def test_distances_are_the_nodes_values(prior: PCAShapePrior) -> None:
+    nodes = grid_of(prior).nodes()[3:6, 4, 5]
+    np.testing.assert_allclose(distance_at(prior, prior.mean, nodes), prior.mean[3:6, 4, 5], atol=1e-6)
+
+
+def test_section_is_the_plane_of_symmetry(prior: PCAShapePrior) -> None:
+    plane, (x0, x1, y0, y1) = section(prior, prior.mean)
+    low, high = prior.bounds_obj.tolist()
+    np.testing.assert_allclose([x0, x1, y0, y1], [low[0], high[0], low[1], high[1]], atol=1e-5)
+    nodes = grid_of(prior).nodes()[:, :, 0].copy()
+    nodes[..., 2] = 0
+    np.testing.assert_allclose(plane.ravel(), distance_at(prior, prior.mean, nodes.reshape(-1, 3)), atol=1e-6)
+
+
+def test_animation_has_a_frame_a_code_and_moves(prior: PCAShapePrior) -> None:
+    codes = code_path(prior.num_codes, steps_a_code=4)
+    assert codes.shape == (4 * prior.num_codes, prior.num_codes)
+    still, moved, still_again = code_frames(prior, codes[[0, 1, 0]])
+    assert still.shape == moved.shape
+    assert (still != moved).any(axis=2).mean() > 0.02
+    assert np.array_equal(still, still_again)
