@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.io.frame_detections import GivenMasks
@@ -145,7 +146,13 @@ class InputReader:
         source = self.sources.masks
         if source is None:
             return ()
-        for index, path in enumerate(source.files(frame_id)):
+        try:
+            paths = source.files(frame_id)
+        except DataFormatError:
+            # The files of a frame stand in its first one.
+            self.problems["masks not found or damaged"] += 1
+            return ()
+        for index, path in enumerate(paths):
             if not self._is_unchanged(frame_id, f"masks_{index}", path):
                 return ()
         return tuple(source.read(frame_id, size_hw))

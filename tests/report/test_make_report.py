@@ -1,0 +1,228 @@
+"""The page of a run as a file: what it carries, what it lacks and says so, and that names stay names."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.report_runs import FinishedRun, finished_run
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.evaluation.comparison import compare_results
+from directshape_torch.io.result_files import read_shapes
+from directshape_torch.report.frame_inputs import InputSources
+from directshape_torch.report.make_report import ReportOptions, make_report, map_settings
+from directshape_torch.report.mesh_data import unpacked
+from directshape_torch.report.residual_maps import MapSettings
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    return finished_run(tmp_path_factory.mktemp("run"), meshes="glb")
+
+
+def blocks(page: Path) -> dict[str, Any]:
+    """The data of a page by name."""
+    found = re.findall(r'<script type="application/json" id="data-([\w-]+)">(.*?)</script>', page.read_text("utf-8"))
+    return {name: json.loads(text) for name, text in found}
+
+
+def test_page_carries_every_part(run: FinishedRun, tmp_path: Path) -> None:
+    outcome = make_report(run.out, tmp_path / "page.html", run.sources, run.prior)
+    data = blocks(outcome.path)
+    assert outcome.notes == ()
+    assert data["run"]["notes"] == []
+    assert outcome.num_bytes == outcome.path.stat().st_size
+    assert (outcome.num_frames, outcome.num_detailed, outcome.num_cars) == (2, 2, 4)
+    assert data["frames"] == {"ids": ["000000", "000001"], "detailed": [0, 1]}
+    for number in range(2):
+        assert all(set(car) == {"before", "after"} for car in data[f"thumbnails-{number}"])
+        for car in data[f"maps-{number}"]:
+            kinds = {f"{kind}_{name}" for kind in ("photometric", "silhouette") for name in ("before", "after")}
+            assert set(car["pictures"]) == kinds
+            assert all(url.startswith("data:image/webp;base64,") for url in car["pictures"].values())
+        scene = data[f"scene-{number}"]
+        assert scene["image"].startswith("data:image/webp;base64,")
+        assert len(scene["cars"]) == len(scene["truth"]) == 2
+        assert np.allclose(scene["ground"][:3], [0, -1, 0], atol=1e-5)
+        assert scene["ground"][3] == pytest.approx(1.65, abs=1e-5)
+
+
+def test_table_says_what_the_files_say(run: FinishedRun, tmp_path: Path) -> None:
+    data = blocks(make_report(run.out, tmp_path / "page.html", run.sources, run.prior).path)
+    rows = [dict(zip(data["cars"]["columns"], row, strict=True)) for row in data["cars"]["rows"]]
+    shapes = read_shapes(run.out / "shapes" / "000001.npz")
+    last = [row for row in rows if row["frame"] == 1]
+    assert [row["line"] for row in last] == shapes.input_lines.tolist() == [1, 3]
+    assert [row["status"] for row in last] == list(shapes.statuses)
+    assert [row["distance_m"] for row in last] == pytest.approx(shapes.T_cam_obj[:, 2, 3], abs=0.006)
+    # The same errors as `directshape compare`, and the means over the same cars.
+    compared = compare_results(run.root / "training" / "label_2", run.root / "detections", run.out)
+    by_car = {(car.frame_id, car.detection_line): car for car in compared.cars}
+    assert by_car
+    for row in rows:
+        key = (data["frames"]["ids"][row["frame"]], row["line"])
+        assert row["counts"] is (key in by_car)
+        if key not in by_car:
+            continue
+        car = by_car[key]
+        assert row["iou_before"] == pytest.approx(car.before.bev_iou, abs=1e-4)
+        assert row["iou_after"] == pytest.approx(car.after.bev_iou, abs=1e-4)
+        assert row["centre_after_m"] == pytest.approx(car.after.centre_m, abs=1e-4)
+    assert data["run"]["errors"]["cars"] == len(compared.cars)
+    assert data["run"]["errors"]["iou_after"] == pytest.approx(
+        np.mean([car.after.bev_iou for car in compared.cars]), abs=1e-4
+    )
+
+
+def test_meshes_stand_on_the_page_where_their_boxes_are(run: FinishedRun, tmp_path: Path) -> None:
+    scene = blocks(make_report(run.out, tmp_path / "page.html", run.sources, run.prior).path)["scene-0"]
+    for car in scene["cars"]:
+        vertices = unpacked(car["mesh"]["vertices"]).reshape(3, -1).T / 1000
+        T = np.array(car["T_cam_obj"]).reshape(4, 4)
+        vertices_cam = vertices @ T[:3, :3].T + T[:3, 3]
+        corners = np.array(car["box_after"]).reshape(8, 3)
+        assert np.linalg.norm(vertices_cam.mean(axis=0) - corners.mean(axis=0)) < 0.25
+        faces = unpacked(car["mesh"]["faces"]).reshape(-1, 3)
+        assert faces.min() == 0
+        assert faces.max() == len(vertices) - 1
+
+
+def test_saved_meshes_stand_in_for_the_prior(run: FinishedRun, tmp_path: Path) -> None:
+    with_prior = blocks(make_report(run.out, tmp_path / "a.html", InputSources(), run.prior).path)["scene-0"]
+    outcome = make_report(run.out, tmp_path / "b.html", InputSources())
+    saved = blocks(outcome.path)["scene-0"]
+    assert any("no residual maps" in note for note in outcome.notes)
+    for decoded_car, saved_car in zip(with_prior["cars"], saved["cars"], strict=True):
+        decoded, read = (unpacked(car["mesh"]["vertices"]).reshape(3, -1) for car in (decoded_car, saved_car))
+        assert np.abs(decoded.min(axis=1) - read.min(axis=1)).max() <= 2
+        assert np.abs(decoded.max(axis=1) - read.max(axis=1)).max() <= 2
+
+
+def test_without_inputs_the_page_says_so(run: FinishedRun, tmp_path: Path) -> None:
+    outcome = make_report(run.out, tmp_path / "page.html", InputSources(), run.prior)
+    data = blocks(outcome.path)
+    assert data["run"]["notes"] == list(outcome.notes)
+    assert any("--data" in note for note in outcome.notes)
+    assert any("--detections" in note for note in outcome.notes)
+    assert data["thumbnails-0"] == [{}, {}]
+    assert data["scene-0"]["image"] is None
+    assert data["scene-0"]["cars"][0]["box_before"] is None
+    assert len(data["scene-0"]["cars"][0]["box_after"]) == 24
+
+
+def test_a_changed_image_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(run.root, tmp_path / "kitti"))
+    shutil.copy(root / "training/image_3/000000.png", root / "training/image_2/000000.png")
+    (root / "training/image_2/000001.png").unlink()
+    (root / "masks/000001.json").unlink()
+    outcome = make_report(run.out, tmp_path / "page.html", FinishedRun(root, run.out).sources, run.prior)
+    data = blocks(outcome.path)
+    assert data["scene-0"]["image"] is None
+    assert "left image not used: the file has changed since the run (1 of 2 frames)" in outcome.notes
+    assert "left image not found (1 of 2 frames)" in outcome.notes
+
+
+def test_another_prior_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
+    outcome = make_report(run.out, tmp_path / "page.html", run.sources, PCAShapePrior.load_bundled())
+    assert any("the prior is not that of the run" in note for note in outcome.notes)
+    assert "mean-mesh" not in blocks(outcome.path)
+
+
+def test_few_frames_have_details(run: FinishedRun, tmp_path: Path) -> None:
+    outcome = make_report(run.out, tmp_path / "page.html", run.sources, run.prior, ReportOptions(most_frames=1))
+    data = blocks(outcome.path)
+    assert len(data["frames"]["detailed"]) == 1
+    assert len(data["cars"]["rows"]) == 4
+    assert sum(name.startswith("scene-") for name in data) == 1
+    assert "pictures and 3D views of 1 of 2 frames (--max-frames)" in outcome.notes
+
+
+def test_chosen_frames_alone(run: FinishedRun, tmp_path: Path) -> None:
+    options = ReportOptions(frames=("000001",))
+    data = blocks(make_report(run.out, tmp_path / "page.html", run.sources, run.prior, options).path)
+    assert data["frames"]["ids"] == ["000001"]
+    assert data["run"]["frames_done"] == 1
+    with pytest.raises(InputError, match="000009"):
+        make_report(run.out, tmp_path / "page.html", run.sources, run.prior, ReportOptions(frames=("000009",)))
+
+
+def test_failed_frames_and_frames_without_cars(run: FinishedRun, tmp_path: Path) -> None:
+    folder = tmp_path / "again"
+    shutil.copytree(run.root, folder / "kitti")
+    data_set = folder / "kitti"
+    (data_set / "training/image_3/000000.png").write_bytes(b"no image")
+    (data_set / "detections/data/000001.txt").write_text("")
+    again = _refined_again(data_set, folder / "out")
+    data = blocks(make_report(again.out, tmp_path / "page.html", again.sources, again.prior).path)
+    assert list(data["run"]["failed"]) == ["000000"]
+    assert data["frames"]["ids"] == ["000001"]
+    assert data["cars"]["rows"] == []
+    assert data["scene-0"]["cars"] == []
+    assert data["run"]["errors"] is None
+
+
+def _refined_again(root: Path, out: Path) -> FinishedRun:
+    from helpers.report_runs import FEW_STEPS
+
+    from directshape_torch.batch.refine_dataset import refine_dataset
+    from directshape_torch.config_files import load_config
+    from directshape_torch.io.kitti_dataset import KittiStereoDataset
+    from directshape_torch.refiner import DirectShapeRefiner
+
+    prior = PCAShapePrior.load(root / "prior.npz")
+    dataset = KittiStereoDataset(root, root / "detections", root / "masks")
+    refine_dataset(dataset, DirectShapeRefiner(prior, load_config(None, FEW_STEPS)), out)
+    return FinishedRun(root, out)
+
+
+def test_equal_runs_give_equal_pages(run: FinishedRun, tmp_path: Path) -> None:
+    pages = [make_report(run.out, tmp_path / f"{n}.html", run.sources, run.prior).path.read_bytes() for n in range(2)]
+    assert pages[0] == pages[1]
+
+
+def test_no_run_no_page(tmp_path: Path) -> None:
+    with pytest.raises(DataFormatError, match=r"summary\.json.*directshape refine"):
+        make_report(tmp_path, tmp_path / "page.html", InputSources())
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_damaged_frame_leaves_the_old_page(run: FinishedRun, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(run.out, tmp_path / "out"))
+    page = tmp_path / "page.html"
+    page.write_text("old")
+    (out / "shapes" / "000001.npz").write_bytes(b"PK")
+    with pytest.raises(DataFormatError, match="000001"):
+        make_report(out, page, run.sources, run.prior)
+    assert page.read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir() if path.name.endswith(".tmp")] == []
+
+
+def test_results_of_other_lines_are_refused(run: FinishedRun, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(run.out, tmp_path / "out"))
+    path = out / "data" / "000000.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[1:]) + "\n")
+    with pytest.raises(DataFormatError, match="1 lines of the refined classes"):
+        make_report(out, tmp_path / "page.html", InputSources())
+
+
+def test_settings_of_maps_are_those_of_the_run() -> None:
+    refiner = {
+        "stages": [{"contour_width_px": 2.0}, {"contour_width_px": 0.7}],
+        "silhouette": {"saturation": 9.0, "probability_floor": 0.02, "weight": 12.0},
+        "photometric": {"brightness": "none"},
+    }
+    expected = replace(
+        MapSettings(), contour_width_px=0.7, saturation=9.0, probability_floor=0.02, matches_brightness=False
+    )
+    assert map_settings(refiner) == expected
+    assert map_settings({}) == MapSettings()
+    with pytest.raises(InputError, match="most_frames"):
+        ReportOptions(most_frames=-1)

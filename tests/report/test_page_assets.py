@@ -1,0 +1,92 @@
+"""The fixed parts of the page: nothing from outside, nothing that runs but what is named, names that stay names."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+from importlib.resources import files
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.report.page_assets import data_block, page_frame
+
+THREE = files("directshape_torch") / "assets" / "vendor" / "three"
+HOSTILE = '"><script>boom()</script><!-- {{data}} {{style}} \\u2028 </title>'
+
+
+def import_map(page: str) -> dict[str, str]:
+    found = re.search(r'<script type="importmap">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    urls: dict[str, str] = json.loads(found[1])["imports"]
+    return urls
+
+
+def source_of(url: str) -> str:
+    head, _, content = url.partition(",")
+    assert head == "data:text/javascript;base64"
+    return base64.b64decode(content).decode()
+
+
+def test_every_import_is_in_the_map() -> None:
+    page = page_frame("a run")
+    modules = {name: source_of(url) for name, url in import_map(page.head).items()}
+    for name, source in modules.items():
+        without_comments = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
+        imported = re.findall(r'(?:\bfrom\s*|\bimport\s*\(?)["\']([^"\']+)["\']', without_comments)
+        assert set(imported) <= set(modules), name
+    assert 'import "report/main"' in page.foot
+
+
+def test_nothing_is_loaded_from_outside() -> None:
+    page = page_frame("a run")
+    text = page.head + page.foot
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', text)
+    assert "@import" not in text
+    assert "url(" not in text
+    own = [source_of(url) for name, url in import_map(text).items() if name.startswith("report/")]
+    assert not [source for source in own if re.search(r"https?://(?!www\.w3\.org/2000/svg)|fetch\(|innerHTML", source)]
+
+
+def test_the_policy_names_what_runs() -> None:
+    page = page_frame("a run")
+    text = page.head + page.foot
+    found = re.search(r'Content-Security-Policy" content="([^"]*)"', text)
+    assert found is not None
+    policy = html.unescape(found[1])
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    inline = re.findall(r'<(?:script type="(?:module|importmap)"|style)>(.*?)</(?:script|style)>', text, re.DOTALL)
+    assert len(inline) == 3
+    for content in inline:
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert f"'sha256-{digest}'" in policy
+
+
+def test_a_hostile_title_stays_text() -> None:
+    page = page_frame(HOSTILE)
+    title = re.search(r"<title>(.*?)</title>", page.head, re.DOTALL)
+    assert title is not None
+    assert html.unescape(title[1]) == HOSTILE
+    assert "<script>boom" not in page.head + page.foot
+
+
+@settings(max_examples=25)
+@given(st.text())
+def test_data_comes_back_as_it_was(text: str) -> None:
+    text = text.encode("utf-8", "replace").decode("utf-8")
+    block = data_block("x", [HOSTILE, text])
+    found = re.fullmatch(r'<script type="application/json" id="data-x">([^<>&]*)</script>\n', block)
+    assert found is not None
+    assert json.loads(found[1]) == [HOSTILE, text]
+
+
+def test_vendored_files_are_those_of_the_list() -> None:
+    rows = re.findall(r"^\| `([^`]+)` \| `[^`]+` \| `([0-9a-f]{64})` \|$", (THREE / "README.md").read_text(), re.M)
+    assert {name for name, _ in rows} == {"three.core.min.js", "three.module.min.js", "OrbitControls.js", "LICENSE"}
+    for name, digest in rows:
+        assert hashlib.sha256((THREE / name).read_bytes()).hexdigest() == digest
+    assert "MIT License" in (THREE / "LICENSE").read_text()

@@ -1,0 +1,213 @@
+"""The page in a real browser, from file://, with hostile names of frames, classes and the run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from helpers.browser import chromium, console_problems, requested_urls, screenshot_of, set_viewport
+from helpers.report_runs import finished_run
+
+from directshape_torch.report.make_report import make_report
+
+if TYPE_CHECKING:
+    from selenium.webdriver import Chrome
+
+FRAMES = ("<img src=x onerror=boom()>", '"><script>boom()', "zz'&amp;{{data}}")
+FIRST_FRAME = sorted(FRAMES)[0]
+CAR_TYPE = "<script>boom()</script>"
+OUT_NAME = "<svg onload=boom()>&lt;"
+# Software rendering on a busy machine takes its time.
+PATIENCE_S = 40.0
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = finished_run(tmp_path_factory.mktemp("browser"), FRAMES, out_name=OUT_NAME, car_type=CAR_TYPE)
+    return make_report(run.out, run.out.parent / "a page#1.html", run.sources, run.prior).path
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Chrome]:
+    with chromium() as driver:
+        # A hostile name that runs leaves its mark before the page's own scripts do.
+        script = {"source": "window.booms = 0; window.boom = () => { window.booms += 1; };"}
+        driver.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", script)
+        yield driver
+
+
+@pytest.fixture
+def opened(browser: Chrome, page: Path) -> Iterator[Chrome]:
+    """The page on a desk, by day; afterwards nothing may have been fetched, complained of, or run."""
+    set_viewport(browser, 1280)
+    open_page(browser, page)
+    yield browser
+    assert console_problems(browser) == []
+    assert {url for url in requested_urls(browser) if url != page.as_uri()} == set()
+    assert browser.execute_script("return window.booms") == 0
+
+
+def open_page(browser: Chrome, page: Path) -> None:
+    browser.get(page.as_uri())
+    until(lambda: browser.execute_script("return document.documentElement.dataset.ready") == "true")
+
+
+def until(condition: Callable[[], Any]) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, "the page did not get there in time"
+        time.sleep(0.05)
+
+
+def find(browser: Chrome, selector: str) -> Any:
+    return browser.find_element("css selector", selector)
+
+
+def texts(browser: Chrome, selector: str) -> list[str]:
+    script = "return [...document.querySelectorAll(arguments[0])].map((node) => node.textContent)"
+    return list(browser.execute_script(script, selector))
+
+
+def show_scene(browser: Chrome) -> Any:
+    scene = find(browser, "#scene")
+    browser.execute_script("arguments[0].scrollIntoView({ block: 'center' })", scene)
+    until(lambda: scene.get_attribute("data-ready"))
+    time.sleep(0.3)
+    return scene
+
+
+def test_hostile_names_are_text(opened: Chrome) -> None:
+    assert OUT_NAME in find(opened, "h1").text
+    assert OUT_NAME in opened.title
+    assert set(texts(opened, ".open-car span:first-child")) == set(FRAMES)
+    assert set(texts(opened, "#frame-choice option")) == set(FRAMES)
+    assert CAR_TYPE in texts(opened, "#car-rows td")
+    assert opened.execute_script("return document.querySelectorAll('main img[src=x], main script, h1 svg').length") == 0
+
+
+def test_sort_by_click_and_by_key(opened: Chrome) -> None:
+    head = opened.find_element("xpath", "//th[button[starts-with(., 'Distance')]]")
+    button = head.find_element("css selector", "button")
+
+    def distances() -> list[float]:
+        return [float(text) for text in texts(opened, "#car-rows td:nth-child(4)")]
+
+    assert head.get_attribute("aria-sort") == "none"
+    button.click()
+    assert head.get_attribute("aria-sort") == "descending"
+    assert distances() == sorted(distances(), reverse=True)
+    opened.execute_script("arguments[0].focus()", button)
+    button.send_keys("\ue007")  # Enter
+    assert head.get_attribute("aria-sort") == "ascending"
+    assert distances() == sorted(distances())
+    assert len(set(distances())) > 1
+    assert len(opened.find_elements("css selector", "th[aria-sort=ascending], th[aria-sort=descending]")) == 1
+
+
+def test_filter(opened: Chrome) -> None:
+    find(opened, "#search").send_keys("ONERROR")
+    assert set(texts(opened, ".open-car span:first-child")) == {FRAMES[0]}
+    assert find(opened, "#car-count").text == "2 of 2 cars shown, 6 in all"
+
+
+def test_thumbnails_come_into_view(opened: Chrome) -> None:
+    image = find(opened, "#car-rows img.thumbnail")
+    opened.execute_script("arguments[0].scrollIntoView()", image)
+    until(lambda: opened.execute_script("return arguments[0].naturalWidth", image) > 20)
+    assert FIRST_FRAME in image.get_attribute("alt")
+    assert opened.execute_script("return [...document.images].every((image) => image.alt !== '')")
+
+
+def test_open_car_and_its_residual_maps(opened: Chrome) -> None:
+    find(opened, ".open-car").click()
+    dialog = find(opened, "#car-dialog")
+    assert dialog.is_displayed()
+    assert find(opened, "#car-dialog h2").text == f"Car {FIRST_FRAME}, line 1"
+    assert dialog.find_elements("css selector", "img.map") == []
+    find(opened, "#show-maps").click()
+    maps = dialog.find_elements("css selector", "img.map")
+    assert len(maps) == 4
+    until(lambda: all(opened.execute_script("return arguments[0].naturalWidth", image) > 10 for image in maps))
+    assert "photometric" in dialog.text
+    assert len(dialog.find_elements("css selector", "svg.chart polyline")) == 2
+    find(opened, "body").send_keys("\ue00c")  # Escape
+    assert not dialog.is_displayed()
+
+
+def test_3d_draws_turns_and_opens_cars(opened: Chrome) -> None:
+    from selenium.webdriver import ActionChains
+
+    scene = show_scene(opened)
+    first = screenshot_of(scene)
+    # Boxes, ground and painted cars, not one even colour.
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 50
+    ActionChains(opened).move_to_element(scene).click_and_hold().move_by_offset(120, 20).release().perform()
+    time.sleep(0.3)
+    turned = screenshot_of(scene)
+    assert np.mean(np.any(first != turned, axis=-1)) > 0.02
+    find(opened, ".open-car").click()
+    find(opened, "#show-in-3d").click()
+    until(lambda: scene.get_attribute("data-car"))
+    assert not find(opened, "#car-dialog").is_displayed()
+    time.sleep(0.3)
+    # The view now looks at the middle of that car: a click there opens it.
+    ActionChains(opened).move_to_element(scene).click().perform()
+    assert find(opened, "#car-dialog").is_displayed()
+    assert scene.get_attribute("data-car") in find(opened, "#car-dialog h2").text
+
+
+def test_frames_change_and_boxes_can_be_hidden(opened: Chrome) -> None:
+    scene = show_scene(opened)
+    find(opened, "#next-frame").click()
+    chosen = find(opened, "#frame-choice").get_attribute("value")
+    until(lambda: texts(opened, f"#frame-choice option[value='{chosen}']")[0] in scene.get_attribute("data-ready"))
+    assert len(opened.find_elements("css selector", ".box-before")) > 12
+    find(opened, "#show-before").click()
+    assert opened.find_elements("css selector", ".box-before") == []
+    assert len(opened.find_elements("css selector", ".box-after")) > 12
+    assert len(opened.find_elements("css selector", ".box-truth")) > 12
+
+
+@pytest.mark.parametrize("width", [390, 320])
+def test_a_phone_is_wide_enough(opened: Chrome, width: int) -> None:
+    set_viewport(opened, width, 844)
+    show_scene(opened)
+    overflow = "return document.documentElement.scrollWidth - window.innerWidth"
+    assert opened.execute_script(overflow) <= 0
+    opened.execute_script("document.querySelector('.open-car').click()")
+    opened.execute_script("document.getElementById('show-maps').click()")
+    dialog = find(opened, "#car-dialog")
+    assert opened.execute_script("return arguments[0].scrollWidth - arguments[0].clientWidth", dialog) <= 0
+    assert opened.execute_script(overflow) <= 0
+
+
+def test_dark_and_light(opened: Chrome) -> None:
+    def lightness(element: Any) -> float:
+        return float(np.median(screenshot_of(element)))
+
+    scene, summary = show_scene(opened), find(opened, "#summary")
+    assert lightness(summary) > 200
+    assert lightness(scene) > 200
+    set_viewport(opened, 1280, dark=True)
+    until(lambda: lightness(scene) < 60)
+    assert lightness(summary) < 60
+
+
+def test_without_webgl_the_rest_works(browser: Chrome, page: Path) -> None:
+    source = "HTMLCanvasElement.prototype.getContext = () => null;"
+    added = browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": source})
+    try:
+        set_viewport(browser, 1280)
+        open_page(browser, page)
+        scene = find(browser, "#scene")
+        browser.execute_script("arguments[0].scrollIntoView()", scene)
+        until(lambda: "No 3D view" in scene.text)
+        find(browser, ".open-car").click()
+        assert find(browser, "#car-dialog").is_displayed()
+    finally:
+        browser.execute_cdp_cmd("Page.removeScriptToEvaluateOnNewDocument", added)
+        console_problems(browser), requested_urls(browser)
