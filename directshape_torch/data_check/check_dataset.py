@@ -12,17 +12,20 @@ from directshape_torch.data_check.check_calibration import check_calibration
 from directshape_torch.data_check.check_distances import DistanceRatios, check_distances, measure_distances
 from directshape_torch.data_check.check_files import check_files
 from directshape_torch.data_check.check_masks import check_masks
-from directshape_torch.data_check.check_pair import check_pair
+from directshape_torch.data_check.check_pair import FEW_MATCHES, check_mirrored, check_pair
 from directshape_torch.data_check.check_times import check_times
 from directshape_torch.data_check.finding import CheckReport, Finding, by_severity
 from directshape_torch.data_check.frame_parts import FrameParts, read_parts
-from directshape_torch.data_check.pair_matches import match_pair
+from directshape_torch.data_check.pair_matches import match_pair, mirror
 from directshape_torch.errors import InputError
 from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.scene import StereoCamera
 
 DEFAULT_MAX_FRAMES = 20
 # With these wrong, what disparities and projections show says nothing more.
-_SPOILS_PAIR = frozenset({"images_swapped", "same_image", "different_scenes", "not_rectified"})
+_SPOILS_PAIR = frozenset(
+    {"images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"}
+)
 _SPOILS_CAMERA = frozenset({"baseline_sign", "baseline_length", "focal_length"})
 
 
@@ -79,20 +82,27 @@ def _check_frame(dataset: FileStereoDataset, frame_id: str, seen: _Seen) -> list
     where = f"frame {frame_id}"
     if parts.calibration is not None:
         findings += check_calibration(parts.calibration, parts.size_hw, where)
-    findings += _check_pair(parts, where)
+    # A wrong calibration must not spoil what the images say by themselves.
+    usable = not _names(findings) & _SPOILS_CAMERA
+    findings += _check_pair(parts, parts.camera if usable else None, where)
     seen.num_cars += len(parts.objects)
     evidence = gather_evidence(parts)
-    if evidence is not None and not _names(findings) & _SPOILS_CAMERA:
+    if evidence is not None and usable:
         seen.evidence.append(evidence)
         if not _names(findings) & _SPOILS_PAIR and parts.left is not None and parts.right is not None:
             seen.ratios.append(measure_distances(evidence, parts.left, parts.right))
     return findings
 
 
-def _check_pair(parts: FrameParts, where: str) -> list[Finding]:
+def _check_pair(parts: FrameParts, camera: StereoCamera | None, where: str) -> list[Finding]:
     if parts.left is None or parts.right is None or parts.size_hw is None:
         return []
-    return check_pair(match_pair(parts.left, parts.right), parts.camera, parts.size_hw, where)
+    matches = match_pair(parts.left, parts.right)
+    if len(matches) < FEW_MATCHES:
+        mirrored = check_mirrored(matches, match_pair(parts.left, mirror(parts.right)), where)
+        if mirrored:
+            return mirrored
+    return check_pair(matches, camera, parts.size_hw, where)
 
 
 def _check_cars(seen: _Seen) -> list[Finding]:
@@ -121,4 +131,4 @@ def _no_cars() -> Finding:
 
 
 def _names(findings: Sequence[Finding]) -> set[str]:
-    return {finding.check for finding in findings if finding.severity == "error"}
+    return {finding.check for finding in findings if finding.severity != "warning"}

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from directshape_torch.data_check.finding import Finding
-from directshape_torch.errors import DirectShapeError
+from directshape_torch.errors import DataFormatError
 from directshape_torch.io.stereo_files import FileStereoDataset
 
 _NAMED = 3
@@ -25,10 +25,10 @@ def check_files(dataset: FileStereoDataset) -> list[Finding]:
 def _files(dataset: FileStereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
     try:
         return [(role.rstrip("_0123456789"), path) for role, path in dataset.input_files(frame_id).items()]
-    except (DirectShapeError, OSError):
-        # A file that names others is itself missing or damaged: that is found when the frame is read.
+    except DataFormatError as error:
+        # A file that names others is itself missing, or damaged: then that is found when the frame is read.
         left, right = dataset.layout.images(frame_id)
-        return [("image_left", left), ("image_right", right)]
+        return [("image_left", left), ("image_right", right), ("list of masks", error.path)]
 
 
 def _finding(role: str, paths: list[str], num_frames: int) -> Finding:

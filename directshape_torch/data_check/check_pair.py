@@ -10,6 +10,8 @@ from directshape_torch.data_check.pair_matches import PairMatches
 from directshape_torch.scene import StereoCamera
 
 MIN_MATCHES = 30
+# With fewer, it is asked whether one of the images is mirrored.
+FEW_MATCHES = 200
 # Two photographs of different places agree on fewer, by chance.
 MIN_INLIER_SHARE = 0.4
 SAME_IMAGE_PX = 0.05
@@ -40,6 +42,22 @@ def check_pair(
     return _check_side(disparity, where) + _check_rows(
         matches, _row_residual(matches, disparity, camera), size_hw, where
     )
+
+
+def check_mirrored(matches: PairMatches, with_mirrored: PairMatches, where: str) -> list[Finding]:
+    """Whether far more features match the mirrored right image than the right image as it is."""
+    if len(with_mirrored) < max(MIN_MATCHES, 3 * len(matches)):
+        return []
+    return [
+        Finding(
+            "image_mirrored",
+            "error",
+            where,
+            f"{len(with_mirrored)} features match the mirrored right image, {len(matches)} the image as it is",
+            "two images of the same sense",
+            "mirror the one that is read in the wrong direction",
+        )
+    ]
 
 
 def _disparity(matches: PairMatches, camera: StereoCamera | None) -> NDArray[np.float64]:

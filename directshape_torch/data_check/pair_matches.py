@@ -56,6 +56,11 @@ def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches
     return PairMatches(uv_left[keep], uv_right[keep], len(pairs))
 
 
+def mirror(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image with left and right exchanged."""
+    return np.ascontiguousarray(image[:, ::-1])
+
+
 def _best(descriptors: NDArray[np.float32], others: NDArray[np.float32]) -> dict[int, int]:
     import cv2
 

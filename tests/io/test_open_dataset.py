@@ -1,0 +1,196 @@
+"""The same frames in every layout give the same tensors."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import get_args
+
+import pytest
+import torch
+from helpers.kitti_folder import write_data_set
+from helpers.layouts import (
+    DAY,
+    DRIVE,
+    SEQUENCE,
+    put,
+    write,
+    write_folder,
+    write_raw,
+    write_sequence,
+    write_stereo2015,
+)
+
+from directshape_torch.cli.data_options import LAYOUTS
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.open_dataset import LayoutName, open_dataset
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+
+FRAMES = ("000000", "000001")
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root, FRAMES)
+    return root
+
+
+@pytest.fixture(scope="module")
+def expected(kitti: Path) -> LoadedFrame:
+    return KittiStereoDataset(kitti, kitti / "detections", kitti / "masks", dtype=torch.float64).load("000001")
+
+
+def renamed(kitti: Path, to: Path, names: tuple[str, ...]) -> tuple[Path, Path]:
+    """Detections and masks of the frames under other names."""
+    for frame_id, name in zip(FRAMES, names, strict=True):
+        put(kitti / "detections" / "data" / f"{frame_id}.txt", to / "detections" / f"{name}.txt")
+        put(kitti / "masks" / f"{frame_id}.json", to / "masks" / f"{name}.json")
+    return to / "detections", to / "masks"
+
+
+def assert_same(dataset: StereoDataset, frame_id: str, expected: LoadedFrame) -> None:
+    loaded = dataset.load(frame_id)
+    assert loaded.frame_id == frame_id
+    assert loaded.refined_rows == expected.refined_rows == (0, -1, 1)
+    assert dataset.objects(frame_id) == loaded.input_objects
+    for name in ("images_left", "images_right", "sizes"):
+        torch.testing.assert_close(getattr(loaded.frame, name), getattr(expected.frame, name), atol=0, rtol=0)
+    for name in ("K_left", "K_right", "T_right_cam"):
+        torch.testing.assert_close(getattr(loaded.frame.camera, name), getattr(expected.frame.camera, name))
+    for name in ("T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right", "has_mask_right"):
+        torch.testing.assert_close(getattr(loaded.detections, name), getattr(expected.detections, name))
+    for role, path in dataset.input_files(frame_id).items():
+        assert path.is_file(), role
+
+
+def test_the_cli_offers_every_layout() -> None:
+    assert get_args(LayoutName) == LAYOUTS
+
+
+def test_kitti(kitti: Path, expected: LoadedFrame) -> None:
+    dataset = open_dataset("kitti", kitti, kitti / "detections", kitti / "masks", dtype=torch.float64)
+    assert_same(dataset, "000001", expected)
+
+
+def test_one_raw_drive(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    drive = write_raw(kitti, tmp_path, FRAMES)
+    detections, masks = renamed(kitti, tmp_path, ("0000000000", "0000000001"))
+    dataset = open_dataset("raw", drive, detections, masks, dtype=torch.float64)
+    assert dataset.frame_ids == ("0000000000", "0000000001")
+    assert_same(dataset, "0000000001", expected)
+    assert dataset.load("0000000001").labels is None
+    assert dataset.load("0000000001").frame.ground.source == ("file",)
+    assert open_dataset("raw", drive, detections, masks, frames=[1]).frame_ids == ("0000000001",)
+    left_s, right_s = dataset.layout.times_s("0000000001") or (0.0, 0.0)
+    assert right_s - left_s == pytest.approx(10.555e-6, abs=1e-6)
+    assert left_s % 60 == pytest.approx(26.964389, abs=1e-5)
+
+
+def test_raw_drives_of_a_day(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    drive = write_raw(kitti, tmp_path, FRAMES)
+    shutil.copytree(drive, drive.parent / "2011_09_26_drive_0009_sync")
+    detections, masks = renamed(kitti, tmp_path, (f"{DRIVE}/data/0000000000", f"{DRIVE}/data/0000000001"))
+    for root in (tmp_path / DAY, tmp_path):
+        dataset = open_dataset("raw", root, detections, masks, dtype=torch.float64)
+        # The other drive has no detections.
+        assert dataset.frame_ids == (f"{DRIVE}_0000000000", f"{DRIVE}_0000000001")
+        assert_same(dataset, f"{DRIVE}_0000000001", expected)
+    with pytest.raises(InputError, match="several sequences"):
+        open_dataset("raw", tmp_path, detections, masks, frames=[1])
+
+
+def test_one_tracking_sequence(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    write_sequence(kitti, tmp_path, FRAMES, single=True)
+    dataset = open_dataset("tracking", tmp_path, kitti / "detections", kitti / "masks", dtype=torch.float64)
+    assert_same(dataset, "000001", expected)
+    labels = dataset.load("000001").labels
+    assert labels is not None
+    assert [label.location_ref for label in labels] == [label.location_ref for label in expected.labels or []]
+
+
+def test_tracking_benchmark_with_one_result_file_a_sequence(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    write_sequence(kitti, tmp_path, FRAMES, single=False)
+    _, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}/000000", f"{SEQUENCE}/000001"))
+    lines = [
+        f"{number} 7 {line}"
+        for number, frame_id in enumerate(FRAMES)
+        for line in (kitti / "detections" / "data" / f"{frame_id}.txt").read_text().splitlines()
+    ]
+    write(tmp_path / "results" / f"{SEQUENCE}.txt", "\n".join(lines))
+    dataset = open_dataset("tracking", tmp_path, tmp_path / "results", masks, dtype=torch.float64)
+    assert dataset.frame_ids == (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001")
+    assert_same(dataset, f"{SEQUENCE}_000001", expected)
+    # Results name what they came from, without the frame and the track.
+    assert dataset.objects(f"{SEQUENCE}_000001")[0].raw_line == expected.input_objects[0].raw_line
+    write(tmp_path / "results" / f"{SEQUENCE}.txt", "0 7 Car 1 2")
+    with pytest.raises(DataFormatError, match=r"0005\.txt, line 1: expected 17 or 18 columns"):
+        open_dataset("tracking", tmp_path, tmp_path / "results", masks).objects(f"{SEQUENCE}_000000")
+
+
+def test_tracking_frames_called_by_sequence_in_one_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    """As a refinement writes its results, which may be refined again."""
+    write_sequence(kitti, tmp_path, FRAMES, single=False)
+    detections, masks = renamed(kitti, tmp_path, (f"{SEQUENCE}_000000", f"{SEQUENCE}_000001"))
+    dataset = open_dataset("tracking", tmp_path, detections, masks, dtype=torch.float64)
+    assert_same(dataset, f"{SEQUENCE}_000001", expected)
+
+
+def test_stereo2015(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    write_stereo2015(kitti, tmp_path, FRAMES)
+    detections, masks = renamed(kitti, tmp_path, ("000000_11", "000001"))
+    put(masks / "000001.json", masks / "000001_11.json")
+    dataset = open_dataset("stereo2015", tmp_path, detections, masks, dtype=torch.float64)
+    assert dataset.frame_ids == ("000000_11", "000001_10")
+    assert_same(dataset, "000001_10", expected)
+    assert dataset.load("000001_10").frame.ground.source == ("file",)
+    assert open_dataset("stereo2015", tmp_path, detections, masks, frames=[1]).frame_ids == ("000001_10",)
+    assert dataset.load("000000_11").labels is None
+
+
+def test_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    write_folder(kitti, tmp_path, FRAMES)
+    dataset = open_dataset("folder", tmp_path, dtype=torch.float64)
+    assert dataset.frame_ids == FRAMES
+    assert_same(dataset, "000001", expected)
+    assert dataset.load("000001").matching.instance_left == (0, 2)
+    assert open_dataset("folder", tmp_path, frames=[1]).frame_ids == ("000001",)
+
+
+def test_masks_of_a_folder_may_come_from_elsewhere(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
+    write_folder(kitti, tmp_path, FRAMES)
+    dataset = open_dataset("folder", tmp_path, masks=kitti / "masks", dtype=torch.float64)
+    assert dataset.load("000001").matching.instance_left == expected.matching.instance_left
+
+
+def test_a_mask_stays_with_its_object_wherever_it_is(kitti: Path, tmp_path: Path) -> None:
+    """Two objects with each other's masks: overlap would set that right, the file is believed."""
+    write_folder(kitti, tmp_path, FRAMES)
+    path = tmp_path / "frames" / "000000.json"
+    content = json.loads(path.read_text())
+    first, _, second = content["objects"]
+    for side in ("mask_left", "mask_right"):
+        first[side], second[side] = second[side], first[side]
+    path.write_text(json.dumps(content))
+    swapped, as_before = (open_dataset("folder", tmp_path).load(frame_id) for frame_id in FRAMES)
+    assert swapped.matching.instance_left == (0, 2)
+    assert torch.equal(swapped.detections.mask_left, as_before.detections.mask_left.flip(0))
+
+
+@pytest.mark.parametrize("layout", ["raw", "tracking", "stereo2015", "folder"])
+def test_another_layout_is_refused_with_the_cure(layout: LayoutName, kitti: Path) -> None:
+    with pytest.raises(DataFormatError, match=r"--layout|check the path"):
+        open_dataset(layout, kitti, kitti / "detections")
+
+
+def test_wrong_words(kitti: Path) -> None:
+    with pytest.raises(
+        InputError, match="layout: expected one of kitti, raw, tracking, stereo2015, folder, got 'coco'"
+    ):
+        open_dataset("coco", kitti)  # type: ignore[arg-type]
+    with pytest.raises(
+        InputError, match="detections: expected a folder of detections for the layout 'kitti', got none"
+    ):
+        open_dataset("kitti", kitti)
