@@ -11,7 +11,7 @@ from directshape_torch.export.exporters import feed
 from directshape_torch.export.frame_source import ExportInputs, FrameSource
 from directshape_torch.export.rerun_iterations import IterationLog
 from directshape_torch.export.rerun_scene import clear_cars, log_conventions, log_frame, log_painted_cars
-from directshape_torch.export.rerun_stream import RerunStream
+from directshape_torch.export.rerun_stream import RerunStream, import_rerun
 from directshape_torch.export.run_folder import RunFolder
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.refiner import DirectShapeRefiner
@@ -30,10 +30,11 @@ class RerunExporter:
     """
 
     def __init__(self, path: Path, run: RunFolder, with_iterations: bool) -> None:
+        import_rerun()
+        self.path, self.with_iterations = path, with_iterations
         self.numbers: Mapping[str, int] = image_numbers(run.frame_ids)
-        self.stream = RerunStream(path, with_iterations)
         self.iteration = 0
-        log_conventions(self.stream)
+        self._stream: RerunStream | None = None
 
     def add(self, source: FrameSource) -> None:
         """Log a frame; with a refiner also the states that it goes through when it refines the frame again.
@@ -41,34 +42,46 @@ class RerunExporter:
         Raises:
             InputError: the frame has no images.
         """
-        frame = self.numbers[source.frame_id]
+        stream, frame = self._begun(source), self.numbers[source.frame_id]
         refiner = source.inputs.refiner
-        self.stream.at(frame, None if refiner is None else self.iteration)
-        log_frame(self.stream, source, source.inputs.has_detections)
-        self.stream.at(frame)
-        clear_cars(self.stream)
-        log_painted_cars(self.stream, source.painted)
+        stream.at(frame, None if refiner is None else self.iteration)
+        log_frame(stream, source, source.inputs.has_detections)
+        stream.at(frame)
+        clear_cars(stream)
+        log_painted_cars(stream, source.painted)
         if refiner is not None:
-            self._add_iterations(source, refiner, frame)
+            self._add_iterations(stream, source, refiner, frame)
 
     def finish(self) -> None:
         """Move the file to its place."""
-        self.stream.close()
+        if self._stream is not None:
+            self._stream.close()
 
     def abandon(self) -> None:
         """Leave no file behind."""
-        self.stream.abandon()
+        if self._stream is not None:
+            self._stream.abandon()
 
-    def _add_iterations(self, source: FrameSource, refiner: DirectShapeRefiner, frame: int) -> None:
+    def _begun(self, source: FrameSource) -> RerunStream:
+        """The recording, begun with the first frame: its images say what the viewer's views are fitted to."""
+        if self._stream is None:
+            height, width = source.with_images("the pictures of a recording").frame.sizes[0].tolist()
+            self._stream = RerunStream(self.path, (width, height), self.with_iterations)
+            log_conventions(self._stream)
+        return self._stream
+
+    def _add_iterations(
+        self, stream: RerunStream, source: FrameSource, refiner: DirectShapeRefiner, frame: int
+    ) -> None:
         loaded = source.with_images("the refinement of its frames")
         trace = _trace(source, refiner)
-        log = IterationLog(self.stream, loaded, trace)
-        self.stream.at(iteration=self.iteration)
-        clear_cars(self.stream)
+        log = IterationLog(stream, loaded, trace)
+        stream.at(iteration=self.iteration)
+        clear_cars(stream)
         for number in range(len(trace)):
-            self.stream.at(iteration=self.iteration + number)
+            stream.at(iteration=self.iteration + number)
             log.log_state(number)
-        self.stream.at(frame)
+        stream.at(frame)
         for car in log.cars:
             log.log_residuals(car, len(trace) - 1)
         self.iteration += len(trace)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,11 +25,15 @@ LEFT, RIGHT = "world/cam/image", "right/image"
 _JPEG_QUALITY = 90
 _MASK_THRESHOLD = 0.5
 _MASK_OPACITY = 0.35
+_MOST_LINES = 255
 
 
 def log_conventions(stream: RerunStream) -> None:
-    """The world is the left camera frame: x right, y down, z forward, metres."""
+    """The world is the left camera frame: x right, y down, z forward, metres. Masks have the numbers of lines."""
     stream.log("world", stream.rr.ViewCoordinates.RDF, static=True)
+    context = stream.rr.AnnotationContext([(0, "no car", (0, 0, 0, 0)), *_car_classes()])
+    for entity in (LEFT, RIGHT):
+        stream.log(f"{entity}/masks", context, static=True)
 
 
 def log_frame(stream: RerunStream, source: FrameSource, has_detections: bool) -> None:
@@ -55,7 +60,7 @@ def log_frame(stream: RerunStream, source: FrameSource, has_detections: bool) ->
 def clear_cars(stream: RerunStream) -> None:
     """Take away what the cars of other frames left at the present places."""
     residuals = [f"{LEFT}/silhouette", f"{RIGHT}/silhouette", f"{LEFT}/photometric"]
-    for entity in ("world/cars", "world/boxes/iteration", *residuals, "costs"):
+    for entity in ("world/cars", "world/boxes/iteration", *residuals, "cost", "terms"):
         stream.log(entity, stream.rr.Clear(recursive=True))
 
 
@@ -106,6 +111,7 @@ def boxes(
         colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
         labels=list(labels),
         show_labels=False,
+        fill_mode=rr.components.FillMode.MajorWireframe,
     )
 
 
@@ -121,6 +127,15 @@ def boxes_of_lines(
     centres_cam = location_cam.numpy() - 0.5 * hwl[:, :1] * T_cam_obj[:, :3, 1]
     labels = [f"{one.line_number}" for one in lines]
     return boxes(stream, centres_cam, T_cam_obj[:, :3, :3], hwl, [colour] * len(lines), labels)
+
+
+def _car_classes() -> list[tuple[int, str, tuple[int, int, int, int]]]:
+    """Numbers, names and colours of cars; hues a golden angle apart differ as much as they can."""
+    classes = []
+    for number in range(1, _MOST_LINES + 1):
+        red, green, blue = (round(255 * part) for part in colorsys.hsv_to_rgb((number * 0.618) % 1, 0.8, 1.0))
+        classes.append((number, f"car {number}", (red, green, blue, 255)))
+    return classes
 
 
 def _log_refined_boxes(stream: RerunStream, source: FrameSource, t_cam_ref: NDArray[np.float64]) -> None:

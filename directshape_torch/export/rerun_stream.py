@@ -11,6 +11,8 @@ from directshape_torch.errors import MissingDependencyError
 FRAME, ITERATION = "frame", "iteration"
 """The timelines: numbers of frames; iterations of all frames, one after another."""
 
+_STATES_PER_SECOND = 3.0
+
 
 def import_rerun() -> Any:
     """The package `rerun`.
@@ -30,18 +32,19 @@ class RerunStream:
 
     Args:
         path: of the .rrd file; its folder is made where it is missing.
+        size_wh: of the images, which the viewer fits its views to.
         with_iterations: whether there is a timeline of iterations to look at.
 
     Raises:
         MissingDependencyError: Rerun is not installed.
     """
 
-    def __init__(self, path: Path, with_iterations: bool = False) -> None:
+    def __init__(self, path: Path, size_wh: tuple[int, int], with_iterations: bool = False) -> None:
         self.rr, self.path = import_rerun(), path
         self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = self.rr.RecordingStream("directshape", send_properties=False)
-        self._stream.save(self._temporary, default_blueprint=_blueprint(with_iterations))
+        self._stream.save(self._temporary, default_blueprint=_blueprint(size_wh, with_iterations))
         # When a line was written says nothing about the refinement.
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
@@ -76,19 +79,33 @@ class RerunStream:
         self._stream.disconnect()
 
 
-def _blueprint(with_iterations: bool) -> Any:
-    """3D view on the left; both images and, with iterations, the costs on the right."""
+def _blueprint(size_wh: tuple[int, int], with_iterations: bool) -> Any:
+    """3D view on the left; images on the right, and with iterations residuals and costs."""
     import rerun.blueprint as rrb
 
-    images: list[Any] = [
-        rrb.Spatial2DView(origin="world/cam", name="left", contents=["world/cam/**", "world/boxes/**"])
-    ]
-    images.append(rrb.Spatial2DView(origin="right", name="right"))
+    bounds = rrb.VisualBounds2D(x_range=[0, size_wh[0]], y_range=[0, size_wh[1]])
+    camera, left, right = "world/cam", "world/cam/image", "right/image"
+
+    def image(name: str, origin: str, *contents: str) -> Any:
+        return rrb.Spatial2DView(origin=origin, name=name, contents=list(contents), visual_bounds=bounds)
+
+    views = [image("left: masks and boxes", camera, left, f"{left}/masks", "world/boxes/**")]
+    seen_right = image("right: masks", "right", right, f"{right}/masks")
     if with_iterations:
-        images.append(rrb.TimeSeriesView(origin="costs", name="costs"))
+        photometric = image("left: right image less left", left, left, f"{left}/photometric/**")
+        silhouettes = [
+            image(f"{side}: silhouettes", entity, entity, f"{entity}/silhouette/**")
+            for side, entity in (("left", left), ("right", right))
+        ]
+        views += [photometric, rrb.Tabs(*silhouettes, seen_right)]
+        views.append(rrb.TimeSeriesView(origin="cost", name="cost of each car"))
+    else:
+        views.append(seen_right)
+    # Above and behind the camera, so that the street lies ahead.
+    eye = rrb.EyeControls3D(position=[-7.0, -8.0, -9.0], look_target=[1.0, 1.0, 14.0], eye_up=[0.0, -1.0, 0.0])
     timeline = ITERATION if with_iterations else FRAME
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Spatial3DView(origin="world", name="3D"), rrb.Vertical(*images)),
-        rrb.TimePanel(timeline=timeline),
+        rrb.Horizontal(rrb.Spatial3DView(origin="world", name="3D", eye_controls=eye), rrb.Vertical(*views)),
+        rrb.TimePanel(timeline=timeline, fps=_STATES_PER_SECOND, play_state="paused"),
         collapse_panels=True,
     )
