@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from directshape_torch.cli.data_options import LAYOUTS
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
+    from directshape_torch.geometry.disparity_field import DisparityField
     from directshape_torch.io.instance_masks import MaskSource
     from directshape_torch.report.frame_inputs import InputSources
+    from directshape_torch.report.run_folder import RunFolder
 
 _DESCRIPTION = """
 Write one self-contained HTML page about a run of 'directshape refine': summary, sortable table of cars, distributions,
@@ -28,8 +30,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("out", type=Path, metavar="OUT", help="the folder of --out of 'directshape refine'")
     parser.add_argument("--html", type=Path, metavar="FILE", help="the page (default: OUT/report.html)")
     inputs = parser.add_argument_group("inputs of the run")
-    inputs.add_argument("--data", type=Path, metavar="ROOT", help="folder that holds training/image_2 ..")
-    inputs.add_argument("--detections", type=Path, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data")
+    inputs.add_argument("--data", type=Path, metavar="ROOT", help="folder of the data set")
+    inputs.add_argument("--layout", choices=LAYOUTS, default="kitti", help="of that data set (default: kitti)")
+    inputs.add_argument("--detections", type=Path, metavar="DIR", help="detections (folder: default those in ROOT)")
     inputs.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
     inputs.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
     inputs.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
@@ -51,13 +54,15 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         DirectShapeError: wrong input; for the main program to show.
     """
+    from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.report.make_report import ReportOptions, make_report
     from directshape_torch.report.run_prior import prior_of_run
 
     page = args.out / "report.html" if args.html is None else args.html
-    frames = None if args.frames is None else [word.zfill(6) if word.isdigit() else word for word in args.frames]
-    options = ReportOptions(frames, args.max_frames)
-    outcome = make_report(args.out, page, _sources(args), prior_of_run(args.out, args.prior), options, _with_progress)
+    options = ReportOptions(args.frames, args.max_frames)
+    prior = prior_of_run(args.out, args.prior)
+    with ProgressBar("report") as progress:
+        outcome = make_report(args.out, page, _sources(args), prior, options, progress)
     for note in outcome.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"page     {outcome.path}  {outcome.num_bytes / 1e6:.1f} MB")
@@ -65,33 +70,66 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _with_progress(frame_ids: Sequence[str]) -> Iterable[str]:
-    from tqdm import tqdm
-
-    return tqdm(frame_ids, unit="frame", desc="report", file=sys.stderr)
-
-
 def _sources(args: argparse.Namespace) -> InputSources:
-    from directshape_torch.geometry.disparity_field import DisparityField
-    from directshape_torch.io.kitti_layout import KittiObjectLayout
+    """Where the inputs lie; a plain folder keeps its detections beside its images."""
+    from directshape_torch.io.open_dataset import open_dataset
     from directshape_torch.report.frame_inputs import InputSources
+    from directshape_torch.report.run_folder import RunFolder
 
+    run = RunFolder.open(args.out)
     if args.data is None:
-        if args.detections is not None:
-            raise InputError("--detections", "--data as well", "only --detections", "give the data set's folder too")
+        _check_data_is_not_needed(args)
         return InputSources()
-    # Without detections the layout still needs a folder of them; the result files stand in, and are not read as such.
-    layout = KittiObjectLayout(args.data, args.out / "data" if args.detections is None else args.detections)
-    field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
-    return InputSources(layout, args.detections is not None, _mask_source(args), field)
+    if not run.done:
+        return InputSources()
+    is_folder = args.layout == "folder"
+    # Without detections a layout still needs a folder of them; the result files stand in, and are not read as such.
+    stand_in = None if is_folder else args.out
+    field = _disparity_field(args.stereo_bias, run)
+    dataset = open_dataset(
+        args.layout,
+        args.data,
+        stand_in if args.detections is None else args.detections,
+        _mask_source(args),
+        frames=run.done,
+        classes=run.classes,
+        disparity_field=field,
+    )
+    has_own_masks = args.masks is None and args.masks_left is None and args.masks_right is None
+    return InputSources(dataset.layout, is_folder or args.detections is not None, dataset.masks, has_own_masks, field)
 
 
-def _mask_source(args: argparse.Namespace) -> MaskSource | None:
-    from directshape_torch.io.instance_masks import CocoFileMasks, mask_source
+def _check_data_is_not_needed(args: argparse.Namespace) -> None:
+    names = ("detections", "masks", "masks_left", "masks_right", "stereo_bias")
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]
+    if given:
+        raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
+
+
+def _disparity_field(path: Path | None, run: RunFolder) -> DisparityField | None:
+    """The field that the run was made with.
+
+    Raises:
+        InputError: it is another one.
+    """
+    from directshape_torch.batch.content_hashes import hash_field
+    from directshape_torch.geometry.disparity_field import DisparityField
+
+    if path is None:
+        return None
+    field = DisparityField.load(path)
+    if hash_field(field) != run.manifest.sha256.get("stereo_bias"):
+        raise InputError("--stereo-bias", "the field that the run was made with", f"another one in {path}")
+    return field
+
+
+def _mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
+    from directshape_torch.io.instance_masks import CocoFileMasks
 
     files = (args.masks_left, args.masks_right)
     if args.masks is not None and files != (None, None):
         raise InputError("--masks", "either a folder or COCO files", "both")
     if files != (None, None):
         return CocoFileMasks(*files)
-    return None if args.masks is None else mask_source(args.masks)
+    masks: Path | None = args.masks
+    return masks

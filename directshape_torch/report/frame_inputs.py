@@ -31,12 +31,14 @@ class InputSources:
         layout: finds images, calibration, planes, labels and detections.
         has_detections: whether the detections of that layout are those that went in.
         masks: instance masks.
+        has_own_masks: whether they are the layout's, which may say what detection each belongs to.
         disparity_field: residual disparity of the rig.
     """
 
     layout: FrameLayout | None = None
     has_detections: bool = False
     masks: MaskSource | None = None
+    has_own_masks: bool = False
     disparity_field: DisparityField | None = None
 
 
@@ -100,7 +102,8 @@ class InputReader:
         camera = self._camera(layout, frame_id)
         ground = None if camera is None else self._ground(layout, frame_id, camera, left, right)
         masks = () if left is None else self._masks(frame_id, (left.shape[0], left.shape[1]))
-        return FrameInputs(left, right, camera, ground, masks, layout.given_masks(frame_id))
+        given = layout.given_masks(frame_id) if self.sources.has_own_masks else None
+        return FrameInputs(left, right, camera, ground, masks, given)
 
     def _is_unchanged(self, frame_id: str, role: str, path: Path) -> bool:
         """Whether the file is the one that the run read."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, cast, get_args
 
 from directshape_torch.batch.content_hashes import hash_prior
+from directshape_torch.batch.options import RunObserver, SilentObserver
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.observation.occlusion import OcclusionOrder
@@ -70,7 +71,7 @@ def make_report(
     sources: InputSources,
     prior: ShapePrior | None = None,
     options: ReportOptions | None = None,
-    progress: Callable[[Sequence[str]], Iterable[str]] = iter,
+    observer: RunObserver | None = None,
 ) -> ReportOutcome:
     """Write the page of a run.
 
@@ -80,7 +81,7 @@ def make_report(
         sources: where the inputs lie.
         prior: the shapes of the run; None, or another one than the run's: boxes alone, without meshes.
         options: what to show.
-        progress: wraps the frames with details.
+        observer: is told of each frame with details.
 
     Raises:
         DataFormatError: no run, or a damaged file in it.
@@ -89,7 +90,7 @@ def make_report(
     options = ReportOptions() if options is None else options
     run = RunFolder.open(out_dir)
     writer = _PageOfRun(run, sources, _right_prior(run, prior), prior is not None)
-    return writer.write(page, options, progress)
+    return writer.write(page, options, SilentObserver() if observer is None else observer)
 
 
 def _right_prior(run: RunFolder, prior: ShapePrior | None) -> ShapePrior | None:
@@ -106,9 +107,7 @@ class _PageOfRun:
         self._prior = prior
         self._prior_was_given = prior_was_given
 
-    def write(
-        self, page: Path, options: ReportOptions, progress: Callable[[Sequence[str]], Iterable[str]]
-    ) -> ReportOutcome:
+    def write(self, page: Path, options: ReportOptions, observer: RunObserver) -> ReportOutcome:
         frame_ids = self._choose(options.frames)
         rows = [row for number, name in enumerate(frame_ids) for row in self._rows(number, name)]
         detailed = choose_frames(rows, len(frame_ids), options.most_frames)
@@ -117,7 +116,7 @@ class _PageOfRun:
         frame = page_frame(f"{self._run.out_dir.resolve().name}: refined cars")
         with replaced_text_file(page) as file:
             file.write(frame.head)
-            self._write_details(file, frame_ids, detailed, progress)
+            self._write_details(file, frame_ids, detailed, observer)
             notes = self._notes(len(frame_ids), len(detailed))
             self._write_tables(file, frame_ids, detailed, rows, notes)
             file.write(frame.foot)
@@ -127,10 +126,13 @@ class _PageOfRun:
         done = self._run.done
         if frames is None:
             return done
-        missing = sorted(set(frames) - set(done))
+        # Numbers name frames with leading zeros or without.
+        by_number = {int(name): name for name in done if name.isdecimal()}
+        known = {word: word if word in done else by_number.get(_number(word)) for word in frames}
+        missing = sorted(word for word, name in known.items() if name is None)
         if missing:
             raise InputError("frames", f"frames that {self._run.out_dir} has finished", ", ".join(missing[:5]))
-        return sorted(set(frames))
+        return sorted({name for name in known.values() if name is not None})
 
     def _rows(self, number: int, frame_id: str) -> list[CarRow]:
         material = self._results(frame_id)
@@ -151,19 +153,21 @@ class _PageOfRun:
         file: IO[str],
         frame_ids: Sequence[str],
         detailed: Sequence[int],
-        progress: Callable[[Sequence[str]], Iterable[str]],
+        observer: RunObserver,
     ) -> None:
         settings = self._detail_settings()
         if settings.mean is not None:
             file.write(data_block("mean-mesh", mesh_data(settings.mean)))
         names = [frame_ids[number] for number in detailed]
-        for number, name in zip(detailed, progress(names), strict=True):
+        observer.started(names)
+        for number, name in zip(detailed, names, strict=True):
             known = self._results(name)
             material = FrameMaterial(known.result, self._reader.read(name), known.lines, known.detections, known.labels)
             details = frame_details(material, settings)
             file.write(data_block(f"thumbnails-{number}", details.thumbnails))
             file.write(data_block(f"maps-{number}", details.maps))
             file.write(data_block(f"scene-{number}", details.scene))
+            observer.finished(name, None)
 
     def _detail_settings(self) -> DetailSettings:
         config = self._run.manifest.config
@@ -171,8 +175,7 @@ class _PageOfRun:
         mean = None if self._prior is None else decoded_mesh(self._prior, self._prior.initial_code(1)[0].cpu().numpy())
         order = refiner.get("sampling", {}).get("occlusion_order", "depth")
         known = order if order in get_args(OcclusionOrder) else "depth"
-        classes = tuple(config.get("classes", ("Car",)))
-        return DetailSettings(classes, self._prior, mean, map_settings(refiner), cast(OcclusionOrder, known))
+        return DetailSettings(self._run.classes, self._prior, mean, map_settings(refiner), cast(OcclusionOrder, known))
 
     def _notes(self, num_frames: int, num_detailed: int) -> list[str]:
         sources = self._reader.sources
@@ -186,6 +189,9 @@ class _PageOfRun:
         if self._prior is None:
             reason = "the prior is not that of the run" if self._prior_was_given else "the prior was not given"
             notes.append(f"no residual maps, and no meshes but saved ones: {reason} (--prior)")
+        has_field = self._run.manifest.sha256.get("stereo_bias") is not None
+        if has_field and sources.layout is not None and sources.disparity_field is None:
+            notes.append("photometric residuals without the run's disparity field, so biased (--stereo-bias)")
         if num_detailed < num_frames:
             notes.append(f"pictures and 3D views of {num_detailed} of {num_frames} frames (--max-frames)")
         return [*notes, *problem_notes(self._reader.problems, num_detailed)]
@@ -201,6 +207,11 @@ class _PageOfRun:
         file.write(data_block("frames", {"ids": list(frame_ids), "detailed": list(detailed)}))
         file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [as_json(row) for row in rows]}))
         file.write(data_block("run", run_facts(self._run, frame_ids, rows, notes)))
+
+
+def _number(word: str) -> int:
+    """-1 for what is no number."""
+    return int(word) if word.isdecimal() else -1
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def car_window(
     Example:
         >>> K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
         >>> car_window(np.zeros((100, 100, 3), np.uint8), K, np.array([[-1.0, -1, 10], [1, 1, 10]]))
-        (36, 38, 65, 63)
+        (35, 38, 65, 62)
     """
     visible = points_cam[points_cam[:, 2] > NEAR_PLANE_M]
     height, width = image.shape[:2]

@@ -60,6 +60,11 @@ class RunFolder:
         return sorted(name for name in self.manifest.frames if self.manifest.is_done(name))
 
     @property
+    def classes(self) -> tuple[str, ...]:
+        """Types that were refined."""
+        return tuple(self.manifest.config.get("classes", ("Car",)))
+
+    @property
     def failed(self) -> dict[str, str]:
         """Why the other frames were not."""
         frames = sorted(self.manifest.frames.items())
@@ -81,8 +86,7 @@ class RunFolder:
 
     def refined_lines(self, lines: list[KittiObject]) -> list[KittiObject]:
         """Of the lines of a detection or result file those that the run refines, in the order of its shapes."""
-        classes = self.manifest.config.get("classes", ("Car",))
-        return [line for line in lines if line.type in classes and line.has_box_3d]
+        return [line for line in lines if line.type in self.classes and line.has_box_3d]
 
     def _mesh_files(self, frame_id: str, shapes: ShapeArrays) -> list[Path | None]:
         names = self.manifest.frames[frame_id].get("mesh_files", ())

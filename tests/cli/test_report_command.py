@@ -44,9 +44,10 @@ def test_notes_say_what_is_missing(run: FinishedRun, tmp_path: Path, capsys: pyt
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--frames", "9"], "000009"),
+        (["--frames", "1", "9"], "got 9"),
         (["--max-frames", "-1"], "most_frames"),
         (["--detections", "."], "--data"),
+        (["--stereo-bias", "field.json"], "--data"),
         (["--prior", "neural"], "the prior of the run"),
         (["--data", "nowhere"], "training"),
         (["--masks", "a", "--masks-left", "b", "--data", "{root}"], "either a folder or COCO files"),

@@ -146,7 +146,7 @@ def test_few_frames_have_details(run: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_chosen_frames_alone(run: FinishedRun, tmp_path: Path) -> None:
-    options = ReportOptions(frames=("000001",))
+    options = ReportOptions(frames=("1", "000001"))
     data = blocks(make_report(run.out, tmp_path / "page.html", run.sources, run.prior, options).path)
     assert data["frames"]["ids"] == ["000001"]
     assert data["run"]["frames_done"] == 1
