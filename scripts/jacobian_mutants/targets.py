@@ -13,6 +13,7 @@ _ROWS = (
     "tests/energy/test_autograd_jacobian.py::test_rows_of_every_term_agree",
 )
 _COST = "tests/energy/test_gradient_of_the_cost.py"
+_TRACKED = ("tests/energy/test_tracked_energy.py", "tests/energy/test_following_rays.py")
 
 
 @dataclass(frozen=True)
@@ -260,6 +261,52 @@ TARGETS: dict[str, Target] = {
             "_huber_of",
         ),
         ("tests/tracking/test_tracking_photometric.py",),
+    ),
+    "tracked_silhouettes": Target(
+        "directshape_torch/energy/tracked_silhouettes.py",
+        (
+            "TrackedSilhouettes.of_terms",
+            "TrackedSilhouettes.linearise",
+            "TrackedSilhouettes.fixed_depths",
+            "TrackedSilhouettes.residuals",
+            "TrackedSilhouettes.accumulate",
+            "TrackedSilhouettes.follow",
+            "TrackedSilhouettes.of_objects",
+            "TrackedSilhouettes._noted",
+            "_side",
+        ),
+        _TRACKED,
+    ),
+    "tracked_photometric": Target(
+        "directshape_torch/energy/tracked_photometric.py",
+        (
+            "TrackedPhotometric.of_term",
+            "TrackedPhotometric.linearise",
+            "TrackedPhotometric.fixed_depths",
+            "TrackedPhotometric.residuals",
+            "TrackedPhotometric.accumulate",
+            "TrackedPhotometric.follow",
+            "TrackedPhotometric.of_objects",
+            "TrackedPhotometric._noted",
+            "_rows",
+            "_right_view",
+            "_hidden",
+            "_hits",
+        ),
+        _TRACKED,
+    ),
+    "tracked_energy": Target(
+        "directshape_torch/energy/tracked_energy.py",
+        (
+            "TrackedEnergy.of_terms",
+            "TrackedEnergy.linearise",
+            "TrackedEnergy.linearise_by_autograd",
+            "TrackedEnergy.follow",
+            "TrackedEnergy.of_objects",
+            "_stacked",
+            "_scaled",
+        ),
+        _TRACKED,
     ),
     "pose_rows": Target(
         "directshape_torch/energy/pose_rows.py",
