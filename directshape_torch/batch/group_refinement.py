@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import time
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -66,6 +67,7 @@ class GroupReport:
         records: of its frames, in the order in which they ended.
         calls: of the refiner.
         num_halved: calls that did not work and were tried again with half of the frames.
+        cpu_s: time that the processor spent on it, reading and writing included, whatever else the machine did.
         peak_memory_mb: of the process so far, where the system tells.
         peak_device_memory_mb: of the graphics card so far.
         stopped: why no other frame could be refined either, or None.
@@ -74,6 +76,7 @@ class GroupReport:
     records: list[FrameRecord] = field(default_factory=list)
     calls: list[CallTiming] = field(default_factory=list)
     num_halved: int = 0
+    cpu_s: float = 0.0
     peak_memory_mb: float | None = None
     peak_device_memory_mb: float | None = None
     stopped: str | None = None
@@ -100,11 +103,12 @@ class GroupRefiner:
 
     def refine(self, group: FrameGroup) -> GroupReport:
         """Refine a group; errors of a frame are in its record, those of the whole run in `stopped`."""
-        step = _GroupStep(self._job, self._journal, group)
+        step, cpu_start_s = _GroupStep(self._job, self._journal, group), time.process_time()
         try:
             step.refine(group.frame_ids)
         except _STOPS_THE_RUN as error:
             step.report.stopped = _reason(error)
+        step.report.cpu_s = time.process_time() - cpu_start_s
         device = self._job.refiner.prior.origin.device
         step.report.peak_memory_mb, step.report.peak_device_memory_mb = peak_memory_mb(), peak_device_memory_mb(device)
         return step.report

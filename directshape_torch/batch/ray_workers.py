@@ -5,6 +5,7 @@ All machines must see the input and the output folder under the same paths, and 
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 from directshape_torch.batch.frame_groups import FrameGroup
@@ -47,6 +48,8 @@ class RayWorkers:
             _connect(self._ray, options)
         num_cpus = int(self._ray.cluster_resources().get("CPU", 1))
         self.num_workers = options.workers or max(1, num_cpus // self._threads)
+        # Ray places all tasks that fit; a cluster of this machine has just the cores of its workers.
+        self._is_limited = options.workers is not None and not (self._starts_cluster and options.ray == "local")
         needs_gpu = job.refiner.prior.origin.device.type == "cuda"
         remote = self._ray.remote(
             num_cpus=self._threads, num_gpus=1 if needs_gpu else 0, max_retries=options.retries, retry_exceptions=False
@@ -57,8 +60,8 @@ class RayWorkers:
 
     @property
     def capacity(self) -> int:
-        """As many groups as keep all workers busy."""
-        return _GROUPS_PER_WORKER * self.num_workers
+        """As many groups as keep all workers busy; on a cluster no more than the workers that were asked for."""
+        return self.num_workers if self._is_limited else _GROUPS_PER_WORKER * self.num_workers
 
     def hand_out(self, group: FrameGroup) -> None:
         """Submit a task."""
@@ -107,6 +110,8 @@ def _import_ray() -> Any:
 
 
 def _connect(ray: Any, options: WorkerOptions) -> None:
+    # Ray would report its use to its makers; who starts a cluster himself has decided that himself.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     quiet = {"log_to_driver": False, "logging_level": "warning"}
     try:
         if options.ray == "local":

@@ -152,6 +152,7 @@ class _Run:
 
     def _take_in(self, report: GroupReport) -> None:
         self.timings.add(report.calls, report.peak_memory_mb, report.peak_device_memory_mb)
+        self.timings.cpu_s += report.cpu_s
         self.num_halved += report.num_halved
         for record in report.records:
             self.observer.finished(record.frame_id, record.failure)

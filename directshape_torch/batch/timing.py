@@ -34,6 +34,7 @@ class RunTimings:
         calls: one entry a call.
         workers: processes that refined side by side.
         threads: of each.
+        cpu_s: seconds that processors spent on the frames, in all workers, reading and writing included.
         wall_s: seconds from the first frame to the last, reading and writing included.
         peak_mb: the largest resident memory of any of these processes, MB, where the system tells.
         peak_device_mb: the largest memory of tensors on a graphics card, MB.
@@ -43,6 +44,7 @@ class RunTimings:
     calls: list[CallTiming] = field(default_factory=list)
     workers: int = 1
     threads: int = field(default_factory=torch.get_num_threads)
+    cpu_s: float = 0.0
     wall_s: float = 0.0
     peak_mb: float | None = None
     peak_device_mb: float | None = None
@@ -95,6 +97,7 @@ def write_timings(path: Path, timings: RunTimings) -> None:
         "peak_memory_mb": timings.peak_mb,
         "peak_device_memory_mb": timings.peak_device_mb,
         "wall_s": _rounded(timings.wall_s),
+        "cpu_s": _rounded(timings.cpu_s),
         "ms_per_car": _rounded(timings.ms_per_car),
         "ms_per_frame": _rounded(timings.ms_per_frame),
         "calls": [

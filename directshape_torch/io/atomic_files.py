@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_bytes(path: Path | str, content: bytes) -> None:
+def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None:
     """Write `content` to `path` by way of a temporary file in the same folder, which is made where it is missing.
 
     Args:
         path: the file to make or replace.
         content: its bytes.
+        durable: wait for the disk, so that not even a power cut leaves a file of another length.
 
     Raises:
         OSError: the folder cannot be made or written; the old file, if any, is then untouched.
@@ -40,6 +41,9 @@ def write_bytes(path: Path | str, content: bytes) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         # mkstemp makes files that only the owner can read; results are for whoever may read the folder.
         os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, path)
@@ -53,13 +57,14 @@ def write_text(path: Path | str, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
-def write_json(path: Path | str, value: Any) -> None:
+def write_json(path: Path | str, value: Any, durable: bool = False) -> None:
     """Write `value` as JSON with sorted keys and a final newline; NaN and infinity are refused, JSON has none.
 
     Raises:
         ValueError: `value` holds a number that JSON cannot express.
     """
-    write_text(path, json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n")
+    text = json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
+    write_bytes(path, text.encode("utf-8"), durable)
 
 
 def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -85,8 +85,8 @@ def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
 
 
 def write_manifest(path: Path | str, manifest: RunManifest) -> None:
-    """Write `summary.json`."""
-    atomic_files.write_json(path, {"schema_version": MANIFEST_SCHEMA_VERSION, **vars(manifest)})
+    """Write `summary.json`, and wait for the disk: without it nobody would know what the results are."""
+    atomic_files.write_json(path, {"schema_version": MANIFEST_SCHEMA_VERSION, **vars(manifest)}, durable=True)
 
 
 def read_manifest(path: Path | str) -> RunManifest | None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -49,24 +50,27 @@ def undisturbed(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def killed_in_the_middle(root: Path, out: Path) -> list[str]:
-    """Kill a run with two workers when it has finished a frame or two; which, and wait for its workers to go."""
+def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
+    """Stop a run with two workers when it has finished a frame or two, and wait until all of its processes are gone."""
     environment = {**os.environ, "PYTHONPATH": str(TESTS), "OMP_NUM_THREADS": "1"}
-    run = subprocess.Popen(
-        [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out)], env=environment
-    )
+    command = [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out)]
+    run = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
         wait_until(lambda: run.poll() is not None or len(read_journals(out).records) > 0)
-        assert run.poll() is None, "the run ended before it was killed"
+        assert run.poll() is None, "the run ended before it was stopped"
         status = read_status(out)
         assert (status.state, status.num_frames) == ("running", len(FRAMES))
         assert status.num_left == len(FRAMES) - status.num_done > 0
+        workers = [int(path.stem.rpartition("-")[2]) for path in journal_folder(out).iterdir()]
+        if by == signal.SIGINT:  # as a terminal does it
+            os.killpg(run.pid, by)
+        else:
+            run.send_signal(by)
+        run.wait(_PATIENCE_S)
+        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
     finally:
-        run.send_signal(signal.SIGKILL)
-        run.wait()
-    workers = [int(path.stem.rpartition("-")[2]) for path in journal_folder(out).iterdir()]
-    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
-    return [record.frame_id for record in read_journals(out).records]
+        with suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
 
 
 def wait_until(condition: object) -> None:
@@ -79,7 +83,8 @@ def wait_until(condition: object) -> None:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
 def test_a_run_that_is_killed_and_damaged_goes_on_where_it_was(root: Path, tmp_path: Path, undisturbed: Path) -> None:
     out = tmp_path / "out"
-    finished = killed_in_the_middle(root, out)
+    stopped_in_the_middle(root, out, signal.SIGKILL)
+    finished = [record.frame_id for record in read_journals(out).records]
     assert 0 < len(finished) < len(FRAMES)
     assert read_status(out).state == "killed"
     # Everything else that a killed process may leave: a line and a file cut short, a file nobody moved to its name.
@@ -104,6 +109,18 @@ def test_a_run_that_is_killed_and_damaged_goes_on_where_it_was(root: Path, tmp_p
         assert (out / "data" / f"{frame_id}.txt").stat().st_ino == before[frame_id]
     assert result_files(out) == result_files(undisturbed)
     assert read_status(out).state == "finished"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="looks for processes in /proc")
+def test_an_interrupted_run_ends_its_frames_and_goes_on(root: Path, tmp_path: Path, undisturbed: Path) -> None:
+    out = tmp_path / "out"
+    stopped_in_the_middle(root, out, signal.SIGINT)
+    status = read_status(out)
+    assert (status.state, status.reason) == ("stopped", "KeyboardInterrupt")
+    assert not journal_folder(out).exists()
+    assert len(list((out / "data").glob("*.txt"))) == status.num_done < len(FRAMES)
+    assert len(refine(root, out).resumed) == status.num_done
+    assert result_files(out) == result_files(undisturbed)
 
 
 @pytest.fixture
