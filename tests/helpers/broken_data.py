@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco
 
+from directshape_torch.io.coco_segmentation import decode_segmentation
+
 Image = NDArray[np.uint8]
 Row = list[str]  # the words of a detection line: h w l at 8, x y z at 11, rotation_y at 14
 P_LEFT, P_RIGHT = "P2:", "P3:"
@@ -185,7 +187,9 @@ def _masks(change: Callable[[dict[str, Any], NDArray[Any]], NDArray[Any]]) -> Ca
         for path in (root / "masks").glob("*.json"):
             entries = json.loads(path.read_text())
             for entry in entries:
-                mask = np.asfortranarray(change(entry, coco.decode(entry["segmentation"])))
+                size = entry["segmentation"]["size"]
+                mask = decode_segmentation(path, 0, entry["segmentation"], (size[0], size[1]))
+                mask = np.asfortranarray(change(entry, mask.astype(np.uint8)))
                 rle = coco.encode(mask)
                 entry["segmentation"] = {"size": list(rle["size"]), "counts": rle["counts"].decode()}
                 for key in ("bbox", "soft_probability"):

@@ -1,0 +1,85 @@
+"""The bundled frame broken in every way that is known, and what is said about it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.broken_data import BREAKS, copy_data
+
+import directshape_torch
+from directshape_torch.data_check import check_dataset as checks
+from directshape_torch.data_check import check_distances
+from directshape_torch.data_check.finding import CheckReport
+from directshape_torch.io.open_dataset import open_dataset
+
+DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
+
+
+def once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same images give the same answer: matching is the slow part and most breaks leave the images alone."""
+    answers: dict[tuple[str, ...], Any] = {}
+
+    def remembered(*images: Any) -> Any:
+        key = tuple(hashlib.sha256(image.tobytes()).hexdigest() for image in images)
+        if key not in answers:
+            answers[key] = function(*images)
+        return answers[key]
+
+    return remembered
+
+
+@pytest.fixture(scope="module", autouse=True)
+def match_once() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checks, "match_pair", once(checks.match_pair))
+        patch.setattr(check_distances, "match_disparity", once(check_distances.match_disparity))
+        yield
+
+
+def broken(tmp_path: Path, name: str | None) -> CheckReport:
+    root = copy_data(
+        DEMO, DEMO / "detections" / "noisy_stereo" / "data", DEMO / "training" / "masks", tmp_path / "data"
+    )
+    if name is not None:
+        BREAKS[name].apply(root)
+    return checks.check_dataset(open_dataset("kitti", root, root / "detections", root / "masks"))
+
+
+def test_the_intact_frame_has_no_finding(tmp_path: Path) -> None:
+    report = broken(tmp_path, None)
+    assert report.findings == ()
+    assert (report.num_frames, report.num_checked, report.num_cars, report.exit_code) == (1, 1, 6, 0)
+
+
+@pytest.mark.parametrize("name", sorted(BREAKS))
+def test_a_break_is_found(name: str, tmp_path: Path) -> None:
+    report = broken(tmp_path, name)
+    found = {finding.check for finding in report.findings}
+    assert found & BREAKS[name].checks, f"found only {found}"
+    for finding in report.findings:
+        assert all((finding.where, finding.measured, finding.expected, finding.cure))
+
+
+@pytest.mark.parametrize(
+    ("name", "checks_alone"),
+    [
+        ("left and right images swapped", {"images_swapped"}),
+        ("right image turned by 0.3 degrees", {"not_rectified"}),
+        ("baseline 1.5 times too long", {"distance_scale"}),
+        ("box centre for bottom", {"box_origin"}),
+        ("yaw of the other sign", {"box_yaw"}),
+        ("order l w h", {"box_order"}),
+        ("x to the left", {"box_axes"}),
+        ("masks of the other side", {"masks_swapped"}),
+        ("baseline not times focal length", {"baseline_length"}),
+    ],
+)
+def test_one_mistake_is_one_finding(name: str, checks_alone: set[str], tmp_path: Path) -> None:
+    """What follows from a mistake is not reported as further ones."""
+    report = broken(tmp_path, name)
+    assert {finding.check for finding in report.findings} == checks_alone
+    assert report.exit_code == 1
