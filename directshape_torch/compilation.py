@@ -173,17 +173,22 @@ class Compilable(Generic[_P, _R]):
         return len(self._variants)
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        compiled = self.compiled(*args, **kwargs)
+        return self.plain(*args, **kwargs) if compiled is None else compiled
+
+    def compiled(self, *args: _P.args, **kwargs: _P.kwargs) -> _R | None:
+        """The compiled form's result, or None where the plain form is called for: a caller may have a better one."""
         # First of all: the user's own compilation traces the plain form.
         if torch.compiler.is_compiling():
-            return self.plain(*args, **kwargs)
+            return None
         region = _region.get()
         if region is None or region.mode == "off" or _process.forked or is_unusual_call():
-            return self.plain(*args, **kwargs)
+            return None
         values = self._signature.bind(*args, **kwargs).args if kwargs else args
         variant = self._variant(values)
         known = variant in self._variants
         if variant is None or not (known or self._may_compile(variant, region)):
-            return self.plain(*args, **kwargs)
+            return None
         # Always the same kind of tensor: memory layout, parameters and gradients that are off make no further variants.
         values = tuple(value if is_normal(value) else normal(value) for value in values)
         with torch.no_grad():
@@ -222,8 +227,8 @@ class Compilable(Generic[_P, _R]):
             _give_up(problem)
         return problem is None
 
-    def _first_call(self, variant: tuple[object, ...], region: _Region, values: tuple[Any, ...]) -> _R:
-        """Compile for a variant; other threads that need it wait."""
+    def _first_call(self, variant: tuple[object, ...], region: _Region, values: tuple[Any, ...]) -> _R | None:
+        """Compile for a variant, None if that fails; other threads that need it wait."""
         from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
 
         with _process.lock:
@@ -234,7 +239,7 @@ class Compilable(Generic[_P, _R]):
                 if region.mode == "on":
                     raise CompilationError(f"{self.plain.__qualname__} could not be compiled: {reason}") from error
                 _give_up(f"{self.plain.__qualname__} could not be compiled: {reason}")
-                return self.plain(*values)  # type: ignore[call-arg]
+                return None
             self._variants.add(variant)
         note_on_disk(self.plain, variant[1:])
         return result

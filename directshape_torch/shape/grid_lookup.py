@@ -13,6 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.device_constants import constant_like
+
 
 class GridField(NamedTuple):
     """B signed distance grids of one geometry and the basis that they are made of."""
@@ -43,11 +45,10 @@ class _Cells(NamedTuple):
 def value_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
     """Signed distance (...) at points (3, ...) of the objects with index broadcastable to (...)."""
     cells = _cells(field, points_obj)
-    c = _corner_values(field, cells, object_index)
     fx, fy, fz = cells.fraction.unbind(0)
-    inside = _along(fx, _along(fy, _along(fz, c[0], c[1]), _along(fz, c[2], c[3])),
-                    _along(fy, _along(fz, c[4], c[5]), _along(fz, c[6], c[7])))  # fmt: skip
-    return inside + field.spacing_m * _safe_norm(cells.outward)
+    along_z = _along(fz, *_corner_values(field, cells, object_index).unbind(2))
+    along_yz = _along(fy, *along_z.unbind(1))
+    return _along(fx, *along_yz.unbind(0)) + field.spacing_m * _safe_norm(cells.outward)
 
 
 def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False) -> Lookup:
@@ -56,17 +57,18 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     With `constant` nothing will be differentiated again, which allows a faster sum over the corners' basis vectors.
     """
     cells = _cells(field, points_obj)
-    c = _corner_values(field, cells, object_index)
     fx, fy, fz = cells.fraction.unbind(0)
-    z00, z01, z10, z11 = (_along(fz, c[i], c[i + 1]) for i in (0, 2, 4, 6))
-    y0, y1 = _along(fy, z00, z01), _along(fy, z10, z11)
-    d_y = _along(fx, z01 - z00, z11 - z10)
-    d_z = _along(fx, _along(fy, c[1] - c[0], c[3] - c[2]), _along(fy, c[5] - c[4], c[7] - c[6]))
+    lower, upper = _corner_values(field, cells, object_index).unbind(2)
+    d_z = _along(fy, *(upper - lower).unbind(1))
+    lower, upper = _along(fz, lower, upper).unbind(1)
+    d_y = upper - lower
+    lower, upper = _along(fy, lower, upper).unbind(0)
+    inside = torch.stack([upper - lower, _along(fx, *d_y.unbind(0)), _along(fx, *d_z.unbind(0))])
     distance = _safe_norm(cells.outward)
     direction = cells.outward / torch.where(distance > 0, distance, torch.ones_like(distance))
-    inside = torch.stack([y1 - y0, d_y, d_z]) * (1 / field.spacing_m)
+    inside = inside * (1 / field.spacing_m)
     gradient = torch.where(cells.outward == 0, inside, torch.zeros_like(inside)) + direction
-    value = _along(fx, y0, y1) + field.spacing_m * distance
+    value = _along(fx, lower, upper) + field.spacing_m * distance
     basis = _summed_basis(field, cells) if constant else _interpolated_basis(field, cells)
     return Lookup(value, gradient, basis)
 
@@ -82,17 +84,27 @@ def _cells(field: GridField, points_obj: Tensor) -> _Cells:
     return _Cells(flat, clamped - lower, position - clamped)
 
 
-def _corners(field: GridField) -> list[int]:
+def _corners(field: GridField) -> tuple[int, ...]:
     """Offsets of the 8 corners of a cell, x outermost: 000, 001, 010, 011, 100, 101, 110, 111."""
     ny, nz = field.basis.shape[1:3]
-    return [i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    return tuple(i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1))
 
 
-def _corner_values(field: GridField, cells: _Cells, object_index: Tensor) -> list[Tensor]:
+def _corner_values(field: GridField, cells: _Cells, object_index: Tensor) -> Tensor:
+    """Nodes (2, 2, 2, ...) about each point, x outermost; corner first, so that each step runs over whole rows."""
     nx, ny, nz, _ = field.basis.shape
     base = cells.lower_node + object_index * (nx * ny * nz)
-    # Eight separate gathers are several times faster in eager mode than one gather of (..., 8).
-    return [_take(field.values, base + corner) for corner in _corners(field)]
+    return _take(field.values, base + _offsets(field, base).view(2, 2, 2, *(1,) * base.ndim))
+
+
+def _offsets(field: GridField, like: Tensor) -> Tensor:
+    """`_corners` (8,), integers."""
+    if not torch.compiler.is_compiling():
+        return constant_like(_corners(field), like)
+    # Where it is compiled: numbers that are part of the code, and no table.
+    ny, nz = field.basis.shape[1:3]
+    two = torch.arange(2, device=like.device)
+    return (two[:, None, None] * (ny * nz) + two[:, None] * nz + two).flatten()
 
 
 def _take(flat: Tensor, index: Tensor) -> Tensor:
@@ -115,8 +127,7 @@ def _summed_basis(field: GridField, cells: _Cells) -> Tensor:
     (x0, y0, z0), (x1, y1, z1) = (1 - upper).unbind(0), upper.unbind(0)
     xy = (x0 * y0, x0 * y1, x1 * y0, x1 * y1)
     weight = torch.stack([w * z for w in xy for z in (z0, z1)], dim=-1)
-    corners = torch.tensor(_corners(field), device=weight.device)
-    node = (cells.lower_node[..., None] + corners).view(-1, 8)
+    node = (cells.lower_node[..., None] + _offsets(field, cells.lower_node)).view(-1, 8)
     rows = torch.nn.functional.embedding_bag(
         node, field.basis.flatten(0, 2), mode="sum", per_sample_weights=weight.view(-1, 8)
     )

@@ -12,7 +12,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.rays import ray_box_interval
+from directshape_torch.shape.compiled_march import (
+    Bracket,
+    SampledRays,
+    interval,
+    neighbours,
+    probe_grids,
+    sample_grids,
+    vertex_offset,
+)
+from directshape_torch.shape.grid_lookup import GridField
+from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import BoundShape
 
 
@@ -44,6 +54,7 @@ class RayMarch(NamedTuple):
     depths: Tensor  # (P, S) metres, ascending
     sdf: Tensor  # (P, S) metres
     crosses_bounds: Tensor  # (P,) bool; where false the depths are meaningless
+    closest_depth: Tensor | None = None  # (P,) `closest_approach_depth`, where it came with the samples
 
 
 class Root(NamedTuple):
@@ -56,17 +67,30 @@ class Root(NamedTuple):
 @torch.no_grad()
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
-    near, far, crosses_bounds = _interval(rays, bounds_obj)
+    if isinstance(shape, GridShape):
+        return _march_grids(shape, rays, bounds_obj, num_samples)
+    near, far, crosses_bounds = interval(rays.origin_obj, rays.direction_obj, bounds_obj)
     share = (torch.arange(num_samples, dtype=near.dtype, device=near.device) + 0.5) / num_samples
     depths = near[:, None] + (far - near)[:, None] * share
     return RayMarch(depths, _sdf_at(shape, rays, depths), crosses_bounds)
 
 
-def _interval(rays: ObjectRays, bounds_obj: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    interval = ray_box_interval(rays.origin_obj, rays.direction_obj, bounds_obj)
-    near = torch.where(interval.hit, interval.near, torch.ones_like(interval.near))
-    far = torch.where(interval.hit, interval.far, torch.full_like(interval.far, 2.0))
-    return near, far, interval.hit
+def _march_grids(shape: GridShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
+    coordinates = _coordinates(rays)
+    sampled = sample_grids.compiled(*shape.field, *coordinates, bounds_obj, num_samples)
+    if sampled is None:
+        sampled = _sampled_in_parts(shape.field, *coordinates, bounds_obj, num_samples)
+    return RayMarch(sampled.depths.mT, sampled.sdf.mT, sampled.crosses_bounds, sampled.closest_depth)
+
+
+def _sampled_in_parts(
+    field: GridField, rays_obj: Tensor, object_index: Tensor, bounds_obj: Tensor, num_samples: int
+) -> SampledRays:
+    """So many rays at a time that the intermediates stay in the caches."""
+    at_once = max(1, _POINTS_AT_ONCE // num_samples if rays_obj.device.type == "cpu" else len(object_index))
+    parts = zip(rays_obj.split(at_once, dim=1), object_index.split(at_once), strict=True)  # type: ignore[no-untyped-call]
+    sampled = [sample_grids.plain(*field, *part, bounds_obj, num_samples) for part in parts]
+    return sampled[0] if len(sampled) == 1 else SampledRays(*(torch.cat(x, -1) for x in zip(*sampled, strict=True)))
 
 
 def _sdf_at(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:
@@ -89,15 +113,33 @@ def _sdf_of_all(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:
 
 
 @torch.no_grad()
+def sdf_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
+    """Signed distance (P,) at one depth (P,) of each ray, a constant."""
+    if isinstance(shape, GridShape):
+        nothing_else = torch.nn.functional.pad(depth[None], (0, 0, 0, len(Bracket._fields) - 1))
+        probed = probe_grids.compiled(*shape.field, *_coordinates(rays), nothing_else)
+        if probed is not None:
+            return Bracket(*probed.unbind(0)).last_sdf
+    return shape.value(rays.at(depth), rays.object_index)
+
+
+def _coordinates(rays: ObjectRays) -> tuple[Tensor, Tensor]:
+    """Origins above directions (6, P), and objects (P,)."""
+    return torch.cat([rays.origin_obj.mT, rays.direction_obj.mT]), rays.object_index
+
+
+@torch.no_grad()
 def closest_approach_depth(marched: RayMarch) -> Tensor:
     """Depth (P,) at which each ray comes closest to the surface from outside, or is deepest inside.
 
     The least sample, improved by the vertex of the parabola through it and its neighbours. At a minimum along the ray
     the derivative by the depth vanishes, so an error of this depth enters the closest distance only in second order.
     """
+    if marched.closest_depth is not None:
+        return marched.closest_depth
     sdf, depths = marched.sdf, marched.depths
-    best, neighbours = _least_sample(sdf)
-    offset = _vertex_offset(sdf.gather(1, torch.stack(neighbours, dim=1)), best, sdf.shape[1])
+    best, around = _least_sample(sdf)
+    offset = vertex_offset(sdf.gather(1, torch.stack(around, dim=1)).unbind(1), best, sdf.shape[1])
     step = depths[:, 1] - depths[:, 0] if sdf.shape[1] > 1 else torch.zeros_like(offset)
     return depths.gather(1, best[:, None])[:, 0] + offset * step
 
@@ -108,11 +150,11 @@ def attached_closest_depth(shape: BoundShape, rays: ObjectRays, bounds_obj: Tens
     Only the least sample and its neighbours are evaluated with a graph, a few points instead of S.
     """
     num_samples = marched.depths.shape[1]
-    near, far, _ = _interval(rays, bounds_obj)
-    best, neighbours = _least_sample(marched.sdf)
+    near, far, _ = interval(rays.origin_obj, rays.direction_obj, bounds_obj)
+    best, around = _least_sample(marched.sdf)
     step = (far - near) / num_samples
-    depths = near[:, None] + (torch.stack(neighbours, dim=1).to(near.dtype) + 0.5) * step[:, None]
-    offset = _vertex_offset(_sdf_at(shape, rays, depths), best, num_samples)
+    depths = near[:, None] + (torch.stack(around, dim=1).to(near.dtype) + 0.5) * step[:, None]
+    offset = vertex_offset(_sdf_at(shape, rays, depths).unbind(1), best, num_samples)
     if num_samples == 1:
         step = torch.zeros_like(step)
     return depths[:, 1] + offset * step
@@ -121,16 +163,7 @@ def attached_closest_depth(shape: BoundShape, rays: ObjectRays, bounds_obj: Tens
 def _least_sample(sdf: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Number (P,) of the least sample of each ray, and the numbers of the one before it, of itself, of the next."""
     best = sdf.argmin(dim=1)
-    return best, ((best - 1).clamp_min(0), best, (best + 1).clamp_max(sdf.shape[1] - 1))
-
-
-def _vertex_offset(sdf: Tensor, best: Tensor, num_samples: int) -> Tensor:
-    """Vertex of the parabola through three samples (P, 3), in sample distances from the middle; zero at the ends."""
-    before, here, after = sdf.unbind(1)
-    curvature = before - 2 * here + after
-    inner = (best > 0) & (best < num_samples - 1) & (curvature > 0)
-    safe = torch.where(inner, curvature, torch.ones_like(curvature))
-    return torch.where(inner, 0.5 * (before - after) / safe, torch.zeros_like(here)).clamp(-0.5, 0.5)
+    return best, neighbours(best, sdf.shape[1])
 
 
 @torch.no_grad()
@@ -147,44 +180,48 @@ def first_crossing(
     The refined point of closest approach counts as a sample too, so thin parts between two samples are not missed.
     """
     if closest_sdf is None:
-        closest_sdf = shape.value(rays.at(closest_depth), rays.object_index)
-    depth, order = torch.cat([marched.depths, closest_depth[:, None]], dim=1).sort(dim=1)
-    sdf = torch.cat([marched.sdf, closest_sdf[:, None]], dim=1).gather(1, order)
+        closest_sdf = sdf_on_rays(shape, rays, closest_depth)
+    # Only rays that may enter are worth more.
+    entering = (marched.crosses_bounds & ((marched.sdf < 0).any(dim=1) | (closest_sdf < 0))).nonzero()[:, 0]
+    samples = marched.depths[entering], marched.sdf[entering]
+    bracket, usable = _first_bracket(*samples, closest_depth[entering], closest_sdf[entering])
+    root = _false_position(shape, rays.select(entering), bracket, num_iterations)
+    found = torch.zeros_like(marched.crosses_bounds).index_copy(0, entering, usable)
+    return Root(closest_depth.index_copy(0, entering, root), found)
+
+
+def _first_bracket(
+    depths: Tensor,  # (Q, S)
+    sdf: Tensor,  # (Q, S)
+    closest_depth: Tensor,  # (Q,)
+    closest_sdf: Tensor,  # (Q,)
+) -> tuple[Bracket, Tensor]:
+    """The first pair of neighbouring samples, the closest approach among them, outside and inside; if any (Q,)."""
     inside = sdf < 0
     first = inside.to(torch.uint8).argmax(dim=1, keepdim=True)
+    behind, behind_sdf, is_inside = (x.gather(1, first)[:, 0] for x in (depths, sdf, inside))
+    is_closest = (closest_sdf < 0) & ((closest_depth < behind) | ~is_inside)
+    behind = torch.where(is_closest, closest_depth, behind)
+    behind_sdf = torch.where(is_closest, closest_sdf, behind_sdf)
     # A ray whose first sample is inside enters through the border of the grid: there is no surface to see.
-    found = marched.crosses_bounds & inside.any(dim=1) & (first[:, 0] > 0)
-    outside = (first - 1).clamp_min(0)
-    ends = torch.cat([outside, first], dim=1)
-    a, b = depth.gather(1, ends).unbind(1)
-    # Only rays that do enter are worth the iterations.
-    entering = found.nonzero()[:, 0]
-    value_a, value_b = sdf.gather(1, ends).unbind(1)
-    bracket = (a[entering], b[entering], value_a[entering], value_b[entering])
-    root = _false_position(shape, rays.select(entering), *bracket, num_iterations)
-    return Root(b.index_copy(0, entering, root), found)
+    last = (depths < behind[:, None]).sum(dim=1, keepdim=True) - 1
+    before, before_sdf = (x.gather(1, last.clamp_min(0))[:, 0] for x in (depths, sdf))
+    is_outside = last[:, 0] >= 0
+    is_closest = (closest_sdf >= 0) & (closest_depth < behind) & ((closest_depth > before) | ~is_outside)
+    before = torch.where(is_closest, closest_depth, before)
+    before_sdf = torch.where(is_closest, closest_sdf, before_sdf)
+    return Bracket.between(before, before_sdf, behind, behind_sdf), is_outside | is_closest
 
 
-def _false_position(
-    shape: BoundShape, rays: ObjectRays, a: Tensor, b: Tensor, value_a: Tensor, value_b: Tensor, iterations: int
-) -> Tensor:
-    best, best_value = b, value_b
-    previous = torch.zeros_like(b, dtype=torch.int8)
-    for _ in range(iterations):
-        slope = value_a - value_b
-        share = torch.where(slope > 0, value_a / torch.where(slope > 0, slope, torch.ones_like(slope)), slope + 0.5)
-        root = a + share.clamp(0, 1) * (b - a)
-        value = shape.value(rays.at(root), rays.object_index)
-        below = value < 0
-        nearer = value.abs() < best_value.abs()
-        best, best_value = torch.where(nearer, root, best), torch.where(nearer, value, best_value)
-        side = torch.where(below, -1, 1).to(torch.int8)
-        # Illinois: halving the value of an end that stays a second time makes the convergence superlinear.
-        stale = torch.where(side == previous, 0.5, 1.0).to(value.dtype)
-        a, value_a = torch.where(below, a, root), torch.where(below, value_a * stale, value)
-        b, value_b = torch.where(below, root, b), torch.where(below, value, value_b * stale)
-        previous = side
-    return best
+def _false_position(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> Tensor:
+    if isinstance(shape, GridShape):
+        coordinates, state = _coordinates(rays), torch.stack(bracket)
+        for _ in range(num_iterations):
+            state = probe_grids(*shape.field, *coordinates, state)
+        return Bracket(*state.unbind(0)).best
+    for _ in range(num_iterations):
+        bracket = bracket.probed(shape.value(rays.at(bracket.depth), rays.object_index))
+    return bracket.best
 
 
 @torch.no_grad()

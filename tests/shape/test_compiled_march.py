@@ -1,0 +1,120 @@
+"""Rays against grids in the coordinate-first form, plain and compiled, against the general path."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from torch import Tensor
+
+from directshape_torch.compilation import compiling
+from directshape_torch.compiler_state import compiler_problem
+from directshape_torch.shape import raycast
+from directshape_torch.shape.compiled_march import probe_grids, sample_grids
+from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root
+from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.shape_prior import SdfDerivatives
+
+SAMPLES = 24
+
+
+class AnyShape:
+    """A grid that does not say that it is one: what `raycast` does with it is the general path."""
+
+    def __init__(self, grids: GridShape) -> None:
+        self.grids = grids
+
+    def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
+        return self.grids.value(points_obj, object_index)
+
+    def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
+        return self.grids.value_and_derivatives(points_obj, object_index)
+
+
+def scene(count: int, dtype: torch.dtype) -> tuple[GridShape, ObjectRays, Tensor]:
+    """Three ellipsoids and rays through, past and beside them."""
+    prior = ellipsoid_prior(dtype)
+    generator = torch.Generator().manual_seed(3)
+    shape = prior.bind(torch.randn(3, prior.num_codes, generator=generator, dtype=dtype))
+    assert isinstance(shape, GridShape)
+    target = 3.0 * (2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1) * torch.tensor([1, 0.4, 1])
+    origin = torch.tensor([0.5, -1.2, -8.0], dtype=torch.float64)
+    direction = target - origin
+    rays = ObjectRays(
+        origin.expand_as(direction).to(dtype),
+        (direction / direction[:, 2:]).to(dtype),
+        torch.sort(torch.randint(0, 3, (count,), generator=generator))[0],
+    )
+    return shape, rays, prior.bounds_obj
+
+
+def cast(
+    shape: raycast.BoundShape, rays: ObjectRays, bounds: Tensor, samples: int = SAMPLES
+) -> tuple[RayMarch, Tensor, Tensor, Root]:
+    marched = raycast.march(shape, rays, bounds, samples)
+    closest = raycast.closest_approach_depth(marched)
+    sdf = raycast.sdf_on_rays(shape, rays, closest)
+    return marched, closest, sdf, raycast.first_crossing(shape, rays, marched, closest, closest_sdf=sdf)
+
+
+def assert_same(
+    found: tuple[RayMarch, Tensor, Tensor, Root], expected: tuple[RayMarch, Tensor, Tensor, Root], tolerance: float
+) -> None:
+    """Of the rays that meet the bounds and, for the root, the surface; of the others nothing is said."""
+    crosses, enters = expected[0].crosses_bounds, expected[3].found
+    assert torch.equal(found[0].crosses_bounds, crosses)
+    assert torch.equal(found[3].found, enters)
+    assert 0 < enters.sum() < crosses.sum() < len(crosses)
+    for mine, theirs in zip((*found[0][:2], *found[1:3]), (*expected[0][:2], *expected[1:3]), strict=True):
+        torch.testing.assert_close(mine[crosses], theirs[crosses], rtol=0, atol=tolerance)
+    torch.testing.assert_close(found[3].depth[enters], expected[3].depth[enters], rtol=0, atol=tolerance)
+    assert found[3].depth.isfinite().all()
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+@pytest.mark.parametrize("samples", [7, SAMPLES])
+def test_grids_are_cast_as_any_other_shape(dtype: torch.dtype, tolerance: float, samples: int) -> None:
+    shape, rays, bounds = scene(400, dtype)
+    assert_same(cast(shape, rays, bounds, samples), cast(AnyShape(shape), rays, bounds, samples), tolerance)
+
+
+def test_parts_of_the_rays_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    shape, rays, bounds = scene(100, torch.float64)
+    whole = raycast.march(shape, rays, bounds, SAMPLES)
+    monkeypatch.setattr(raycast, "_POINTS_AT_ONCE", 7 * SAMPLES)
+    for mine, theirs in zip(raycast.march(shape, rays, bounds, SAMPLES), whole, strict=True):
+        assert mine is not None
+        assert theirs is not None
+        assert torch.equal(mine, theirs)
+
+
+def test_the_closest_approach_that_comes_with_the_samples_is_that_of_the_samples() -> None:
+    shape, rays, bounds = scene(200, torch.float64)
+    marched = raycast.march(shape, rays, bounds, SAMPLES)
+    from_samples = raycast.closest_approach_depth(marched._replace(closest_depth=None))
+    torch.testing.assert_close(raycast.closest_approach_depth(marched), from_samples, rtol=0, atol=1e-13)
+
+
+def test_a_ray_that_is_nowhere_disturbs_no_other() -> None:
+    shape, rays, bounds = scene(50, torch.float32)
+    origin = rays.origin_obj.clone()
+    origin[3] = torch.nan
+    whole, damaged = (cast(shape, ObjectRays(o, *list_of(rays)[1:]), bounds) for o in (rays.origin_obj, origin))
+    others = torch.arange(50) != 3
+    assert torch.equal(damaged[3].found[others], whole[3].found[others])
+    assert torch.equal(damaged[3].depth[others], whole[3].depth[others])
+    assert not damaged[3].found[3]
+
+
+def list_of(rays: ObjectRays) -> list[Tensor]:
+    return [rays.origin_obj, rays.direction_obj, rays.object_index]
+
+
+@pytest.mark.skipif(compiler_problem() is not None, reason=f"no C++ compiler: {compiler_problem()}")
+def test_compiled_rays_are_the_plain_ones_for_any_number_of_them() -> None:
+    for count in (60, 333, 2000):
+        shape, rays, bounds = scene(count, torch.float32)
+        with compiling("on", 3):
+            compiled = cast(shape, rays, bounds)
+        assert_same(compiled, cast(shape, rays, bounds), 1e-4)
+    assert sample_grids.num_variants == probe_grids.num_variants == 1
