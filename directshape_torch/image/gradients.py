@@ -103,11 +103,11 @@ def length_2d(
         >>> flat.grad
         tensor([0.])
     """
-    length = torch.hypot(d_u, d_v)
-    if not length.requires_grad:
-        return length
-    flat = length.detach() == 0
-    return torch.where(flat, 0, torch.hypot(torch.where(flat, 1, d_u), d_v))
+    square = d_u * d_u + d_v * d_v
+    if not square.requires_grad:
+        return square.sqrt_()
+    flat = square.detach() == 0
+    return torch.where(flat, 0, torch.where(flat, 1, square).sqrt())
 
 
 def _central_difference(

@@ -115,8 +115,10 @@ def _extents(
     count, _, width = masks.shape
     foreground = torch.zeros(count, width, dtype=torch.float32, device=masks.device)
     amounts = [(bottom - top) * width for top, bottom in tops_and_bottoms]
-    for part in portions(amounts, pixels_at_once(masks.device)):
-        tops, bottoms = zip(*(rows for rows in tops_and_bottoms[part] if rows[1] or not any(amounts[part])), strict=True)
+    for part in portions(amounts, pixels_at_once(masks.device) // 2):
+        tops, bottoms = zip(
+            *(rows for rows in tops_and_bottoms[part] if rows[1] or not any(amounts[part])), strict=True
+        )
         window = masks[part, min(tops) : max(bottoms)]
         # Floating-point flags: comparing into them and summing them up is many times faster than with bool ones.
         background = torch.le(window, MASK_THRESHOLD, out=torch.empty(window.shape, device=masks.device))

@@ -6,6 +6,7 @@ Pixels are packed over cars and frames, sorted by object, because a near car has
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from itertools import groupby
 from typing import NamedTuple
 
 import torch
@@ -14,12 +15,14 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
-from directshape_torch.observation.gradient_tiles import gradient_tiles
+from directshape_torch.observation.gradient_cells import GradientCells, ImageRegion, gradient_cells
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides
 from directshape_torch.observation.pixel_sampling import candidate_pixels
+from directshape_torch.observation.portions import pixels_at_once, portions
 from directshape_torch.observation.regions import RegionPixels, region_boxes
 from directshape_torch.observation.sampling_settings import SamplingSettings
+from directshape_torch.observation.strongest_pixels import StrongestPixels, strongest_pixels
 from directshape_torch.scene import Detections, FrameBatch
 
 # Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
@@ -178,53 +181,97 @@ def _chosen_pixels(
     frames: FrameBatch, detections: Detections, regions: Tensor, hidden: OcclusionCrops | None, config: SamplingConfig
 ) -> tuple[_Chosen, _Chosen]:
     """The visible ones of the pixels that `select_pixels` chooses, of the regions (2 B, 4) of both images."""
-    settings = sampling_settings(config)
-    frame = torch.cat([detections.frame_index, detections.frame_index + len(frames)])
-    tiles = gradient_tiles((frames.images_left, frames.images_right), frames.sizes, regions, frame, settings)
-    pixels = RegionPixels.of(regions, settings.threshold_cell_px)
-    entry, threshold = tiles.entries_and_thresholds(pixels, frame)
-    magnitudes = tiles.magnitude.flatten()
-    magnitude = magnitudes.detach().index_select(0, entry)
-    above = magnitude.float() > threshold.float()
-    index, exists = candidate_pixels(pixels, regions, magnitude, above, settings)
-    object_index, uv = pixels.uv_of(index)
+    count, settings = len(detections), sampling_settings(config)
+    images, sizes = (frames.images_left, frames.images_right), frames.sizes.tolist()
+    boxes, frame = regions.tolist(), detections.frame_index.tolist()
+    areas = [(u1 - u0) * (v1 - v0) for u0, v0, u1, v1 in boxes]
+    # Cars of one frame stay together, where they are neighbours in the batch.
+    runs = [list(run) for _, run in groupby(range(count), key=frame.__getitem__)]
+    amounts = [sum(areas[n] + areas[count + n] for n in run) for run in runs]
+    number = torch.arange(2 * count, device=regions.device)
+    sides: tuple[list[_Chosen], list[_Chosen]] = ([], [])
+    for part in portions(amounts, pixels_at_once(regions.device)) or [slice(0, 0)]:
+        cars = [n for run in runs[part] for n in run]
+        of_images = [ImageRegion(side, frame[n], boxes[side * count + n]) for side in (0, 1) for n in cars]
+        cells = gradient_cells(images, sizes, of_images, settings)
+        begin, end = (cars[0], cars[-1] + 1) if cars else (0, 0)
+        both = torch.cat([number[begin:end], number[count + begin : count + end]])
+        visible = _visible(cells, regions[both], both, images[0].shape[3], hidden, settings)
+        num_left = int((visible.object_index < count).sum())
+        left, right = (_Chosen(*x) for x in zip(*(x.tensor_split([num_left]) for x in visible), strict=True))
+        sides[0].append(left)
+        sides[1].append(right._replace(object_index=right.object_index - count))
+    left, right = (_Chosen(*(torch.cat(x) for x in zip(*parts, strict=True))) for parts in sides)
+    return left, right
+
+
+def _visible(
+    cells: GradientCells,
+    regions: Tensor,  # (R, 4)
+    number: Tensor,  # (R,) of each region among all of them
+    image_width: int,
+    hidden: OcclusionCrops | None,
+    settings: SamplingSettings,
+) -> _Chosen:
+    """The chosen pixels of some regions that no instance hides."""
+    found = _candidates(regions, cells, image_width, settings)
+    object_index, uv, exists = (
+        number.index_select(0, found.object_index),
+        torch.stack([found.u, found.v], 1),
+        found.exists,
+    )
     if hidden is not None:
         exists = exists & ~hidden.at(object_index, uv)
     kept = exists.nonzero()[:, 0]
-    object_index, uv = object_index.index_select(0, kept), uv.index_select(0, kept)
-    magnitude = magnitudes.index_select(0, entry.index_select(0, index.index_select(0, kept)))
-    num_left = int((object_index < len(detections)).sum())
-    return (
-        _Chosen(object_index[:num_left], uv[:num_left], magnitude[:num_left]),
-        _Chosen(object_index[num_left:] - len(detections), uv[num_left:], magnitude[num_left:]),
-    )
+    uv = uv.index_select(0, kept)
+    magnitude = cells.magnitude_at(found.object_index.index_select(0, kept), uv)
+    return _Chosen(object_index.index_select(0, kept), uv, magnitude)
+
+
+def _candidates(regions: Tensor, cells: GradientCells, image_width: int, settings: SamplingSettings) -> StrongestPixels:
+    if settings.mode in ("adaptive", "round_one"):
+        return strongest_pixels(cells, regions, image_width, settings)
+    # The other modes do not look at the image.
+    pixels = RegionPixels.of(regions)
+    unseen = torch.zeros(len(pixels), device=regions.device)
+    chosen = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
+    object_index, uv = pixels.uv_of(chosen.pixel)
+    return StrongestPixels(object_index, uv[:, 0], uv[:, 1], chosen.exists)
 
 
 def _pack_side(frames: FrameBatch, detections: Detections, side: Side, chosen: _Chosen) -> PixelSamples:
     left = side == "left"
     object_index, uv = chosen.object_index, chosen.uv
     mask = detections.mask_left if left else detections.mask_right
-    dtype = frames.images_left.dtype
-    uv_float = uv.to(dtype)
-    rays = _rays_left(frames, detections, object_index, uv_float) if left else _rays_right(
-        frames, detections, object_index, uv_float
-    )  # fmt: skip
+    uv_float = uv.to(frames.images_left.dtype)
+    origin, ray, (bias, vertical) = (_rays_left if left else _rays_right)(frames, detections, object_index, uv_float)
     return PixelSamples(
         object_index=object_index,
         uv=uv_float,
-        origin_cam=rays[0],
-        ray_cam=rays[1],
-        foreground=mask[object_index, uv[:, 1], uv[:, 0]].to(dtype),
+        origin_cam=origin,
+        ray_cam=ray,
+        foreground=_at_pixels(mask, object_index, uv).to(uv_float.dtype),
         gradient_magnitude=chosen.gradient_magnitude,
-        bias_px=rays[2][0],
-        vertical_px=rays[2][1],
+        bias_px=bias,
+        vertical_px=vertical,
     )
+
+
+def _at_pixels(masks: Tensor, object_index: Tensor, uv: Tensor) -> Tensor:
+    """Values (P,) of masks (B, H, W) at integer pixels, each in the mask of its object."""
+    height, width = masks.shape[1:]
+    return masks.reshape(-1).index_select(0, (object_index * height + uv[:, 1]) * width + uv[:, 0])
+
+
+def _of_pixels(values: Tensor, object_index: Tensor) -> Tensor:
+    """`values[object_index]` of a tensor (B, ...), in a third of the time."""
+    return values.flatten(1).index_select(0, object_index).view(-1, *values.shape[1:])
 
 
 def _rays_left(
     frames: FrameBatch, detections: Detections, object_index: Tensor, uv: Tensor
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
-    K = frames.camera.K_left[detections.frame_index[object_index]]
+    K = _of_pixels(frames.camera.K_left[detections.frame_index], object_index)
     ray = rays_from_pixels(uv, K)
     return torch.zeros_like(ray), ray, residual_offsets(frames, uv)
 
@@ -233,12 +280,11 @@ def _rays_right(
     frames: FrameBatch, detections: Detections, object_index: Tensor, uv: Tensor
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor]]:
     """The corresponding left pixel is the one at the car's INPUT depth: frozen per car, so moving does not pay."""
-    camera = frames.camera
-    frame = detections.frame_index[object_index]
-    z_input = detections.T_cam_obj[object_index, 2, 3]
-    shift = camera.K_left[frame, 0, 0] * camera.baseline[frame] / z_input
-    shift = shift + camera.K_left[frame, 0, 2] - camera.K_right[frame, 0, 2]
-    uv_left = torch.stack([uv[:, 0] + shift, uv[:, 1]], dim=-1)
+    camera, frame = frames.camera, detections.frame_index
+    K_left, K_right, T_right_cam = camera.K_left[frame], camera.K_right[frame], camera.T_right_cam[frame]
+    shift = K_left[:, 0, 0] * camera.baseline[frame] / detections.T_cam_obj[:, 2, 3]
+    shift = shift + K_left[:, 0, 2] - K_right[:, 0, 2]
+    uv_left = torch.stack([uv[:, 0] + shift.index_select(0, object_index), uv[:, 1]], dim=-1)
     offsets = residual_offsets(frames, uv_left)
-    rays = right_rays(uv, camera.K_right[frame], camera.T_right_cam[frame], *offsets)
+    rays = right_rays(uv, _of_pixels(K_right, object_index), _of_pixels(T_right_cam, object_index), *offsets)
     return rays.origin_cam, rays.direction_cam, offsets

@@ -144,7 +144,7 @@ def candidate_pixels(
     if settings.mode == "dense":
         every = torch.arange(len(pixels), device=regions.device)
         return Candidates(every, torch.ones_like(above_threshold))
-    side = _small_cell_side(regions, settings)
+    side = small_cell_side(regions, settings)
     cell, num_cells = _small_cells(regions, side, pixels)
     if settings.mode == "uniform":
         uv = torch.stack([pixels.u, pixels.v], dim=-1)
@@ -178,7 +178,7 @@ def _strongest_of_each_cell(
     return (-1 - best.view(torch.int32)[::2]).long() * exists, exists
 
 
-def _small_cell_side(
+def small_cell_side(
     regions: Tensor,  # (B, 4)
     settings: SamplingSettings,
 ) -> Tensor:

@@ -66,7 +66,7 @@ def region_boxes(
 
 @dataclass(frozen=True)
 class RegionPixels:
-    """All A pixels of B regions, object by object, row-major: R runs of neighbouring pixels within a row.
+    """All A pixels of B regions, object by object, row-major: R runs, the rows of the regions.
 
     Attributes:
         run_object, run_v, run_u: (R,) object of each run, its row and its first column.
@@ -117,33 +117,18 @@ class RegionPixels:
     def of(
         cls,
         regions: Tensor,  # (B, 4)
-        cell_px: int | None = None,
     ) -> RegionPixels:
-        """The pixels of half-open regions (u0, v0, u1, v1), with one host synchronisation.
-
-        Args:
-            regions: (B, 4) integer.
-            cell_px: side of cells; no run crosses the border of a cell. None: a run is a whole row of its region.
-        """
+        """The pixels of half-open integer regions (u0, v0, u1, v1), with one host synchronisation."""
         u0, v0, u1, v1 = regions.unbind(dim=1)
         widths, heights = u1 - u0, v1 - v0
-        # Cells of a row, the first one and their number; without cells one of any width.
-        side = cell_px or 2**31
-        first_cell = torch.div(u0, side, rounding_mode="floor")
-        cells = torch.div(u1 - 1, side, rounding_mode="floor") - first_cell + 1
-        cells = torch.where(widths > 0, cells, 0)
-        num_runs, num_pixels = torch.stack([(cells * heights).sum(), (widths * heights).sum()]).tolist()
+        num_runs, num_pixels = torch.stack([heights.sum(), (widths * heights).sum()]).tolist()
         number = torch.arange(len(regions), device=regions.device)
-        run_object = number.repeat_interleave(cells * heights, output_size=num_runs)
+        run_object = number.repeat_interleave(heights, output_size=num_runs)
         run_number = torch.arange(num_runs, device=regions.device)
-        in_region = run_number - ((cells * heights).cumsum(0) - cells * heights)[run_object]
-        cells = cells[run_object]
-        row = torch.div(in_region, cells, rounding_mode="floor")
-        left = (first_cell[run_object] + in_region - row * cells) * side
-        run_u = torch.maximum(left, u0[run_object])
-        length = torch.minimum(left + side, u1[run_object]) - run_u
+        row = run_number - (heights.cumsum(0) - heights)[run_object]
+        length = widths[run_object]
         run = run_number.int().repeat_interleave(length, output_size=num_pixels)
-        return cls(run_object, row + v0[run_object], run_u, length.cumsum(0) - length, run)
+        return cls(run_object, row + v0[run_object], u0[run_object], length.cumsum(0) - length, run)
 
 
 def region_pixels(

@@ -215,8 +215,8 @@ def test_work_follows_the_cars_and_not_the_frame() -> None:
     frames, detections = random_scene(6, count=5, num_frames=1, others=0)
     small, large = (touched_by_packing(*enlarged(frames, detections, factor)) for factor in (4, 8))
     pixels = [detections.mask_left[0].numel() * factor**2 for factor in (4, 8)]
-    # Four times the frame: every mask is read once more, and its rows with foreground twice, twice as long; nothing else
-    # is of the size of a frame.
+    # Four times the frame: every mask is read once more, its rows with foreground, now longer, twice. Nothing else is of
+    # the size of a frame.
     masks_read = 2 * len(detections) * (pixels[1] - pixels[0])
     assert masks_read <= large[0] - small[0] < 1.5 * masks_read
     assert large[1] - small[1] < 0.2 * (pixels[1] - pixels[0])  # one number a threshold cell and car
@@ -250,7 +250,7 @@ def test_few_host_synchronisations_however_many_cars(count: int, monkeypatch: py
     with HostWaits() as waits:
         monkeypatch.setattr(Tensor, "tolist", lambda self: (waits.names.append("tolist"), to_list(self))[1])
         pack_pixels(frames, detections, SamplingConfig())
-    assert 0 < len(waits.names) <= 10, waits.names
+    assert 0 < len(waits.names) <= 14, waits.names
 
 
 def test_work_is_linear_in_the_cars() -> None:

@@ -1,0 +1,39 @@
+"""Gradients of rectangular parts of frames: work where something is to be seen, not in whole frames."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from directshape_torch.image.gradients import grey_of_channels, length_2d
+
+
+def gradient_magnitude_of_part(
+    image: Tensor,  # (3, H, W)
+    size_hw: tuple[int, int],
+    part: tuple[int, int, int, int],
+) -> Tensor:
+    """`gradient_magnitude` of one part of a frame, the same numbers as in the whole; differentiable by the image.
+
+    Args:
+        image: (3, H, W), RGB in [0, 1], padded at the right and bottom.
+        size_hw: (height, width) of the frame without padding; at its own edge the edge is replicated.
+        part: (u0, v0, u1, v1) within the frame, half open, not empty.
+
+    Returns:
+        (v1 - v0, u1 - u0), grey levels per pixel.
+
+    Example:
+        >>> ramp = torch.arange(40.0).expand(3, 40, 40) / 255
+        >>> gradient_magnitude_of_part(ramp, (40, 40), (0, 8, 3, 9))
+        tensor([[0.5000, 1.0000, 1.0000]])
+    """
+    (u0, v0, u1, v1), (height, width) = part, size_hw
+    # One pixel more on each side, as far as there is one.
+    left, top, right, bottom = int(u0 > 0), int(v0 > 0), int(u1 < width), int(v1 < height)
+    grey = grey_of_channels(*image[:, v0 - top : v1 + bottom, u0 - left : u1 + right])
+    if not left or not top or not right or not bottom:
+        missing = (1 - left, 1 - right, 1 - top, 1 - bottom)
+        grey = torch.nn.functional.pad(grey[None], missing, mode="replicate")[0]
+    d_u, d_v = grey[1:-1, 2:] - grey[1:-1, :-2], grey[2:, 1:-1] - grey[:-2, 1:-1]
+    return length_2d(d_u.mul_(0.5), d_v.mul_(0.5))
