@@ -1,0 +1,76 @@
+"""docs/exports.md: its commands are understood, its names are those of the code, and its Python runs."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from helpers.finished_run import FinishedRun, make_run
+
+from directshape_torch.cli.export import _FORMATS
+from directshape_torch.cli.main import make_parser
+from directshape_torch.export.coco3d_file import KITTI_TYPES
+from directshape_torch.export.export_run import ExportFormat
+from directshape_torch.export.nuscenes_file import DETECTION_NAMES
+from directshape_torch.export.painted_cars import NEUTRAL_RGB
+
+TEXT = (Path(__file__).parent.parent.parent / "docs" / "exports.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    return make_run(tmp_path_factory.mktemp("run"))
+
+
+def test_every_format_has_a_row() -> None:
+    assert get_args(ExportFormat) == _FORMATS
+    table = TEXT[: TEXT.index("`cam` is the left")]
+    assert tuple(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == _FORMATS
+
+
+def test_commands_are_understood() -> None:
+    blocks = re.findall(r"```bash\n(.*?)```", TEXT, re.DOTALL)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    commands = [line.split("#")[0] for line in lines if line.startswith("directshape ") and "..." not in line]
+    assert len(commands) == 4
+    for command in commands:
+        make_parser().parse_args(shlex.split(command)[1:])
+
+
+def test_options_are_those_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        make_parser().parse_args(["export", "--help"])
+    known = set(re.findall(r"--[a-z][a-z-]+", capsys.readouterr().out)) - {"--help", "--format", "--out", "--frames"}
+    table = TEXT[TEXT.index("| option | |") : TEXT.index("## Surfaces")]
+    assert set(re.findall(r"--[a-z][a-z-]+", table)) == known
+
+
+def test_names_are_those_of_the_code() -> None:
+    flat = " ".join(TEXT.split())
+    numbered = ", ".join(f"{number} {name.lower()}" for number, name in enumerate(KITTI_TYPES, start=1))
+    assert f"Categories: {numbered}." in flat
+    assert f"sRGB {NEUTRAL_RGB}" in flat
+    for name in DETECTION_NAMES.values():
+        assert f"`{name}`" in flat
+
+
+def test_the_python_example_runs(finished: FinishedRun, tmp_path: Path) -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    places = {
+        '"OUT"': finished.out,
+        '"pca"': finished.root / "prior.npz",
+        '"ROOT"': finished.root,
+        '"DETECTIONS"': finished.root / "detections",
+        '"MASKS"': finished.root / "masks",
+        '"EXPORTS"': tmp_path,
+    }
+    for name, place in places.items():
+        assert name in code
+        code = code.replace(name, repr(str(place)))
+    names: dict[str, object] = {}
+    exec(code, names)
+    assert (tmp_path / "glb" / "000001.glb").is_file()
+    assert (tmp_path / "nuscenes.json").is_file()
