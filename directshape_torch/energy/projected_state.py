@@ -19,6 +19,7 @@ from directshape_torch.shape.raycast import (
     first_crossing,
     march,
     polished_depth,
+    sdf_on_rays,
 )
 from directshape_torch.shape.shape_prior import BoundShape, SdfDerivatives, ShapePrior
 
@@ -72,8 +73,7 @@ class ProjectedView:
     @cached_property
     def closest_sdf(self) -> Tensor:
         """Signed distance (P,) at the closest approach, a constant."""
-        depth = self.closest_depth.detach()
-        return self._shape.value(self.rays.at(depth).detach(), self.rays.object_index).detach()
+        return sdf_on_rays(self._shape, self.rays, self.closest_depth.detach()).detach()
 
     @cached_property
     def _entry(self) -> Root:
