@@ -63,12 +63,13 @@ def _real_cars(prior: ShapePrior, folder: Path, options: MeshOptions) -> list[Fi
     """The cars of all meshes that can be made solid; the others are named on stderr."""
     grid, fitted = grid_of(prior), []
     for file in tqdm(find_meshes(folder, "**/*"), unit="mesh", desc="meshes", file=sys.stderr):
+        name = str(file.relative_to(folder).with_suffix(""))
         try:
-            truth = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file, options), grid, options, file.stem))
+            truth = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file, options), grid, options, name))
         except MeshError as problem:
             print(f"skipped: {problem}", file=sys.stderr)
             continue
-        fitted.append(fit_car(prior, truth, file.stem))
+        fitted.append(fit_car(prior, truth, name))
     if not fitted:
         raise InputError("--meshes", "at least one mesh that can be made solid", f"none in {folder}")
     return fitted

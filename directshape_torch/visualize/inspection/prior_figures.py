@@ -30,7 +30,7 @@ def write_code_figure(path: Path | str, prior: ShapePrior) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    figure = new_figure(12.0, 1.4 * prior.num_codes + 1.1, "drawing a prior")
+    figure = new_figure(13.0, 1.4 * prior.num_codes + 0.4, "drawing a prior")
     figure.suptitle(f"{prior.num_codes} codes; surfaces coloured by their distance from the mean shape")
     axes = figure.subplots(prior.num_codes, 4, squeeze=False)
     mean = prior.values(prior.initial_code(1))[0].detach()
@@ -56,7 +56,7 @@ def write_fit_figure(path: Path | str, prior: ShapePrior, cars: Sequence[FittedC
         MissingDependencyError: matplotlib is not installed.
     """
     rows = -(-len(cars) // _CARS_A_ROW)
-    figure = new_figure(12.5, 3.3 * rows + 0.6, "drawing fitted cars")
+    figure = new_figure(14.0, 2.9 * rows + 0.4, "drawing fitted cars")
     figure.suptitle("known cars (green) and the prior's nearest shapes (black)")
     axes = figure.subplots(2 * rows, _CARS_A_ROW, squeeze=False)
     for place in range(rows * _CARS_A_ROW):
@@ -76,8 +76,8 @@ def write_fit_figure(path: Path | str, prior: ShapePrior, cars: Sequence[FittedC
 
 
 def _add_scales(figure: Any, axes: Any, field: Any, limit_m: float, label: str) -> None:
-    """Both scales side by side below all panels."""
-    bars = {"location": "bottom", "extend": "both", "shrink": 0.7, "aspect": 40}
-    left, right = axes[:, : axes.shape[1] // 2], axes[:, axes.shape[1] // 2 :]
-    figure.colorbar(distance_scale(limit_m), ax=left, label=f"surface: {label}", **bars)
-    figure.colorbar(field, ax=right, label="field: signed distance [m]", **bars)
+    """Both scales to the right of all panels, as long as a few rows."""
+    inches = figure.get_figheight()
+    bars = {"location": "right", "extend": "both", "shrink": min(1.0, 4.0 / inches), "aspect": 25, "pad": 0.02}
+    figure.colorbar(distance_scale(limit_m), ax=axes, label=f"surface: {label}", **bars)
+    figure.colorbar(field, ax=axes, label="field: signed distance [m]", **bars)

@@ -18,7 +18,7 @@ from directshape_torch.visualize.inspection.residual_values import (
 )
 
 _PANEL_INCHES = 3.6
-_SIZE_INCHES = (3 * _PANEL_INCHES + 0.4, 6.0)
+_SIZE_INCHES = (3 * _PANEL_INCHES + 0.4, 6.5)
 # -log 0.01: what a pixel pays whose mask is certain and wrong.
 _WORST_SILHOUETTE = 4.6
 _CONTOUR_INK = "cyan"

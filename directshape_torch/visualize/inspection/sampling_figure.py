@@ -22,6 +22,8 @@ from directshape_torch.visualize.sampling_picture import PANEL_GAP_PX, occlusion
 
 _SIZE_INCHES = (12.0, 5.0)
 _STRONG_INK, _FILL_INK = "lime", "red"
+# Of the region of a far car in the occlusion picture.
+_LEAST_HEIGHT_PX = 180
 _SIDES: tuple[Side, Side] = ("left", "right")
 
 
@@ -77,8 +79,8 @@ def write_occlusion_picture(path: Path | str, view: CarView) -> None:
     for side, region in zip(_SIDES, regions, strict=True):
         u0, v0, u1, v1 = region[view.car].tolist()
         if u1 > u0 and v1 > v0:
-            order = config.occlusion_order
-            rows.append(occlusion_picture(view.loaded.frame, detections, region, view.car, side, order))
+            order, scale = config.occlusion_order, max(2, round(_LEAST_HEIGHT_PX / (v1 - v0)))
+            rows.append(occlusion_picture(view.loaded.frame, detections, region, view.car, side, order, scale))
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, ((0, PANEL_GAP_PX), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
     write_png(path, np.concatenate(padded))
