@@ -79,6 +79,12 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("_residual_and_jacobian", "at.value", "(-at.value)", _VALUE_UNUSED),
     Equivalent("surface_under", "at.value", "(-at.value)", _VALUE_UNUSED),
     Equivalent(
+        "photometric_residuals",
+        "settings.contrast_floor_grey_levels",
+        "(-settings.contrast_floor_grey_levels)",
+        "the floor of the contrast enters as a square",
+    ),
+    Equivalent(
         "Blocks.join",
         "(0, width - place.shape[1])",
         "(width - place.shape[1], 0)",

@@ -154,7 +154,9 @@ def test_a_ray_that_misses_the_bounds_counts_as_background(form: Literal["closes
     gone = problem.project(_translated(state, [25.0, 0.0, 0.0]))
     for term in problem.terms:
         if isinstance(term, SilhouetteTerm):
-            torch.testing.assert_close(term.pixel_residual(gone), -torch.log(1 - term.foreground))
+            expected = -torch.log(1 - term.foreground)
+            torch.testing.assert_close(term.pixel_residual(gone), expected)
+            torch.testing.assert_close(term.residual_at(term.view(gone)), expected)
             assert (term.linearise(gone).gradient == 0).all()
 
 

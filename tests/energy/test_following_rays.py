@@ -9,7 +9,7 @@ import torch
 from helpers.derivatives import moved
 from helpers.five_cars import begun_stage, five_cars, step_of, with_solver
 from helpers.host_traffic import host_traffic
-from helpers.problems import DEFAULT, MARCHED
+from helpers.problems import DEFAULT, MARCHED, begun_problem
 from helpers.synthetic_scene import cached_street, disturbed, select
 from torch import Tensor
 
@@ -18,6 +18,7 @@ from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.energy.tracked_energy import TrackedEnergy
+from directshape_torch.geometry import se3
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.solver.problem import Linearisation, StageProblem
@@ -312,14 +313,17 @@ def refined(rays: str, jacobian: str = "analytic") -> RefinementResult:
 
 
 def test_marched_rays_lead_to_the_same_place() -> None:
-    """Costs of either are those of the marched energy; the toy's grid is coarse, and its optimum flat."""
+    """By the marched energy of one set of pixels; the toy's grid is coarse, and its optimum flat."""
     tracked, marched = refined("tracked"), refined("marched")
     assert all(status.is_refined for status in (*tracked.status, *marched.status))
-    torch.testing.assert_close(tracked.cost_before, marched.cost_before, rtol=0, atol=0)
-    torch.testing.assert_close(tracked.cost_after.sum(dim=1), marched.cost_after.sum(dim=1), rtol=0.01, atol=0)
+    prior, scene = cached_street()
+    problem, start = begun_problem(prior, scene.frames, disturbed(scene.detections), MARCHED)
+    costs = [problem.cost(CarState(se3.inverse(r.T_cam_obj), r.code)) for r in (tracked, marched)]
+    assert (costs[1] < 0.6 * problem.cost(start)).all()
+    torch.testing.assert_close(costs[0], costs[1], rtol=0.05, atol=0)
     apart = tracked.T_cam_obj[:, :3, 3] - marched.T_cam_obj[:, :3, 3]
-    assert float(apart.norm(dim=1).max()) < 0.02
-    assert float((tracked.code - marched.code).abs().max()) < 0.2
+    assert float(apart.norm(dim=1).max()) < 0.01
+    assert float((tracked.code - marched.code).abs().max()) < 0.05
 
 
 def test_differentiated_refinements_march() -> None:

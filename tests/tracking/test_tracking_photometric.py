@@ -43,6 +43,7 @@ SETTINGS = {
     "plain": PhotometricSettings(9.0, 30.0, False, 0.1, "plain", 2.0),
     "truncated": PhotometricSettings(9.0, 30.0, True, 0.1, "plain", 2.0),
     "normalised": PhotometricSettings(9.0, 30.0, False, 0.1, "normalised", 2.0),
+    "lost within the corner": PhotometricSettings(40.0, 12.0, False, 0.1, "plain", 2.0),
 }
 
 
