@@ -1,7 +1,8 @@
 """Every factor of the chain by itself, at the very values that it takes at the states of a regime.
 
 The hand-derived Jacobians are those that the package uses (lookups, warp, projections, depth), or the closed forms of
-the derivations where the package never forms them (exponential, transform, pinhole projection).
+the derivations where the package never forms them (exponential, transform, pinhole projection). At the end of the chain
+stand the rows as the iterations evaluate them, with rays that are followed (`tracked_rows`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from directshape_torch.laboratory import kinks
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.subjects import Experiment, factor_experiment
 from directshape_torch.laboratory.surface_depth import ray_depth_experiment
+from directshape_torch.laboratory.tracked_rows import tracked_photometric, tracked_silhouettes
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.silhouette import (
     project_closest_approach,
@@ -208,6 +210,8 @@ FACTORS: Mapping[str, Callable[[Bench], Experiment]] = {
     "pi_product": pi_product,
     "ray_depth": ray_depth_experiment,
     "robust_norm": robust_norm,
+    "tracked_silhouettes": tracked_silhouettes,
+    "tracked_photometric": tracked_photometric,
 }
 """By name; each is built from a bench."""
 

@@ -15,6 +15,7 @@ from directshape_torch.laboratory.factors import FACTORS, left_jacobian
 from directshape_torch.laboratory.second_derivatives import DEPTH_ONE_STEP, PIXEL_COST, second_derivatives
 from directshape_torch.laboratory.subjects import forward_mode_columns
 from directshape_torch.laboratory.term_experiment import term_experiment
+from directshape_torch.laboratory.tracked_rows import tracked_photometric
 
 BenchOf = Callable[..., Bench]
 
@@ -25,6 +26,27 @@ def test_factors(bench_of: BenchOf, factor: str) -> None:
         (found,) = comparison.compare(FACTORS[factor](bench_of(regime)), regime)
         assert found.broken_bounds() == []
         assert found.compared > 0
+
+
+def test_tracked_photometric_rows_are_those_of_the_term(bench_of: BenchOf) -> None:
+    """Where a stage begins the tracked rows stand on the roots themselves, so none is lost and all are the same."""
+    bench = bench_of("typical")
+    (subject,) = tracked_photometric(bench).subjects
+    term = bench.terms["photometric"]
+    assert torch.equal(subject.usable, term.residuals(bench.projected).usable)
+    expected = term.jacobian(bench.projected)
+    assert (subject.norm > 0).any()
+    torch.testing.assert_close(subject.analytic, expected, rtol=1e-8, atol=1e-9 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("name", ["tracked_silhouettes", "tracked_photometric"])
+def test_a_wrong_tracked_row_is_seen(bench_of: BenchOf, name: str) -> None:
+    experiment = FACTORS[name](bench_of("typical"))
+    (subject,) = experiment.subjects
+    J = subject.analytic.clone()
+    J[int(subject.norm.argmax())] *= 1 + 1e-5
+    (found,) = comparison.compare(replace(experiment, subjects=(replace(subject, analytic=J),)), "typical")
+    assert len(found.broken_bounds()) == 2  # against autograd and against differences
 
 
 @pytest.mark.parametrize("regime", ["typical", "contour"])
