@@ -43,6 +43,7 @@ class RayWorkers:
     def __init__(self, job: RunJob, options: WorkerOptions) -> None:
         self._ray = _import_ray()
         self._threads = options.threads_per_worker or 1
+        self._retries = options.retries
         self._starts_cluster = not self._ray.is_initialized()
         if self._starts_cluster:
             _connect(self._ray, options)
@@ -73,7 +74,7 @@ class RayWorkers:
         return [(self._busy.pop(task), self._result(task)) for task in done]
 
     def close(self) -> None:
-        """Wait for the tasks that run, drop the others, and leave a cluster that this run has started."""
+        """Give up the tasks that are left, and end a cluster that this run has started."""
         for task in self._busy:
             self._ray.cancel(task)
         if self._busy:
@@ -86,7 +87,7 @@ class RayWorkers:
         try:
             report: GroupReport = self._ray.get(task)
         except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError) as error:
-            return WorkerDiedError(f"Ray: {str(error).splitlines()[0]}")
+            return WorkerDiedError(f"Ray: {str(error).splitlines()[0]}", num_tries=self._retries + 1)
         except errors.RayError as error:
             raise DirectShapeError(f"Ray could not run a group of frames: {error}") from error
         return report

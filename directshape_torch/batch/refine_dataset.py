@@ -125,7 +125,9 @@ class _Run:
             return
         start = time.perf_counter()
         workers = self._workers()
-        dispatch = GroupDispatch(groups, workers, self.who.retries, self._finished)
+        # Ray has tried as often as that before it says that a worker died.
+        retries = self.who.retries if self.who.ray is None else 0
+        dispatch = GroupDispatch(groups, workers, retries, self._finished)
         try:
             for report in dispatch.reports():
                 self._take_in(report)

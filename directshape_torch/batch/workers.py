@@ -15,7 +15,16 @@ _HOPELESS_DEATHS = 6
 
 
 class WorkerDiedError(Exception):
-    """The process that worked on a group ended without an answer; says what is known of it."""
+    """The process that worked on a group ended without an answer.
+
+    Args:
+        reason: what is known of it.
+        num_tries: how often somebody else has tried already.
+    """
+
+    def __init__(self, reason: str, num_tries: int = 1) -> None:
+        super().__init__(reason)
+        self.num_tries = num_tries
 
 
 class Workers(Protocol):
@@ -120,5 +129,5 @@ class GroupDispatch:
         elif len(group.frame_ids) > 1:
             self._waiting.extendleft(reversed(group.halves()))
         else:
-            times = self._deaths[group.frame_ids]
+            times = self._deaths[group.frame_ids] * death.num_tries
             self.lost[group.frame_ids[0]] = f"its worker died each of {times} times ({death})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from helpers.faulty_refiners import DeadlyRefiner, QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
+import directshape_torch
 from directshape_torch.batch.options import RefineOptions, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import RunSummary
@@ -42,8 +44,9 @@ def _cluster() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         ray = pytest.importorskip("ray")
-        # Workers must find the helpers of the tests as well.
-        environment = {"env_vars": {"PYTHONPATH": str(Path(__file__).parent.parent)}}
+        # Workers must find the helpers of the tests as well, and the package that this test has.
+        folders = (Path(__file__).parent.parent, Path(directshape_torch.__file__).parent.parent)
+        environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(map(str, folders))}}
         ray.init(
             num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error", runtime_env=environment
         )

@@ -17,6 +17,7 @@ from helpers.faulty_refiners import QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
+import directshape_torch
 from directshape_torch.batch.journal import journal_folder, read_journals
 from directshape_torch.batch.options import RefineOptions, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
@@ -52,7 +53,9 @@ def undisturbed(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
     """Stop a run with two workers when it has finished a frame or two, and wait until all of its processes are gone."""
-    environment = {**os.environ, "PYTHONPATH": str(TESTS), "OMP_NUM_THREADS": "1"}
+    # The package that this test has, wherever it lies, and the helpers.
+    folders = os.pathsep.join([str(TESTS), str(Path(directshape_torch.__file__).parent.parent)])
+    environment = {**os.environ, "PYTHONPATH": folders, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out)]
     run = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
