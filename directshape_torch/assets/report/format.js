@@ -16,6 +16,8 @@ export function change(before, after, decimals = 2) {
 
 export const carName = (car) => `${car.frameId}, line ${car.line}`;
 
+export const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
+
 // Relative change of the cost, or null.
 export function costChange(car) {
   return car.cost_before > 0 && car.cost_after !== null ? car.cost_after / car.cost_before - 1 : null;

@@ -1,7 +1,7 @@
 // The left image of a frame with the boxes drawn over it.
 
 import { svg } from "report/dom";
-import { carName } from "report/format";
+import { carName, counted } from "report/format";
 
 const NEAR_M = 0.3;
 // The edges of a box in the order of `box_corners`, and the line to its front.
@@ -9,7 +9,7 @@ export const EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7
 
 export function framePicture(scene, cars, shown, open) {
   const [width, height] = scene.size_wh;
-  const picture = svg("svg", { class: "frame-picture", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": `Left image with ${cars.length} cars` },
+  const picture = svg("svg", { class: "frame-picture", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": `Left image with ${counted(cars.length, "car")}` },
     svg("image", { href: scene.image, width, height }));
   if (scene.K === null) return picture;
   if (shown.truth) scene.truth.forEach((box) => picture.append(...boxLines(box, scene.K, "box-truth")));

@@ -2,7 +2,7 @@
 
 import { element, byId } from "report/dom";
 import { carsOfFrame, frames, sceneOf } from "report/data";
-import { carName } from "report/format";
+import { carName, counted } from "report/format";
 import { framePicture } from "report/frame_picture";
 
 const shown = { before: true, after: true, truth: true };
@@ -74,7 +74,7 @@ function redraw() {
   picture.replaceChildren(scene.image === null
     ? element("p", { class: "quiet" }, "The image of this frame is not in the page.")
     : framePicture(scene, inFrame, shown, openCar));
-  caption.textContent = `Frame ${frames.ids[current]}: ${inFrame.length} cars. ${groundWords(scene)}`;
+  caption.textContent = `Frame ${frames.ids[current]}: ${counted(inFrame.length, "car")}. ${groundWords(scene)}`;
   viewer?.show(scene, shown, `Frame ${frames.ids[current]} in 3D`);
 }
 

@@ -22,12 +22,12 @@ export function showHighlights() {
   const better = ranked.filter((car) => !hasErrorsBefore || value(car) > 0).length;
   const half = Math.min(COUNT, Math.ceil(ranked.length / 2));
   place.append(element("p", { class: "quiet" }, rule),
-    element("h3", {}, "Best"), cards(ranked.slice(0, Math.min(half, better))),
-    element("h3", {}, "Worst"), cards(ranked.slice(half).slice(-half).reverse()));
+    element("h3", {}, "Best"), cards(ranked.slice(0, Math.min(half, better)), "No car became better."),
+    element("h3", {}, "Worst"), cards(ranked.slice(half).slice(-half).reverse(), "No further car."));
 }
 
-function cards(chosen) {
-  if (!chosen.length) return element("p", { class: "quiet" }, "No further car.");
+function cards(chosen, none) {
+  if (!chosen.length) return element("p", { class: "quiet" }, none);
   return element("ul", { class: "cards" }, ...chosen.map((car) => element("li", {},
     element("button", { class: "card", type: "button", onclick: () => openCar(car) }, pair(car),
       element("strong", {}, carName(car)), figures(car)))));

@@ -4,6 +4,7 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/orbit-controls";
 import { meanMesh } from "report/data";
+import { counted } from "report/format";
 import { readMesh } from "report/mesh";
 import { EDGES } from "report/frame_picture";
 
@@ -53,7 +54,7 @@ export class Viewer {
     if (generation !== this.generation) return;  // another frame was chosen meanwhile
     const isFirst = this.data === undefined;
     this.data = data;
-    this.canvas.setAttribute("aria-label", `${label}: ${data.cars.length} cars`);
+    this.canvas.setAttribute("aria-label", `${label}: ${counted(data.cars.length, "car")}`);
     release(this.cars);
     this.cars = new THREE.Group();
     // The camera's y points down and its z forward; here up is +y.
@@ -106,14 +107,15 @@ export class Viewer {
   lookFrom(name) {
     if (this.data === undefined) return;
     const depths = this.data.cars.map((car) => boxCentre(car.box_after)[2]).sort((a, b) => a - b);
-    const middle = Math.min(depths[Math.floor(depths.length / 2)] ?? 15, 25);
+    // Where the nearest car is far, the view starts nearer to it.
+    const ahead = Math.max(0, (depths[0] ?? 0) - 12);
     // A narrow canvas sees less to the sides: it stands farther back.
     const back = Math.max(1, 1.5 / this.camera.aspect);
     const slope = Math.tan(0.5 * this.camera.fov * Math.PI / 180);
     const { far, side } = this.reach;
     const height = 1.1 * Math.max(0.5 * far, side / this.camera.aspect) / slope;
     const views = {
-      behind: [[0, 4.5 * back, 7 * back], [0, -1.65, -0.6 * middle]],
+      behind: [[0, 4.5 * back, 7 * back - ahead], [0, -1.65, -9 - ahead]],
       camera: [[0, 0, 0], [0, -0.05, -1.5]],
       above: [[0, height, -0.5 * far + 0.1], [0, 0, -0.5 * far]],
     };

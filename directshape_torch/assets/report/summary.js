@@ -2,11 +2,11 @@
 
 import { element, byId } from "report/dom";
 import { run } from "report/data";
-import { change, percent } from "report/format";
+import { change, counted, percent } from "report/format";
 
 export function showSummary() {
   byId("title").textContent = `Refined cars: ${run.name}`;
-  byId("subtitle").textContent = `${run.frames_done} frames, ${run.cars} cars, ${run.refined} of them refined`;
+  byId("subtitle").textContent = `${counted(run.frames_done, "frame")}, ${counted(run.cars, "car")}, ${run.refined} refined`;
   byId("made-by").textContent =
     `Written by directshape_torch (results of version ${run.package_version}). 3D views by three.js, MIT licence.`;
   byId("summary").append(...[tiles(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
@@ -60,7 +60,7 @@ function statuses() {
 function settings() {
   const rows = [
     ...Object.entries(run.sha256).map(([name, hash]) => [`sha256 of ${name}`, hash ?? "none"]),
-    ...Object.entries(run.ground_sources).map(([name, count]) => [`ground from ${name}`, `${count} frames`]),
+    ...Object.entries(run.ground_sources).map(([name, count]) => [`ground from ${name}`, counted(count, "frame")]),
     ...Object.entries(run.settings),
   ];
   return element("details", { id: "settings" }, element("summary", {}, "Settings of the run"),
