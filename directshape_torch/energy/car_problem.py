@@ -30,7 +30,8 @@ class CarProblem:
     Args:
         prior: the family of shapes.
         terms: summands of the energy.
-        left, right: packed pixels whose rays the terms share.
+        left: packed pixels of the left image whose rays the terms share.
+        right: the same of the right image.
         config: stages, trust region, samples per ray.
         term_weights: (B, T) factors of the terms of each car, beside their own weights; None for 1.
         unknowns: which of them move, until a stage says otherwise.

@@ -209,7 +209,8 @@ class PCAShapePrior(nn.Module):
 
         Args:
             sdf_samples: grids of N > num_codes cars, metres, untruncated.
-            origin, spacing_m: of the grids.
+            origin: node (0, 0, 0) of the grids, (3,), metres.
+            spacing_m: between their nodes.
             num_codes: components to keep.
             provenance: kept inside the prior.
             surface_band_m: nodes count by how near they are to the samples' surfaces (Gaussian of this width), because

@@ -61,6 +61,13 @@ _FLOORS = (0.05, 0.1)
 _EXPOSURES: tuple[Exposure, ...] = ("flatter", "vignetted")
 
 
+_RAYS = {
+    "marched at every state": ("solver.rays=marched",),
+    "followed, converged below a decrease of 1e-4": ("solver.cost_tolerance=0.0001",),
+    "marched, converged below a decrease of 1e-4": ("solver.rays=marched", "solver.cost_tolerance=0.0001"),
+}
+
+
 def _points(number: int) -> Settings:
     return Settings((f"sampling.min_pixels={number}", f"sampling.max_pixels={number}"))
 
@@ -97,6 +104,7 @@ ROWS: tuple[Row, ...] = (
     *(Row("points a car", f"{number}", _points(number)) for number in (50, 100, 200, 400, 1000, 3000)),
     Row("stages", "fine stage only", Settings((f"stages=[{_FINE_POSE.replace('pose', 'both')}]",))),
     *(Row("start states kept by cost", name, Settings(overrides)) for name, overrides in _SEARCHES.items()),
+    *(Row("rays", name, Settings(overrides)) for name, overrides in _RAYS.items()),
     Row("shape", "mean shape, pose only", Settings((f"stages=[{_COARSE_POSE}, {_FINE_POSE}]",))),
     *(Row("shape", f"K = {number}", Settings(prior=f"pca:{number}")) for number in (1, 2, 3, 5)),
     Row("prior", "network (neural)", Settings(prior="neural")),
@@ -115,6 +123,7 @@ ROWS: tuple[Row, ...] = (
     Row("far start", "adaptive (default)", start="mono"),
     Row("far start", "the detector's pose and its sigmas", _pose_sigmas(0.05, 0.25, 0.06, 9.0), "mono"),
     *(Row("far start", name, Settings(overrides), "mono") for name, overrides in _SAMPLINGS.items()),
+    Row("far start", "rays marched at every state", Settings(_RAYS["marched at every state"]), "mono"),
     Row("far start", "silhouette only", Settings(("photometric.weight=0",)), "mono"),
     Row("far start", "photometric only", Settings(("silhouette.weight=0",)), "mono"),
     *(Row("far start", f"start states: {name}", Settings(overrides), "mono") for name, overrides in _SEARCHES.items()),
