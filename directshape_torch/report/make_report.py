@@ -179,7 +179,8 @@ class _PageOfRun:
 
     def _notes(self, num_frames: int, num_detailed: int) -> list[str]:
         sources = self._reader.sources
-        notes = []
+        unfinished = self._run.unfinished
+        notes = [] if unfinished is None else [f"the run has not finished ({unfinished}): the page is of what is done"]
         if sources.layout is None:
             notes.append("no pictures and no residual maps: the images were not given (--data)")
         if not sources.has_detections:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from directshape_torch.batch.journal import read_journals
+from directshape_torch.batch.run_file import read_run_file
+from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path
@@ -35,7 +38,7 @@ class RunFolder:
 
     Attributes:
         out_dir: the folder.
-        manifest: its `summary.json`.
+        manifest: its `summary.json`, with the frames that its journals add.
     """
 
     out_dir: Path
@@ -52,7 +55,19 @@ class RunFolder:
         manifest = read_manifest(path)
         if manifest is None:
             raise DataFormatError(path, "is missing", cure="give the folder of --out of 'directshape refine'")
-        return cls(out_dir, manifest)
+        frames, inputs = dict(manifest.frames), dict(manifest.inputs)
+        # While a run goes on, and after one that was cut off, the latest frames stand in its journals alone.
+        for record in read_journals(out_dir).records:
+            frames[record.frame_id], inputs[record.frame_id] = record.entry, record.inputs
+        return cls(out_dir, replace(manifest, frames=frames, inputs=inputs))
+
+    @property
+    def unfinished(self) -> str | None:
+        """How the run stands and how many frames are left where it has not finished; None where it has."""
+        if read_run_file(self.out_dir) is None:
+            return None
+        status = read_status(self.out_dir)
+        return None if status.state == "finished" else f"{status.state}, {status.num_left} frames left"
 
     @property
     def done(self) -> list[str]:

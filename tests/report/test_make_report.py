@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from helpers.report_runs import FinishedRun, finished_run
 
+from directshape_torch.batch.journal import FrameRecord, Journal
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
@@ -181,6 +182,21 @@ def _refined_again(root: Path, out: Path) -> FinishedRun:
     dataset = KittiStereoDataset(root, root / "detections", root / "masks")
     refine_dataset(dataset, DirectShapeRefiner(prior, load_config(None, FEW_STEPS)), out)
     return FinishedRun(root, out)
+
+
+def test_a_run_that_was_cut_off(run: FinishedRun, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(run.out, tmp_path / "out"))
+    summary = json.loads((out / "summary.json").read_text())
+    entry, inputs = summary["frames"].pop("000001"), summary["inputs"].pop("000001")
+    (out / "summary.json").write_text(json.dumps(summary))
+    state = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps({**state, "state": "running", "todo": ["000000", "000001", "000002"]}))
+    assert blocks(make_report(out, tmp_path / "a.html", run.sources, run.prior).path)["frames"]["ids"] == ["000000"]
+    Journal(out, state["run_id"]).add(FrameRecord("000001", inputs, entry))
+    outcome = make_report(out, tmp_path / "b.html", run.sources, run.prior)
+    assert blocks(outcome.path)["frames"]["ids"] == ["000000", "000001"]
+    (note,) = outcome.notes
+    assert re.search(r"not finished \(killed, \d+ frames left\)", note)
 
 
 def test_equal_runs_give_equal_pages(run: FinishedRun, tmp_path: Path) -> None:

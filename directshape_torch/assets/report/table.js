@@ -103,8 +103,8 @@ function render() {
 
 function row(car) {
   return element("tr", {},
-    element("td", { class: "name" }, element("button", { type: "button", class: "open-car", "aria-label": `Open car ${carName(car)}`, onclick: () => openCar(car) },
-      element("span", {}, car.frameId), element("span", { class: "quiet" }, `line ${car.line}`))),
+    element("td", { class: "name" }, element("button", { type: "button", class: "open-car", onclick: () => openCar(car) },
+      element("span", {}, car.frameId), " ", element("span", { class: "quiet" }, `line ${car.line}`))),
     element("td", {}, thumbnail(car, "before")), element("td", {}, thumbnail(car, "after")),
     ...columns.map((column) => element("td", { class: column.kind }, column.text(car) || MISSING)));
 }
