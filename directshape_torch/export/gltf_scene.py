@@ -78,6 +78,8 @@ def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, paint: Paint) -
 
 def _finish(tree: dict[str, Any]) -> None:
     """Colours of 16 bits, which trimesh has no way to ask for, and a material that is no metal."""
+    if "meshes" not in tree:
+        return
     tree["materials"] = [
         {"name": "image", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": False}
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB
 from directshape_torch.export.run_folder import RunFolder
 from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.result_files import read_shapes, write_shapes
 
 Floats = NDArray[np.float64]
 LINES = (1, 3)
@@ -264,3 +266,16 @@ def test_equal_runs_give_equal_bytes(finished: FinishedRun, exported: Path, tmp_
     assert len(names) > 10
     for name in names:
         assert (exported / name).read_bytes() == (tmp_path / name).read_bytes(), name
+
+
+def test_a_frame_without_refined_cars_has_no_surfaces(finished: FinishedRun, tmp_path: Path) -> None:
+    """The scene is the ground alone, and without images there is nothing to write."""
+    out = Path(shutil.copytree(finished.out, tmp_path / "out"))
+    path = out / "shapes" / "000000.npz"
+    write_shapes(path, replace(read_shapes(path), statuses=("no_mask", "singular")))
+    run = RunFolder(out, [0])
+    export_run(run, tmp_path / "images", ["glb", "ply", "points"], finished.inputs())
+    assert set(glb(tmp_path / "images" / "glb" / "000000.glb").nodes) == {"ground"}
+    export_run(run, tmp_path / "plain", ["glb", "ply", "points"], finished.inputs(with_images=False))
+    assert glb(tmp_path / "plain" / "glb" / "000000.glb").nodes == {}
+    assert not list(tmp_path.rglob("*.ply"))
