@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from copy import copy
 
 import torch
 from torch import Tensor
@@ -54,7 +54,11 @@ def without_empty_masks(detections: Detections, extents: SceneExtents | None = N
     """
     areas = (scene_extents(detections) if extents is None else extents).areas()
     left, right = (areas > 0).unbind(dim=1)
-    return replace(detections, has_mask_left=left, has_mask_right=right)
+    # A copy and not `replace`, which would check all over again what is not touched.
+    same = copy(detections)
+    object.__setattr__(same, "has_mask_left", left)
+    object.__setattr__(same, "has_mask_right", right)
+    return same
 
 
 def refusals(

@@ -59,6 +59,9 @@ def scene_extents(detections: Detections) -> SceneExtents:
         detections: B cars, with M further occluders or without. Absent masks are not read.
     """
     d, others = detections, detections.occluders
+    if others is not None and others.mask_left.shape[1:] != d.mask_left.shape[1:]:
+        got = tuple(others.mask_left.shape[1:])
+        raise InputError("occluders", f"masks of {tuple(d.mask_left.shape[1:])}", f"{got}")
     masks, present = [d.mask_left, d.mask_right], [d.has_mask_left, d.has_mask_right]
     if others is not None and len(others.frame_index):
         masks += [others.mask_left, others.mask_right]
@@ -74,7 +77,7 @@ def mask_extents(masks: Sequence[Tensor], present: Sequence[Tensor]) -> list[Mas
     """Extents of several stacks of masks, with one host synchronisation in all.
 
     Args:
-        masks: stacks (I, H, W) of foreground probabilities or bool; I may differ.
+        masks: stacks (I, H, W) of foreground probabilities, or 0 and 1 in bool; I may differ.
         present: (I,) bool of each stack; absent masks have no extent.
 
     Example:
@@ -85,19 +88,27 @@ def mask_extents(masks: Sequence[Tensor], present: Sequence[Tensor]) -> list[Mas
         ([[3, 2, 8, 4]], [10])
     """
     for stack, exists in zip(masks, present, strict=True):
-        if stack.ndim != 3 or len(stack) != len(exists):
-            raise InputError("masks", f"shape ({len(exists)}, H, W)", f"{tuple(stack.shape)}")
-    stacks = [_comparable(stack) for stack in masks]
-    spans, unknown = [], []
-    for stack, exists in zip(stacks, present, strict=True):
-        highest = stack.amax(dim=2)
-        spans.append(torch.stack(_first_and_end((highest > MASK_THRESHOLD) & exists[:, None]), dim=1))
-        unknown.append((highest != highest).any())
-    rows = iter(torch.cat([*(span.flatten() for span in spans), torch.stack(unknown).long()]).tolist())
-    spans_on_host = [[(next(rows), next(rows)) for _ in stack] for stack in stacks]
+        if stack.ndim != 3 or len(stack) != len(exists) or stack.shape[1:] != masks[0].shape[1:]:
+            size = ", ".join(str(length) for length in masks[0].shape[1:]) if masks[0].ndim == 3 else "H, W"
+            raise InputError("masks", f"shape ({len(exists)}, {size})", f"{tuple(stack.shape)}")
+    stacks, lengths = [_comparable(stack) for stack in masks], [len(stack) for stack in masks]
+    highest = [stack.amax(dim=2) for stack in stacks]
+    in_rows = torch.cat([rows > MASK_THRESHOLD for rows in highest]) & torch.cat(list(present))[:, None]
+    top, bottom = _first_and_end(in_rows)
+    has_nan = torch.stack([(rows != rows).any() for rows in highest]).long()
+    on_host = torch.cat([top, bottom, has_nan]).tolist()
+    rows = list(zip(on_host[: len(top)], on_host[len(top) : -len(stacks)], strict=True))
+    columns, numbers = [], iter(rows)
+    for stack in stacks:
+        columns.append(_foreground_of_columns(stack, [next(numbers) for _ in stack]))
+    # Absent masks had their share of the rows of others.
+    foreground = torch.cat(columns) * (bottom > 0)[:, None]
+    left, right = _first_and_end(foreground > 0)
+    boxes = torch.stack([left, top, right, bottom], dim=1).split_with_sizes(lengths)
+    areas = foreground.sum(dim=1, dtype=torch.float64).long().split_with_sizes(lengths)
     return [
-        _plain_extents(stack, exists) if next(rows) else _extents(stack, span, tops_and_bottoms)
-        for stack, exists, span, tops_and_bottoms in zip(stacks, present, spans, spans_on_host, strict=True)
+        _plain_extents(stack, exists) if unknown else MaskExtents(*extents)
+        for *extents, stack, exists, unknown in zip(boxes, areas, stacks, present, on_host[-len(stacks) :], strict=True)
     ]
 
 
@@ -106,28 +117,26 @@ def _comparable(masks: Tensor) -> Tensor:
     return masks.view(torch.uint8) if masks.dtype == torch.bool else masks.detach()
 
 
-def _extents(
+def _foreground_of_columns(
     masks: Tensor,  # (I, H, W) without NaN
-    span: Tensor,  # (I, 2) first row with foreground and the one behind the last; 0, 0 without any
-    tops_and_bottoms: Sequence[tuple[int, int]],  # the same on the host
-) -> MaskExtents:
-    """Extents from the rows that have foreground: neighbours in the stack together, in the rows of them all."""
+    rows: Sequence[tuple[int, int]],  # first row with foreground and the one behind the last; 0, 0 without any
+) -> Tensor:
+    """Foreground pixels (I, W) of each column: neighbours in the stack together, in the rows of them all."""
     count, _, width = masks.shape
     foreground = torch.zeros(count, width, dtype=torch.float32, device=masks.device)
-    amounts = [(bottom - top) * width for top, bottom in tops_and_bottoms]
+    amounts = [(bottom - top) * width for top, bottom in rows]
     for part in portions(amounts, pixels_at_once(masks.device) // 2):
-        tops, bottoms = zip(
-            *(rows for rows in tops_and_bottoms[part] if rows[1] or not any(amounts[part])), strict=True
-        )
+        if not any(amounts[part]):
+            continue
+        tops, bottoms = zip(*(span for span in rows[part] if span[1]), strict=True)
         window = masks[part, min(tops) : max(bottoms)]
+        if masks.dtype == torch.uint8:
+            foreground[part] = window.sum(dim=1, dtype=torch.int32)
+            continue
         # Floating-point flags: comparing into them and summing them up is many times faster than with bool ones.
         background = torch.le(window, MASK_THRESHOLD, out=torch.empty(window.shape, device=masks.device))
         torch.sub(window.shape[1], background.sum(dim=1), out=foreground[part])
-    # Absent masks had their share of the rows of others.
-    foreground *= span[:, 1:] > 0
-    u0, u1 = _first_and_end(foreground > 0)
-    boxes = torch.stack([u0, span[:, 0], u1, span[:, 1]], dim=1)
-    return MaskExtents(boxes, foreground.sum(dim=1, dtype=torch.float64).long())
+    return foreground
 
 
 def _plain_extents(masks: Tensor, present: Tensor) -> MaskExtents:

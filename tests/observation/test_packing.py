@@ -215,7 +215,7 @@ def test_work_follows_the_cars_and_not_the_frame() -> None:
     frames, detections = random_scene(6, count=5, num_frames=1, others=0)
     small, large = (touched_by_packing(*enlarged(frames, detections, factor)) for factor in (4, 8))
     pixels = [detections.mask_left[0].numel() * factor**2 for factor in (4, 8)]
-    # Four times the frame: every mask is read once more, its rows with foreground, now longer, twice. Nothing else is of
+    # Four times the frame: every mask is read once more, its rows with foreground, now longer, twice. Nothing else has
     # the size of a frame.
     masks_read = 2 * len(detections) * (pixels[1] - pixels[0])
     assert masks_read <= large[0] - small[0] < 1.5 * masks_read
