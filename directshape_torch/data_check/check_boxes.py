@@ -11,9 +11,10 @@ from directshape_torch.data_check.convention_scores import ConventionScores, sco
 from directshape_torch.data_check.finding import Finding
 
 ALL_FRAMES = "all frames"
-# Mean overlap that another convention must gain for boxes to be taken as written in it, with the observation angles
-# and without them; intact frames stay below 0.04 (one frame of six cars).
-MIN_GAIN, MIN_GAIN_IMAGE = 0.08, 0.06
+# Mean overlap that another convention must gain for boxes to be taken as written in it: with the observation angles,
+# and without them for many and for few cars. Intact sets gain nothing, single frames of two to six cars up to 0.05.
+MIN_GAIN, MIN_GAIN_IMAGE, MIN_GAIN_OF_FEW = 0.08, 0.06, 0.12
+MANY_CARS = 8
 MIN_OVERLAP = 0.45
 LENGTHS_M = (2.3, 9.0)
 MIN_CARS_FOR_SHAPE = 4
@@ -53,7 +54,8 @@ def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 def _better_convention(scores: ConventionScores) -> int | None:
     """The convention that explains image and observation angles so much better that it must be the one in use."""
-    for score, gain in ((scores.score_with_angles, MIN_GAIN), (scores.score, MIN_GAIN_IMAGE)):
+    image_gain = MIN_GAIN_IMAGE if scores.overlap.shape[1] >= MANY_CARS else MIN_GAIN_OF_FEW
+    for score, gain in ((scores.score_with_angles, MIN_GAIN), (scores.score, image_gain)):
         best = int(np.argmax(score))
         explains = scores.overlap[best].mean() > MIN_OVERLAP
         if best and explains and score[best] - score[0] > gain:

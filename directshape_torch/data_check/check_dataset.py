@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from directshape_torch.data_check.car_evidence import FrameEvidence, gather_evidence
-from directshape_torch.data_check.check_box_2d import check_box_2d
+from directshape_torch.data_check.check_box_2d import check_box_2d, check_corners
 from directshape_torch.data_check.check_boxes import check_boxes
 from directshape_torch.data_check.check_calibration import check_calibration
 from directshape_torch.data_check.check_distances import DistanceRatios, check_distances, measure_distances
@@ -109,14 +109,12 @@ def _check_cars(seen: _Seen) -> list[Finding]:
     """Boxes, masks and distances; each is asked only where what it rests on was found right."""
     if not seen.num_cars:
         return [_no_cars()]
-    of_box_2d = check_box_2d(seen.evidence)
-    if of_box_2d:
-        return of_box_2d
-    findings = check_masks(seen.evidence)
-    of_boxes = check_boxes(seen.evidence)
-    if not of_boxes:
-        findings += check_distances(seen.ratios)
-    return findings + of_boxes
+    of_boxes = check_box_2d(seen.evidence) or check_boxes(seen.evidence)
+    if any(finding.severity == "error" for finding in of_boxes):
+        # Masks are found by the boxes and distances are those of the boxes, so they would only say the same again.
+        return [*of_boxes, *(finding for finding in check_masks(seen.evidence) if finding.check != "masks_elsewhere")]
+    found = [*of_boxes, *check_corners(seen.evidence), *check_masks(seen.evidence)]
+    return found + check_distances(seen.ratios)
 
 
 def _no_cars() -> Finding:

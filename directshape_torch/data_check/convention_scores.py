@@ -19,6 +19,8 @@ from directshape_torch.io.mask_matching import box_iou, project_boxes
 _PENALTY_PER_DEVIATION = 0.02
 # Cars are longer than wide and wide or high; a turned box and a swapped pair of lengths project alike.
 _PENALTY_SHORT_CARS = 0.2
+# Mean overlap from which on 2D boxes are taken for projections of the 3D ones.
+_SAME_BOX = 0.95
 # What it counts when all observation angles agree with heading and place.
 _ANGLE_WEIGHT = 0.15
 _ANGLE_TOLERANCE_RAD = 0.06
@@ -32,7 +34,7 @@ class ConventionScores:
 
     Attributes:
         conventions: C, the documented one first.
-        overlap: (C, N) with the 2D box of the detection or the box of its mask, whichever fits better.
+        overlap: (C, N) with what the image shows.
         penalty: (C,) to be taken from the mean overlap.
         angle_share: (C,) share of the cars whose observation angle `alpha` agrees with heading and place.
         has_angles: whether the observation angles say anything.
@@ -56,9 +58,14 @@ class ConventionScores:
 
 
 def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
-    """The scores over the cars of all frames; there must be at least one."""
+    """The scores over the cars of all frames; there must be at least one.
+
+    What the image shows are the 2D box of the detection and the masks, whichever fits best; where the 2D boxes were
+    only projected from the 3D ones, the masks alone, and as many cars as there are masks.
+    """
     conventions = tuple(all_conventions())
-    overlap = np.concatenate([_overlaps(frame, conventions) for frame in frames if len(frame.boxes)], axis=1)
+    projections = boxes_are_projections(frames)
+    overlap = np.concatenate([_overlaps(frame, conventions, projections) for frame in frames], axis=1)
     hwl = np.concatenate([frame.boxes.hwl for frame in frames])
     penalty = [_penalty(convention, hwl) for convention in conventions]
     alpha = np.concatenate([frame.boxes.alpha for frame in frames])
@@ -85,7 +92,40 @@ def _penalty(convention: BoxConvention, hwl: NDArray[np.float64]) -> float:
     return _PENALTY_PER_DEVIATION * len(convention.deviations) + _PENALTY_SHORT_CARS * bool(short)
 
 
-def _overlaps(frame: FrameEvidence, conventions: Sequence[BoxConvention]) -> NDArray[np.float64]:  # (C, N)
+def _overlaps(
+    frame: FrameEvidence, conventions: Sequence[BoxConvention], boxes_are_projections: bool
+) -> NDArray[np.float64]:  # (C, N), or the best of each convention where not every car can have a mask
+    projected = project_conventions(frame, conventions)
+    seen = np.array([box for mask in frame.masks["left"] for box in (mask.mask_box, mask.box)]).reshape(-1, 4)
+    overlaps = np.zeros(projected.shape[:2])
+    for car in range(len(frame.boxes)):
+        own = seen if boxes_are_projections else np.concatenate([seen, frame.boxes.box_2d[car : car + 1]])
+        if len(own):
+            overlaps[:, car] = box_iou(projected[:, car], own).max(axis=1)
+    if not boxes_are_projections:
+        return overlaps
+    return -np.sort(-overlaps, axis=1)[:, : min(len(frame.boxes), len(frame.masks["left"]))]
+
+
+def boxes_are_projections(frames: Sequence[FrameEvidence]) -> bool:
+    """Whether the 2D boxes were made from the 3D ones, read as documented, and so say nothing about them.
+
+    Where there are no masks they are all that there is.
+    """
+    if not any(frame.masks["left"] for frame in frames):
+        return False
+    overlaps = [
+        box_iou(box[None], seen[None])[0, 0]
+        for frame in frames
+        for box, seen in zip(project_conventions(frame, [BoxConvention()])[0], frame.boxes.box_2d, strict=True)
+    ]
+    return bool(np.mean(overlaps) > _SAME_BOX)
+
+
+def project_conventions(
+    frame: FrameEvidence, conventions: Sequence[BoxConvention]
+) -> NDArray[np.float64]:  # (C, N, 4) pixels
+    """2D boxes around the 3D boxes in the left image, under each convention."""
     found = [convention.to_kitti(frame.boxes) for convention in conventions]
     T_ref_obj = pose_from_kitti(
         torch.from_numpy(np.concatenate([boxes.location for boxes in found])),
@@ -94,9 +134,4 @@ def _overlaps(frame: FrameEvidence, conventions: Sequence[BoxConvention]) -> NDA
     hwl = torch.from_numpy(np.concatenate([boxes.hwl for boxes in found]))
     T_cam_obj = shift_frame(T_ref_obj, frame.camera.t_cam_ref[0])
     projected, _ = project_boxes(T_cam_obj, hwl, frame.camera, frame.size_hw)
-    per_convention = projected.reshape(len(conventions), len(frame.boxes), 4)
-    overlaps = np.zeros(per_convention.shape[:2])
-    for car, seen in enumerate(zip(frame.boxes.box_2d, frame.mask_boxes, strict=True)):
-        both = np.nan_to_num(box_iou(per_convention[:, car], np.array(seen)))
-        overlaps[:, car] = both.max(axis=1)
-    return overlaps
+    return projected.reshape(len(conventions), len(frame.boxes), 4)

@@ -209,9 +209,9 @@ def _half_size(entry: dict[str, Any], mask: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(mask[::2, ::2])
 
 
-def _mirrored(entry: dict[str, Any], mask: NDArray[Any]) -> NDArray[Any]:
+def _moved(entry: dict[str, Any], mask: NDArray[Any]) -> NDArray[Any]:
     del entry
-    return np.ascontiguousarray(mask[:, ::-1])
+    return np.roll(mask, mask.shape[1] // 3, axis=1)
 
 
 def _category(entry: dict[str, Any], mask: NDArray[Any]) -> NDArray[Any]:
@@ -294,7 +294,7 @@ BREAKS: dict[str, Break] = {
     "classes in lower case": _break(_boxes(_lower_case), "no_cars"),
     "masks of the other side": _break(_masks(_other_side), "masks_swapped"),
     "masks of half the size": _break(_masks(_half_size), "mask_size"),
-    "masks of other images": _break(_masks(_mirrored), "masks_elsewhere"),
+    "masks of other images": _break(_masks(_moved), "masks_elsewhere"),
     "masks of another category": _break(_masks(_category), "no_masks"),
     "missing right image": _break(_remove("training/image_3"), "missing_files"),
     "missing calibration": _break(_remove("training/calib"), "missing_files"),
