@@ -27,7 +27,7 @@ from directshape_torch.visualize.inspection.residual_values import (
 _WORST_SILHOUETTE = 4.6
 _WORST_GREY_LEVELS = 30.0
 _LOST_RGB = (130, 130, 130)
-_DOT_PX = 0.7
+_DOT_PX = 1.6
 # Not the colour of the boxes that the run ended with.
 _STATE_RGB = (120, 220, 235)
 

@@ -18,8 +18,9 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         program.main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    for command in ("refine", "demo", "compare", "evaluate", "evaluate-shape", "build-prior", "calibrate-stereo"):
-        assert re.search(rf"^ {{4}}{command}\s", text, re.MULTILINE)
+    assert {"refine", "demo", "build_prior", "calibrate_stereo", "export"} < set(program.COMMANDS)
+    for command in program.COMMANDS:
+        assert re.search(rf"^ {{4}}{command.replace('_', '-')}\s", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize("arguments", [[], ["refin"], ["refine"], ["compare", "--labels", "x"]])
