@@ -1,0 +1,82 @@
+"""The bundled frame as a rig of another's own, converted by the example and read again."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from helpers.layouts import put
+
+import directshape_torch
+from directshape_torch.cli.main import main
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.kitti_labels import poses_cam
+from directshape_torch.io.mask_matching import box_iou
+from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
+
+DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "convert_to_folder.py"
+
+
+def write_rig(demo: LoadedFrame, root: Path) -> None:
+    """The frame as its detector and OpenCV would have it."""
+    for side, folder in (("left", "image_2"), ("right", "image_3")):
+        put(DEMO / "training" / folder / "000000.png", root / side / "street.png")
+    camera = demo.frame.camera
+    K_left, K_right, t = (
+        np.asarray(part[0], dtype=float) for part in (camera.K_left, camera.K_right, camera.T_right_cam[:, :3, 3:])
+    )
+    file = cv2.FileStorage(str(root / "stereo.yml"), cv2.FILE_STORAGE_WRITE)
+    file.write("P1", np.concatenate([K_left, np.zeros((3, 1))], axis=1))
+    file.write("P2", np.concatenate([K_right, K_right @ t], axis=1))
+    file.write("image_size", np.array([1242, 375]))
+    file.release()
+    origins = poses_cam(demo.input_objects, camera.t_cam_ref[0])[:, :3, 3].tolist()
+    boxes: list[dict[str, Any]] = []
+    for found, (x, y, z) in zip(demo.input_objects, origins, strict=True):
+        height, width, length = found.hwl
+        boxes.append(
+            {
+                "label": "car",
+                "score": found.score,
+                "center": [x, y - height / 2, z],
+                "size_lwh": [length, width, height],
+                "yaw": -math.pi / 2 - found.rotation_y,
+            }
+        )
+    (root / "boxes.json").write_text(json.dumps({"street": boxes}))
+    masks = json.loads((DEMO / "training" / "masks" / "000000.json").read_text())
+    for mask in masks:
+        # Instances 1001 .. 1006 are the cars in the order of the detections.
+        mask["box"] = mask["instance_id"] - 1001 if mask["instance_id"] <= 1006 else -1
+    (root / "masks.json").write_text(json.dumps({"street": masks}))
+
+
+def test_the_converted_folder_gives_the_same_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    kitti = KittiStereoDataset(
+        DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks", dtype=torch.float64
+    ).load("000000")
+    rig, folder = tmp_path / "rig", tmp_path / "folder"
+    write_rig(kitti, rig)
+    command = [sys.executable, str(EXAMPLE), "--rig", str(rig), "--out", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("1 frames in")
+    loaded = open_dataset("folder", folder, dtype=torch.float64).load("street")
+    torch.testing.assert_close(loaded.detections.T_cam_obj, kitti.detections.T_cam_obj)
+    torch.testing.assert_close(loaded.detections.mask_left, kitti.detections.mask_left)
+    torch.testing.assert_close(loaded.detections.mask_right, kitti.detections.mask_right)
+    torch.testing.assert_close(loaded.frame.camera.T_right_cam, kitti.frame.camera.T_right_cam)
+    # 2D boxes that no file gives are those of the projected 3D boxes, which the detector's own are near.
+    overlaps = box_iou(loaded.detections.box_2d.numpy(), kitti.detections.box_2d.numpy()).diagonal()
+    assert overlaps.min() > 0.5
+    assert main(["check-data", "--layout", "folder", "--data", str(folder)]) == 0
+    assert "0 errors, 0 warnings, 0 notes" in capsys.readouterr().out
