@@ -146,6 +146,10 @@ class CarView:
         return {}
 
     @cached_property
+    def _footprints(self) -> dict[int, Array]:
+        return {}
+
+    @cached_property
     def detector_corners_cam(self) -> Array:
         """(8, 3) of the detection's box."""
         d = self.loaded.detections
@@ -153,7 +157,10 @@ class CarView:
 
     def footprint(self, number: int) -> Array:
         """The box of a state's zero level seen from above: x and z (4, 2) in the left camera frame, the front first."""
-        return _footprint(self.prior, self.state(number))
+        known: dict[int, Array] = self._footprints
+        if number not in known:
+            known[number] = _footprint(self.prior, self.state(number))
+        return known[number]
 
     def centre_cam(self, number: int) -> Array:
         """Middle of the footprint (2,), x and z, metres."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,16 @@ def costs_of_car(view: CarView) -> dict[str, NDArray[np.float64]]:
     return {**named, "sum": costs.sum(axis=1)}
 
 
+def stage_beginnings(stage: Sequence[int]) -> list[float]:
+    """Places between the states where a later stage than the first begins.
+
+    Example:
+        >>> stage_beginnings([-1, 0, 0, 1, 1])
+        [2.5]
+    """
+    return [k - 0.5 for k in range(1, len(stage)) if stage[k] != stage[k - 1] and stage[k] > 0]
+
+
 def write_cost_figure(path: Path | str, view: CarView) -> None:
     """Write the figure as PNG: all costs are those of the final stage, so a step of an earlier stage may raise them.
 
@@ -41,15 +52,12 @@ def write_cost_figure(path: Path | str, view: CarView) -> None:
     axes.plot(
         iterations[refused], costs["sum"][refused], "x", color="0.5", markersize=5, label="step refused, or car done"
     )
-    stage = view.trace.stage
-    for k in range(1, len(stage)):
-        if stage[k] != stage[k - 1] and stage[k] > 0:
-            axes.axvline(k - 0.5, color="0.6", linestyle=":")
-            axes.annotate("next stage", (k - 0.5, 0.98), xycoords=("data", "axes fraction"), fontsize=8, rotation=90,
-                          ha="right", va="top", color="0.4")  # fmt: skip
+    for number, place in enumerate(stage_beginnings(view.trace.stage)):
+        axes.axvline(place, color="0.6", linestyle=":", label=None if number else "next stage")
     axes.set_yscale("log")
     axes.set_ylim(bottom=_LEAST_SHARE * costs["sum"].max())
     axes.set(xlabel="iteration", ylabel="cost at the final stage's settings", title=view.title)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8)
     write_figure(path, figure)

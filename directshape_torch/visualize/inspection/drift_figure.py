@@ -91,5 +91,6 @@ def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:
     is_truth = next(iter(views.values())).truth_corners_cam is not None
     axes.set(xlabel="iteration", ylabel=f"distance to the {'true' if is_truth else 'input'} centre [m]")
     axes.set_ylim(bottom=0)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)

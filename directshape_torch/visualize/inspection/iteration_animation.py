@@ -68,6 +68,7 @@ def _draw_costs(axes: Any, view: CarView) -> None:
         if name in ("sum", "photometric") or name.startswith("silhouette"):
             axes.plot(values, color="black" if name == "sum" else None, label=name, linewidth=1.2)
     axes.set_ylim(bottom=0)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set(xlabel="iteration", title="cost")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7, loc="upper right")
