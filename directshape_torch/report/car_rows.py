@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
-
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.report.errors_to_labels import JudgedCar, judge_cars
+from directshape_torch.report.json_numbers import known
 from directshape_torch.report.run_folder import FrameResult
 from directshape_torch.status import Status
 
@@ -102,7 +100,7 @@ def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) ->
         line=int(shapes.input_lines[car]),
         type=kitti.type,
         status=shapes.statuses[car],
-        refined=_is_refined(shapes.statuses[car]),
+        refined=is_refined(shapes.statuses[car]),
         distance_m=known(shapes.T_cam_obj[car, 2, 3], 2),
         score=known(kitti.score),
         cost_before=known(shapes.costs_before[car].sum()),
@@ -126,16 +124,6 @@ def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) ->
     )
 
 
-def known(value: float | np.floating[Any] | None, decimals: int = 4) -> float | None:
-    """A number as JSON can hold it: rounded, and None where it is not finite.
-
-    Example:
-        >>> known(0.123456), known(float("nan"))
-        (0.1235, None)
-    """
-    return None if value is None or not math.isfinite(value) else round(float(value), decimals)
-
-
-def _is_refined(status: str) -> bool:
+def is_refined(status: str) -> bool:
     """Whether a status is one of a refined state; one of a later version is taken for none."""
     return status in Status.__members__ and Status[status].is_refined

@@ -16,10 +16,10 @@ from directshape_torch.batch.mesh_files import T_GLTF_CAM
 from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.report.car_rows import is_refined
 from directshape_torch.report.run_folder import FrameResult
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.status import Status
 from directshape_torch.visualize.drawing import Surface
 
 Array = npt.NDArray[np.floating[Any]]
@@ -84,8 +84,7 @@ def states_after(
     corners = box_corners(T_cam_box, torch.from_numpy(np.asarray(shapes.boxes_hwl, dtype=np.float64))).numpy()
     states = []
     for car, status in enumerate(shapes.statuses):
-        is_refined = Status[status].is_refined
-        if not is_refined and before is not None:
+        if not is_refined(status) and before is not None:
             states.append(before[car])
             continue
         T = np.asarray(shapes.T_cam_obj[car], dtype=np.float64)

@@ -15,8 +15,9 @@ from directshape_torch.observation.occlusion import OcclusionOrder
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, as_json, car_rows
 from directshape_torch.report.chosen_frames import choose_frames
 from directshape_torch.report.drawn_frame import decoded_mesh
-from directshape_torch.report.frame_details import DetailSettings, FrameMaterial, frame_details
+from directshape_torch.report.frame_details import frame_details
 from directshape_torch.report.frame_inputs import InputReader, InputSources
+from directshape_torch.report.frame_material import DetailSettings, FrameMaterial
 from directshape_torch.report.mesh_data import mesh_data
 from directshape_torch.report.page_assets import data_block, page_frame
 from directshape_torch.report.page_writer import replaced_text_file
