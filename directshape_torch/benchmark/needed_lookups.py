@@ -1,8 +1,12 @@
 """The lookups of signed distance that a Gauss-Newton iteration cannot avoid, as points to look up.
 
-A pixel whose contour is in play must know the least distance along its ray: the point of the last state is corrected
-(one value with its gradient), and there value, gradient and code derivative make residual and Jacobian. A pixel of the
-photometric set must know its depth: the same two. Pixels that are certain, and everything else, need none.
+A ray whose contour is in play must know its least distance to the shape at the new state: three values about the depth
+where it was closest correct that depth, a parabola needing three, and there value, gradient and code derivative make
+residual and Jacobian. A pixel of the photometric set must know its depth: one value corrects it, and there the
+derivatives are taken. Rays of which the contour is certain, and everything else, need none.
+
+Not counted, because another method could do without: rays that an iteration carries along in case they come into play
+later, empty places in blocks, lookups of pixels that turn out to see no surface.
 """
 
 from __future__ import annotations
@@ -12,92 +16,83 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig
-from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.geometry.rays import ray_box_interval
-from directshape_torch.observation.packing import PixelSamples
-from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
+from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.silhouette_term import SilhouetteTerm
 
-_SAMPLES = 64
-_LOOKUPS_PER_POINT = 2
+# A contour is in play where |zeta sdf| is below this: beyond it a ray's weight in the sums is below 5 per mille.
+IN_PLAY_EXPONENT = 8.0
+# What the three samples about a depth of closest approach are apart, metres.
+_SAMPLE_DISTANCE_M = 0.12
 
 
 @dataclass(frozen=True)
 class NeededLookups:
-    """Points of one iteration, the contours' first, each to be looked up twice.
+    """Points of one iteration: C rays near contours and S pixels with a surface.
 
     Attributes:
-        points_obj: (P, 3).
-        object_index: (P,).
-        num_contour: of them belong to silhouettes.
+        contour_samples_obj: (3, 3, C) coordinates of three samples of each ray, for values.
+        contour_obj: (3, C) the points of closest approach, for derivatives.
+        contour_object: (C,) object of each ray.
+        surface_obj: (3, S) where pixels meet the surface, for a value and for derivatives.
+        surface_object: (S,)
     """
 
-    points_obj: Tensor
-    object_index: Tensor
-    num_contour: int
+    contour_samples_obj: Tensor
+    contour_obj: Tensor
+    contour_object: Tensor
+    surface_obj: Tensor
+    surface_object: Tensor
 
     @property
-    def num_surface(self) -> int:
-        return len(self.points_obj) - self.num_contour
+    def num_values(self) -> int:
+        """Lookups of a value alone."""
+        return 3 * len(self.contour_object) + len(self.surface_object)
 
     @property
-    def num_lookups(self) -> int:
-        return _LOOKUPS_PER_POINT * len(self.points_obj)
+    def num_derivatives(self) -> int:
+        """Lookups of value, gradient and code derivative."""
+        return len(self.contour_object) + len(self.surface_object)
 
 
 @torch.no_grad()
-def needed_lookups(
-    prior: ShapePrior,
-    state: CarState,
-    cars: CarBatch,
-    left: PixelSamples,
-    right: PixelSamples,
-    config: RefinerConfig,
-) -> NeededLookups:
-    """The points at a state, in the last stage: least distances near the contour of both views, and surface points.
+def needed_lookups(problem: CarProblem, state: CarState) -> NeededLookups:
+    """The points at a state, in the last stage, which begins there.
 
     Args:
-        prior: the family of shapes.
-        state: of B cars.
-        cars: their constants.
-        left, right: packed pixels.
-        config: contour and saturation, which say what is in play.
+        problem: of B cars, with contours by closest approach.
+        state: of these cars.
     """
-    shape = prior.bind(state.code)
-    zeta = cars.focal_over_depth / config.stages[-1].contour_width_px
-    zeta = zeta.clamp(config.silhouette.min_zeta_per_m, config.silhouette.max_zeta_per_m)
-    contour, surface = [], []
-    for pixels in (left, right):
-        marched = _march(shape, prior.bounds_obj, state, pixels)
-        in_play = (zeta[pixels.object_index] * marched.least_sdf).abs() < config.silhouette.saturation
-        contour.append((marched.closest_obj[in_play], pixels.object_index[in_play]))
-        if pixels is left:
-            on_car = (marched.least_sdf < 0) & (pixels.foreground > 0.5)
-            surface.append((marched.entry_obj[on_car], pixels.object_index[on_car]))
-    points, index = (torch.cat(parts) for parts in zip(*contour, *surface, strict=True))
-    return NeededLookups(points, index, sum(len(rows) for rows, _ in contour))
+    problem.begin_stage(problem.stages()[-1], state)
+    projected = problem.project(state)
+    contours, surfaces = [], []
+    for term in problem.terms:
+        if isinstance(term, SilhouetteTerm):
+            contours.append(_contour_points(term, projected))
+        elif isinstance(term, PhotometricTerm):
+            surfaces.append(_surface_points(term, projected))
+    samples, contour_object = (torch.cat(parts, dim=-1) for parts in zip(*contours, strict=True))
+    surface, surface_object = (torch.cat(parts, dim=-1) for parts in zip(*surfaces, strict=True))
+    return NeededLookups(samples, samples[:, 1].contiguous(), contour_object, surface, surface_object)
 
 
-@dataclass(frozen=True)
-class _Marched:
-    least_sdf: Tensor  # (P,) infinite for rays that miss the prior's bounds
-    closest_obj: Tensor  # (P, 3)
-    entry_obj: Tensor  # (P, 3) first sample inside, where there is one
+def _contour_points(term: SilhouetteTerm, projected: ProjectedState) -> tuple[Tensor, Tensor]:
+    """Samples (3, 3, C) about the points of closest approach of the rays in play, and their objects (C,)."""
+    view = term.view(projected)
+    in_play = view.march.crosses_bounds & ((view.closest_sdf * term.zeta).abs() < IN_PLAY_EXPONENT)
+    chosen = in_play.nonzero()[:, 0]
+    rays = view.rays.select(chosen)
+    step = _SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=1)
+    depth = view.closest_depth[chosen]
+    points = [rays.at(depth + offset * step) for offset in (-1, 0, 1)]
+    return torch.stack(points).permute(2, 0, 1).contiguous(), rays.object_index
 
 
-def _march(shape: BoundShape, bounds_obj: Tensor, state: CarState, pixels: PixelSamples) -> _Marched:
-    T = state.T_obj_cam[pixels.object_index]
-    origin = (T[:, :3, :3] @ pixels.origin_cam[..., None])[..., 0] + T[:, :3, 3]
-    direction = (T[:, :3, :3] @ pixels.ray_cam[..., None])[..., 0]
-    interval = ray_box_interval(origin, direction, bounds_obj)
-    share = (torch.arange(_SAMPLES, dtype=origin.dtype, device=origin.device) + 0.5) / _SAMPLES
-    near, far = (torch.where(interval.hit, end, torch.ones_like(end)) for end in (interval.near, interval.far))
-    depth = near[:, None] + (far - near)[:, None] * share
-    points = origin[:, None] + depth[..., None] * direction[:, None]
-    index = pixels.object_index[:, None].expand_as(depth)
-    sdf = shape.value(points.reshape(-1, 3), index.reshape(-1)).view_as(depth)
-    least, closest = sdf.min(dim=1)
-    entry = (sdf < 0).to(torch.uint8).argmax(dim=1)
-    row = torch.arange(len(pixels), device=origin.device)
-    return _Marched(torch.where(interval.hit, least, torch.inf), points[row, closest], points[row, entry])
+def _surface_points(term: PhotometricTerm, projected: ProjectedState) -> tuple[Tensor, Tensor]:
+    """Points (3, S) where the pixels of the set meet the surface, and their objects (S,)."""
+    rays, root = projected.left.surface(term.pixel_set.pixel_index)
+    found = root.found.nonzero()[:, 0]
+    chosen = rays.select(found)
+    return chosen.at(root.depth[found]).mT.contiguous(), chosen.object_index

@@ -16,13 +16,14 @@ from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import demo_scene, first_cars
 from directshape_torch.compilation import CompileMode, compilable, compiling
-from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_state import CarState
+from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.shape.shape_prior import BoundShape
+from directshape_torch.shape.grid_lookup import GridField, Lookup, derivatives_at, value_at
+from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.normal_equations import Segments
 
@@ -40,47 +41,49 @@ def run_kernels(settings: SuiteSettings) -> SuiteResult:
     frames, detections = collate([first_cars(loaded, 1) if settings.quick else loaded])
     rows: list[Row] = []
     notes = [f"the bundled frame, cars: {len(detections)}, default preset, single precision"]
-    needed, shape = _needed(frames, detections)
+    needed, field = _needed(frames, detections)
     for mode in available_modes():
         settings.progress(f"kernels: one iteration and bare lookups, {mode}")
-        rows += _iteration_rows(mode, needed, shape, frames, detections, settings)
+        rows += _iteration_rows(mode, needed, field, frames, detections, settings)
         settings.progress(f"kernels: Jacobians by hand and by autograd, {mode}")
         rows.append(_autograd_row(mode, frames, detections, settings))
         rows += _problem_rows(mode, frames, detections, settings)
-    notes.append(f"needed: {needed.num_contour} points of contours and {needed.num_surface} of surfaces, twice each")
+    rays, pixels = len(needed.contour_object), len(needed.surface_object)
+    notes.append(f"needed: 3 values and once derivatives for {rays} rays near contours, 1 and once for {pixels} pixels")
     settings.progress("kernels: parts")
     rows += _sum_and_solve_rows(frames, detections, settings)
     return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
 
 
-def _needed(frames: FrameBatch, detections: Detections) -> tuple[NeededLookups, BoundShape]:
+def _needed(frames: FrameBatch, detections: Detections) -> tuple[NeededLookups, GridField]:
     """At the states that a refinement ends in."""
     refiner = make_refiner("default", "eager")
     problem, _ = refiner.problem(frames, detections)
     result = refiner(frames, detections)
     state = CarState(se3.inverse(result.T_cam_obj), result.code)
-    cars = CarBatch.from_scene(frames, detections)
-    found = needed_lookups(refiner.prior, state, cars, problem.left, problem.right, refiner.config)
-    return found, refiner.prior.bind(state.code)
+    shape = refiner.prior.bind(state.code)
+    if not isinstance(shape, GridShape):
+        raise InputError("prior", "grids, like the bundled one", type(shape).__name__)
+    return needed_lookups(problem, state), shape.field
 
 
 def _iteration_rows(
     mode: str,
     needed: NeededLookups,
-    shape: BoundShape,
+    field: GridField,
     frames: FrameBatch,
     detections: Detections,
     settings: SuiteSettings,
 ) -> list[Row]:
     few, many = (partial(_endless(mode, n), frames, detections) for n in (_FEW, _MANY))
-    lookups = _bare_lookups(mode, needed, shape)
+    lookups = _bare_lookups(mode, needed, field)
     times = time_interleaved({"few": few, "many": many, "lookups": lookups}, settings.repetitions)
     iteration = _per_iteration(times)
     lookup = [seconds / (_MANY - _FEW) for seconds in times.seconds["lookups"]]
     ratio = Spread.of([a / b for a, b in zip(iteration, lookup, strict=True)])
     bare = Spread.of(lookup)
     note = f"calls of {_MANY} less calls of {_FEW} iterations, which all cars take part in"
-    rate = bare.median / needed.num_lookups
+    rate = bare.median / (needed.num_values + needed.num_derivatives)
     return [
         _row(f"one iteration over the lookups it needs, {mode}", ratio, "", "ratio", goal=_ITERATION_GOAL, note=note),
         _row(f"one iteration, {mode}", Spread.of(iteration).scaled(1e3), "ms", "time"),
@@ -101,22 +104,51 @@ def _per_iteration(times: InterleavedTimes) -> list[float]:
     return [max(many - few, 0.0) / (_MANY - _FEW) for many, few in pairs]
 
 
-@compilable(sizes={"points_obj": 0, "object_index": 0})
-def _value_and_derivatives(
-    shape: BoundShape,
-    points_obj: Tensor,  # (P, 3)
-    object_index: Tensor,  # (P,)
-) -> tuple[Tensor, ...]:
-    """One value, and one value with its derivatives, at every point: nothing else."""
-    return shape.value(points_obj, object_index), *shape.value_and_derivatives(points_obj, object_index)
+@compilable(
+    sizes={
+        "values": 0,
+        "contour_samples_obj": 2,
+        "contour_obj": 1,
+        "contour_object": 0,
+        "surface_obj": 1,
+        "surface_object": 0,
+    }
+)
+def _values_and_derivatives(
+    values: Tensor,
+    basis: Tensor,
+    origin: Tensor,
+    last_node: Tensor,
+    spacing_m: float,
+    contour_samples_obj: Tensor,  # (3, 3, C)
+    contour_obj: Tensor,  # (3, C)
+    contour_object: Tensor,  # (C,)
+    surface_obj: Tensor,  # (3, S)
+    surface_object: Tensor,  # (S,)
+) -> tuple[Tensor | Lookup, ...]:
+    """What is needed of the grids of all objects, and nothing else; every tensor by itself, for the compiler."""
+    field = GridField(values, basis, origin, last_node, spacing_m)
+    return (
+        value_at(field, contour_samples_obj, contour_object),
+        derivatives_at(field, contour_obj, contour_object, constant=True),
+        value_at(field, surface_obj, surface_object),
+        derivatives_at(field, surface_obj, surface_object, constant=True),
+    )
 
 
-def _bare_lookups(mode: str, needed: NeededLookups, shape: BoundShape) -> Callable[[], object]:
+def _bare_lookups(mode: str, needed: NeededLookups, field: GridField) -> Callable[[], object]:
     """The lookups as often as there are iterations to compare with, compiled like the refiner's own functions."""
+    points = (
+        needed.contour_samples_obj,
+        needed.contour_obj,
+        needed.contour_object,
+        needed.surface_obj,
+        needed.surface_object,
+    )
 
     def run() -> None:
         for _ in range(_MANY - _FEW):
-            _value_and_derivatives(shape, needed.points_obj, needed.object_index)
+            _values_and_derivatives(*field, *points)
 
     return _in_mode(mode, run)
 

@@ -4,46 +4,53 @@ from __future__ import annotations
 
 import torch
 
-from directshape_torch.benchmark.needed_lookups import needed_lookups
+from directshape_torch.benchmark.needed_lookups import IN_PLAY_EXPONENT, needed_lookups
 from directshape_torch.benchmark.workloads import demo_scene
-from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.energy import tracked_silhouettes
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.refiner import DirectShapeRefiner
 
 
-def test_points_of_contours_are_in_play_and_points_of_surfaces_inside() -> None:
+def demo_problem() -> tuple[CarProblem, CarState]:
     loaded = demo_scene().frames[0]
-    refiner = DirectShapeRefiner()
-    problem, state = refiner.problem(loaded.frame, loaded.detections)
-    cars = CarBatch.from_scene(loaded.frame, loaded.detections)
-
-    found = needed_lookups(refiner.prior, state, cars, problem.left, problem.right, refiner.config)
-
-    sdf = refiner.prior.bind(state.code).value(found.points_obj, found.object_index)
-    contour, surface = sdf[: found.num_contour], sdf[found.num_contour :]
-    zeta = (cars.focal_over_depth / refiner.config.stages[-1].contour_width_px)[found.object_index]
-    assert 0 < found.num_contour < len(problem.left) + len(problem.right)
-    assert 0 < found.num_surface < len(problem.left)
-    assert bool(((zeta[: found.num_contour] * contour).abs() < refiner.config.silhouette.saturation).all())
-    assert bool((surface < 0).all())
-    assert found.num_lookups == 2 * len(sdf)
-    # A first sample inside is at most one sample behind the surface: 64 samples of a ray of at most 7 m.
-    assert float(surface.median()) > -0.11
+    return DirectShapeRefiner().problem(loaded.frame, loaded.detections)
 
 
-def test_a_rays_least_distance_is_not_beaten_by_a_denser_march() -> None:
-    loaded = demo_scene().frames[0]
-    refiner = DirectShapeRefiner()
-    problem, state = refiner.problem(loaded.frame, loaded.detections)
-    cars = CarBatch.from_scene(loaded.frame, loaded.detections)
-    found = needed_lookups(refiner.prior, state, cars, problem.left, problem.right, refiner.config)
-    shape = refiner.prior.bind(state.code)
-    points, index = found.points_obj[: found.num_contour], found.object_index[: found.num_contour]
+def test_points_of_contours_are_in_play_and_points_of_surfaces_on_them() -> None:
+    problem, state = demo_problem()
+    needed = needed_lookups(problem, state)
+    shape = problem.prior.bind(state.code)
 
-    value = shape.value(points, index)
-    at = shape.value_and_derivatives(points, index)
-    # Along its own ray the field is level there, so a step of a tenth of a sample gains next to nothing.
-    centre = state.T_obj_cam[index, :3, 3]
-    ray = torch.nn.functional.normalize(points - centre, dim=-1)
-    along = (at.gradient * ray).sum(-1).abs()
-    assert float(along.median()) < 0.3
-    assert bool(value.isfinite().all())
+    at_contour = shape.value(needed.contour_obj.mT, needed.contour_object)
+    zeta = {int(i): float(z) for term in problem.terms if isinstance(term, SilhouetteTerm)
+            for i, z in zip(term.pixels.object_index, term.zeta, strict=True)}  # fmt: skip
+    zeta_of_points = torch.tensor([zeta[int(i)] for i in needed.contour_object])
+    assert bool(((zeta_of_points * at_contour).abs() < IN_PLAY_EXPONENT).all())
+    assert float(shape.value(needed.surface_obj.mT, needed.surface_object).abs().max()) < 2e-3
+
+
+def test_what_is_counted_is_part_of_what_an_iteration_follows() -> None:
+    problem, state = demo_problem()
+    needed = needed_lookups(problem, state)
+    (photometric,) = (term for term in problem.terms if isinstance(term, PhotometricTerm))
+    rays = sum(len(term.pixels) for term in problem.terms if isinstance(term, SilhouetteTerm))
+    contour, surface = len(needed.contour_object), len(needed.surface_object)
+    assert 0 < contour < rays
+    assert 0 < surface <= len(photometric.pixel_set.pixel_index)
+    assert (needed.num_values, needed.num_derivatives) == (3 * contour + surface, contour + surface)
+    assert IN_PLAY_EXPONENT == tracked_silhouettes._IN_PLAY_EXPONENT
+
+
+def test_a_rays_least_distance_is_not_beaten_by_its_other_samples() -> None:
+    problem, state = demo_problem()
+    needed = needed_lookups(problem, state)
+    shape = problem.prior.bind(state.code)
+    before, here, after = (shape.value(needed.contour_samples_obj[:, k].mT, needed.contour_object) for k in (0, 1, 2))
+    assert torch.equal(needed.contour_samples_obj[:, 1], needed.contour_obj)
+    # 12 cm away along the ray the shape is further, but for rays that graze it or meet it twice.
+    assert float(((here <= before) & (here <= after)).float().mean()) > 0.9
+    apart = (needed.contour_samples_obj[:, 2] - needed.contour_obj).norm(dim=0)
+    torch.testing.assert_close(apart, torch.full_like(apart, 0.12), rtol=1e-3, atol=0)
