@@ -160,6 +160,21 @@ def test_3d_draws_turns_and_opens_cars(opened: Chrome) -> None:
     assert scene.get_attribute("data-car") in find(opened, "#car-dialog h2").text
 
 
+def test_3d_turns_by_a_finger(opened: Chrome) -> None:
+    set_viewport(opened, 390, 844)
+    scene = show_scene(opened)
+    area = opened.execute_script("return arguments[0].getBoundingClientRect().toJSON()", scene)
+    middle = {"x": area["x"] + area["width"] / 2, "y": area["y"] + area["height"] / 2}
+    before = screenshot_of(scene)
+    steps = [("touchStart", 0), ("touchMove", 20), ("touchMove", 60), ("touchMove", 100), ("touchEnd", None)]
+    for kind, along in steps:
+        points = [] if along is None else [{"x": middle["x"] + along, "y": middle["y"]}]
+        opened.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    time.sleep(0.3)
+    assert np.mean(np.any(before != screenshot_of(scene), axis=-1)) > 0.02
+    assert not find(opened, "#car-dialog").is_displayed()
+
+
 def test_frames_change_and_boxes_can_be_hidden(opened: Chrome) -> None:
     scene = show_scene(opened)
     find(opened, "#next-frame").click()
