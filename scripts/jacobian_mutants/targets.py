@@ -13,7 +13,16 @@ _ROWS = (
     "tests/energy/test_autograd_jacobian.py::test_rows_of_every_term_agree",
 )
 _COST = "tests/energy/test_gradient_of_the_cost.py"
-_TRACKED = ("tests/energy/test_tracked_energy.py", "tests/energy/test_following_rays.py")
+_TRACKED = "tests/energy/test_tracked_energy.py"
+_FOLLOWING = tuple(
+    f"tests/energy/test_following_rays.py::{name}"
+    for name in (
+        "test_a_refused_step_leaves_no_trace",
+        "test_each_car_follows_for_itself",
+        "test_cars_that_leave_change_nothing_of_the_others",
+        "test_a_car_without_any_pixel_has_its_priors_alone",
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -275,7 +284,13 @@ TARGETS: dict[str, Target] = {
             "TrackedSilhouettes._noted",
             "_side",
         ),
-        _TRACKED,
+        (
+            f"{_TRACKED}::test_sums_of_the_silhouettes_ray_by_ray",
+            f"{_TRACKED}::test_a_ray_that_misses_the_bounds_waits_by_their_middle",
+            f"{_TRACKED}::test_factors_of_single_cars",
+            *_FOLLOWING,
+            f"{_TRACKED}::test_hand_derived_rows_are_those_of_autograd",
+        ),
     ),
     "tracked_photometric": Target(
         "directshape_torch/energy/tracked_photometric.py",
@@ -293,7 +308,13 @@ TARGETS: dict[str, Target] = {
             "_hidden",
             "_hits",
         ),
-        _TRACKED,
+        (
+            f"{_TRACKED}::test_where_a_stage_begins_the_photometric_rows_are_the_marched_ones",
+            f"{_TRACKED}::test_factors_of_single_cars",
+            *_FOLLOWING,
+            f"{_TRACKED}::test_a_pixel_that_comes_to_be_hidden_or_leaves_the_image_pays_as_the_marched_one",
+            f"{_TRACKED}::test_hand_derived_rows_are_those_of_autograd",
+        ),
     ),
     "tracked_energy": Target(
         "directshape_torch/energy/tracked_energy.py",
@@ -306,7 +327,12 @@ TARGETS: dict[str, Target] = {
             "_stacked",
             "_scaled",
         ),
-        _TRACKED,
+        (
+            f"{_TRACKED}::test_the_terms_that_are_tracked_and_the_others",
+            f"{_TRACKED}::test_factors_of_single_cars",
+            *_FOLLOWING,
+            f"{_TRACKED}::test_hand_derived_rows_are_those_of_autograd",
+        ),
     ),
     "pose_rows": Target(
         "directshape_torch/energy/pose_rows.py",

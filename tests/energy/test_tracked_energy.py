@@ -164,6 +164,7 @@ def test_sums_of_the_silhouettes_ray_by_ray(stage: int) -> None:
         sharpness = term.zeta * view.closest_sdf.abs()
         in_play = (sharpness < 8 + 0.2 * term.zeta) | ~view.march.crosses_bounds
         count = int(in_play.sum())
+        assert torch.equal(crossings[:count], term.view(problem.project(state)).march.crosses_bounds[in_play])
         residual, J = residuals_by_definition(problem, term, state, in_play, depths[:count], crossings[:count])
         depths, crossings = depths[count:], crossings[count:]
         index = term.pixels.object_index
@@ -202,6 +203,26 @@ def residuals_by_definition(
     return residuals(zero), torch.func.jacfwd(residuals)(zero)
 
 
+def test_a_ray_that_misses_the_bounds_waits_by_their_middle() -> None:
+    """Should it come in, it will come by there: the point of the ray that is next to it, whatever its march says."""
+    problem, _, state = begun_stage()
+    shifted = moved(state, torch.tensor([0.0, 1.2, 0.6] + [0.0] * 6, dtype=torch.float64).expand(5, 9))
+    problem.begin_stage(problem.stages()[1], shifted)
+    energy = tracked(problem, shifted, kind_of(problem, SilhouetteTerm)).silhouettes
+    assert energy is not None
+    rays = energy.rows.rays.in_objects(energy.rows.rays.of_blocks(shifted.T_obj_cam))
+    bounds = problem.prior.bounds_obj
+    misses = energy.rows.filled & ~rays.interval(bounds).hit
+    assert int(misses.sum()) > 20
+    middle = bounds.mean(dim=0).view(3, 1, 1)
+    depth = rays.depth_next_to(energy.anchor_obj)
+    torch.testing.assert_close(energy.anchor_obj[:, misses], rays.at(depth)[:, misses])
+    aside = ((energy.anchor_obj - middle) * rays.direction_obj).sum(0)
+    assert float(aside[misses].abs().max()) < 1e-9
+    crossing = energy.rows.filled & ~misses
+    assert float(aside[crossing].abs().max()) > 0.1
+
+
 def test_factors_of_single_cars() -> None:
     problem, _, state = begun_stage()
     factors = torch.rand(5, len(problem.terms), generator=torch.Generator().manual_seed(3), dtype=torch.float64) + 0.2
@@ -224,14 +245,19 @@ def test_factors_of_single_cars() -> None:
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.01, 0.1), (0.3, 0.8)])
 @pytest.mark.parametrize("name", CONFIGS)
 def test_hand_derived_rows_are_those_of_autograd(name: str, place: tuple[float, float], weights: bool) -> None:
-    """At the state itself, near it, and so far away that rays have lost their surface and miss the bounds."""
+    """At the state itself, near it, and so far away that rays have lost their surface and miss the bounds; and there
+    again once it has been followed to."""
     config = CONFIGS[name]
     factors = {"photometric": torch.tensor([1.0, 0.5, 2.0, 0.0, 1.5], dtype=torch.float64)} if weights else None
-    both = []
+    first, second = [], []
     for jacobian in ("analytic", "autograd"):
         _, stage, state = begun_stage(with_solver(config, jacobian=jacobian), term_weights=factors)
-        both.append(stage.linearise(moved(state, step_of(5, *place))))
-    assert max(errors(both[0], both[1])) < 1e-9
+        there = moved(state, step_of(5, *place))
+        first.append(stage.linearise(there))
+        stage.follow(torch.ones(5, dtype=torch.bool))
+        second.append(stage.linearise(there))
+    assert max(errors(*first)) < 1e-9
+    assert max(errors(*second)) < 1e-9
 
 
 def test_the_terms_that_are_tracked_and_the_others() -> None:
