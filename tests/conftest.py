@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+
 import hypothesis
 import pytest
 import torch
+
+from directshape_torch import compilation
 
 # The same examples in every run: a failure that comes and goes helps nobody.
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None)
@@ -16,3 +20,9 @@ torch.set_num_threads(1)
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _fresh_count_of_cars(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The setting `compile: auto` counts the cars of a process: without this a test would change form in the middle."""
+    monkeypatch.setattr(compilation, "_process", compilation._Process(threading.RLock()))

@@ -45,9 +45,7 @@ def _inputs(num_points: int, num_cars: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.fixture(autouse=True)
-def _fresh_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No memory of other tests: neither of cars nor of a compiler that failed."""
-    monkeypatch.setattr(compilation, "_process", compilation._Process(threading.RLock()))
+def _no_counts() -> None:
     counters.clear()
 
 
