@@ -9,7 +9,7 @@ from directshape_torch.data_check.finding import Finding, Severity
 from directshape_torch.io.instance_masks import SIDES, Side
 
 # Mean overlap of masks and 2D boxes, over as many pairs as there could be.
-OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.45
+OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37
 # A detector may well miss all of three cars.
 MIN_PAIRS = 4
 # How much better the right masks must fit the left boxes.
