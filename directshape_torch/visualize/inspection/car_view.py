@@ -126,6 +126,12 @@ class CarView:
         du, dv = math.ceil(_SURROUNDINGS * (u1 - u0)), math.ceil(_SURROUNDINGS * (v1 - v0))
         return max(u0 - du, 0), max(v0 - dv, 0), min(u1 + du, width), min(v1 + dv, height)
 
+    def panel_aspect(self) -> float:
+        """Height over width of a panel that either window fits into, within reason."""
+        windows = self.window("left"), self.window("right")
+        tallest = max((v1 - v0) / (u1 - u0) for u0, v0, u1, v1 in windows)
+        return min(max(tallest, 0.3), 1.0)
+
     def seen(self, side: Side, number: int) -> tuple[PixelGrid, SeenShape]:
         """A state as the camera sees it, within the window."""
         grid = PixelGrid.covering(self.window(side))

@@ -18,7 +18,9 @@ from directshape_torch.visualize.inspection.residual_values import (
 )
 
 _PANEL_INCHES = 3.6
-_SIZE_INCHES = (3 * _PANEL_INCHES + 0.4, 6.5)
+_WIDTH_INCHES = 3 * _PANEL_INCHES + 0.4
+# Of titles and colour bars.
+_ROOM_INCHES = 1.9
 # -log 0.01: what a pixel pays whose mask is certain and wrong.
 _WORST_SILHOUETTE = 4.6
 _CONTOUR_INK = "cyan"
@@ -34,7 +36,8 @@ def write_residual_figure(path: Path | str, view: CarView) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    figure = new_figure(*_SIZE_INCHES, "drawing residuals")
+    height_inches = 2 * _PANEL_INCHES * view.panel_aspect() + _ROOM_INCHES
+    figure = new_figure(_WIDTH_INCHES, height_inches, "drawing residuals")
     figure.suptitle(view.title)
     axes = figure.subplots(2, 3)
     grey_levels = view.trace.problem.config.photometric.lost_grey_levels

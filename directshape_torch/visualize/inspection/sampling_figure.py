@@ -20,7 +20,7 @@ from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.panels import draw_lines, show_crop, write_figure
 from directshape_torch.visualize.sampling_picture import PANEL_GAP_PX, occlusion_picture
 
-_SIZE_INCHES = (12.0, 5.0)
+_PANEL_INCHES, _ROOM_INCHES = 6.0, 0.8
 _STRONG_INK, _FILL_INK = "lime", "red"
 # Of the region of a far car in the occlusion picture.
 _LEAST_HEIGHT_PX = 180
@@ -56,7 +56,7 @@ def write_sampling_figure(path: Path | str, view: CarView) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    figure = new_figure(*_SIZE_INCHES, "drawing sampled pixels")
+    figure = new_figure(2 * _PANEL_INCHES, _PANEL_INCHES * view.panel_aspect() + _ROOM_INCHES, "drawing sampled pixels")
     figure.suptitle(view.title)
     for axes, side in zip(figure.subplots(1, 2), _SIDES, strict=True):
         pixels = sampled_pixels(view, side)
