@@ -18,7 +18,6 @@ from directshape_torch.residuals import robust
 from directshape_torch.residuals.photometric import DSO_PATTERN, surface_slope
 from directshape_torch.residuals.photometric_patch import patch_residual
 from directshape_torch.residuals.photometric_profile import DisparityResiduals, disparity_residuals
-from directshape_torch.shape.raycast import ObjectRays
 
 _CENTRE = DSO_PATTERN.index((0, 0))
 # Of many offsets at once: 8 MB in single precision.
@@ -52,12 +51,12 @@ def stage_pixels(term: PhotometricTerm) -> PixelSet:
 
 def seen_surface(term: PhotometricTerm, projected: ProjectedState, rows: Tensor | slice) -> SeenSurface:
     """The surface of a state under some rows (R,) of the term's pixel set."""
-    rays, root = projected.left.surface(stage_pixels(term).pixel_index)
-    chosen = ObjectRays(rays.origin_obj[rows], rays.direction_obj[rows], rays.object_index[rows])
-    depth = root.depth[rows]
-    gradient = projected.shape.value_and_derivatives(chosen.at(depth), chosen.object_index).gradient
-    _, grazing = surface_slope(gradient, chosen.direction_obj, term.config.min_ray_cosine)
-    return SeenSurface(depth, root.found[rows] & ~grazing)
+    pixels = stage_pixels(term).pixel_index[rows]
+    rays, root = projected.left.surface(pixels)
+    # The cost of the state has looked these derivatives up already.
+    gradient = projected.left.at_surface(pixels, rays, root.depth).gradient
+    _, grazing = surface_slope(gradient, rays.direction_obj, term.config.min_ray_cosine)
+    return SeenSurface(root.depth, root.found & ~grazing)
 
 
 def match(term: PhotometricTerm, rows: Tensor | slice, seen: SeenSurface, offsets_px: Tensor) -> Match:
