@@ -25,6 +25,8 @@ class Equivalent:
 _OF_ZERO = "the negative of zero is zero"
 _EITHER_SIGN = "a quaternion and its negative are the same rotation, and so3_log turns it to w >= 0"
 _BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its value nor its derivative gets anywhere"
+_SQUARED = "the floor of the contrast enters as a square"
+_FLAG = "a flag, whose truth a sign leaves alone"
 _IN_PAIRS = "enters as a square, or twice as a factor"
 _FOR_SPEED = "a threshold that only saves work: what it leaves out is below the rounding of the sum"
 _VALUE_UNUSED = "carried along with the derivatives, and the Jacobian does not depend on it"
@@ -41,9 +43,8 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         Equivalent("SilhouetteTerm._rows_product", _THRESHOLD, after, _FOR_SPEED)
         for after in (f"(-({_THRESHOLD}))", f"({_THRESHOLD.removeprefix('self.zeta[:, None] * ')})")
     ),
-    Equivalent(
-        "ProjectedView.__init__", "moving_depths", "(-moving_depths)", "a flag, whose truth a sign leaves alone"
-    ),
+    Equivalent("ProjectedView.__init__", "moving_depths", "(-moving_depths)", _FLAG),
+    Equivalent("TrackedPhotometric.of_term", "config.truncated", "(-config.truncated)", _FLAG),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     *(
         Equivalent("_corner_values", "(nx, ny, nz, _)", after, "only the product of the three is used")
@@ -78,11 +79,9 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent("_residual_and_jacobian", "at.value", "(-at.value)", _VALUE_UNUSED),
     Equivalent("surface_under", "at.value", "(-at.value)", _VALUE_UNUSED),
-    Equivalent(
-        "photometric_residuals",
-        "settings.contrast_floor_grey_levels",
-        "(-settings.contrast_floor_grey_levels)",
-        "the floor of the contrast enters as a square",
+    *(
+        Equivalent(function, f"{owner}.contrast_floor_grey_levels", f"(-{owner}.contrast_floor_grey_levels)", _SQUARED)
+        for function, owner in (("photometric_residuals", "settings"), ("TrackedPhotometric.of_term", "config"))
     ),
     Equivalent(
         "Blocks.join",

@@ -23,6 +23,7 @@ from directshape_torch.energy.tracked_energy import TrackedEnergy
 from directshape_torch.geometry import se3
 from directshape_torch.solver.problem import Linearisation
 from directshape_torch.tracking.field import block_field
+from directshape_torch.tracking.photometric import photometric_residuals
 
 CONFIGS = {"default": DEFAULT, "truncated": TRUNCATED, "normalised": replace(NORMALISED, stages=DEFAULT.stages)}
 
@@ -68,6 +69,48 @@ def test_where_a_stage_begins_the_photometric_rows_are_the_marched_ones(name: st
     terms = kind_of(problem, PhotometricTerm)
     found = evaluated(tracked(problem, state, terms), problem, state)
     assert max(errors(found, marched(problem, state, terms))) < 1e-9
+
+
+@pytest.mark.parametrize("stage", [0, 1])
+@pytest.mark.parametrize("name", CONFIGS)
+def test_at_any_depth_a_pixel_lands_where_the_marched_one_does(name: str, stage: int) -> None:
+    """Far beyond the images' borders and onto nearer cars: residuals, their derivative and what can be compared."""
+    problem, state = cropped(CONFIGS[name], stage)
+    (term,) = kind_of(problem, PhotometricTerm)
+    assert isinstance(term, PhotometricTerm)
+    energy = tracked(problem, state, [term]).photometric
+    assert energy is not None
+    filled = energy.rows.pixel_weight > 0
+    generator = torch.Generator().manual_seed(17)
+    lost = []
+    for scale in (1.0, 0.8, 0.35, 0.1, 3.0, 100.0):
+        shares = 1 + 0.2 * torch.rand(len(term.pixel_set.object_index), generator=generator, dtype=torch.float64)
+        depth = scale * shares * state_depth(problem, term, state)
+        packed = torch.ones(filled.shape, dtype=torch.float64).masked_scatter(filled, depth)
+        found, expected = photometric_residuals(energy.rows, energy.settings, packed), term._residual(depth)
+        usable = term._is_usable(torch.ones_like(depth, dtype=torch.bool), expected.inside, expected.uv_right)
+        assert torch.equal(found.comparable[filled], usable)
+        lost.append(float((~usable).double().mean()))
+        torch.testing.assert_close(found.value[filled][usable], expected.residual[usable], rtol=1e-9, atol=1e-9)
+        slope = found.J_residual_depth[filled][usable]
+        torch.testing.assert_close(slope, expected.J_residual_depth[usable], rtol=1e-8, atol=1e-8)
+    assert all(0.05 < share < 0.95 for share in lost[2:3] + lost[-1:]), lost
+
+
+def cropped(config: RefinerConfig, stage: int) -> tuple[CarProblem, CarState]:
+    """Frames that end amid the cars, on the right and below, and a right camera 0.2 m off in height: with its depth a
+    pixel leaves at every side."""
+    prior, frames, detections = five_cars()
+    T_right_cam = frames.camera.T_right_cam.clone()
+    T_right_cam[:, 1, 3] = 0.2
+    camera = replace(frames.camera, T_right_cam=T_right_cam)
+    frames = replace(frames, camera=camera, sizes=torch.tensor([[46, 64], [44, 60]]))
+    return begun_problem(prior, frames, detections, config, stage)
+
+
+def state_depth(problem: CarProblem, term: PhotometricTerm, state: CarState) -> Tensor:
+    """Depth (Q,) of the surface under the pixels of the set."""
+    return problem.project(state).left.surface(term.pixel_set.pixel_index)[1].depth
 
 
 @pytest.mark.parametrize("stage", [0, 1])
