@@ -71,8 +71,8 @@ def _deviations(scores: ConventionScores, best: int) -> list[Finding]:
             f"they fit when read as '{value}': projected boxes overlap 2D boxes or masks by {after:.2f} instead of "
             f"{before:.2f}"
         )
-        if scores.has_angles:
-            shares = scores.angle_share[best], scores.angle_share[0]
+        shares = scores.angle_share[best], scores.angle_share[0]
+        if scores.has_angles and shares[0] > shares[1]:
             measured += f", alpha agrees in {shares[0]:.0%} instead of {shares[1]:.0%}"
         where = f"{ALL_FRAMES}, {scores.overlap.shape[1]} cars"
         findings.append(Finding(f"box_{part}", "error", where, measured, _EXPECTED[part], _CURE[part]))

@@ -14,10 +14,12 @@ REPORT_SCHEMA_VERSION = 1
 
 
 def format_report(report: CheckReport) -> str:
-    """One block a kind of finding, the first frame in full, and a last line that sums up."""
-    groups: dict[tuple[str, str], list[Finding]] = {}
+    """One block a finding, of findings about single frames one a kind with the first in full, and a last line."""
+    groups: dict[tuple[str, ...], list[Finding]] = {}
     for finding in report.findings:
-        groups.setdefault((finding.severity, finding.check), []).append(finding)
+        frames = finding.where.split()[0]
+        kind = ("frame",) if frames == "frame" else (finding.where, finding.measured)
+        groups.setdefault((finding.severity, finding.check, *kind), []).append(finding)
     blocks = [_block(findings) for findings in groups.values()]
     return "\n".join([*blocks, _last_line(report)]) + "\n"
 

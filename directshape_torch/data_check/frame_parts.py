@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.data_check.finding import Finding
-from directshape_torch.errors import DirectShapeError
+from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
@@ -57,7 +57,9 @@ def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, l
         try:
             return read()
         except (DirectShapeError, OSError) as error:
-            findings.append(_unreadable(check, frame_id, expected, error))
+            # That a file is missing is found for all frames at once.
+            if not (isinstance(error, DataFormatError) and not error.path.exists()):
+                findings.append(_unreadable(check, frame_id, expected, error))
             return None
 
     layout = dataset.layout

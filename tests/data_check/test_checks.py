@@ -1,0 +1,236 @@
+"""Single checks on numbers whose answer is known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers.kitti_folder import write_data_set
+from helpers.layouts import put, write_folder, write_raw
+
+from directshape_torch.cli.main import main
+from directshape_torch.data_check.box_conventions import AS_DOCUMENTED, BoxConvention, all_conventions
+from directshape_torch.data_check.car_evidence import CarBoxes
+from directshape_torch.data_check.check_calibration import check_calibration
+from directshape_torch.data_check.check_dataset import check_dataset
+from directshape_torch.data_check.check_distances import DistanceRatios, check_distances
+from directshape_torch.data_check.check_pair import check_pair, fit_rows
+from directshape_torch.data_check.check_text import format_report
+from directshape_torch.data_check.check_times import check_times
+from directshape_torch.data_check.finding import CheckReport, Finding
+from directshape_torch.data_check.pair_matches import PairMatches, match_pair
+from directshape_torch.errors import InputError
+from directshape_torch.io.kitti_calibration import KittiCalibration
+from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.scene import StereoCamera
+
+SIZE_HW = (400, 1200)
+K = np.array([[700.0, 0, 600], [0, 700, 200], [0, 0, 1]])
+
+
+def calibration(baseline_m: float = 0.5, right: np.ndarray = K, down_m: float = 0.0) -> KittiCalibration:
+    t = np.array([[-baseline_m], [down_m], [0]])
+    return KittiCalibration(Path("calib.txt"), np.hstack([K, np.zeros((3, 1))]), np.hstack([right, right @ t]))
+
+
+def camera(found: KittiCalibration) -> StereoCamera:
+    return StereoCamera.from_projections(torch.from_numpy(found.P2)[None], torch.from_numpy(found.P3)[None])
+
+
+def matches(row_offset: float = 0.0, disparity: float = 20.0, across: float = 0.0, count: int = 300) -> PairMatches:
+    random = np.random.default_rng(0)
+    uv_left = random.uniform((100, 0), (1200, 400), (count, 2))
+    rows = row_offset + across * (uv_left[:, 0] / 1200 - 0.5) + random.normal(0, 0.2, count)
+    depth_spread = random.uniform(0.5, 1.5, count)
+    uv_right = uv_left + np.column_stack([-disparity * depth_spread, rows])
+    return PairMatches(uv_left, uv_right, count)
+
+
+@pytest.mark.parametrize(
+    ("pair", "expected"),
+    [
+        (matches(), []),
+        (matches(row_offset=0.5), []),
+        (matches(row_offset=1.0), [("not_rectified", "warning")]),
+        (matches(row_offset=-2.0), [("not_rectified", "error")]),
+        (matches(across=3.0), [("not_rectified", "error")]),
+        (matches(disparity=-20.0), [("images_swapped", "error")]),
+        (matches(count=10), [("few_matches", "note")]),
+        (PairMatches(np.zeros((40, 2)), np.zeros((40, 2)), 200), [("different_scenes", "error")]),
+        (PairMatches(np.ones((40, 2)), np.ones((40, 2)), 40), [("same_image", "error")]),
+    ],
+)
+def test_pairs(pair: PairMatches, expected: list[tuple[str, str]]) -> None:
+    found = check_pair(pair, None, SIZE_HW, "frame 1")
+    assert [(finding.check, finding.severity) for finding in found] == expected
+
+
+def test_rows_may_differ_as_the_calibration_says() -> None:
+    """A right camera 5 cm lower sees everything higher by disparity x 5 / 50; one whose cy is 10 px larger, lower."""
+    pair = matches()
+    lower = PairMatches(
+        pair.uv_left, pair.uv_right + [[0, 1.0]] * (pair.uv_left - pair.uv_right)[:, :1] * -0.1, len(pair)
+    )
+    assert check_pair(lower, None, SIZE_HW, "")[0].check == "not_rectified"
+    assert check_pair(lower, camera(calibration(down_m=-0.05)), SIZE_HW, "") == []
+    other_centre = K + np.array([[0, 0, 0], [0, 0, 10], [0, 0, 0]])
+    shifted = PairMatches(pair.uv_left, pair.uv_right + np.array([0, 10]), len(pair))
+    assert check_pair(shifted, None, SIZE_HW, "")[0].check == "not_rectified"
+    assert check_pair(shifted, camera(calibration(right=other_centre)), SIZE_HW, "") == []
+
+
+def test_row_fit_ignores_a_tenth_of_wrong_matches() -> None:
+    uv = np.random.default_rng(1).uniform((0, 0), (1200, 400), (200, 2))
+    rows = 0.3 + 2.0 * (uv[:, 1] / 400 - 0.5)
+    rows[:20] += 50
+    offset, across, down, scatter = fit_rows(uv, rows, SIZE_HW)
+    assert (across, down, scatter) == pytest.approx((0.0, 2.0, 0.0), abs=1e-6)
+    assert offset == pytest.approx(0.3, abs=0.3)
+
+
+def test_features_of_a_shifted_texture_match_where_they_should() -> None:
+    import cv2
+
+    random = np.random.default_rng(0)
+    left = cv2.resize(random.integers(0, 255, (40, 60, 3), dtype=np.uint8), (480, 320), interpolation=cv2.INTER_CUBIC)
+    found = match_pair(left, np.roll(left, (3, -8), axis=(0, 1)))
+    assert len(found) > 50
+    assert np.median(found.uv_left - found.uv_right, axis=0) == pytest.approx([8, -3], abs=0.1)
+    assert len(match_pair(np.zeros_like(left), left)) == 0
+
+
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (calibration(), []),
+        (calibration(-0.5), ["baseline_sign"]),
+        (calibration(50.0), ["baseline_length"]),
+        (calibration(right=np.diag([4.0, 4.0, 1.0])), ["focal_length"]),
+        (calibration(right=K + np.array([[0, 0, 300], [0, 0, 0], [0, 0, 0]])), ["principal_point"]),
+        (calibration(right=np.diag([1, 0.5, 1]) @ K), ["focal_length", "principal_point"]),
+    ],
+)
+def test_calibrations(found: KittiCalibration, expected: list[str]) -> None:
+    assert [finding.check for finding in check_calibration(found, SIZE_HW, "frame 1")] == expected
+    where = [finding.where for finding in check_calibration(found, SIZE_HW, "frame 1")]
+    assert all(text == "frame 1, calib.txt" for text in where)
+
+
+def test_every_convention_can_be_undone() -> None:
+    """A box written in a convention is the documented one again; there are 6 x 3 x 6 x 6 of them."""
+    conventions = list(all_conventions())
+    assert len(conventions) == len(set(conventions)) == 648
+    assert conventions[0] == BoxConvention()
+    assert conventions[0].deviations == {}
+
+    def boxes(location: list[float], hwl: list[float], yaw: float) -> CarBoxes:
+        return CarBoxes(np.array([location]), np.array([hwl]), np.array([yaw]), np.zeros(1), np.zeros((1, 4)))
+
+    lidar = BoxConvention(
+        "LiDAR's: x forward, y left, z up",
+        "centre of the box",
+        "opposite sign and offset by 90 degrees (LiDAR's)",
+        "l w h",
+    )
+    # 20 m ahead, 3 m to the left, centre 0.85 m below the sensor, driving straight ahead.
+    kitti = lidar.to_kitti(boxes([20.0, 3.0, -0.85], [4.0, 1.6, 1.5], 0.0))
+    assert kitti.location.tolist() == [[-3.0, 0.85 + 0.75, 20.0]]
+    assert kitti.hwl.tolist() == [[1.5, 1.6, 4.0]]
+    assert kitti.rotation_y.tolist() == [-np.pi / 2]
+    assert BoxConvention(yaw="degrees").to_kitti(boxes([0.0, 0, 1], [1.0, 1, 1], 180.0)).rotation_y.tolist() == [np.pi]
+    assert AS_DOCUMENTED not in lidar.deviations.values()
+
+
+def test_distances_tell_the_baseline_from_the_boxes() -> None:
+    def ratios(stereo: float, size: float) -> list[DistanceRatios]:
+        return [DistanceRatios(np.full(10, stereo), np.full(10, size))]
+
+    assert check_distances([]) == check_distances(ratios(1.1, 1.0)) == []
+    assert check_distances(ratios(1.2, 1.0))[0].severity == "warning"
+    (of_baseline,) = check_distances(ratios(1.5, 1.0))
+    assert of_baseline.severity == "error"
+    assert "the baseline is wrong: divide it by 1.50" in of_baseline.cure
+    assert "against the boxes" in check_distances(ratios(0.6, 0.62))[0].cure
+    assert "focal length" in check_distances(ratios(1.5, 0.7))[0].cure
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root, ("000000", "000001"))
+    return root
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ((25.0, 25.001, 26.0, 26.001), []),
+        ((25.0, 25.010, 26.0, 26.001), [("pair_times", "warning")]),
+        ((25.0, 25.100, 26.0, 26.001), [("pair_times", "error")]),
+        ((25.0, 25.001, 24.0, 24.001), [("time_order", "error")]),
+        (None, [("time_file", "error")]),
+    ],
+)
+def test_times_of_a_raw_drive(
+    times: tuple[float, ...] | None, expected: list[tuple[str, str]], kitti: Path, tmp_path: Path
+) -> None:
+    drive = write_raw(kitti, tmp_path, ("000000", "000001"))
+    for index, folder in enumerate(("image_02", "image_03")):
+        lines = ["yesterday"] if times is None else [f"2011-09-26 13:02:{at:09.6f}" for at in times[index::2]]
+        (drive / folder / "timestamps.txt").write_text("\n".join(lines))
+    for number in range(2):
+        put(kitti / "detections" / "data" / "000000.txt", tmp_path / "detections" / f"{number:010d}.txt")
+    dataset = open_dataset("raw", drive, tmp_path / "detections")
+    found = check_times(dataset, dataset.frame_ids)
+    assert [(finding.check, finding.severity) for finding in found] == expected
+
+
+def test_layouts_without_times_have_none(kitti: Path, tmp_path: Path) -> None:
+    dataset = open_dataset("kitti", kitti, kitti / "detections")
+    assert check_times(dataset, dataset.frame_ids) == []
+    write_folder(kitti, tmp_path, ("000000",))
+    path = tmp_path / "frames" / "000000.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "times_s": [1.0, 1.5]}))
+    folder = open_dataset("folder", tmp_path)
+    assert check_times(folder, folder.frame_ids)[0].measured.startswith("left and right image are up to 500.0 ms apart")
+
+
+def test_report_in_words() -> None:
+    first = Finding("images_swapped", "error", "frame 1", "m", "e", "c")
+    report = CheckReport((first, Finding("images_swapped", "error", "frame 2", "m", "e", "c")), 9, 2, 5)
+    assert report.exit_code == 1
+    assert format_report(report).splitlines() == [
+        "error: images_swapped (frame 1 and 1 more)",
+        "  measured  m",
+        "  expected  e",
+        "  cure      c",
+        "",
+        "2 errors, 0 warnings, 0 notes in 2 of 9 frames with 5 cars",
+    ]
+
+
+def command(kitti: Path, *extra: str) -> list[str]:
+    masks = ["--masks", str(kitti / "masks")]
+    return ["check-data", "--data", str(kitti), "--detections", str(kitti / "detections"), *masks, *extra]
+
+
+def test_command(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty" / "training").mkdir(parents=True)
+    code = main([*command(kitti), "--data", str(tmp_path / "empty"), "--json", str(tmp_path / "found.json")])
+    assert code == 1
+    out = capsys.readouterr().out
+    # Each kind of file once, and not again for each frame.
+    assert out.count("error: missing_files (2 of 2 frames)") == 3
+    assert "3 errors, 0 warnings, 0 notes in 2 frames with 4 cars" in out
+    content = json.loads((tmp_path / "found.json").read_text())
+    assert content["schema_version"] == 1
+    assert {"check", "severity", "where", "measured", "expected", "cure"} == set(content["findings"][0])
+    assert main([*command(kitti), "--data", str(tmp_path / "nowhere"), "--json", "-"]) == 1
+    (finding,) = json.loads(capsys.readouterr().out)["findings"]
+    assert finding["check"] == "layout"
+    assert main([*command(kitti), "--frames", "77"]) == 2
+    with pytest.raises(InputError, match="max_frames: expected at least 1"):
+        check_dataset(open_dataset("kitti", kitti, kitti / "detections"), 0)
