@@ -70,10 +70,18 @@ def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
         else:
             run.send_signal(by)
         run.wait(_PATIENCE_S)
-        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in workers))
+        wait_until(lambda: not any(map(is_running, workers)))
     finally:
         with suppress(ProcessLookupError):
             os.killpg(run.pid, signal.SIGKILL)
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process is there and is more than an entry that its new parent has not cleared away yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def wait_until(condition: object) -> None:

@@ -30,6 +30,22 @@ def test_a_failed_replacement_keeps_the_old_file_and_leaves_no_temporary(
     assert [entry.name for entry in tmp_path.iterdir()] == ["a.txt"]
 
 
+def test_a_durable_file_is_on_the_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    real = {name: getattr(os, name) for name in ("fsync", "replace")}
+    for name, function in real.items():
+
+        def noted(*args: object, name: str = name, function: object = function) -> object:
+            calls.append(name)
+            return function(*args)  # type: ignore[operator]
+
+        monkeypatch.setattr(os, name, noted)
+    atomic_files.write_bytes(tmp_path / "a", b"1")
+    atomic_files.write_json(tmp_path / "b", {"a": 1}, durable=True)
+    assert calls == ["replace", "fsync", "replace"]
+    assert json.loads((tmp_path / "b").read_text()) == {"a": 1}
+
+
 def test_folders_are_made_and_line_ends_kept(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "a.txt"
     atomic_files.write_text(path, "a\r\nb\n")
