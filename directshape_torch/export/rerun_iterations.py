@@ -79,9 +79,10 @@ class IterationLog:
 
     def _log_costs(self, car: int, number: int) -> None:
         costs = self.trace.costs[number, car].double().cpu().tolist()
-        self.stream.log(f"cost/{self.line(car)}", self.stream.rr.Scalars(sum(costs)))
+        series = f"{self.loaded.frame_id}/{self.line(car)}"
+        self.stream.log(f"cost/{series}", self.stream.rr.Scalars(sum(costs)))
         for name, cost in zip(self.trace.result.term_names, costs, strict=True):
-            self.stream.log(f"terms/{self.line(car)}/{name.replace(' ', '_')}", self.stream.rr.Scalars(cost))
+            self.stream.log(f"terms/{series}/{name.replace(' ', '_')}", self.stream.rr.Scalars(cost))
 
     def _boxes(self, number: int) -> Any:
         """Boxes measured on the zero level of the state, as those of a result are."""

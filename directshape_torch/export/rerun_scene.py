@@ -60,7 +60,7 @@ def log_frame(stream: RerunStream, source: FrameSource, has_detections: bool) ->
 def clear_cars(stream: RerunStream) -> None:
     """Take away what the cars of other frames left at the present places."""
     residuals = [f"{LEFT}/silhouette", f"{RIGHT}/silhouette", f"{LEFT}/photometric"]
-    for entity in ("world/cars", "world/boxes/iteration", *residuals, "cost", "terms"):
+    for entity in ("world/cars", "world/boxes/iteration", *residuals):
         stream.log(entity, stream.rr.Clear(recursive=True))
 
 

@@ -38,7 +38,7 @@ def test_refine_and_export_record_the_same(source: Path, tmp_path: Path, capsys:
     words = ["export", tmp_path / "out", "--format", "rerun", "--iterations", "--prior", source / "prior.npz", *inputs]
     assert main([str(word) for word in (*words, "--out", tmp_path / "export")]) == 0
     found = entities(tmp_path / "run.rrd")
-    assert {"/world/cars/1", "/world/cars/3", "/terms/1/photometric", "/world/boxes/before"} <= found
+    assert {"/world/cars/1", "/world/cars/3", "/terms/000000/1/photometric", "/world/boxes/before"} <= found
     assert entities(tmp_path / "export" / "recording.rrd") == found
 
 

@@ -111,15 +111,17 @@ def corners_of_lines(run: FinishedRun, path: Path) -> NDArray[np.float64]:
 
 def test_frames_and_iterations_are_timelines(recording: Recording) -> None:
     assert set(recording.of("/world/cam/image", "blob")) == {(0, 0), (1, min(second_frame(recording)))}
-    iterations = sorted(place[1] for place in recording.of("/terms/1/height", "scalars"))
+    both = [recording.of(f"/terms/{frame}/1/height", "scalars") for frame in ("000000", "000001")]
+    assert {place[0] for places in both for place in places} == {None}
+    # The iterations of all frames follow one another.
+    iterations = [place[1] for places in both for place in sorted(places)]
     assert iterations == list(range(len(iterations)))
-    assert all(place[0] is None for place in recording.of("/terms/1/height", "scalars"))
 
 
 def second_frame(recording: Recording) -> list[int]:
     """The iterations of the second frame, which begin where its images are."""
     begin = max(place[1] or 0 for place in recording.of("/world/cam/image", "blob"))
-    return [place[1] for place in recording.of("/terms/1/height", "scalars") if place[1] >= begin]
+    return [place[1] for place in recording.of("/terms/000001/1/height", "scalars") if place[1] >= begin]
 
 
 @pytest.mark.parametrize(("entity", "folder"), [("/world/cam/image", "image_2"), ("/right/image", "image_3")])
@@ -207,7 +209,7 @@ def test_costs_end_at_those_of_the_result_and_fall(finished: FinishedRun, record
     arrays, numbers = state(finished, 1), second_frame(recording)
     for car, line in enumerate((1, 3)):
         series = {
-            str(name): recording.of(f"/terms/{line}/{str(name).replace(' ', '_')}", "scalars")
+            str(name): recording.of(f"/terms/000001/{line}/{str(name).replace(' ', '_')}", "scalars")
             for name in arrays["term_names"]
         }
         for place, costs in ((min(numbers), arrays["costs_before"]), (max(numbers), arrays["costs_after"])):
@@ -215,7 +217,7 @@ def test_costs_end_at_those_of_the_result_and_fall(finished: FinishedRun, record
             np.testing.assert_allclose(got, costs[car], rtol=1e-3, atol=1e-5)
         totals = [sum(float(one[None, number][0]) for one in series.values()) for number in numbers]
         assert totals[-1] < 0.8 * totals[0]
-        whole = [float(recording.of(f"/cost/{line}", "scalars")[None, number][0]) for number in numbers]
+        whole = [float(recording.of(f"/cost/000001/{line}", "scalars")[None, number][0]) for number in numbers]
         np.testing.assert_allclose(whole, totals)
 
 
