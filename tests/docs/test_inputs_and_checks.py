@@ -1,0 +1,49 @@
+"""The documented layouts and findings are those of the code."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+from directshape_torch.cli.data_options import LAYOUTS
+from directshape_torch.data_check.box_conventions import all_conventions
+from directshape_torch.io import folder_json
+
+ROOT = Path(__file__).parents[2]
+INPUTS = (ROOT / "docs" / "inputs.md").read_text(encoding="utf-8")
+CHECKS = (ROOT / "docs" / "check_data.md").read_text(encoding="utf-8")
+
+
+def first_column(text: str) -> set[str]:
+    """Words in code type in the first column of tables."""
+    cells = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    return {name for cell in cells for name in re.findall(r"`([a-zA-Z0-9_]+)`", cell)}
+
+
+def test_every_layout_is_in_the_table() -> None:
+    assert first_column(INPUTS.split("## A plain folder")[0]) == set(LAYOUTS)
+
+
+def test_keys_of_the_folder() -> None:
+    documented = first_column(INPUTS.split("## A plain folder")[1])
+    keys = folder_json._RIG_KEYS | folder_json._FRAME_KEYS | folder_json._OBJECT_KEYS
+    assert documented == keys - {"comment"}
+
+
+def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
+    (example,) = re.findall(r"```json\n(.*?)```", INPUTS, flags=re.DOTALL)
+    path = tmp_path / "000000.json"
+    path.write_text(json.dumps(json.loads(example)))
+    (car,) = folder_json.read_frame(path).objects
+    assert car.bottom_center_cam == (-3.2, 1.6, 14.0)
+
+
+def test_every_finding_is_in_the_table() -> None:
+    sources = [path.read_text() for path in (ROOT / "directshape_torch" / "data_check").glob("*.py")]
+    sources.append((ROOT / "directshape_torch" / "cli" / "check_data.py").read_text())
+    text = "\n".join(sources)
+    named = set(re.findall(r'Finding\(\s*\(?"([a-z0-9_]{2,})"', text)) | set(re.findall(r'attempt\("([a-z_]+)"', text))
+    of_parts = {f"box_{part}" for part in ("axes", "origin", "yaw", "order")}
+    assert named | of_parts | {"mask_size"} == first_column(CHECKS.split("## Findings")[1].split("## Conventions")[0])
+    assert f"in {len(list(all_conventions())) - 1} other ways" in CHECKS
