@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from helpers.layouts import put
 
 import directshape_torch
 from directshape_torch.cli.main import main
+from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import poses_cam
 from directshape_torch.io.mask_matching import box_iou
@@ -61,15 +64,25 @@ def write_rig(demo: LoadedFrame, root: Path) -> None:
     (root / "masks.json").write_text(json.dumps({"street": masks}))
 
 
-def test_the_converted_folder_gives_the_same_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    kitti = KittiStereoDataset(
-        DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks", dtype=torch.float64
-    ).load("000000")
-    rig, folder = tmp_path / "rig", tmp_path / "folder"
+@pytest.fixture(scope="module")
+def kitti() -> LoadedFrame:
+    detections, masks = DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks"
+    return KittiStereoDataset(DEMO, detections, masks, dtype=torch.float64).load("000000")
+
+
+@pytest.fixture(scope="module")
+def folder(kitti: LoadedFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rig, folder = tmp_path_factory.mktemp("rig"), tmp_path_factory.mktemp("folder")
     write_rig(kitti, rig)
     command = [sys.executable, str(EXAMPLE), "--rig", str(rig), "--out", str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("1 frames in")
+    return folder
+
+
+def test_the_converted_folder_gives_the_same_frame(
+    kitti: LoadedFrame, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     loaded = open_dataset("folder", folder, dtype=torch.float64).load("street")
     torch.testing.assert_close(loaded.detections.T_cam_obj, kitti.detections.T_cam_obj)
     torch.testing.assert_close(loaded.detections.mask_left, kitti.detections.mask_left)
@@ -80,3 +93,26 @@ def test_the_converted_folder_gives_the_same_frame(tmp_path: Path, capsys: pytes
     assert overlaps.min() > 0.5
     assert main(["check-data", "--layout", "folder", "--data", str(folder)]) == 0
     assert "0 errors, 0 warnings, 0 notes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("forget", "check"),
+    [
+        (lambda entry: entry["bottom_center_m"].__setitem__(1, entry["bottom_center_m"][1] - 0.75), "box_origin"),
+        (lambda entry: entry.update(rotation_y_rad=entry["rotation_y_rad"] + math.pi / 2), "box_yaw"),
+        (lambda entry: entry["dimensions_hwl_m"].reverse(), "box_order"),
+    ],
+)
+def test_a_conversion_that_was_forgotten_is_found(
+    forget: Callable[[dict[str, Any]], None], check: str, folder: Path, tmp_path: Path
+) -> None:
+    """The folder gives no 2D boxes, so those made from the wrong 3D boxes must not speak for them: the masks do."""
+    shutil.copytree(folder, tmp_path / "folder")
+    path = tmp_path / "folder" / "frames" / "street.json"
+    content = json.loads(path.read_text())
+    for entry in content["objects"]:
+        if "dimensions_hwl_m" in entry:
+            forget(entry)
+    path.write_text(json.dumps(content))
+    report = check_dataset(open_dataset("folder", tmp_path / "folder"))
+    assert [finding.check for finding in report.findings] == [check]
