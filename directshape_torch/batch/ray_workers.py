@@ -121,4 +121,7 @@ def _connect(ray: Any, options: WorkerOptions) -> None:
         else:
             ray.init(address=options.ray, **quiet)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        raise DirectShapeError(f"no Ray cluster answers at {options.ray!r}: {error}") from error
+        raise DirectShapeError(
+            f"no Ray cluster answers at {options.ray!r}: {error}; is it started, and if it asks for a token, is "
+            "RAY_AUTH_MODE=token set here too?"
+        ) from error
