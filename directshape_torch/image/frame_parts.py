@@ -36,4 +36,4 @@ def gradient_magnitude_of_part(
         missing = (1 - left, 1 - right, 1 - top, 1 - bottom)
         grey = torch.nn.functional.pad(grey[None], missing, mode="replicate")[0]
     d_u, d_v = grey[1:-1, 2:] - grey[1:-1, :-2], grey[2:, 1:-1] - grey[:-2, 1:-1]
-    return length_2d(d_u.mul_(0.5), d_v.mul_(0.5))
+    return length_2d(d_u, d_v).mul_(0.5)

@@ -14,6 +14,7 @@ from torch import Tensor
 from directshape_torch.image.frame_parts import gradient_magnitude_of_part
 from directshape_torch.observation.gradient_thresholds import smoothed_thresholds
 from directshape_torch.observation.lower_median import lower_medians
+from directshape_torch.observation.portions import pixels_at_once
 from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 
 Box = tuple[int, int, int, int]
@@ -139,16 +140,20 @@ def _around(a: Box, b: Box) -> Box:
 
 
 def _write_cells(cells: Tensor, image: Tensor, size_hw: Sequence[int], part: _Part, side: int) -> None:
-    """The magnitudes of an image into its cells (rows columns, side, side)."""
-    rows, columns = part.shape
-    height, width = size_hw
-    u0, v0, u1, v1 = (side * edge for edge in part.cells)
-    seen = (u0, v0, min(u1, width), min(v1, height))
-    magnitude = gradient_magnitude_of_part(image, (height, width), seen)
-    beyond = (0, u1 - seen[2], 0, v1 - seen[3])
-    if any(beyond):
-        magnitude = torch.nn.functional.pad(magnitude, beyond, value=torch.inf)
-    cells.view(rows, columns, side, side).copy_(magnitude.view(rows, side, columns, side).transpose(1, 2))
+    """The magnitudes of an image into its cells (rows columns, side, side), a few rows of cells at a time."""
+    (rows, columns), (height, width) = part.shape, size_hw
+    u0, v0, u1, _ = (side * edge for edge in part.cells)
+    by_place = cells.view(rows, columns, side, side)
+    at_once = max(1, pixels_at_once(image.device) // (4 * (u1 - u0) * side))
+    for first in range(0, rows, at_once):
+        end = min(first + at_once, rows)
+        top, bottom = v0 + first * side, v0 + end * side
+        seen = (u0, top, min(u1, width), min(bottom, height))
+        magnitude = gradient_magnitude_of_part(image, (height, width), seen)
+        beyond = (0, u1 - seen[2], 0, bottom - seen[3])
+        if any(beyond):
+            magnitude = torch.nn.functional.pad(magnitude, beyond, value=torch.inf)
+        by_place[first:end].copy_(magnitude.view(end - first, side, columns, side).transpose(1, 2))
 
 
 def _thresholds(medians: Tensor, parts: Sequence[_Part], settings: SamplingSettings) -> Tensor:

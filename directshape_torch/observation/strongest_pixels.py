@@ -43,7 +43,7 @@ def strongest_pixels(
     """
     grid = _SmallCells.of(regions, settings)
     bands = _bands(cells, regions, grid, image_width)
-    best, row = _best_of_lines(_ranks(cells).view(-1, cells.side_px), bands)
+    best, row = _best_of_lines(cells, bands)
     column = torch.arange(cells.side_px, dtype=torch.int32, device=regions.device)
     # The first of equals is the one whose reversed position is largest.
     reversed_position = row.mul_(-image_width).sub_((bands.position.int() + 1)[:, None]).sub_(column)
@@ -60,14 +60,17 @@ def strongest_pixels(
     return StrongestPixels(grid.object_index(), position - v * image_width, v, exists)
 
 
-def _ranks(cells: GradientCells) -> Tensor:
-    """Integers (C, side, side) that rise with what is preferred: above the threshold, then strength, not finite as 0.
+def _ranks(
+    magnitude: Tensor,  # (Q, side)
+    threshold: Tensor,  # (Q, 1) float32
+) -> Tensor:
+    """Integers (Q, side) that rise with what is preferred: above the threshold, then strength, not finite as 0.
 
     The bits of floats that are not negative are ordered as the floats are; the sign bit puts all that are not above
     their threshold behind.
     """
-    magnitude = cells.magnitude.detach().float()
-    below = (magnitude > cells.thresholds.float()[:, None, None]).logical_not_()
+    magnitude = magnitude.detach().float()
+    below = (magnitude > threshold).logical_not_()
     ranks = magnitude.nan_to_num(nan=0.0, posinf=0.0).view(torch.int32)
     return ranks.add_(below, alpha=_INT32_MIN)
 
@@ -107,6 +110,7 @@ class _SmallCells(NamedTuple):
 class _Bands(NamedTuple):
     """Q bands: rows that one row of small cells and one threshold cell have in common."""
 
+    cell: Tensor  # (Q,) threshold cell
     first_line: Tensor  # (Q,) among the lines of all threshold cells
     with_further: list[int]  # how many bands, the first ones, have a second line, a third one, ...
     position: Tensor  # (Q,) of the first pixel in its image
@@ -127,23 +131,30 @@ def _bands(cells: GradientCells, regions: Tensor, grid: _SmallCells, image_width
     # The longest first, so that those with a further line are always the first so many.
     num_lines, order = num_lines.sort(descending=True, stable=True)
     first = first[order]
-    of, v, small_row = of[first], v[first], small_row[first]
+    of, v, small_row = (x.index_select(0, first) for x in (of, v, small_row))
     # Each of them in every column of threshold cells.
     columns = _Columns.of(regions, grid, side)
-    by_length = torch.zeros(side + 1, dtype=torch.long, device=of.device).index_add_(0, num_lines, columns.number[of])
+    number, left, start = (x.index_select(0, of) for x in (columns.number, columns.first, columns.start))
+    by_length = torch.zeros(side + 1, dtype=torch.long, device=of.device).index_add_(0, num_lines, number)
     total, *with_further = by_length.flip(0).cumsum(0).flip(0)[1:].tolist()
-    band = _numbers(of).repeat_interleave(columns.number[of], output_size=total)
-    of_band = of[band]
-    column = _numbers(band) - ((columns.number[of].cumsum(0) - columns.number[of])[band])
-    u = (columns.first[of_band] + column) * side
-    cell = cells.first[of_band] + torch.div(v, side, rounding_mode="floor")[band] * cells.columns[of_band]
-    small_cell = columns.small_column.index_select(0, columns.start[of_band] + column)
-    return _Bands(
-        (cell + columns.first[of_band] + column) * side + (v % side)[band],
-        with_further,
-        v[band] * image_width + u,
-        small_cell.add_((grid.start[of] + small_row * grid.columns[of])[band, None]),
+    row_of_cells = torch.div(v, side, rounding_mode="floor")
+    in_first_column = torch.stack(
+        [
+            number.cumsum(0) - number,
+            cells.first.index_select(0, of) + row_of_cells * cells.columns.index_select(0, of) + left,
+            v - row_of_cells * side,
+            v * image_width + left * side,
+            start,
+            grid.start.index_select(0, of) + small_row * grid.columns.index_select(0, of),
+        ],
+        dim=1,
     )
+    band = _numbers(of).repeat_interleave(number, output_size=total)
+    first_of_row, cell, line, position, start, small_cell = in_first_column.index_select(0, band).unbind(1)
+    column = _numbers(band) - first_of_row
+    cell = cell + column
+    small_cells = columns.small_column.index_select(0, start + column).add_(small_cell[:, None])
+    return _Bands(cell, cell * side + line, with_further, position + column * side, small_cells)
 
 
 class _Columns(NamedTuple):
@@ -168,17 +179,17 @@ class _Columns(NamedTuple):
         return cls(first, number, start, torch.where(inside, small_column, grid.columns[of, None] - 1))
 
 
-def _best_of_lines(
-    lines: Tensor,  # (C * side, side) int32
-    bands: _Bands,
-) -> tuple[Tensor, Tensor]:
-    """The largest of each column of all bands (Q, side), and the first line with it, counted from the band's own."""
-    best = lines.index_select(0, bands.first_line)
+def _best_of_lines(cells: GradientCells, bands: _Bands) -> tuple[Tensor, Tensor]:
+    """The largest rank of each column of all bands (Q, side), and the first line with it, counted from their own."""
+    lines = cells.magnitude.detach().view(-1, cells.side_px)
+    threshold = cells.thresholds.index_select(0, bands.cell).float()[:, None]
+    best = _ranks(lines.index_select(0, bands.first_line), threshold)
     line = torch.zeros_like(best)
     for number, count in enumerate(bands.with_further, start=1):
         if not count:
             break
-        other, so_far = lines.index_select(0, bands.first_line[:count] + number), best[:count]
+        other = _ranks(lines.index_select(0, bands.first_line[:count] + number), threshold[:count])
+        so_far = best[:count]
         line[:count].masked_fill_(other > so_far, number)
         torch.maximum(so_far, other, out=so_far)
     return best, line
