@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -18,7 +19,7 @@ from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
 import directshape_torch
-from directshape_torch.batch.journal import journal_folder, read_journals
+from directshape_torch.batch.journal import FrameRecord, Journal, journal_folder, read_journals
 from directshape_torch.batch.options import RefineOptions, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_lock import RunLock
@@ -176,6 +177,18 @@ def test_two_runs_at_once(root: Path, tmp_path: Path, undisturbed: Path) -> None
         refine(root, out)
     assert result_files(out) == result_files(undisturbed)
     assert len(refine(root, out).resumed) == len(FRAMES)
+
+
+def test_journals_that_the_summary_has_taken_in_already_change_nothing(
+    root: Path, tmp_path: Path, undisturbed: Path
+) -> None:
+    """A run that was killed after it wrote the summary and before it removed its journals."""
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    summary = json.loads((out / "summary.json").read_text())
+    for frame_id in FRAMES:
+        Journal(out, "killed").add(FrameRecord(frame_id, summary["inputs"][frame_id], summary["frames"][frame_id]))
+    assert refine(root, out).resumed == FRAMES
+    assert result_files(out) == result_files(undisturbed)
 
 
 def test_frames_of_a_group_that_was_cut_get_the_bytes_of_the_whole_group(root: Path, tmp_path: Path) -> None:
