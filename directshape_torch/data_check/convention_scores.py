@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.data_check.box_conventions import BoxConvention, all_conventions
-from directshape_torch.data_check.car_evidence import CarBoxes, FrameEvidence
+from directshape_torch.data_check.box_conventions import AXES, ORDERS, YAWS, BoxConvention, all_conventions
+from directshape_torch.data_check.car_evidence import FrameEvidence
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.kitti_labels import shift_frame
 from directshape_torch.io.mask_matching import box_iou, project_boxes
@@ -66,28 +67,28 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
     conventions = tuple(all_conventions())
     projections = boxes_are_projections(frames)
     overlap = np.concatenate([_overlaps(frame, conventions, projections) for frame in frames], axis=1)
-    hwl = np.concatenate([frame.boxes.hwl for frame in frames])
-    penalty = [_penalty(convention, hwl) for convention in conventions]
+    median_hwl = np.median(np.concatenate([frame.boxes.hwl for frame in frames]), axis=0)
+    penalty = [_penalty(convention, median_hwl) for convention in conventions]
     alpha = np.concatenate([frame.boxes.alpha for frame in frames])
     has_angles = bool((np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0))
-    angles = np.stack([_angles_agree(convention, frames) for convention in conventions])
-    return ConventionScores(conventions, overlap, np.array(penalty), angles.mean(axis=1), has_angles)
+    # Neither origin nor order changes an angle seen from above.
+    share = {(axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames) for axes, yaw in product(AXES, YAWS)}
+    angle_share = np.array([share[convention.axes, convention.yaw] for convention in conventions])
+    return ConventionScores(conventions, overlap, np.array(penalty), angle_share, has_angles)
 
 
-def _angles_agree(convention: BoxConvention, frames: Sequence[FrameEvidence]) -> NDArray[np.bool_]:  # (N,)
-    """Whether `alpha = rotation_y - atan2(x, z)`, about."""
+def _angles_agree(convention: BoxConvention, frames: Sequence[FrameEvidence]) -> float:
+    """Share of the cars with `alpha = rotation_y - atan2(x, z)`, about."""
     agree = []
     for boxes in (convention.to_kitti(frame.boxes) for frame in frames):
         expected = boxes.rotation_y - np.arctan2(boxes.location[:, 0], boxes.location[:, 2])
         difference = np.angle(np.exp(1j * (boxes.alpha - expected)))
         agree.append(np.abs(difference) < _ANGLE_TOLERANCE_RAD)
-    return np.concatenate(agree)
+    return float(np.concatenate(agree).mean())
 
 
-def _penalty(convention: BoxConvention, hwl: NDArray[np.float64]) -> float:
-    zero = np.zeros(len(hwl))
-    boxes = CarBoxes(np.zeros_like(hwl), hwl, zero, zero, np.zeros((len(hwl), 4)))
-    height, width, length = np.median(convention.to_kitti(boxes).hwl, axis=0)
+def _penalty(convention: BoxConvention, median_hwl: NDArray[np.float64]) -> float:
+    height, width, length = median_hwl[list(ORDERS[convention.order])]
     short = length < max(height, width)
     return _PENALTY_PER_DEVIATION * len(convention.deviations) + _PENALTY_SHORT_CARS * bool(short)
 

@@ -40,24 +40,32 @@ def match_once() -> Any:
         yield
 
 
-def broken(tmp_path: Path, name: str | None) -> CheckReport:
-    root = copy_data(
-        DEMO, DEMO / "detections" / "noisy_stereo" / "data", DEMO / "training" / "masks", tmp_path / "data"
-    )
-    if name is not None:
-        BREAKS[name].apply(root)
-    return checks.check_dataset(open_dataset("kitti", root, root / "detections", root / "masks"))
+@pytest.fixture(scope="module")
+def report_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str | None], CheckReport]:
+    """What is said of the frame broken in a way, or of the intact one; each worked out once."""
+    reports: dict[str | None, CheckReport] = {}
+
+    def report(name: str | None) -> CheckReport:
+        if name not in reports:
+            detections, masks = DEMO / "detections" / "noisy_stereo" / "data", DEMO / "training" / "masks"
+            root = copy_data(DEMO, detections, masks, tmp_path_factory.mktemp("data") / "data")
+            if name is not None:
+                BREAKS[name].apply(root)
+            reports[name] = checks.check_dataset(open_dataset("kitti", root, root / "detections", root / "masks"))
+        return reports[name]
+
+    return report
 
 
-def test_the_intact_frame_has_no_finding(tmp_path: Path) -> None:
-    report = broken(tmp_path, None)
+def test_the_intact_frame_has_no_finding(report_of: Callable[[str | None], CheckReport]) -> None:
+    report = report_of(None)
     assert report.findings == ()
     assert (report.num_frames, report.num_checked, report.num_cars, report.exit_code) == (1, 1, 6, 0)
 
 
 @pytest.mark.parametrize("name", sorted(BREAKS))
-def test_a_break_is_found(name: str, tmp_path: Path) -> None:
-    report = broken(tmp_path, name)
+def test_a_break_is_found(name: str, report_of: Callable[[str | None], CheckReport]) -> None:
+    report = report_of(name)
     found = {finding.check for finding in report.findings}
     assert found & BREAKS[name].checks, f"found only {found}"
     for finding in report.findings:
@@ -78,8 +86,10 @@ def test_a_break_is_found(name: str, tmp_path: Path) -> None:
         ("baseline not times focal length", {"baseline_length"}),
     ],
 )
-def test_one_mistake_is_one_finding(name: str, checks_alone: set[str], tmp_path: Path) -> None:
+def test_one_mistake_is_one_finding(
+    name: str, checks_alone: set[str], report_of: Callable[[str | None], CheckReport]
+) -> None:
     """What follows from a mistake is not reported as further ones."""
-    report = broken(tmp_path, name)
+    report = report_of(name)
     assert {finding.check for finding in report.findings} == checks_alone
     assert report.exit_code == 1
