@@ -139,8 +139,9 @@ def fit_rows(
 
     Example:
         >>> uv = np.random.default_rng(0).uniform(0, 100, (50, 2))
-        >>> [round(value, 6) for value in fit_rows(uv, 0.02 * (uv[:, 0] - 50), (100, 100))[1:]]
-        [2.0, 0.0, 0.0]
+        >>> _, across, down, _ = fit_rows(uv, 0.02 * (uv[:, 0] - 50), (100, 100))
+        >>> f"{across:.3f} px more at the right edge, {abs(down):.3f} px at the bottom"
+        '2.000 px more at the right edge, 0.000 px at the bottom'
     """
     height, width = size_hw
     basis = np.column_stack([np.ones(len(residual)), uv_left[:, 0] / width - 0.5, uv_left[:, 1] / height - 0.5])
