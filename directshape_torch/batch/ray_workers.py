@@ -117,7 +117,7 @@ def _connect(ray: Any, options: WorkerOptions) -> None:
     try:
         if options.ray == "local":
             cpus = None if options.workers is None else options.workers * (options.threads_per_worker or 1)
-            ray.init(num_cpus=cpus, include_dashboard=False, **quiet)
+            ray.init(address="local", num_cpus=cpus, include_dashboard=False, **quiet)
         else:
             ray.init(address=options.ray, **quiet)
     except (ConnectionError, RuntimeError, ValueError) as error:

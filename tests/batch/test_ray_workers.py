@@ -48,7 +48,12 @@ def _cluster() -> Iterator[None]:
         folders = (Path(__file__).parent.parent, Path(directshape_torch.__file__).parent.parent)
         environment = {"env_vars": {"PYTHONPATH": os.pathsep.join(map(str, folders))}}
         ray.init(
-            num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error", runtime_env=environment
+            "local",
+            num_cpus=2,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level="error",
+            runtime_env=environment,
         )
         yield
         ray.shutdown()
