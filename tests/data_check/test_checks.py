@@ -40,10 +40,12 @@ def camera(found: KittiCalibration) -> StereoCamera:
     return StereoCamera.from_projections(torch.from_numpy(found.P2)[None], torch.from_numpy(found.P3)[None])
 
 
-def matches(row_offset: float = 0.0, disparity: float = 20.0, across: float = 0.0, count: int = 300) -> PairMatches:
+def matches(
+    row_offset: float = 0.0, disparity: float = 20.0, across: float = 0.0, count: int = 300, scatter: float = 0.2
+) -> PairMatches:
     random = np.random.default_rng(0)
     uv_left = random.uniform((100, 0), (1200, 400), (count, 2))
-    rows = row_offset + across * (uv_left[:, 0] / 1200 - 0.5) + random.normal(0, 0.2, count)
+    rows = row_offset + across * (uv_left[:, 0] / 1200 - 0.5) + random.normal(0, scatter, count)
     depth_spread = random.uniform(0.5, 1.5, count)
     uv_right = uv_left + np.column_stack([-disparity * depth_spread, rows])
     return PairMatches(uv_left, uv_right, count)
@@ -57,6 +59,7 @@ def matches(row_offset: float = 0.0, disparity: float = 20.0, across: float = 0.
         (matches(row_offset=1.0), [("not_rectified", "warning")]),
         (matches(row_offset=-2.0), [("not_rectified", "error")]),
         (matches(across=3.0), [("not_rectified", "error")]),
+        (matches(scatter=2.0, count=3000), [("not_synchronous", "warning")]),
         (matches(disparity=-20.0), [("images_swapped", "error")]),
         (matches(count=10), [("few_matches", "note")]),
         (PairMatches(np.zeros((40, 2)), np.zeros((40, 2)), 200), [("different_scenes", "error")]),
