@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -30,6 +30,7 @@ from directshape_torch.solver.normal_equations import Segments
 _SUITE = "kernels"
 _ITERATION_GOAL, _AUTOGRAD_GOAL = Goal("at most", 3.0), Goal("at least", 5.0)
 _FEW, _MANY = 4, 20
+_Result = TypeVar("_Result")
 
 # One stage in which no car settles, so that every car takes part in every iteration.
 _ENDLESS = ("solver.cost_tolerance=0", "solver.step_tolerance=0", "solver.accept_every_step=true")
@@ -168,24 +169,35 @@ def _autograd_row(mode: str, frames: FrameBatch, detections: Detections, setting
 
 
 def _problem_rows(mode: str, frames: FrameBatch, detections: Detections, settings: SuiteSettings) -> list[Row]:
-    """The energy at a state of the last stage: where a stage begins, its value, its value with derivatives."""
+    """The energy at a state of the last stage: where a stage begins, its value, its value with derivatives.
+
+    An iteration follows the rays from the state before, which is what makes it cheap; the same with every ray sampled
+    anew stands beside it. A problem remembers what it has projected, so each call brings tensors of its own.
+    """
     problem, state = make_refiner("default", mode).problem(frames, detections)
+    beginning, _ = make_refiner("default", mode).problem(frames, detections)
     stage = problem.stages()[-1]
+    followed = _in_mode(mode, partial(problem.begin_stage, stage, state))()
+
+    def anew(function: Callable[[CarState], object]) -> object:
+        return function(CarState(*(part.clone() for part in state)))
+
     kernels: dict[str, Callable[[], object]] = {
-        "beginning of a stage": partial(problem.begin_stage, stage, state),
-        "cost of a state": partial(problem.cost, state),
-        "cost, gradient and Hessian of a state": partial(problem.linearise, state),
+        "beginning of a stage": partial(anew, partial(beginning.begin_stage, stage)),
+        "cost of a state": partial(anew, problem.cost),
+        "cost, gradient and Hessian of a state, rays followed": partial(followed.linearise, state),
+        "cost, gradient and Hessian of a state, rays marched": partial(anew, problem.linearise_terms),
     }
     calls = {name: _in_mode(mode, call) for name, call in kernels.items()}
     times = time_interleaved(calls, settings.repetitions)
     return [_row(f"{name}, {mode}", times.spread(name).scaled(1e3), "ms", "time") for name in calls]
 
 
-def _in_mode(mode: str, call: Callable[[], object]) -> Callable[[], object]:
+def _in_mode(mode: str, call: Callable[[], _Result]) -> Callable[[], _Result]:
     """What the refiner opens around its work."""
 
     @torch.no_grad()
-    def run() -> object:
+    def run() -> _Result:
         with compiling(_compile_mode(mode), num_cars=1):
             return call()
 
