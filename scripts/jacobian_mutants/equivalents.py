@@ -27,6 +27,7 @@ _EITHER_SIGN = "a quaternion and its negative are the same rotation, and so3_log
 _BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its value nor its derivative gets anywhere"
 _SQUARED = "the floor of the contrast enters as a square"
 _FLAG = "a flag, whose truth a sign leaves alone"
+_ROW_IN_PAIRS = "a residual changes its sign with its Jacobian, and both enter as products of two"
 _IN_PAIRS = "enters as a square, or twice as a factor"
 _FOR_SPEED = "a threshold that only saves work: what it leaves out is below the rounding of the sum"
 _VALUE_UNUSED = "carried along with the derivatives, and the Jacobian does not depend on it"
@@ -45,6 +46,63 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent("ProjectedView.__init__", "moving_depths", "(-moving_depths)", _FLAG),
     Equivalent("TrackedPhotometric.of_term", "config.truncated", "(-config.truncated)", _FLAG),
+    Equivalent("heading_constants", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("_hidden", "nowhere", "(-nowhere)", _OF_ZERO),
+    Equivalent("_hidden", "nowhere[:, :1]", "(-nowhere[:, :1])", _OF_ZERO),
+    Equivalent("_hidden", "nowhere[:, :1]", "nowhere[:, 1:2]", "another column of the same zeros"),
+    *(
+        Equivalent("TrackedEnergy.of_terms", "[*sides, *photometric, *priors]", after, "only membership is asked")
+        for after in ("[*photometric, *sides, *priors]", "[*sides, *priors, *photometric]")
+    ),
+    Equivalent(
+        "_Dimensions.rows",
+        "torch.cat([at.J_hwl_code, at.hwl[..., None] - self.detector_hwl], dim=2) * self.scale",
+        "(-(torch.cat([at.J_hwl_code, at.hwl[..., None] - self.detector_hwl], dim=2) * self.scale))",
+        _ROW_IN_PAIRS,
+    ),
+    Equivalent("StackedPriors.from_terms", "terms[0]", "terms[1]", "all priors of a batch know the same cars"),
+    Equivalent("StackedPriors.linearise", "(1, 2)", "(2, 1)", "a sum over both axes, in either order"),
+    Equivalent("StackedPriors.of_objects", "self.pose_rows[keep]", "(-self.pose_rows[keep])", _ROW_IN_PAIRS),
+    Equivalent(
+        "_roots_of_weights", "math.sqrt(term.weight) * ones", "(-(math.sqrt(term.weight) * ones))", _ROW_IN_PAIRS
+    ),
+    Equivalent(
+        "_roots_of_weights",
+        "root * factor.to(torch.float64).sqrt()",
+        "(-(root * factor.to(torch.float64).sqrt()))",
+        _ROW_IN_PAIRS,
+    ),
+    Equivalent("_pose_rows", "root / normal[:, 1]", "(-(root / normal[:, 1]))", _ROW_IN_PAIRS),
+    Equivalent("_pose_rows", "root[:, None] * normal", "(-(root[:, None] * normal))", _ROW_IN_PAIRS),
+    Equivalent(
+        "_pose_rows",
+        "root[:, None] / detector_pose_sigma(config, cars)",
+        "(-(root[:, None] / detector_pose_sigma(config, cars)))",
+        _ROW_IN_PAIRS,
+    ),
+    Equivalent(
+        "_pose_rows",
+        "scale[:, :3, None] * viewing_axes(origin)",
+        "(-(scale[:, :3, None] * viewing_axes(origin)))",
+        _ROW_IN_PAIRS,
+    ),
+    Equivalent(
+        "_pose_rows",
+        "[position_rows(axes, -(axes @ origin[..., None])[..., 0]), heading_rows(scale[:, 3])]",
+        "[heading_rows(scale[:, 3]), position_rows(axes, -(axes @ origin[..., None])[..., 0])]",
+        "the order of the rows, over which everything is summed",
+    ),
+    Equivalent(
+        "_pose_rows",
+        "position_rows(axes, -(axes @ origin[..., None])[..., 0])",
+        "(-position_rows(axes, -(axes @ origin[..., None])[..., 0]))",
+        _ROW_IN_PAIRS,
+    ),
+    Equivalent("_pose_rows", "heading_rows(scale[:, 3])", "(-heading_rows(scale[:, 3]))", _ROW_IN_PAIRS),
+    Equivalent("_pose_rows", "level_rows(normal)[:, :0]", "level_rows(normal)[:, 0:0]", "an empty slice either way"),
+    Equivalent("_code_rows", "root[:, None, None] * identity", "(-(root[:, None, None] * identity))", _ROW_IN_PAIRS),
+    Equivalent("_code_rows", "rows[:, :0]", "rows[:, 0:0]", "an empty slice either way"),
+    Equivalent("_dimensions", "root[:, None] / sigma", "(-(root[:, None] / sigma))", _ROW_IN_PAIRS),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     *(
         Equivalent("_corner_values", "(nx, ny, nz, _)", after, "only the product of the three is used")

@@ -311,6 +311,7 @@ TARGETS: dict[str, Target] = {
         (
             f"{_TRACKED}::test_where_a_stage_begins_the_photometric_rows_are_the_marched_ones",
             f"{_TRACKED}::test_at_any_depth_a_pixel_lands_where_the_marched_one_does",
+            f"{_TRACKED}::test_photometric_rows_a_step_away",
             f"{_TRACKED}::test_factors_of_single_cars",
             *_FOLLOWING,
             f"{_TRACKED}::test_a_pixel_that_comes_to_be_hidden_or_leaves_the_image_pays_as_the_marched_one",

@@ -71,15 +71,19 @@ def test_where_a_stage_begins_the_photometric_rows_are_the_marched_ones(name: st
     assert max(errors(found, marched(problem, state, terms))) < 1e-9
 
 
+UNOCCLUDED = replace(DEFAULT, sampling=replace(DEFAULT.sampling, occlusion=False))
+
+
 @pytest.mark.parametrize("stage", [0, 1])
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", [*CONFIGS, "no occlusion"])
 def test_at_any_depth_a_pixel_lands_where_the_marched_one_does(name: str, stage: int) -> None:
     """Far beyond the images' borders and onto nearer cars: residuals, their derivative and what can be compared."""
-    problem, state = cropped(CONFIGS[name], stage)
+    problem, state = cropped(CONFIGS.get(name, UNOCCLUDED), stage)
     (term,) = kind_of(problem, PhotometricTerm)
     assert isinstance(term, PhotometricTerm)
     energy = tracked(problem, state, [term]).photometric
     assert energy is not None
+    assert energy.linearise(block_field(problem.prior.bind(state.code)), state.T_obj_cam).cost.isfinite().all()
     filled = energy.rows.pixel_weight > 0
     generator = torch.Generator().manual_seed(17)
     lost = []
@@ -306,14 +310,18 @@ def test_hand_derived_rows_are_those_of_autograd(name: str, place: tuple[float, 
 def test_the_terms_that_are_tracked_and_the_others() -> None:
     """The paper's form of the silhouette is always marched; with it the photometric term is tracked all the same."""
     mixed = replace(PAPER, solver=DEFAULT.solver, stages=DEFAULT.stages)
-    problem, stage, state = begun_stage(mixed)
-    assert stage is problem
-    energy = tracked(problem, state, list(problem.terms))
-    assert [term.name for term in energy.others] == ["silhouette_left", "silhouette_right"]
-    assert energy.silhouettes is None
-    assert energy.photometric is not None
-    reference, _, _ = begun_stage(replace(mixed, solver=PAPER.solver))
-    assert max(errors(stage.linearise(state), reference.linearise(state))) < 1e-9
+    generator = torch.Generator().manual_seed(6)
+    names = ("silhouette_left", "photometric", "height")
+    weights = {name: torch.rand(5, generator=generator, dtype=torch.float64) + 0.3 for name in names}
+    for factors in (None, weights):
+        problem, stage, state = begun_stage(mixed, term_weights=factors)
+        assert stage is problem
+        energy = tracked(problem, state, list(problem.terms))
+        assert [term.name for term in energy.others] == ["silhouette_left", "silhouette_right"]
+        assert energy.silhouettes is None
+        assert energy.photometric is not None
+        reference, _, _ = begun_stage(replace(mixed, solver=PAPER.solver), term_weights=factors)
+        assert max(errors(stage.linearise(state), reference.linearise(state))) < 1e-9
 
 
 def test_the_iterations_see_what_the_problem_says() -> None:
