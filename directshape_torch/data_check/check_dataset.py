@@ -112,7 +112,9 @@ def _check_cars(seen: _Seen) -> list[Finding]:
     of_boxes = check_box_2d(seen.evidence) or check_boxes(seen.evidence)
     if any(finding.severity == "error" for finding in of_boxes):
         # Masks are found by the boxes and distances are those of the boxes, so they would only say the same again.
-        return [*of_boxes, *(finding for finding in check_masks(seen.evidence) if finding.check != "masks_elsewhere")]
+        explained = _names(of_boxes) != {"box_projection"}
+        of_masks = check_masks(seen.evidence)
+        return [*of_boxes, *(found for found in of_masks if found.check != "masks_elsewhere" or not explained)]
     found = [*of_boxes, *check_corners(seen.evidence), *check_masks(seen.evidence)]
     return found + check_distances(seen.ratios)
 
