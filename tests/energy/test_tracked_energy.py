@@ -10,6 +10,7 @@ from helpers.derivatives import moved, relative_error
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.five_cars import begun_stage, five_cars, step_of, with_solver
 from helpers.problems import DEFAULT, MARCHED, NORMALISED, PAPER, TRUNCATED, begun_problem
+from helpers.synthetic_scene import select
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
@@ -103,8 +104,11 @@ def test_at_any_depth_a_pixel_lands_where_the_marched_one_does(name: str, stage:
 
 def cropped(config: RefinerConfig, stage: int) -> tuple[CarProblem, CarState]:
     """Frames that end amid the cars, on the right and below, and a right camera 0.2 m off in height: with its depth a
-    pixel leaves at every side."""
+    pixel leaves at every side. The far cars come first, and their right masks cover the nearest one's as well."""
     prior, frames, detections = five_cars()
+    detections = select(detections, torch.tensor([2, 1, 0, 4, 3]))
+    overlapping = detections.mask_right.maximum(detections.mask_right[[2, 2, 2, 4, 4]])
+    detections = replace(detections, mask_right=overlapping)
     T_right_cam = frames.camera.T_right_cam.clone()
     T_right_cam[:, 1, 3] = 0.2
     camera = replace(frames.camera, T_right_cam=T_right_cam)
