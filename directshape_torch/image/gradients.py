@@ -48,7 +48,8 @@ def grey_of_channels(
         tensor([ 76.2450, 149.6850,  29.0700], dtype=torch.float64)
     """
     of_red, of_green, of_blue = (255.0 * weight for weight in LUMA_WEIGHTS)
-    return torch.add(red * of_red, green, alpha=of_green).add(blue, alpha=of_blue)
+    # In the memory of the first product: whole frames are larger than any cache.
+    return (red * of_red).add_(green, alpha=of_green).add_(blue, alpha=of_blue)
 
 
 def image_gradient(
@@ -103,7 +104,7 @@ def length_2d(
         >>> flat.grad
         tensor([0.])
     """
-    square = d_u * d_u + d_v * d_v
+    square = (d_u * d_u).add_(d_v * d_v)
     if not square.requires_grad:
         return square.sqrt_()
     flat = square.detach() == 0
