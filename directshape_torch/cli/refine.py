@@ -43,7 +43,10 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
         help="record frames and iterations for Rerun's viewer (extra viewer); refines a second time, for few frames",
     )
     again = group.add_mutually_exclusive_group()
-    again.add_argument("--resume", action="store_false", dest="fresh", help="go on where DIR was left (the default)")
+    # `store_false` alone would make True the default of both.
+    again.add_argument(
+        "--resume", action="store_false", dest="fresh", default=False, help="go on where DIR was left (the default)"
+    )
     again.add_argument(
         "--fresh", action="store_true", help="remove the results that runs have left in DIR, start again"
     )
