@@ -35,6 +35,8 @@ _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEI
 
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("exp", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("viewing_axes", "zero", "(-zero)", _OF_ZERO),
     Equivalent("_by_rotation", "zeros[..., :3]", "(-zeros[..., :3])", _OF_ZERO),
@@ -53,6 +55,15 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     *(
         Equivalent("TrackedEnergy.of_terms", "[*sides, *photometric, *priors]", after, "only membership is asked")
         for after in ("[*photometric, *sides, *priors]", "[*sides, *priors, *photometric]")
+    ),
+    *(
+        Equivalent(
+            f"TrackedEnergy.{function}",
+            "[*parts, self.priors.linearise(state)]",
+            "[self.priors.linearise(state), *parts]",
+            "the order of the parts, which are added",
+        )
+        for function in ("linearise", "linearise_by_autograd")
     ),
     Equivalent(
         "_Dimensions.rows",

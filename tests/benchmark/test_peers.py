@@ -11,13 +11,20 @@ from typing import Literal
 import pytest
 import torch
 from helpers.peer_stages import street_solver
-from helpers.problems import DEFAULT
+from helpers.problems import DEFAULT, MARCHED
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.benchmark import peers_task
 from directshape_torch.benchmark.peers import PeerCase, missing_libraries, notes_on_missing, timed_sides
 from directshape_torch.benchmark.peers_rows import Figures, cost_rows, ratio_rows, time_row
-from directshape_torch.benchmark.peers_task import OwnSolver, StageRun, Trace, iterations_to, stage_tasks
+from directshape_torch.benchmark.peers_task import (
+    OwnSolver,
+    StageRun,
+    Trace,
+    iterations_to,
+    stage_tasks,
+    with_marched_rays,
+)
 from directshape_torch.benchmark.rows import Goal
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import Repetitions
@@ -69,6 +76,16 @@ def test_autograd_ends_where_the_hand_derived_jacobians_end() -> None:
     tasks = stage_tasks(street_solver())
     for run, task in zip(street_solver(tasks, "autograd").run(), tasks, strict=True):
         torch.testing.assert_close(task.problem.cost(run.state), task.target_cost, rtol=1e-6, atol=0)
+
+
+def test_marched_rays_end_near_by_the_energy_that_others_are_given() -> None:
+    prior, scene = cached_street()
+    marched = with_marched_rays(DirectShapeRefiner(prior, DEFAULT))
+    assert marched.config == MARCHED
+    tasks = stage_tasks(street_solver())
+    own = OwnSolver(marched, scene.frames, disturbed(scene.detections), [task.start for task in tasks])
+    for run, task in zip(own.run(), tasks, strict=True):
+        torch.testing.assert_close(task.problem.cost(run.state), task.target_cost, rtol=0.1, atol=0)
 
 
 def test_seconds_to_a_cost() -> None:

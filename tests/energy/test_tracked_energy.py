@@ -326,6 +326,8 @@ def test_the_terms_that_are_tracked_and_the_others() -> None:
         assert energy.photometric is not None
         reference, _, _ = begun_stage(replace(mixed, solver=PAPER.solver), term_weights=factors)
         assert max(errors(stage.linearise(state), reference.linearise(state))) < 1e-9
+        by_autograd, _, _ = begun_stage(with_solver(mixed, jacobian="autograd"), term_weights=factors)
+        assert max(errors(by_autograd.linearise(state), reference.linearise(state))) < 1e-8
 
 
 def test_the_iterations_see_what_the_problem_says() -> None:
