@@ -14,14 +14,12 @@ from torch import Tensor
 
 from directshape_torch.shape.compiled_march import (
     Bracket,
-    SampledRays,
     interval,
     neighbours,
     probe_grids,
     sample_grids,
     vertex_offset,
 )
-from directshape_torch.shape.grid_lookup import GridField
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import BoundShape
 
@@ -68,29 +66,13 @@ class Root(NamedTuple):
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
     if isinstance(shape, GridShape):
-        return _march_grids(shape, rays, bounds_obj, num_samples)
+        sampled = sample_grids.compiled(*shape.field, *_coordinates(rays), bounds_obj, num_samples)
+        if sampled is not None:
+            return RayMarch(sampled.depths.mT, sampled.sdf.mT, sampled.crosses_bounds, sampled.closest_depth)
     near, far, crosses_bounds = interval(rays.origin_obj, rays.direction_obj, bounds_obj)
     share = (torch.arange(num_samples, dtype=near.dtype, device=near.device) + 0.5) / num_samples
     depths = near[:, None] + (far - near)[:, None] * share
     return RayMarch(depths, _sdf_at(shape, rays, depths), crosses_bounds)
-
-
-def _march_grids(shape: GridShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
-    coordinates = _coordinates(rays)
-    sampled = sample_grids.compiled(*shape.field, *coordinates, bounds_obj, num_samples)
-    if sampled is None:
-        sampled = _sampled_in_parts(shape.field, *coordinates, bounds_obj, num_samples)
-    return RayMarch(sampled.depths.mT, sampled.sdf.mT, sampled.crosses_bounds, sampled.closest_depth)
-
-
-def _sampled_in_parts(
-    field: GridField, rays_obj: Tensor, object_index: Tensor, bounds_obj: Tensor, num_samples: int
-) -> SampledRays:
-    """So many rays at a time that the intermediates stay in the caches."""
-    at_once = max(1, _POINTS_AT_ONCE // num_samples if rays_obj.device.type == "cpu" else len(object_index))
-    parts = zip(rays_obj.split(at_once, dim=1), object_index.split(at_once), strict=True)  # type: ignore[no-untyped-call]
-    sampled = [sample_grids.plain(*field, *part, bounds_obj, num_samples) for part in parts]
-    return sampled[0] if len(sampled) == 1 else SampledRays(*(torch.cat(x, -1) for x in zip(*sampled, strict=True)))
 
 
 def _sdf_at(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:

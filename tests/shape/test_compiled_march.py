@@ -82,17 +82,20 @@ def test_parts_of_the_rays_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> Non
     shape, rays, bounds = scene(100, torch.float64)
     whole = raycast.march(shape, rays, bounds, SAMPLES)
     monkeypatch.setattr(raycast, "_POINTS_AT_ONCE", 7 * SAMPLES)
-    for mine, theirs in zip(raycast.march(shape, rays, bounds, SAMPLES), whole, strict=True):
-        assert mine is not None
-        assert theirs is not None
-        assert torch.equal(mine, theirs)
+    assert torch.equal(raycast.march(shape, rays, bounds, SAMPLES).sdf, whole.sdf)
 
 
-def test_the_closest_approach_that_comes_with_the_samples_is_that_of_the_samples() -> None:
-    shape, rays, bounds = scene(200, torch.float64)
-    marched = raycast.march(shape, rays, bounds, SAMPLES)
-    from_samples = raycast.closest_approach_depth(marched._replace(closest_depth=None))
-    torch.testing.assert_close(raycast.closest_approach_depth(marched), from_samples, rtol=0, atol=1e-13)
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+@pytest.mark.parametrize("samples", [1, 7, SAMPLES])
+def test_what_is_compiled_samples_as_the_general_path(dtype: torch.dtype, tolerance: float, samples: int) -> None:
+    shape, rays, bounds = scene(200, dtype)
+    marched = raycast.march(AnyShape(shape), rays, bounds, samples)
+    sampled = sample_grids.plain(*shape.field, *raycast._coordinates(rays), bounds, samples)
+    crosses = marched.crosses_bounds
+    assert torch.equal(sampled.crosses_bounds, crosses)
+    expected = (marched.depths.mT, marched.sdf.mT, raycast.closest_approach_depth(marched))
+    for mine, theirs in zip((sampled.depths, sampled.sdf, sampled.closest_depth), expected, strict=True):
+        torch.testing.assert_close(mine[..., crosses], theirs[..., crosses], rtol=0, atol=tolerance)
 
 
 def test_a_ray_that_is_nowhere_disturbs_no_other() -> None:
