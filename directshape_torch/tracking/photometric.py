@@ -28,6 +28,10 @@ from directshape_torch.tracking.rays import BlockRays
 _MAX_STEP_M = 0.3
 # Signed distance at which a Newton step lands on the surface to a fraction of a millimetre.
 _NEAR_SURFACE_M = 0.03
+# Of a step along the ray whose ends tell a slope.
+_LEAST_STEP_M = 1e-3
+# Of the slope at the hit that the slope of a secant must have at least.
+_FLATTEST_SHARE = 0.2
 # What is not so far in front of the right camera is not seen by it.
 _LEAST_DEPTH_M = 1e-6
 # The neighbour that is the pixel itself.
@@ -257,7 +261,13 @@ def surface_under(
     to_plane = ((points - rays.centre_obj) * normal).sum(0) / slope
     next_to = rays.depth_next_to(points)
     depth = next_to + (to_plane - next_to).clamp(-_MAX_STEP_M, _MAX_STEP_M)
-    depth = depth - (field.value(rays.at(depth), rows.rays.owner) / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
+    sdf = field.value(rays.at(depth), rows.rays.owner)
+    step = -(sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
+    depth = depth + step
+    # The old slope was that of another point: after a long step of the car only the second secant reaches the surface.
+    last, sdf = sdf, field.value(rays.at(depth), rows.rays.owner)
+    slope = _secant_slope(step, last, sdf, slope)
+    depth = depth - (sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
     near = rays.at(depth)
     at = field.derivatives(near, rows.rays.owner, constant=True)
     slope = (at.gradient * rays.direction_obj).sum(0)
@@ -268,6 +278,14 @@ def surface_under(
     there = depth_state_jacobian(near.movedim(0, -1), last, rays.direction_obj.movedim(0, -1), settings.min_ray_cosine)
     new = Hits(torch.where(found, near, points), torch.where(found, at.gradient, normal))
     return Surface(on_surface, found & ~there.grazing, there.J_depth_state, depth, slope, new)
+
+
+def _secant_slope(step: Tensor, last_sdf: Tensor, sdf: Tensor, slope: Tensor) -> Tensor:
+    """Slope along the ray (M, 64) between the last two points; the one at hand where they tell none."""
+    far_enough = step.abs() > _LEAST_STEP_M
+    secant = (sdf - last_sdf) / torch.where(far_enough, step, torch.ones_like(step))
+    # Entering, and not so flat that the next step would be a leap.
+    return torch.where(far_enough & (secant < _FLATTEST_SHARE * slope) & (slope < 0), secant, slope)
 
 
 def depth_of_state(field: BlockField, rows: PhotometricRows, T_obj_cam: Tensor, surface: Surface) -> Tensor:

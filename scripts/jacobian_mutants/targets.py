@@ -266,6 +266,7 @@ TARGETS: dict[str, Target] = {
             "_norm_and_weight",
             "_cost",
             "surface_under",
+            "_secant_slope",
             "depth_of_state",
             "photometric_residuals",
             "_is_hidden",

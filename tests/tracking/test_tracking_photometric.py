@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -218,21 +219,21 @@ def test_a_plane_that_moved_is_met_exactly() -> None:
 
 @dataclass(frozen=True)
 class _Prescribed:
-    """A field with prescribed values whatever the points, and a prescribed gradient."""
+    """A field with prescribed values whatever the points, one lookup after the other, and a prescribed gradient."""
 
-    first: Tensor  # (M, 64)
-    second: Tensor  # (M, 64)
+    values: Iterator[Tensor]  # (M, 64) each
+    last: Tensor  # (M, 64)
     gradient: Tensor  # (3, M, 64)
 
     def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
-        return self.first
+        return next(self.values)
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
-        return Lookup(self.second, self.gradient, points_obj.new_zeros(*points_obj.shape[1:], 2))
+        return Lookup(self.last, self.gradient, points_obj.new_zeros(*points_obj.shape[1:], 2))
 
 
 def at_near_depth(
-    first_m: float, second_m: float, plane_off_m: float = 0.0, turned: bool = False
+    first_m: float, last_m: float, plane_off_m: float = 0.0, turned: bool = False, second_m: float = 0.0
 ) -> tuple[Surface, Tensor, ObjectBlockRays, Hits]:
     """The surface in a field with prescribed values, and the depth of the ray that is next to each hit."""
     rows = rows_of()
@@ -249,7 +250,8 @@ def at_near_depth(
     if turned:
         normal = -normal
     shape = (4, 64)
-    field = _Prescribed(torch.full(shape, first_m).double(), torch.full(shape, second_m).double(), normal)
+    first, second, last = (torch.full(shape, x, dtype=torch.float64) for x in (first_m, second_m, last_m))
+    field = _Prescribed(iter([first, second]), last, normal)
     hits = Hits(points, normal)
     return surface_under(field, rows, SETTINGS["plain"], of_blocks(rows), hits), next_to, rays, hits
 
@@ -262,10 +264,30 @@ def test_the_tangent_plane_gives_the_first_depth_within_a_limit(plane_off: float
 
 
 @pytest.mark.parametrize("first", [0.05, -0.11, 5.0, -5.0])
-def test_the_secant_step_has_the_slope_of_the_remembered_plane_and_a_limit(first: float) -> None:
+def test_the_first_step_has_the_slope_of_the_remembered_plane_and_a_limit(first: float) -> None:
     found, next_to, rays, hits = at_near_depth(first, 0.0)
     slope = (hits.normal_obj * rays.direction_obj).sum(0)
     expected = next_to - (first / slope).clamp(-0.3, 0.3)
+    torch.testing.assert_close(found.near_depth, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "share"),
+    [
+        (0.1, 0.05, 0.5),  # half the slope that was expected
+        (-0.1, 0.05, 1.5),  # past the surface
+        (0.1, 0.09, None),  # flatter than a fifth of it: no guide
+        (0.1, 0.12, None),  # of the other sign
+        (1e-5, 0.05, None),  # too short a step to tell a slope
+        (-0.05, -0.02, 0.6),
+    ],
+)
+def test_the_second_step_has_the_slope_of_the_first_one(first: float, second: float, share: float | None) -> None:
+    """`share` of the remembered slope, None where that is kept."""
+    found, next_to, rays, hits = at_near_depth(first, 0.0, second_m=second)
+    slope = (hits.normal_obj * rays.direction_obj).sum(0)
+    secant = slope if share is None else slope * share
+    expected = next_to - first / slope - (second / secant).clamp(-0.3, 0.3)
     torch.testing.assert_close(found.near_depth, expected, rtol=0, atol=1e-9)
 
 
@@ -294,7 +316,8 @@ def test_a_plane_along_the_ray_is_no_guide() -> None:
     along = torch.linalg.cross(rays.direction_obj, spread(facing(rays)), dim=0)
     points = rays.at(torch.full((4, 64), 8.0, dtype=torch.float64)) + 0.1 * along
     shape = (4, 64)
-    field = _Prescribed(torch.zeros(shape).double(), torch.zeros(shape).double(), -spread(facing(rays)))
+    zeros = torch.zeros(shape).double()
+    field = _Prescribed(iter([zeros, zeros]), zeros, -spread(facing(rays)))
     found = surface_under(field, rows, SETTINGS["plain"], of_blocks(rows), Hits(points, along))
     moved = found.near_depth - rays.depth_next_to(points)
     # (points - centre) . normal is positive here, hence towards the camera.
@@ -310,7 +333,8 @@ def test_grazing_rays_are_not_usable() -> None:
     aside = aside / aside.norm(dim=0)
     for degrees, usable in ((83.0, True), (85.0, False)):  # the limit is a cosine of 0.1: 84.3 degrees
         normal = math.cos(math.radians(degrees)) * towards + math.sin(math.radians(degrees)) * aside
-        field = _Prescribed(torch.zeros(4, 64).double(), torch.zeros(4, 64).double(), normal)
+        zeros = torch.zeros(4, 64).double()
+        field = _Prescribed(iter([zeros, zeros]), zeros, normal)
         found = surface_under(field, rows, SETTINGS["plain"], of_blocks(rows), Hits(hits, normal))
         assert bool(found.usable.all()) == bool(found.usable.any()) == usable
         assert bool((found.J_depth_state == 0).all()) != usable
