@@ -10,8 +10,8 @@ from helpers.problems import DEFAULT, begun_problem
 from helpers.synthetic_scene import cached_street
 
 from directshape_torch.covariance import covariance_xyz_yaw, shared_disparity_covariance, tangent_covariance
-from directshape_torch.energy.term import sum_of
 from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.term import sum_of
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 

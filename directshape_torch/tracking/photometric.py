@@ -265,8 +265,8 @@ def surface_under(
     step = -(sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
     depth = depth + step
     # The old slope was that of another point: after a long step of the car only the second secant reaches the surface.
-    last, sdf = sdf, field.value(rays.at(depth), rows.rays.owner)
-    slope = _secant_slope(step, last, sdf, slope)
+    before, sdf = sdf, field.value(rays.at(depth), rows.rays.owner)
+    slope = _secant_slope(step, before, sdf, slope)
     depth = depth - (sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
     near = rays.at(depth)
     at = field.derivatives(near, rows.rays.owner, constant=True)
@@ -280,10 +280,10 @@ def surface_under(
     return Surface(on_surface, found & ~there.grazing, there.J_depth_state, depth, slope, new)
 
 
-def _secant_slope(step: Tensor, last_sdf: Tensor, sdf: Tensor, slope: Tensor) -> Tensor:
+def _secant_slope(step: Tensor, sdf_before: Tensor, sdf: Tensor, slope: Tensor) -> Tensor:
     """Slope along the ray (M, 64) between the last two points; the one at hand where they tell none."""
     far_enough = step.abs() > _LEAST_STEP_M
-    secant = (sdf - last_sdf) / torch.where(far_enough, step, torch.ones_like(step))
+    secant = (sdf - sdf_before) / torch.where(far_enough, step, torch.ones_like(step))
     # Entering, and not so flat that the next step would be a leap.
     return torch.where(far_enough & (secant < _FLATTEST_SHARE * slope) & (slope < 0), secant, slope)
 
