@@ -106,7 +106,8 @@ class PCAShapePrior(nn.Module):
     @property
     def bounds_obj(self) -> Tensor:
         """Lower and upper corner of the grid, (2, 3), metres."""
-        last_node = torch.tensor(self.mean.shape, dtype=self.origin.dtype, device=self.origin.device) - 1
+        # Filled on the device: a list would be copied there, and the host would wait.
+        last_node = torch.cat([self.origin.new_full((1,), count - 1) for count in self.mean.shape])
         return torch.stack([self.origin, self.origin + self.spacing_m * last_node])
 
     @property

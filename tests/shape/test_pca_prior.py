@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from helpers.host_traffic import host_traffic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,6 +46,10 @@ def test_implements_the_protocol(prior):
     assert isinstance(prior, ShapePrior)
     assert prior.num_codes == 4
     torch.testing.assert_close(prior.bounds_obj[1], torch.tensor([2.0, 0.4, 1.0], dtype=torch.float64))
+
+
+def test_bounds_are_computed_without_the_host(prior):
+    assert host_traffic(lambda: prior.bounds_obj).found == []
 
 
 def test_unweighted_components_equal_those_of_a_singular_value_decomposition(samples):
