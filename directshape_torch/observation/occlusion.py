@@ -159,8 +159,10 @@ class OcclusionCrops:
     def crop(self, index: int) -> Tensor:
         """The occlusion mask of one object in its region, (v1 - v0, u1 - u0) bool, for pictures."""
         u0, v0, u1, v1 = self.wanted[index].tolist()
-        v, u = torch.meshgrid(torch.arange(v0, v1), torch.arange(u0, u1), indexing="ij")
-        return self.at(torch.tensor(index), torch.stack([u, v], dim=-1).to(self.wanted.device))
+        device = self.table.device
+        v, u = (torch.arange(*ends, device=device) for ends in ((v0, v1), (u0, u1)))
+        uv = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+        return self.at(torch.full((), index, device=device), uv)
 
 
 def _rows(values: Tensor, index: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.host_traffic import host_traffic
 from torch import Tensor
 
 from directshape_torch.errors import InputError
@@ -84,6 +85,15 @@ def test_hidden_pixels_are_the_mask_in_front() -> None:
         hidden = hidden_pixels(detections, side, object_index, uv).reshape(2, HEIGHT, WIDTH)
         assert not hidden[0].any()
         assert torch.equal(hidden[1], expected > 0.5)
+
+
+def test_a_crop_is_looked_up_where_its_table_is() -> None:
+    """The region is read by the host; a device without data stands for a GPU."""
+    crops = occlusion_crops(scene([10.0, 20.0], [15.0, 18.0]), "left", torch.tensor([[4, 4, 16, 16], [8, 6, 27, 20]]))
+    elsewhere = {name: getattr(crops, name).to("meta") for name in ("boxes", "table", "in_front", "covering")}
+    crop = replace(crops, **elsewhere).crop(1)
+    assert (crop.device.type, crop.shape) == ("meta", (14, 19))
+    assert host_traffic(lambda: crops.crop(1)).found == []
 
 
 def test_half_probability_does_not_hide() -> None:
