@@ -49,26 +49,29 @@ class _Dimensions:
     """The prior of the dimensions: three rows by the code."""
 
     prior: ShapePrior
-    detector_hwl: Tensor  # (B, 3, 1)
+    detector_hwl: Tensor  # (B, 3, 1) float64
     scale: Tensor  # (B, 3, 1) root of the weight over sigma
 
     @property
     def are_linear(self) -> bool:
         """Has the code a constant influence on the dimensions?"""
-        return isinstance(self.prior, PCAShapePrior)
+        # A class made from this one may have dimensions of its own.
+        return type(self.prior) is PCAShapePrior
 
     def rows(self, code: Tensor) -> Tensor:
-        """`[J r]` at codes (B, K), (B, 3, K + 1)."""
+        """`[J r]` at codes (B, K), (B, 3, K + 1), in float64 from the dimensions on."""
         at = self.prior.dimensions_and_derivative(code)
-        return torch.cat([at.J_hwl_code, at.hwl[..., None] - self.detector_hwl], dim=2) * self.scale
+        residual = at.hwl.to(torch.float64)[..., None] - self.detector_hwl
+        return torch.cat([at.J_hwl_code.to(torch.float64), residual], dim=2) * self.scale
 
-    def of_objects(self, keep: Tensor) -> _Dimensions:
-        return _Dimensions(self.prior, self.detector_hwl[keep], self.scale[keep])
+    def of_objects(self, index: Tensor) -> _Dimensions:
+        """Those of the cars with these numbers."""
+        return _Dimensions(self.prior, self.detector_hwl.index_select(0, index), self.scale.index_select(0, index))
 
 
 @dataclass(frozen=True)
 class StackedPriors:
-    """The sum of several `PriorTerm`s, in float64 throughout.
+    """The sum of several `PriorTerm`s, in float64 throughout but for the dimensions that a shape prior computes itself.
 
     Attributes:
         pose_rows: (B, R * 7, F) from the features of a pose to the rows (R, 7) of its priors.
@@ -77,7 +80,7 @@ class StackedPriors:
             `[code, 1]`.
         hessian: (B, D, D) its part by the code, zero elsewhere.
         one: (B, 1, 1).
-        dimensions: dimensions that are not linear in the code, if there are such.
+        dimensions: priors of dimensions that are not linear in the code.
     """
 
     pose_rows: Tensor
@@ -85,13 +88,14 @@ class StackedPriors:
     code_form: Tensor
     hessian: Tensor
     one: Tensor
-    dimensions: _Dimensions | None
+    dimensions: tuple[_Dimensions, ...]
 
     @staticmethod
     def takes(term: Term) -> TypeGuard[PriorTerm]:
         """Is the term one of the priors that can be stacked, and not a user's own?"""
         known = ShapeResidual, HeightResidual, TiltResidual, DimensionsResidual, PoseResidual
-        return isinstance(term, PriorTerm) and isinstance(term.residual_of, known)
+        # Not by `isinstance`: a class made from one of these has a residual of its own.
+        return type(term) is PriorTerm and type(term.residual_of) in known
 
     @classmethod
     def from_terms(cls, terms: Sequence[PriorTerm], num_codes: int, factors: Tensor | None = None) -> StackedPriors:
@@ -120,7 +124,7 @@ class StackedPriors:
             code_form=code_form,
             hessian=torch.nn.functional.pad(code_form[:, :-1, :-1], (_TWIST, 0, _TWIST, 0)),
             one=code_form.new_ones(len(code_form), 1, 1),
-            dimensions=next((d for d in dimensions if d is not None and not d.are_linear), None),
+            dimensions=tuple(d for d in dimensions if d is not None and not d.are_linear),
         )
 
     @property
@@ -144,23 +148,25 @@ class StackedPriors:
         gradient = torch.cat([by_twist[:, :, RESIDUAL], slopes[:, :-1, 0]], dim=1)
         hessian = self.hessian.clone()
         hessian[:, :_TWIST, :_TWIST] = by_twist[:, :, :RESIDUAL]
-        if self.dimensions is not None:
-            curved = self.dimensions.rows(state.code)
+        for dimensions in self.dimensions:
+            curved = dimensions.rows(state.code)
             more = torch.bmm(curved.mT, curved)
             hessian[:, _TWIST:, _TWIST:] += more[:, :-1, :-1]
             gradient[:, _TWIST:] += more[:, :-1, -1]
             cost = cost + 0.5 * more[:, -1, -1]
         return TermLinearisation(cost, gradient, hessian, hessian)
 
-    def of_objects(self, keep: Tensor) -> StackedPriors:
-        """Those of the cars where `keep` (B,) holds, or of the cars with these numbers."""
+    def of_objects(self, keep: Tensor, count: int | None = None) -> StackedPriors:
+        """Those of the cars where `keep` (B,) bool holds; so many (`count`), or the host asks for their number."""
+        kept = keep.nonzero() if count is None else torch.nonzero_static(keep, size=count)
+        index = kept[:, 0]
         return StackedPriors(
-            self.pose_rows[keep],
-            None if self.heading is None else self.heading[keep],
-            self.code_form[keep],
-            self.hessian[keep],
-            self.one[keep],
-            None if self.dimensions is None else self.dimensions.of_objects(keep),
+            self.pose_rows.index_select(0, index),
+            None if self.heading is None else self.heading.index_select(0, index),
+            self.code_form.index_select(0, index),
+            self.hessian.index_select(0, index),
+            self.one.index_select(0, index),
+            tuple(dimensions.of_objects(index) for dimensions in self.dimensions),
         )
 
 
@@ -207,6 +213,7 @@ def _dimensions(term: PriorTerm, root: Tensor) -> _Dimensions | None:
     match term.residual_of:
         case DimensionsResidual(prior, sigma_hwl_m):
             sigma = torch.tensor(sigma_hwl_m, dtype=torch.float64, device=root.device)
-            return _Dimensions(prior, term.cars.detector_hwl[..., None], (root[:, None] / sigma)[..., None])
+            detector_hwl = term.cars.detector_hwl.to(torch.float64)
+            return _Dimensions(prior, detector_hwl[..., None], (root[:, None] / sigma)[..., None])
         case _:
             return None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import copy
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -15,12 +16,14 @@ from torch import Tensor
 from directshape_torch.config import PriorConfig, RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.prior_terms import PriorTerm, prior_terms
+from directshape_torch.energy.prior_terms import AtState, DimensionsResidual, PriorTerm, ShapeResidual, prior_terms
 from directshape_torch.energy.stacked_priors import StackedPriors
 from directshape_torch.energy.term import Term, TermLinearisation
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.residuals.priors import PriorResidual, shape_prior
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.shape_prior import DimensionsDerivative
 
 POSE = PriorConfig(pose_sigma_along_share=0.02, pose_sigma_vertical_m=0.3, pose_sigma_yaw_deg=4.0)
 SETTINGS = {
@@ -157,6 +160,21 @@ def test_some_of_the_cars(kind: str) -> None:
     assert [x.shape for x in empty[:3]] == [(0,), (0, 6 + num_codes), (0, 6 + num_codes, 6 + num_codes)]
 
 
+@pytest.mark.parametrize("kind", ["pca", "neural"])
+def test_some_of_the_cars_without_a_question_where_their_number_is_known(kind: str) -> None:
+    cars = _cars(4, sigma=True)
+    stacked = StackedPriors.from_terms(_terms(SETTINGS["pose"], kind, cars), prior_of(kind).num_codes)
+    keep = torch.tensor([True, False, False, True])
+    parts: list[StackedPriors] = []
+    assert host_traffic(lambda: parts.append(stacked.of_objects(keep, 2))).found == []
+    # Otherwise once, however many constants there are.
+    assert host_traffic(lambda: parts.append(stacked.of_objects(keep))).found == ["aten.nonzero"]
+    state = _state(cars, prior_of(kind).num_codes)
+    known, asked = (part.linearise(CarState(*(x[keep] for x in state))) for part in parts)
+    for a, b in zip(known, asked, strict=True):
+        assert torch.equal(a, b)
+
+
 def test_a_broken_car_touches_no_other() -> None:
     cars = _cars(3, sigma=True)
     stacked = StackedPriors.from_terms(_terms(SETTINGS["pose"], "pca", cars), 3)
@@ -177,6 +195,71 @@ def test_single_precision_states_are_computed_with_in_double() -> None:
     found = stacked.linearise(single)
     assert found.cost.dtype == found.hessian.dtype == torch.float64
     _same(found, _one_by_one(terms, CarState(*(x.double() for x in single))))
+
+
+@pytest.mark.parametrize("kind", ["pca", "neural"])
+def test_dimensions_in_single_precision_are_subtracted_in_double(kind: str) -> None:
+    """The difference of the very numbers: a detector with more digits behind the point than a car's length has."""
+    prior = copy.deepcopy(prior_of(kind)).float()
+    cars = _cars(2)
+    code = _random(2, prior.num_codes, seed=11).float()
+    hwl = prior.dimensions_and_derivative(code).hwl
+    cars = replace(cars, detector_hwl=0.3 + 0.01 * _random(2, 3, seed=12).float())
+    term = PriorTerm("dimensions", 1.0, cars, DimensionsResidual(prior, (0.1, 0.1, 0.1)))
+    stacked = StackedPriors.from_terms([term], prior.num_codes)
+    found = stacked.cost(CarState(_state(cars, 1).T_obj_cam, code))
+    expected = 0.5 * (((hwl.double() - cars.detector_hwl.double()) / 0.1) ** 2).sum(dim=1)
+    if kind == "pca":
+        # Linear in the code: not even the dimensions are rounded.
+        linear = prior.dimensions_mean_hwl.double() + code.double() @ prior.dimensions_basis_hwl.double().T
+        expected = 0.5 * (((linear - cars.detector_hwl.double()) / 0.1) ** 2).sum(dim=1)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0.0)
+
+
+@pytest.mark.parametrize("kind", ["pca", "neural", "kernel_pca"])
+def test_several_priors_of_the_dimensions(kind: str) -> None:
+    cars, prior = _cars(3), prior_of(kind)
+    residuals = [DimensionsResidual(prior, sigma) for sigma in ((0.1, 0.2, 0.3), (0.4, 0.1, 0.2))]
+    terms = [PriorTerm("dimensions", 0.5 + i, cars, residual) for i, residual in enumerate(residuals)]
+    state = _state(cars, prior.num_codes)
+    stacked = StackedPriors.from_terms(terms, prior.num_codes)
+    _same(stacked.linearise(state), _one_by_one(terms, state))
+    keep = torch.tensor([False, True, True])
+    part = stacked.of_objects(keep, 2).linearise(CarState(*(x[keep] for x in state)))
+    _same(part, TermLinearisation(*(x[keep] for x in _one_by_one(terms, state))))
+
+
+@dataclass(frozen=True)
+class _OwnShape(ShapeResidual):
+    """A hundred times the residual that it inherits."""
+
+    def __call__(self, cars: CarBatch, at: AtState) -> PriorResidual:
+        return PriorResidual(*(100.0 * x for x in super().__call__(cars, at)))
+
+
+class _OwnTerm(PriorTerm):
+    """A user's own way to a cost."""
+
+
+def test_a_kind_made_from_a_known_one_is_not_taken_for_it() -> None:
+    cars = _cars(2)
+    assert StackedPriors.takes(PriorTerm("shape", 1.0, cars, ShapeResidual()))
+    assert not StackedPriors.takes(PriorTerm("shape", 1.0, cars, _OwnShape()))
+    assert not StackedPriors.takes(_OwnTerm("shape", 1.0, cars, ShapeResidual()))
+
+
+def test_dimensions_of_a_prior_made_from_a_linear_one_may_be_curved() -> None:
+    class Curved(PCAShapePrior):
+        def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
+            at = super().dimensions_and_derivative(code)
+            return DimensionsDerivative(at.hwl**2, 2 * at.hwl[..., None] * at.J_hwl_code)
+
+    prior = copy.deepcopy(prior_of("pca"))
+    prior.__class__ = Curved
+    cars = _cars(2)
+    terms = [PriorTerm("dimensions", 1.0, cars, DimensionsResidual(prior, (0.1, 0.1, 0.1)))]
+    state = _state(cars, prior.num_codes)
+    _same(StackedPriors.from_terms(terms, prior.num_codes).linearise(state), _one_by_one(terms, state))
 
 
 def test_only_known_priors_are_stacked() -> None:
