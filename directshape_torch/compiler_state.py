@@ -29,27 +29,54 @@ def compiler_problem() -> str | None:
         >>> problem is None or isinstance(problem, str)
         True
     """
+    if start_problem() is not None:
+        return start_problem()
     from torch._inductor.cpp_builder import get_cpp_compiler
 
     try:
         compiler = get_cpp_compiler()
-    except RuntimeError as error:
-        return f"none was found ({_first_line(str(error)) or type(error).__name__})"
-    with tempfile.TemporaryDirectory() as folder:
-        command = [compiler, "-x", "c++", "-", "-shared", "-fPIC", "-fopenmp", "-o", os.path.join(folder, "trial.so")]
-        command += ["-I", sysconfig.get_paths()["include"]]
-        try:
-            trial = subprocess.run(
-                command, input=_TRIAL, capture_output=True, text=True, timeout=_TRIAL_SECONDS, check=False
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            return f"{compiler} does not run ({error})"
-    return None if trial.returncode == 0 else f"{compiler} fails ({_first_line(trial.stderr)})"
+    except (RuntimeError, OSError) as error:
+        return f"none was found ({first_line_of(error)})"
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            return _trial_problem(compiler, folder)
+    except OSError as error:
+        return f"{compiler} has no temporary folder ({error})"
+
+
+@functools.cache
+def start_problem() -> str | None:
+    """Why PyTorch's compiler cannot be imported or has no folder for its files, or None if all is well.
+
+    Asked once: an import that has failed fails in another way the second time, and hides the reason.
+    """
+    try:
+        from torch._inductor import cpp_builder  # noqa: F401
+
+        _cache_folder()
+    except Exception as error:  # an import can raise anything, and whatever it is there is no compiler
+        return f"PyTorch's compiler does not start ({type(error).__name__}: {first_line_of(error)})"
+    return None
+
+
+def compiler_failures() -> tuple[type[Exception], ...]:
+    """What a call of a compiled function raises if compiling fails."""
+    from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
+
+    return TorchDynamoException, FailOnRecompileLimitHit, OSError, ImportError
+
+
+def first_line_of(error: BaseException) -> str:
+    """What an error says, in one line."""
+    return _first_line(str(error)) or type(error).__name__
 
 
 def is_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> bool:
     """Whether an earlier process compiled the function, with this very source, for the variant on such a machine."""
-    return _marker(function, variant).is_file()
+    try:
+        return _marker(function, variant).is_file()
+    except (OSError, ImportError):
+        return False
 
 
 def note_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> None:
@@ -57,25 +84,41 @@ def note_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> N
 
     The note lies in the cache's own folder: who empties the cache takes the note with it.
     """
-    from torch._inductor import config
-
-    marker = _marker(function, variant)
-    if config.force_disable_caches or not config.fx_graph_cache:
-        return
     try:
+        from torch._inductor import config
+
+        if config.force_disable_caches or not config.fx_graph_cache:
+            return
+        marker = _marker(function, variant)
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
-    except OSError:
+    except (OSError, ImportError):
         # A cache that cannot be written has nothing to remember either.
         return
 
 
-def _marker(function: Callable[..., Any], variant: tuple[object, ...]) -> Path:
+def _trial_problem(compiler: str, folder: str) -> str | None:
+    command = [compiler, "-x", "c++", "-", "-shared", "-fPIC", "-fopenmp", "-o", os.path.join(folder, "trial.so")]
+    command += ["-I", sysconfig.get_paths()["include"]]
+    try:
+        trial = subprocess.run(
+            command, input=_TRIAL, capture_output=True, text=True, timeout=_TRIAL_SECONDS, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"{compiler} does not run ({error})"
+    return None if trial.returncode == 0 else f"{compiler} fails ({_first_line(trial.stderr)})"
+
+
+def _cache_folder() -> Path:
     from torch._inductor.runtime.cache_dir_utils import cache_dir
 
+    return Path(cache_dir())
+
+
+def _marker(function: Callable[..., Any], variant: tuple[object, ...]) -> Path:
     name = f"{function.__module__}.{function.__qualname__}"
     number = hashlib.sha256(repr(variant).encode()).hexdigest()[:16]
-    return Path(cache_dir()) / "directshape_torch" / _fingerprint() / f"{name}-{number}"
+    return _cache_folder() / "directshape_torch" / _fingerprint() / f"{name}-{number}"
 
 
 @functools.cache

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import stat
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,14 +13,21 @@ import torch._inductor.cpp_builder
 from torch._inductor.runtime import cache_dir_utils
 
 from directshape_torch import compiler_state
-from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk
+from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk, start_problem
 
 VARIANT = ("float32", (-1, 3))
 
 
 @pytest.fixture(autouse=True)
-def _ask_again() -> None:
+def _ask_again() -> Iterator[None]:
+    _forget()
+    yield
+    _forget()
+
+
+def _forget() -> None:
     compiler_problem.cache_clear()
+    start_problem.cache_clear()
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, compiler: str) -> None:
@@ -44,6 +53,24 @@ def test_a_compiler_that_fails_says_why(monkeypatch, tmp_path: Path) -> None:
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     _pretend(monkeypatch, str(script))
     assert compiler_problem() == f"{script} fails (fatal error: Python.h: No such file)"
+
+
+def test_no_folder_for_the_trial(monkeypatch, tmp_path: Path) -> None:
+    _pretend(monkeypatch, "c++")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    assert (compiler_problem() or "").startswith("c++ has no temporary folder (")
+
+
+def _no_cache() -> str:
+    raise FileNotFoundError(2, "No such file or directory", "/no/such")
+
+
+def test_a_cache_folder_that_cannot_be_made(monkeypatch) -> None:
+    monkeypatch.setattr(cache_dir_utils, "cache_dir", _no_cache)
+    problem = "PyTorch's compiler does not start (FileNotFoundError: [Errno 2] No such file or directory: '/no/such')"
+    assert start_problem() == compiler_problem() == problem
+    assert not is_on_disk(_function, VARIANT)
+    note_on_disk(_function, VARIANT)
 
 
 def _function() -> None: ...
