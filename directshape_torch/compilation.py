@@ -20,16 +20,23 @@ from dataclasses import dataclass
 from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
-from torch import Tensor
 
 from directshape_torch.compiler_inputs import (
-    global_settings,
     is_normal,
     is_unusual_call,
     normal,
     outside_inference_mode,
+    variant_of,
+    with_varying_sizes,
 )
-from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk
+from directshape_torch.compiler_state import (
+    compiler_failures,
+    compiler_problem,
+    first_line_of,
+    is_on_disk,
+    note_on_disk,
+    start_problem,
+)
 from directshape_torch.errors import CompilationError
 
 CompileMode = Literal["auto", "on", "off"]
@@ -50,8 +57,6 @@ _OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
     "size_asserts": False,
     "cpp.dynamic_threads": True,
 }
-# Sizes below are special to the compiler: each would be one more compilation.
-_LEAST_SIZE = 2
 _MAX_VARIANTS = 64
 
 _logger = logging.getLogger(__name__)
@@ -66,10 +71,11 @@ class _Job:
     cars_ahead: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Region:
     mode: CompileMode
     cars: int  # that speak for compiling: those ahead where that is known, else those so far
+    compiling_helps: bool = False  # a call has come that has a compiled form
 
 
 @dataclass
@@ -77,7 +83,7 @@ class _Process:
     """What this process has done so far."""
 
     lock: threading.RLock
-    cars: int = 0
+    cars: int = 0  # whose refinement has a compiled form, used or not
     given_up: bool = False
     forked: bool = False
 
@@ -103,16 +109,17 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
 
     "on" compiles always, "off" never. "auto" compiles once the cars that are known to be ahead (`cars_ahead`) make up
     for it; where nobody knows, once the cars refined so far would have, so that at most twice the best possible time is
-    spent. Code that is on disk from an earlier process is loaded for far fewer cars. Without a working compiler "auto"
-    stays plain and says so once in the log. Forked processes stay plain. Inference mode becomes `no_grad` inside: its
-    tensors would be one more compilation of everything.
+    spent; those that have no compiled form, as in float64, and those refined with "off" do not count. Code that is on
+    disk from an earlier process is loaded for far fewer cars. Without a working compiler "auto" stays plain and says so
+    once in the log. Forked processes stay plain. Inference mode becomes `no_grad` inside: its tensors would be one more
+    compilation of everything.
 
     Args:
         mode: the setting.
         num_cars: of this call.
 
     Raises:
-        CompilationError: mode "on" and no working C++ compiler.
+        CompilationError: mode "on" and no working C++ compiler, or no folder for its files.
 
     Example:
         >>> @compilable(sizes={"x": 0})
@@ -127,14 +134,15 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
     if mode == "on":
         _require_compiler()
     job = _job.get()
-    token = _region.set(_Region(mode, _process.cars + num_cars if job is None else max(job.cars_ahead, num_cars)))
+    region = _Region(mode, _process.cars + num_cars if job is None else max(job.cars_ahead, num_cars))
+    token = _region.set(region)
     try:
         with outside_inference_mode():
             yield
     finally:
         _region.reset(token)
         with _process.lock:
-            _process.cars += num_cars
+            _process.cars += num_cars if region.compiling_helps else 0
             if job is not None:
                 job.cars_ahead = max(job.cars_ahead - num_cars, 0)
 
@@ -188,82 +196,66 @@ class Compilable(Generic[_P, _R]):
         if region is None or region.mode == "off" or _process.forked or is_unusual_call():
             return None
         values = self._signature.bind(*args, **kwargs).args if kwargs else args
-        variant = self._variant(values)
+        variant = variant_of(values, self._varying)
+        if variant is None:
+            return None
+        region.compiling_helps = True
         known = variant in self._variants
-        if variant is None or not (known or self._may_compile(variant, region)):
+        if not (known or self._may_compile(variant, region)):
             return None
         # Always the same kind of tensor: memory layout, parameters and gradients that are off make no further variants.
         values = tuple(value if is_normal(value) else normal(value) for value in values)
         with torch.no_grad():
-            if not known or self._compiled is None:
-                return self._first_call(variant, region, values)
-            result: _R = self._compiled(*values)
-            return result
-
-    def _variant(self, values: tuple[object, ...]) -> tuple[object, ...] | None:
-        """What a compilation holds for, or None where the plain form is called for."""
-        grad = torch.is_grad_enabled()
-        variant: list[object] = [global_settings()]
-        for value, varying in zip(values, self._varying, strict=False):
-            if not isinstance(value, Tensor):
-                variant.append(value)
-                continue
-            if value.dtype == torch.float64 or (grad and value.requires_grad):
+            try:
+                if known and self._compiled is not None:
+                    result: _R = self._compiled(*values)
+                    return result
+                return self._first_call(variant, values)
+            # A later call may compile too, if something changed that is no part of the variant.
+            except compiler_failures() as error:
+                self._fail(variant, region, error)
                 return None
-            shape = list(value.shape)
-            for dim in varying:
-                if shape[dim] < _LEAST_SIZE:
-                    return None
-                shape[dim] = -1
-            variant += (value.dtype, value.device, *shape)
-        return tuple(variant)
 
     def _may_compile(self, variant: tuple[object, ...], region: _Region) -> bool:
         if region.mode == "on":
             return True
         if _process.given_up or region.cars < CARS_WORTH_LOADING:
             return False
-        if region.cars < CARS_WORTH_COMPILING and not is_on_disk(self.plain, variant[1:]):
+        problem = start_problem()
+        if problem is None and region.cars < CARS_WORTH_COMPILING and not is_on_disk(self.plain, variant[1:]):
             return False
-        problem = compiler_problem()
+        problem = problem or compiler_problem()
         if problem is not None:
             _give_up(problem)
         return problem is None
 
-    def _first_call(self, variant: tuple[object, ...], region: _Region, values: tuple[Any, ...]) -> _R | None:
-        """Compile for a variant, None if that fails; other threads that need it wait."""
-        from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
-
+    def _first_call(self, variant: tuple[object, ...], values: tuple[Any, ...]) -> _R:
+        """Compile for a variant; other threads that need it wait."""
         with _process.lock:
-            try:
-                result: _R = self._compile(values)
-            except (TorchDynamoException, FailOnRecompileLimitHit) as error:
-                reason = str(error).strip().splitlines()[0]
-                if region.mode == "on":
-                    raise CompilationError(f"{self.plain.__qualname__} could not be compiled: {reason}") from error
-                _give_up(f"{self.plain.__qualname__} could not be compiled: {reason}")
-                return None
+            result = self._compile(values)
             self._variants.add(variant)
         note_on_disk(self.plain, variant[1:])
         return result
+
+    def _fail(self, variant: tuple[object, ...], region: _Region, error: Exception) -> None:
+        self._variants.discard(variant)
+        problem = f"{self.plain.__qualname__} could not be compiled: {first_line_of(error)}"
+        if region.mode == "on":
+            raise CompilationError(problem) from error
+        _give_up(problem)
 
     def _compile(self, values: tuple[Any, ...]) -> _R:
         import torch._dynamo
 
         if self._compiled is None:
             self._compiled = torch.compile(self.plain, fullgraph=True, options=_OPTIONS)
-        # Copies of the tensor objects: the marks must not stay on the caller's.
-        values = tuple(value.detach() if isinstance(value, Tensor) else value for value in values)
-        for value, varying in zip(values, self._varying, strict=False):
-            for dim in varying:
-                torch._dynamo.mark_dynamic(value, dim)
         _logger.info("compiling %s", self.plain.__qualname__)
         with (
             warnings.catch_warnings(),
             torch._dynamo.config.patch(recompile_limit=_MAX_VARIANTS),
         ):
             warnings.simplefilter("ignore")
-            result: _R = self._compiled(*values)
+            result: _R = self._compiled(*with_varying_sizes(values, self._varying))
         return result
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._device import DeviceContext
+
+# Sizes below are special to the compiler: each would be one more compilation.
+_LEAST_SIZE = 2
 
 
 def is_normal(value: object) -> bool:
@@ -28,14 +33,78 @@ def normal(value: object) -> object:
 
 
 def is_unusual_call() -> bool:
-    """Inside jacfwd, vmap, ..., a region of forward-mode differentiation, or autocast."""
+    """Inside jacfwd, vmap, ..., a region of forward-mode differentiation, autocast, or a mode that sees every call."""
     forward_mode = torch.autograd.forward_ad._current_level >= 0
-    return bool(torch._C._are_functorch_transforms_active() or forward_mode or torch._C._is_any_autocast_enabled())
+    if torch._C._are_functorch_transforms_active() or forward_mode or torch._C._is_any_autocast_enabled():
+        return True
+    if not torch._C._is_torch_function_enabled():
+        return True
+    return not all(isinstance(mode, DeviceContext) for mode in _function_modes())
+
+
+def variant_of(values: Iterable[object], varying: Iterable[tuple[int, ...]]) -> tuple[object, ...] | None:
+    """What a compilation for these arguments holds for, or None where the plain form is called for.
+
+    Its first part, the number of threads, makes no difference to code on disk.
+
+    Args:
+        values: arguments of the function.
+        varying: for each of them, the dimensions whose sizes vary from call to call.
+
+    Example:
+        >>> variant_of([torch.ones(5, 3)], [(0,)])[-2:]
+        (-1, 3)
+        >>> variant_of([torch.ones(5, 3).double()], [(0,)]) is None
+        True
+    """
+    grad = torch.is_grad_enabled()
+    variant = [*global_settings()]
+    for value, dims in zip(values, varying, strict=False):
+        if not isinstance(value, Tensor):
+            variant.append(value)
+            continue
+        if value.dtype == torch.float64 or (grad and value.requires_grad):
+            return None
+        shape = list(value.shape)
+        for dim in dims:
+            if shape[dim] < _LEAST_SIZE:
+                return None
+            shape[dim] = -1
+        variant += (value.dtype, value.device, *shape)
+    return tuple(variant)
+
+
+def with_varying_sizes(values: Iterable[object], varying: Iterable[tuple[int, ...]]) -> tuple[object, ...]:
+    """The arguments with their varying dimensions marked for the compiler."""
+    import torch._dynamo
+
+    # Copies of the tensor objects: the marks must not stay on the caller's.
+    values = tuple(value.detach() if isinstance(value, Tensor) else value for value in values)
+    for value, dims in zip(values, varying, strict=False):
+        for dim in dims:
+            torch._dynamo.mark_dynamic(value, dim)
+    return values
 
 
 def global_settings() -> tuple[object, ...]:
-    """Settings of torch whose change makes compiled code be made anew."""
-    return torch.get_num_threads(), torch.are_deterministic_algorithms_enabled(), torch.get_default_dtype()
+    """Settings of torch whose change makes compiled code be made anew; the number of threads comes first."""
+    return (
+        torch.get_num_threads(),
+        torch.get_default_dtype(),
+        *(mode.device for mode in _function_modes()),
+        torch.are_deterministic_algorithms_enabled(),
+        torch.is_deterministic_algorithms_warn_only_enabled(),
+        # Of the ways to ask for it the one that does not raise where old and new names of the setting were mixed.
+        torch._C._get_fp32_precision_getter("cuda", "matmul") == "tf32",
+        torch._C._get_cublas_allow_fp16_reduced_precision_reduction(),
+        torch._C._get_cublas_allow_bf16_reduced_precision_reduction(),
+        torch.is_autocast_cache_enabled(),
+    )
+
+
+def _function_modes() -> list[Any]:
+    """Those around this call: a default device is one."""
+    return [torch._C._get_function_stack_at(i) for i in range(torch._C._len_torch_function_stack())]
 
 
 @contextmanager

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import logging
 import os
+import subprocess
+import sys
 import threading
 import types
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +27,7 @@ from directshape_torch.compilation import (
     compilable,
     compiling,
 )
+from directshape_torch.compiler_inputs import variant_of
 from directshape_torch.compiler_state import compiler_problem
 from directshape_torch.errors import CompilationError
 
@@ -233,9 +239,19 @@ class TestAuto:
             nearest(*_inputs(20, 10))
         assert nearest.num_variants == 1
 
-    def test_a_job_that_is_known_to_be_short_never_compiles_whatever_came_before(self, nearest) -> None:
-        with compiling("auto", 10 * CARS_WORTH_COMPILING):
-            pass
+    @pytest.mark.parametrize(("mode", "dtype"), [("off", torch.float32), ("auto", torch.float64)])
+    def test_cars_that_compiling_would_not_have_helped_do_not_count(self, nearest, mode, dtype) -> None:
+        points, grid, car = _inputs(20, 10)
+        with compiling(mode, 10 * CARS_WORTH_COMPILING):
+            nearest(points.to(dtype), grid.to(dtype), car)
+        assert compilation._process.cars == 0
+        with compiling("auto", 10):
+            nearest(points, grid, car)
+        assert nearest.num_variants == 0
+        assert compilation._process.cars == 10
+
+    def test_a_job_that_is_known_to_be_short_never_compiles_whatever_came_before(self, nearest, monkeypatch) -> None:
+        monkeypatch.setattr(compilation._process, "cars", 10 * CARS_WORTH_COMPILING)
         with cars_ahead(50):
             for _ in range(5):
                 with compiling("auto", 10):
@@ -319,6 +335,147 @@ class TestFailure:
     def test_on_raises(self, function) -> None:
         with compiling("on", 1), pytest.raises(CompilationError, match="branching could not be compiled"):
             function(torch.ones(3))
+
+    def test_a_folder_that_cannot_be_written_is_such_a_failure(self, function, monkeypatch, caplog) -> None:
+        def no_space(*_: object) -> object:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(Compilable, "_compile", no_space)
+        with cars_ahead(CARS_WORTH_COMPILING), compiling("auto", 1):
+            assert torch.equal(function(torch.ones(3)), torch.full((3,), 2.0))
+        assert "could not be compiled: [Errno 28] No space left on device" in caplog.text
+        with compiling("on", 1), pytest.raises(CompilationError, match="No space left on device"):
+            function(torch.ones(3))
+
+    def test_a_later_call_that_is_compiled_anew_and_fails_is_such_a_failure_too(self, function, caplog) -> None:
+        def anew(*_: object) -> Tensor:
+            raise torch._dynamo.exc.FailOnRecompileLimitHit("hit its limit")
+
+        x, calls = torch.ones(3), []
+        function._compiled = anew
+        function._variants.add(variant_of((x,), ((0,),)))
+        with (
+            compiling("on", 1),
+            pytest.raises(CompilationError, match="branching could not be compiled: hit its limit"),
+        ):
+            function(x)
+        function._variants.add(variant_of((x,), ((0,),)))
+        for _ in range(2):
+            with compiling("auto", 1):
+                calls.append(function(x))
+        assert all(torch.equal(call, torch.full((3,), 2.0)) for call in calls)
+        assert caplog.text.count("hit its limit") == 1
+        assert function.num_variants == 0
+
+
+NO_FOLDER = """
+import logging, torch
+from directshape_torch import compilation
+from directshape_torch.errors import CompilationError
+logging.basicConfig()
+compilation._process.cars = {cars}
+doubled = compilation.compilable(sizes={{"x": 0}})(lambda x: 2 * x)
+for _ in range(2):
+    with compilation.compiling("auto", 1):
+        assert doubled(torch.ones(3)).tolist() == [2, 2, 2]
+for _ in range(2):
+    try:
+        compilation.compiling("on", 1).__enter__()
+    except CompilationError as error:
+        print(error)
+"""
+
+
+@pytest.mark.parametrize("cars", [CARS_WORTH_LOADING, CARS_WORTH_COMPILING])
+def test_where_the_compiler_can_have_no_folder_auto_says_so_once_and_on_raises(cars, tmp_path: Path) -> None:
+    # In a process of its own: the folder is made, or not, when the compiler is imported.
+    (tmp_path / "file").touch()
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "file" / "cache"), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", NO_FOLDER.format(cars=cars)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("compile: auto goes on without compiling") == 1
+    assert done.stderr.count("Not a directory") == 1
+    refused = done.stdout.splitlines()
+    assert len(refused) == 2
+    assert all("Not a directory" in line and line.endswith("set compile to auto or off") for line in refused)
+
+
+@contextlib.contextmanager
+def _set(setter: Callable[..., object], value: object, before: object) -> Iterator[None]:
+    setter(value)
+    try:
+        yield
+    finally:
+        setter(before)
+
+
+def _deterministic(value: tuple[bool, bool]) -> None:
+    torch.use_deterministic_algorithms(value[0], warn_only=value[1])
+
+
+def _reduction(dtype: str) -> Callable[[bool], None]:
+    return lambda value: setattr(torch.backends.cuda.matmul, f"allow_{dtype}_reduced_precision_reduction", value)
+
+
+SETTINGS = {
+    "matmul precision": lambda: _set(torch.set_float32_matmul_precision, "high", "highest"),
+    "deterministic": lambda: _set(_deterministic, (True, False), (False, False)),
+    "deterministic, warn only": lambda: _set(_deterministic, (True, True), (False, False)),
+    "default device": lambda: _set(torch.set_default_device, "cpu", None),
+    "default device of a region": lambda: torch.device("cpu"),
+    "autocast cache": lambda: _set(torch.set_autocast_cache_enabled, False, True),
+    "reduction in half precision": lambda: _set(_reduction("fp16"), False, True),
+    "reduction in bfloat16": lambda: _set(_reduction("bf16"), False, True),
+    "default dtype": lambda: _set(torch.set_default_dtype, torch.float64, torch.float32),
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_global_setting_that_compiled_code_is_bound_to_makes_a_variant_of_its_own(nearest, name, monkeypatch) -> None:
+    # Traced and run as it is: the tracer alone decides about a new compilation.
+    compile_with = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda f, **_: compile_with(f, fullgraph=True, backend="aot_eager"))
+    _no_disk(monkeypatch)
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    inputs = _inputs(40, 3)
+    with compiling("on", 3):
+        nearest(*inputs)
+        assert nearest.num_variants == counters["stats"]["unique_graphs"] == 1
+        with SETTINGS[name]():
+            nearest(*inputs)
+            nearest(*inputs)
+        nearest(*inputs)
+    assert nearest.num_variants == 2
+    assert counters["stats"]["unique_graphs"] == 2
+
+
+def test_a_mode_that_watches_every_function_sees_the_plain_one(nearest) -> None:
+    seen = []
+
+    class Watching(torch.overrides.TorchFunctionMode):
+        def __torch_function__(self, function, types, args=(), kwargs=None):
+            seen.append(function)
+            return function(*args, **(kwargs or {}))
+
+    with compiling("on", 3) if compiler_problem() is None else compiling("auto", 3), Watching():
+        nearest(*_inputs(40, 3))
+    assert torch.fmin in seen
+    assert nearest.num_variants == 0
+
+
+def test_every_setting_that_the_tracer_looks_at_is_known_here() -> None:
+    # Beside those in SETTINGS: gradients are off in every compiled call, calls under autocast or without
+    # __torch_function__ are plain, and code that asks for the number of threads serves all numbers.
+    known = {"allow_bf16_reduce", "allow_fp16_reduce", "allow_tf32", "autocast_state", "default_dtype"}
+    known |= {"deterministic_algorithms", "deterministic_algorithms_warn_only", "grad_mode", "num_threads"}
+    known |= {"torch_function", "torch_function_all_disabled"}
+    assert set(json.loads(torch._C._dynamo.guards.GlobalStateGuard().__getstate__())) <= known
 
 
 def test_a_misspelt_size_is_found_at_once() -> None:
