@@ -75,6 +75,13 @@ def test_number_of_states_is_that_of_the_iterations(trace: RefinementTrace) -> N
     assert len(trace.accepted) == len(trace.costs) == len(trace)
 
 
+def test_costs_are_those_of_the_iterations_that_a_car_took(trace: RefinementTrace) -> None:
+    took_part = trace.result.cost_history.isfinite()
+    assert torch.equal(took_part.sum(dim=1), trace.result.iterations)
+    first = len(trace) - took_part.shape[1]
+    assert not (trace.accepted[first:].T & ~took_part).any()
+
+
 def test_search_adds_the_start_that_it_chose(demo_frame: LoadedFrame) -> None:
     config = load_config("fast", ["compile=off", _SEARCH, "stages=[{max_iterations: 1}]"])
     trace = trace_refinement(DirectShapeRefiner(config=config), demo_frame.frame, demo_frame.detections)

@@ -114,6 +114,25 @@ def test_finished_problems_are_evaluated_no_more() -> None:
     assert len(problem.evaluated) <= 4
 
 
+@pytest.mark.parametrize("block", [1, 3, 100])
+@pytest.mark.parametrize("config", [DAMPED, PURE], ids=["damped", "pure"])
+def test_costs_are_logged_while_a_problem_takes_part_and_no_longer(config: SolverConfig, block: int) -> None:
+    """Blocks of one iteration have nothing to leave out: the costs are the same for blocks of any length."""
+    problem = rosenbrock(6, [Stage(2.0, 1, 20), Stage(1.0, 0, 20)])
+    uneven = Vector(torch.linspace(-1.3, 1.0, 6, dtype=torch.float64)[:, None].repeat(1, 2))
+    result = minimise(problem, uneven, replace(config, block_iterations=block), record=True)
+    took_part = result.cost_history.isfinite()
+    assert len(result.iterations.unique()) > 1
+    assert torch.equal(took_part.sum(dim=1), result.iterations)
+    stage = torch.tensor([it.stage for it in result.trajectory])
+    for number in range(2):
+        # From the first iteration of a stage on, without gaps.
+        assert (took_part[:, stage == number].long().diff(dim=1) <= 0).all()
+    single = minimise(rosenbrock(6, problem.stages()), uneven, replace(config, block_iterations=1))
+    for history, expected in zip(result.cost_history, single.cost_history, strict=True):
+        torch.testing.assert_close(history[history.isfinite()], expected[expected.isfinite()], rtol=1e-12, atol=1e-13)
+
+
 def _poisoned(kind: str) -> ResidualProblem:
     """Three valleys of which the middle one is broken."""
     valley = rosenbrock(3).residual
@@ -147,6 +166,59 @@ def test_a_broken_problem_keeps_its_input_and_touches_no_other(kind: str, config
     assert (result.state.x[1] == -1.3).all()
     assert (result.state.x[[0, 2]] == healthy.state.x[[0, 2]]).all()
     assert (result.status[[0, 2]] == healthy.status[[0, 2]]).all()
+
+
+TWO_STAGES = [Stage(2.0, 1, 30), Stage(1.0, 0, 30)]
+
+
+@pytest.mark.parametrize("block", [1, 4])
+@pytest.mark.parametrize("kind", ["nan at the input", "singular", "nan after a step"])
+def test_what_failed_is_not_evaluated_in_the_next_stage(kind: str, block: int) -> None:
+    config = replace(PURE, block_iterations=block)
+    problem = _poisoned(kind)
+    problem._stages = TWO_STAGES
+    evaluated_before: list[int] = []
+
+    class Counted(ResidualProblem):
+        def begin_stage(self, stage: Stage, state: Vector) -> ResidualProblem:
+            evaluated_before.append(len(self.evaluated))
+            return super().begin_stage(stage, state)
+
+    problem.__class__ = Counted
+    result = minimise(problem, start(3, 2, -1.3), config)
+    second = [len(x) for x in problem.evaluated[evaluated_before[1] :]]
+    assert second[0] == max(second) == 2
+    healthy = minimise(rosenbrock(3, TWO_STAGES), start(3, 2, -1.3), config)
+    others = torch.tensor([0, 2])
+    assert torch.equal(result.state.x[others], healthy.state.x[others])
+    assert torch.equal(result.iterations[others], healthy.iterations[others])
+    assert torch.equal(result.status[others], healthy.status[others])
+    first = minimise(_poisoned(kind), start(3, 2, -1.3), config)
+    assert result.status[1] == first.status[1]
+    assert result.iterations[1] == first.iterations[1] == result.cost_history[1].isfinite().sum()
+    assert (result.state.x[1] == -1.3).all()
+
+
+def test_stages_of_problems_that_have_all_failed_evaluate_nothing() -> None:
+    problem = _poisoned("nan at the input")
+    problem.identity, problem._stages = torch.tensor([1, 1]), TWO_STAGES
+    result = minimise(problem, start(2, 2, -1.3), PURE)
+    assert status_of(result.status) == [Status.non_finite] * 2
+    assert len(problem.begun) == 2
+    # At the input, and the one block's first iterations.
+    assert len(problem.evaluated) == 1 + PURE.block_iterations
+    assert (result.state.x == -1.3).all()
+
+
+def test_what_failed_unseen_by_the_host_is_told_from_what_it_saw() -> None:
+    """A stage without iterations is not read: its failures are only known at the end of the next block."""
+    problem = _poisoned("nan at the input")
+    problem._stages = [Stage(2.0, 1, 0), *TWO_STAGES]
+    result = minimise(problem, start(3, 2, -1.3), PURE)
+    healthy = minimise(rosenbrock(3, TWO_STAGES), start(3, 2, -1.3), PURE)
+    assert status_of(result.status)[1] is Status.non_finite
+    assert torch.equal(result.state.x[[0, 2]], healthy.state.x[[0, 2]])
+    assert torch.equal(result.iterations[[0, 2]], healthy.iterations[[0, 2]])
 
 
 def test_damping_survives_a_singular_system() -> None:

@@ -1,0 +1,146 @@
+"""One damped Gauss-Newton iteration of a batch of problems, without a word to the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import SolverConfig
+from directshape_torch.solver.damped_solve import damped_step, is_finite, limited_step
+from directshape_torch.solver.problem import Linearisation, StageProblem, StateT, put_rows, take_rows, where_rows
+from directshape_torch.status import Status
+
+# Of a problem that goes on; else the code of the status with which it ended.
+RUNNING = -1
+
+
+class Outcome(NamedTuple):
+    """What an iteration did to each problem, (B,) bool."""
+
+    running: Tensor  # it took part
+    accepted: Tensor  # its step was taken
+    improved: Tensor  # that led to its best state
+
+
+@dataclass
+class Progress(Generic[StateT]):
+    """What changes from iteration to iteration, for the problems of one compacted batch."""
+
+    state: StateT
+    best_state: StateT
+    best_cost: Tensor  # (B,)
+    at_state: Linearisation
+    damping: Tensor  # (B,)
+    ended: Tensor  # (B,) status code or RUNNING
+    iterations: Tensor  # (B,)
+
+    def take(self, index: Tensor) -> Progress[StateT]:
+        """That of some of the problems."""
+        return Progress(
+            take_rows(self.state, index),
+            take_rows(self.best_state, index),
+            self.best_cost[index],
+            take_rows(self.at_state, index),
+            self.damping[index],
+            self.ended[index],
+            self.iterations[index],
+        )
+
+    def scatter(self, rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor) -> tuple[StateT, Tensor, Tensor]:
+        """Best states, ends and iterations of all problems, of which these are the rows."""
+        return (
+            put_rows(state, rows, self.best_state),
+            ended.index_copy(0, rows, self.ended),
+            iterations.index_copy(0, rows, self.iterations),
+        )
+
+
+def has_failed(ended: Tensor) -> Tensor:
+    """Whether each problem (B,) ended and did not converge.
+
+    Example:
+        >>> has_failed(torch.tensor([RUNNING, Status.converged.code, Status.singular.code]))
+        tensor([False, False,  True])
+    """
+    return (ended >= 0) & (ended != Status.converged.code)
+
+
+def begin(problem: StageProblem[StateT], state: StateT, ended: Tensor, config: SolverConfig) -> Progress[StateT]:
+    """At the first states of a stage, with the ends (B,) of the stage before."""
+    at_state = problem.linearise(state)
+    fresh = torch.where(_is_finite(at_state), RUNNING, Status.non_finite.code)
+    return Progress(
+        state=state,
+        best_state=state,
+        best_cost=at_state.cost,
+        at_state=at_state,
+        damping=torch.full_like(at_state.cost, config.initial_damping),
+        # Of the stage before only failures count: what has converged there goes on.
+        ended=torch.where(has_failed(ended), ended, fresh),
+        iterations=torch.zeros_like(ended),
+    )
+
+
+def iterate(problem: StageProblem[StateT], p: Progress[StateT], config: SolverConfig, limits: Tensor) -> Outcome:
+    """One iteration of a batch, whose progress is written to.
+
+    Args:
+        problem: B problems.
+        p: where they are.
+        config: damping, acceptance, convergence.
+        limits: (D,) largest trusted step of each unknown.
+    """
+    step, solvable = damped_step(p.at_state.hessian, p.at_state.gradient, p.damping)
+    step, size = limited_step(step, limits)
+    candidate = problem.retract(p.state, step)
+    at_candidate = problem.linearise(candidate)
+    running = p.ended < 0
+    usable = running & solvable
+    decrease = p.at_state.cost - at_candidate.cost
+    takeable = usable & _is_finite(at_candidate)
+    downhill = takeable & (at_candidate.cost <= p.at_state.cost)
+    accepted = takeable if config.accept_every_step else downhill
+    problem.follow(accepted)
+    # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.
+    at_limit = p.damping >= config.max_damping
+    p.iterations = p.iterations + running
+    small_decrease = decrease <= config.cost_tolerance * p.at_state.cost.abs()
+    if config.accept_every_step:
+        small_decrease = small_decrease & downhill
+    settled = usable & ((size < config.step_tolerance) | torch.where(accepted, small_decrease, at_limit))
+    p.ended = torch.where(settled, Status.converged.code, p.ended)
+    hopeless = running & ~solvable
+    if config.initial_damping > 0:
+        hopeless = hopeless & at_limit
+    p.ended = torch.where(hopeless, Status.singular.code, p.ended)
+    if config.accept_every_step:
+        p.ended = torch.where(usable & ~takeable, Status.non_finite.code, p.ended)
+    improved = _move(p, candidate, at_candidate, accepted, config)
+    return Outcome(running, accepted, improved)
+
+
+def _move(
+    p: Progress[StateT], candidate: StateT, at_candidate: Linearisation, accepted: Tensor, config: SolverConfig
+) -> Tensor:
+    """To the candidates where they are accepted; returns where that made the best state."""
+    p.state = where_rows(accepted, candidate, p.state)
+    p.at_state = where_rows(accepted, at_candidate, p.at_state)
+    if config.initial_damping > 0:
+        smaller = (p.damping * config.damping_decrease).clamp_min(config.min_damping)
+        larger = (p.damping * config.damping_increase).clamp_max(config.max_damping)
+        p.damping = torch.where(accepted, smaller, larger)
+    if not config.accept_every_step:
+        # Nothing uphill is taken: the present state is the best one.
+        p.best_state, p.best_cost = p.state, p.at_state.cost
+        return accepted
+    better = accepted & (at_candidate.cost <= p.best_cost)
+    p.best_state = where_rows(better, candidate, p.best_state)
+    p.best_cost = torch.where(better, at_candidate.cost, p.best_cost)
+    return better
+
+
+def _is_finite(at: Linearisation) -> Tensor:
+    return is_finite(at.cost + at.gradient.sum(dim=1) + at.hessian.sum(dim=(1, 2)))
