@@ -27,6 +27,7 @@ from directshape_torch.compiler_inputs import (
     normal,
     outside_inference_mode,
     variant_of,
+    varying_dimensions,
     with_varying_sizes,
 )
 from directshape_torch.compiler_state import (
@@ -168,12 +169,7 @@ class Compilable(Generic[_P, _R]):
     def __init__(self, function: Callable[_P, _R], sizes: Mapping[str, int | tuple[int, ...]]) -> None:
         self.plain = function
         self._signature = inspect.signature(function)
-        names = list(self._signature.parameters)
-        unknown = sorted(set(sizes) - set(names))
-        if unknown:
-            raise ValueError(f"{function.__qualname__} has no argument {unknown[0]!r}: {', '.join(names)}")
-        varying = (sizes.get(name, ()) for name in names)
-        self._varying = tuple((dims,) if isinstance(dims, int) else tuple(dims) for dims in varying)
+        self._varying = varying_dimensions(function, sizes)
         self._compiled: Callable[..., Any] | None = None
         self._variants: set[tuple[object, ...]] = set()
         functools.update_wrapper(self, function)
@@ -266,7 +262,8 @@ def compilable(
 
     Inside a `compiling` region it is compiled once for all values of the named sizes; each combination of the other
     sizes, dtypes, devices and values of arguments that are not tensors is a compilation of its own. Calls with
-    gradients, in float64, inside a functorch transform, a forward-mode region, autocast or the user's own
+    gradients, in float64, inside a functorch transform, a forward-mode region, autocast, a `TorchFunctionMode` that is
+    not a default device, or the user's own
     `torch.compile`, or with a named size below 2 take the plain form.
 
     Args:

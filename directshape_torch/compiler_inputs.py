@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -39,7 +40,27 @@ def is_unusual_call() -> bool:
         return True
     if not torch._C._is_torch_function_enabled():
         return True
-    return not all(isinstance(mode, DeviceContext) for mode in _function_modes())
+    return any(not isinstance(mode, DeviceContext) for mode in _function_modes())
+
+
+def varying_dimensions(
+    function: Callable[..., object], sizes: Mapping[str, int | tuple[int, ...]]
+) -> tuple[tuple[int, ...], ...]:
+    """For each argument of a function the dimensions that vary, from those given by name.
+
+    Raises:
+        ValueError: a name that is no argument's.
+
+    Example:
+        >>> varying_dimensions(torch.nn.functional.normalize, {"input": 0, "out": (0, 1)})
+        ((0,), (), (), (), (0, 1))
+    """
+    names = list(inspect.signature(function).parameters)
+    unknown = sorted(set(sizes) - set(names))
+    if unknown:
+        raise ValueError(f"{function.__qualname__} has no argument {unknown[0]!r}: {', '.join(names)}")
+    varying = (sizes.get(name, ()) for name in names)
+    return tuple((dims,) if isinstance(dims, int) else tuple(dims) for dims in varying)
 
 
 def variant_of(values: Iterable[object], varying: Iterable[tuple[int, ...]]) -> tuple[object, ...] | None:
@@ -102,8 +123,10 @@ def global_settings() -> tuple[object, ...]:
     )
 
 
-def _function_modes() -> list[Any]:
+def _function_modes() -> Sequence[Any]:
     """Those around this call: a default device is one."""
+    if not torch._C._len_torch_function_stack():
+        return ()
     return [torch._C._get_function_stack_at(i) for i in range(torch._C._len_torch_function_stack())]
 
 

@@ -426,7 +426,7 @@ def _reduction(dtype: str) -> Callable[[bool], None]:
 SETTINGS = {
     "matmul precision": lambda: _set(torch.set_float32_matmul_precision, "high", "highest"),
     "deterministic": lambda: _set(_deterministic, (True, False), (False, False)),
-    "deterministic, warn only": lambda: _set(_deterministic, (True, True), (False, False)),
+    "deterministic, warn only": lambda: _set(_deterministic, (False, True), (False, False)),
     "default device": lambda: _set(torch.set_default_device, "cpu", None),
     "default device of a region": lambda: torch.device("cpu"),
     "autocast cache": lambda: _set(torch.set_autocast_cache_enabled, False, True),
