@@ -14,6 +14,7 @@ from typing import TypeGuard
 import torch
 from torch import Tensor
 
+from directshape_torch.device_constants import constant_like
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.pose_rows import (
     NUM_COLUMNS,
@@ -212,8 +213,7 @@ def _code_rows(term: PriorTerm, root: Tensor, num_codes: int) -> Tensor:
 def _dimensions(term: PriorTerm, root: Tensor) -> _Dimensions | None:
     match term.residual_of:
         case DimensionsResidual(prior, sigma_hwl_m):
-            sigma = torch.tensor(sigma_hwl_m, dtype=torch.float64, device=root.device)
-            detector_hwl = term.cars.detector_hwl.to(torch.float64)
-            return _Dimensions(prior, detector_hwl[..., None], (root[:, None] / sigma)[..., None])
+            scale = root[:, None] / constant_like(sigma_hwl_m, root)
+            return _Dimensions(prior, term.cars.detector_hwl.to(torch.float64)[..., None], scale[..., None])
         case _:
             return None

@@ -279,6 +279,8 @@ def test_few_operations_and_nothing_from_the_host() -> None:
     cars = _cars(2, sigma=True)
     stacked = StackedPriors.from_terms(_terms(SETTINGS["pose"], "pca", cars), 3)
     state = CarState(*(x.float() for x in _state(cars, 3)))
+    again = host_traffic(lambda: StackedPriors.from_terms(_terms(SETTINGS["default"], "pca", cars), 3))
+    assert again.found == []
     traffic = host_traffic(lambda: stacked.linearise(state))
     assert traffic.operations <= 50
     assert traffic.found == []
