@@ -133,6 +133,8 @@ class OwnSolver:
         with compiling(self.compile, num_cars=len(self.starts[0].code)):
             for number, problem in enumerate(self.problems):
                 start = self.starts[number] if number < len(self.starts) else minima[-1].state
+                # A state that the problem has not met: else it would remember the beginning of the stage from run to run.
+                start = CarState(*(x.clone() for x in start))
                 minima.append(minimise(problem, start, self.solver))
         return minima
 

@@ -54,8 +54,8 @@ class CarProblem:
         self.term_weights = term_weights
         self.unknowns = unknowns
         self._tracked: TrackedEnergy | None = None
-        self._projections: list[ProjectedState] = []
-        self._costs: list[tuple[ProjectedState, Tensor]] = []  # of the present stage
+        self._projections: list[tuple[_Versions, ProjectedState]] = []
+        self._costs: list[tuple[_Versions, ProjectedState, Tensor]] = []  # of the present stage
 
     def stages(self) -> list[Stage]:
         return method_stages(self.config)
@@ -87,16 +87,19 @@ class CarProblem:
     ) -> ProjectedState:
         """Everything that the terms share at a state; the options are those of `ProjectedState`.
 
-        Without options the same state (the very tensors) gives the same projection, with all that it has computed.
+        Without options the same state (the very tensors, unchanged) gives the same projection, with all that it has
+        computed.
         """
         plain = frozen is None and root_iterations == ROOT_ITERATIONS and not moving_depths
-        if not plain or torch.is_grad_enabled():
+        of_prior = [tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters())]
+        versions = _versions(*state, *of_prior)
+        if not plain or torch.is_grad_enabled() or versions is None:
             return self._new_projection(state, frozen, root_iterations, moving_depths)
-        for known in self._projections:
-            if all(mine is theirs for mine, theirs in zip(known.state, state, strict=True)):
+        for then, known in self._projections:
+            if then == versions and all(mine is theirs for mine, theirs in zip(known.state, state, strict=True)):
                 return known
         projected = self._new_projection(state, None, ROOT_ITERATIONS, False)
-        self._projections = [projected, *self._projections[: _REMEMBERED - 1]]
+        self._projections = [(versions, projected), *self._projections[: _REMEMBERED - 1]]
         return projected
 
     def _new_projection(
@@ -119,13 +122,15 @@ class CarProblem:
     def term_costs(self, state: CarState) -> Tensor:
         """Cost (B, T) of each term; differentiable by autograd."""
         projected = self.project(state)
-        if torch.is_grad_enabled():
+        versions = _versions(*([] if self.term_weights is None else [self.term_weights]))
+        if torch.is_grad_enabled() or versions is None:
             return self._new_costs(projected)
-        for known, costs in self._costs:
-            if known is projected:
+        versions = (*versions, *map(id, self.terms))
+        for then, known, costs in self._costs:
+            if then == versions and known is projected:
                 return costs
         costs = self._new_costs(projected)
-        self._costs = [(projected, costs), *self._costs[:1]]
+        self._costs = [(versions, projected, costs), *self._costs[:1]]
         return costs
 
     def _new_costs(self, projected: ProjectedState) -> Tensor:
@@ -133,6 +138,11 @@ class CarProblem:
         return costs if self.term_weights is None else costs * self.term_weights.to(torch.float64)
 
     def linearise(self, state: CarState) -> Linearisation:
+        """See `StageProblem`.
+
+        With tracked rays it depends on where the stage began and on what was followed since, and `follow` changes it; by
+        itself a state is evaluated by `cost` and `linearise_terms`, which march.
+        """
         if self._tracked is None:
             return self._without_held(total_of(self.linearise_terms(state)))
         if self.config.solver.jacobian == "autograd":
@@ -194,3 +204,13 @@ class CarProblem:
         )
         part._tracked = None if self._tracked is None else self._tracked.of_objects(keep, numbers)
         return part
+
+
+_Versions = tuple[int, ...]
+
+
+def _versions(*tensors: Tensor) -> _Versions | None:
+    """Which tensors these are and how often they were written to; None where that is not counted."""
+    if any(tensor.is_inference() for tensor in tensors):
+        return None
+    return tuple(number for tensor in tensors for number in (id(tensor), tensor._version))

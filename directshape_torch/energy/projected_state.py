@@ -137,21 +137,22 @@ class ProjectedState:
         self.state = state
         self.shape = prior.bind(state.code)
 
-        def view(pixels: PixelSamples, frozen_view: ProjectedView | None) -> ProjectedView:
-            return ProjectedView(
-                self.shape,
-                prior.bounds_obj,
-                state,
-                pixels,
-                samples_per_ray,
-                frozen=frozen_view,
-                root_iterations=root_iterations,
-                moving_depths=moving_depths,
-            )
+        self._pixels, self._frozen = (left, right), frozen
+        self._bounds_obj, self._samples = prior.bounds_obj, samples_per_ray
+        self._root_iterations, self._moving_depths = root_iterations, moving_depths
 
-        self._view = view
-        self._pixels = left, right
-        self._frozen = frozen
+    # No closure over `self` anywhere: a cycle would keep every march alive until the garbage collector comes by.
+    def _view(self, pixels: PixelSamples, frozen: ProjectedView | None) -> ProjectedView:
+        return ProjectedView(
+            self.shape,
+            self._bounds_obj,
+            self.state,
+            pixels,
+            self._samples,
+            frozen=frozen,
+            root_iterations=self._root_iterations,
+            moving_depths=self._moving_depths,
+        )
 
     @cached_property
     def left(self) -> ProjectedView:

@@ -47,8 +47,10 @@ class TrackedEnergy:
         """From the terms of a stage at the state where it begins, and factors (B, T) of them."""
         columns = [None] * len(terms) if weights is None else list(weights.to(torch.float64).unbind(dim=1))
         pairs = list(zip(terms, columns, strict=True))
+        # One of each kind and side; what is more is evaluated as any other term.
         sides = [(t, w) for t, w in pairs if isinstance(t, SilhouetteTerm) and t.config.form == "closest_approach"]
-        photometric = [(t, w) for t, w in pairs if isinstance(t, PhotometricTerm)]
+        sides = [(t, w) for t, w in sides if t.config == sides[0][0].config][:2]
+        photometric = [(t, w) for t, w in pairs if isinstance(t, PhotometricTerm)][:1]
         priors = [(t, w) for t, w in pairs if StackedPriors.takes(t)]
         tracked = [term for term, _ in [*sides, *photometric, *priors]]
         others = [(t, w) for t, w in pairs if not any(t is known for known in tracked)]
@@ -111,7 +113,7 @@ class TrackedEnergy:
         return TrackedEnergy(
             None if self.silhouettes is None else self.silhouettes.of_objects(keep, kept),
             None if self.photometric is None else self.photometric.of_objects(keep, kept),
-            None if self.priors is None else self.priors.of_objects(keep),
+            None if self.priors is None else self.priors.of_objects(keep, len(kept)),
             [term.of_objects(keep) for term in self.others],
             [None if w is None else w[keep] for w in self.factors],
         )

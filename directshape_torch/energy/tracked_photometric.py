@@ -169,9 +169,7 @@ def _hidden(term: PhotometricTerm, owner: Tensor) -> tuple[Tensor, Tensor, Tenso
     if hidden is None:
         nowhere = torch.zeros(len(owner), 6, dtype=torch.long, device=owner.device)
         return nowhere, nowhere[:, :1], nowhere.new_zeros(2, 1)
-    # Two entries at least, so that frames in which nothing hides anything are no special case for a compiler.
-    covering = torch.cat([hidden.covering, hidden.covering.new_zeros(2, hidden.covering.shape[1])])
-    return hidden.table[row], hidden.in_front[row], covering
+    return hidden.table[row], hidden.in_front[row], hidden.covering
 
 
 def _hits(term: PhotometricTerm, projected: ProjectedState, packed: PackedBlocks) -> Hits:

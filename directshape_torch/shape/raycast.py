@@ -65,7 +65,7 @@ class Root(NamedTuple):
 @torch.no_grad()
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
-    if isinstance(shape, GridShape):
+    if type(shape) is GridShape:
         sampled = sample_grids.compiled(*shape.field, *_coordinates(rays), bounds_obj, num_samples)
         if sampled is not None:
             return RayMarch(sampled.depths.mT, sampled.sdf.mT, sampled.crosses_bounds, sampled.closest_depth)
@@ -97,7 +97,7 @@ def _sdf_of_all(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:
 @torch.no_grad()
 def sdf_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
     """Signed distance (P,) at one depth (P,) of each ray, a constant."""
-    if isinstance(shape, GridShape):
+    if type(shape) is GridShape:
         nothing_else = torch.nn.functional.pad(depth[None], (0, 0, 0, len(Bracket._fields) - 1))
         probed = probe_grids.compiled(*shape.field, *_coordinates(rays), nothing_else)
         if probed is not None:
@@ -196,7 +196,7 @@ def _first_bracket(
 
 
 def _false_position(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> Tensor:
-    if isinstance(shape, GridShape):
+    if type(shape) is GridShape:
         coordinates, state = _coordinates(rays), torch.stack(bracket)
         for _ in range(num_iterations):
             state = probe_grids(*shape.field, *coordinates, state)

@@ -55,7 +55,8 @@ class PackedBlockField(NamedTuple):
 
 def block_field(shape: BoundShape) -> BlockField:
     """The fields of a bound shape, for points in blocks."""
-    return GridBlockField(shape.field) if isinstance(shape, GridShape) else PackedBlockField(shape)
+    # Not `isinstance`: a shape that looks up in its own way must be asked.
+    return GridBlockField(shape.field) if type(shape) is GridShape else PackedBlockField(shape)
 
 
 def _packed(points_obj: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,70 @@
+"""A problem remembers what it has projected: only of tensors that nobody has changed, and not longer than it lives."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import weakref
+
+import pytest
+import torch
+from helpers.five_cars import begun_stage
+
+from directshape_torch.energy.car_problem import CarProblem
+from directshape_torch.energy.car_state import CarState
+
+
+def begun() -> tuple[CarProblem, CarState]:
+    problem, _, state = begun_stage()
+    problem.prior = copy.deepcopy(problem.prior)  # others use it too
+    return problem, state
+
+
+@torch.no_grad()
+def test_the_same_tensors_are_projected_once() -> None:
+    problem, state = begun()
+    assert problem.project(state) is problem.project(state)
+    assert problem.term_costs(state) is problem.term_costs(state)
+    assert problem.project(CarState(state.T_obj_cam, state.code.clone())) is not problem.project(state)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("what", ["state", "prior", "prior's tensor", "weights", "new weights"])
+def test_what_was_changed_in_place_is_evaluated_anew(what: str) -> None:
+    problem, state = begun()
+    state = CarState(*(x.clone() for x in state))
+    problem.term_weights = torch.ones(len(state.code), len(problem.terms), dtype=torch.float64)
+    before = problem.cost(state)
+    if what == "state":
+        state.code.add_(0.5)
+    elif what == "prior":
+        problem.prior.mean += 0.1
+    elif what == "prior's tensor":
+        problem.prior.mean = problem.prior.mean + 0.1
+    elif what == "weights":
+        problem.term_weights *= 2
+    else:
+        problem.term_weights = 2 * problem.term_weights
+    assert not torch.isclose(problem.cost(state), before, rtol=1e-6).any()
+
+
+def test_inference_tensors_are_not_remembered() -> None:
+    problem, state = begun()
+    with torch.inference_mode():
+        inferred = CarState(*(x.clone() for x in state))
+        assert problem.project(inferred) is not problem.project(inferred)
+        torch.testing.assert_close(problem.cost(inferred), problem.cost(state))
+
+
+@torch.no_grad()
+def test_projections_die_with_their_problem() -> None:
+    problem, state = begun()
+    projected = problem.project(state)
+    projected.left.march, projected.right.march  # noqa: B018
+    seen = weakref.ref(projected)
+    gc.disable()
+    try:
+        del problem, projected
+        assert seen() is None
+    finally:
+        gc.enable()
