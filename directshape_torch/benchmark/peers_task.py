@@ -67,7 +67,7 @@ class StageTask:
         max_iterations: of the stage.
         solver: damping and tolerances of the own solver.
         target_cost: (B,) where our own solver ends, by the energy with marched rays, whichever it went by.
-        near_iterations: of our own solver until the costs of all cars stay near that.
+        near_iterations: of our own solver until the costs of all cars stay near where it ends.
     """
 
     problem: CarProblem
@@ -133,7 +133,7 @@ class OwnSolver:
         with compiling(self.compile, num_cars=len(self.starts[0].code)):
             for number, problem in enumerate(self.problems):
                 start = self.starts[number] if number < len(self.starts) else minima[-1].state
-                # A state that the problem has not met: else it would remember the beginning of the stage from run to run.
+                # A state that the problem has not met: else it would remember the beginning of the stage.
                 start = CarState(*(x.clone() for x in start))
                 minima.append(minimise(problem, start, self.solver))
         return minima
@@ -174,7 +174,9 @@ def stage_tasks(own: OwnSolver) -> list[StageTask]:
             stage = problem.stages()[0]
             problem.begin_stage(stage, state)
             cost = problem.cost(minimum.state)
-            near = iterations_to(_NEAR * cost, minimum.cost_history)
+            # In the terms of its own iterations, which are costs of followed rays where rays are followed.
+            reached = minimum.cost_history.nan_to_num(torch.inf).amin(dim=1)
+            near = iterations_to(_NEAR * reached, minimum.cost_history)
             tasks.append(StageTask(problem, state, stage.max_iterations, own.solver, cost, near))
             state = minimum.state
     return tasks

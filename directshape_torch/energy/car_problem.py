@@ -140,8 +140,8 @@ class CarProblem:
     def linearise(self, state: CarState) -> Linearisation:
         """See `StageProblem`.
 
-        With tracked rays it depends on where the stage began and on what was followed since, and `follow` changes it; by
-        itself a state is evaluated by `cost` and `linearise_terms`, which march.
+        With tracked rays it depends on where the stage began and on what was followed since, and `follow` changes it.
+        By itself a state is evaluated by `cost` and `linearise_terms`, which march.
         """
         if self._tracked is None:
             return self._without_held(total_of(self.linearise_terms(state)))
