@@ -67,13 +67,18 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent(
         "_Dimensions.rows",
-        "torch.cat([at.J_hwl_code, at.hwl[..., None] - self.detector_hwl], dim=2) * self.scale",
-        "(-(torch.cat([at.J_hwl_code, at.hwl[..., None] - self.detector_hwl], dim=2) * self.scale))",
+        "torch.cat([at.J_hwl_code.to(torch.float64), residual], dim=2) * self.scale",
+        "(-(torch.cat([at.J_hwl_code.to(torch.float64), residual], dim=2) * self.scale))",
         _ROW_IN_PAIRS,
     ),
     Equivalent("StackedPriors.from_terms", "terms[0]", "terms[1]", "all priors of a batch know the same cars"),
     Equivalent("StackedPriors.linearise", "(1, 2)", "(2, 1)", "a sum over both axes, in either order"),
-    Equivalent("StackedPriors.of_objects", "self.pose_rows[keep]", "(-self.pose_rows[keep])", _ROW_IN_PAIRS),
+    Equivalent(
+        "StackedPriors.of_objects",
+        "self.pose_rows.index_select(0, index)",
+        "(-self.pose_rows.index_select(0, index))",
+        _ROW_IN_PAIRS,
+    ),
     Equivalent(
         "_roots_of_weights", "math.sqrt(term.weight) * ones", "(-(math.sqrt(term.weight) * ones))", _ROW_IN_PAIRS
     ),
@@ -113,7 +118,12 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("_pose_rows", "level_rows(normal)[:, :0]", "level_rows(normal)[:, 0:0]", "an empty slice either way"),
     Equivalent("_code_rows", "root[:, None, None] * identity", "(-(root[:, None, None] * identity))", _ROW_IN_PAIRS),
     Equivalent("_code_rows", "rows[:, :0]", "rows[:, 0:0]", "an empty slice either way"),
-    Equivalent("_dimensions", "root[:, None] / sigma", "(-(root[:, None] / sigma))", _ROW_IN_PAIRS),
+    Equivalent(
+        "_dimensions",
+        "root[:, None] / constant_like(sigma_hwl_m, root)",
+        "(-(root[:, None] / constant_like(sigma_hwl_m, root)))",
+        _ROW_IN_PAIRS,
+    ),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     *(
         Equivalent("_corner_values", "(nx, ny, nz, _)", after, "only the product of the three is used")
