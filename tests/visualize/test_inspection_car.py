@@ -98,7 +98,7 @@ def test_residuals_of_the_pixels_make_the_costs_of_the_trace(view: CarView, numb
 def test_photometric_residuals_fall_and_hardly_a_pixel_is_lost(view: CarView) -> None:
     before, after = (photometric_residuals(view.trace, _CAR, k) for k in (0, len(view.trace) - 1))
     assert np.array_equal(before.uv, after.uv)
-    assert after.lost.mean() < 0.01
+    assert after.lost.mean() < 0.05
     both = ~before.lost & ~after.lost
     assert np.abs(after.value[both]).mean() < np.abs(before.value[both]).mean()
     term = next(t for t in view.trace.problem.terms if t.name == "photometric")
