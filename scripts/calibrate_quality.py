@@ -45,7 +45,8 @@ from quality_calibration.report import (
     sigma_line,
 )
 
-from directshape_torch.config import AcceptanceConfig, RefinerConfig, RigConfig
+from directshape_torch.config import AcceptanceConfig, RigConfig
+from directshape_torch.config_files import load_config
 from directshape_torch.evidence import EVIDENCE_NAMES
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -59,20 +60,23 @@ USUAL_LEVELS = ("stereo", "mono")
 STRICT = Thresholds(0.8, 0.9)
 
 
-def refiner(disparity_sigma_px: float = 0.0) -> DirectShapeRefiner:
-    """The default settings, every result returned, for a rig that is off by so much."""
-    return DirectShapeRefiner(config=replace(RefinerConfig(), acceptance=EVERYTHING, rig=RigConfig(disparity_sigma_px)))
+def refiner(overrides: Sequence[str], disparity_sigma_px: float = 0.0) -> DirectShapeRefiner:
+    """The default settings but for `overrides`, every result returned, for a rig that is off by so much."""
+    config = load_config(None, overrides)
+    return DirectShapeRefiner(config=replace(config, acceptance=EVERYTHING, rig=RigConfig(disparity_sigma_px)))
 
 
 def development_cars(args: argparse.Namespace, *, says_sigmas: bool = False) -> Observations:
     """Refined cars of drawn detections, from OUT where they are there already; does the detector say its sigmas?"""
     parts = []
     for masks in args.masks:
-        name = "_".join(["cars", masks.name, *map(str, args.seeds), *(["sigmas"] if says_sigmas else [])])
+        says = ["sigmas"] if says_sigmas else []
+        name = "_".join(["cars", masks.name, *map(str, args.seeds), *says, *args.set])
         kept = args.out / f"{name}.npz"
         if not kept.is_file():
             dataset = KittiStereoDataset(args.data, args.exact, masks, frames=args.frames)
-            drawn = observe_noisy(dataset, refiner(), LEVELS, args.seeds, masks.name, _tell, says_sigmas=says_sigmas)
+            refine = refiner(args.set)
+            drawn = observe_noisy(dataset, refine, LEVELS, args.seeds, masks.name, _tell, says_sigmas=says_sigmas)
             drawn.save(kept)
         parts.append(Observations.load(kept))
     return Observations.joined(parts)
@@ -80,11 +84,12 @@ def development_cars(args: argparse.Namespace, *, says_sigmas: bool = False) -> 
 
 def other_cars(args: argparse.Namespace, disparity_sigma_px: float) -> Observations:
     """Refined cars of the real frames, judged as those of a rig that is off by so much."""
-    kept = args.out / f"cars_other_{disparity_sigma_px:g}px.npz"
+    name = "_".join([f"cars_other_{disparity_sigma_px:g}px", *args.set])
+    kept = args.out / f"{name}.npz"
     if not kept.is_file():
         field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
         dataset = KittiStereoDataset(args.other, args.other_detections, args.other_masks, disparity_field=field)
-        observe_dataset(dataset, refiner(disparity_sigma_px), args.other.name).save(kept)
+        observe_dataset(dataset, refiner(args.set, disparity_sigma_px), args.other.name).save(kept)
     return Observations.load(kept)
 
 
@@ -154,7 +159,7 @@ def run(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     cars = development_cars(args)
     read = HeadColumns(tuple(args.better), tuple(args.not_worse))
-    model = fitted(cars, _provenance(cars), read)
+    model = fitted(cars, _provenance(cars, args.set), read)
     held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}, read), test))
     drawn = levels_of(judged("rendered, all", cars, held_out), "rendered")
     said = judged_with_sigmas(args, cars, read) if args.detector_says_sigmas else []
@@ -169,13 +174,13 @@ def run(args: argparse.Namespace) -> None:
     print(report)
 
 
-def _provenance(cars: Observations) -> dict[str, object]:
+def _provenance(cars: Observations, overrides: Sequence[str]) -> dict[str, object]:
     return {
         "made_by": "scripts/calibrate_quality.py",
         "cars": len(cars),
         "frames": len(set(cars.group.tolist())),
         "sources": sorted(set(cars.source.tolist())),
-        "settings": "configs/default.yaml",
+        "settings": " ".join(["configs/default.yaml", *overrides]),
         "worse_by": 0.05,
     }
 
@@ -246,6 +251,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     head = {"nargs": "+", "choices": EVIDENCE_NAMES, "metavar": "COLUMN"}
     parser.add_argument("--better", default=columns.BETTER, help="evidence for it; default the bundled model's", **head)
     parser.add_argument("--not-worse", default=columns.NOT_WORSE, help="the same", **head)
+    parser.add_argument(
+        "--set", nargs="+", default=[], metavar="KEY=VALUE", help="other settings than those of the default"
+    )
     parser.add_argument("--threads", type=int, default=1)
     return run_command(parser, run, arguments)
 

@@ -21,11 +21,8 @@ from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
-
-# A contour is in play where |zeta sdf| is below this: beyond it a ray's weight in the sums is below 5 per mille.
-IN_PLAY_EXPONENT = 8.0
-# What the three samples about a depth of closest approach are apart, metres.
-_SAMPLE_DISTANCE_M = 0.12
+from directshape_torch.energy.tracked_silhouettes import IN_PLAY_EXPONENT
+from directshape_torch.tracking.silhouette import SAMPLE_DISTANCE_M
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ def _contour_points(term: SilhouetteTerm, projected: ProjectedState) -> tuple[Te
     in_play = view.march.crosses_bounds & ((view.closest_sdf * term.zeta).abs() < IN_PLAY_EXPONENT)
     chosen = in_play.nonzero()[:, 0]
     rays = view.rays.select(chosen)
-    step = _SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=1)
+    step = SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=1)
     depth = view.closest_depth[chosen]
     points = [rays.at(depth + offset * step) for offset in (-1, 0, 1)]
     return torch.stack(points).permute(2, 0, 1).contiguous(), rays.object_index

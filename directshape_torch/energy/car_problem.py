@@ -12,8 +12,8 @@ from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.method import method_stages
 from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
-from directshape_torch.energy.stage_rules import moving_unknowns, step_limits, without_held
-from directshape_torch.energy.term import Term, TermLinearisation, total_of
+from directshape_torch.energy.stage_unknowns import moving_unknowns, step_limits, without_held
+from directshape_torch.energy.term import Term, TermLinearisation, scaled, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy
 from directshape_torch.energy.tracked_problem import TrackedProblem
 from directshape_torch.observation.packing import PixelSamples
@@ -178,12 +178,7 @@ class CarProblem:
         if self.term_weights is None:
             return parts
         columns = self.term_weights.to(torch.float64).unbind(dim=1)
-        return [
-            TermLinearisation(
-                w * p.cost, w[:, None] * p.gradient, *(w[:, None, None] * x for x in (p.hessian, p.fisher))
-            )
-            for w, p in zip(columns, parts, strict=True)
-        ]
+        return [scaled(part, factor) for part, factor in zip(parts, columns, strict=True)]
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         return retract(state, step, self.config.solver.max_code)

@@ -75,6 +75,14 @@ class Term(Protocol):
         ...
 
 
+def scaled(part: TermLinearisation, factor: Tensor | None) -> TermLinearisation:
+    """A part whose cars have a factor (B,) each, float64; None for 1."""
+    if factor is None:
+        return part
+    matrices = (factor[:, None, None] * x for x in (part.hessian, part.fisher))
+    return TermLinearisation(factor * part.cost, factor[:, None] * part.gradient, *matrices)
+
+
 def total_of(parts: Sequence[TermLinearisation]) -> Linearisation:
     """What the solver sees of the terms of an energy."""
     return Linearisation(

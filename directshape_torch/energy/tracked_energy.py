@@ -14,7 +14,7 @@ from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.energy.stacked_priors import StackedPriors
-from directshape_torch.energy.term import ResidualRows, Term, TermLinearisation
+from directshape_torch.energy.term import ResidualRows, Term, TermLinearisation, scaled
 from directshape_torch.energy.tracked_photometric import TrackedPhotometric
 from directshape_torch.energy.tracked_silhouettes import TrackedSilhouettes
 from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
@@ -74,7 +74,7 @@ class TrackedEnergy:
 
     def linearise_others(self, projected: ProjectedState) -> list[TermLinearisation]:
         """The terms that are not tracked, at a projected state."""
-        return [_scaled(t.linearise(projected), w) for t, w in zip(self.others, self.factors, strict=True)]
+        return [scaled(t.linearise(projected), w) for t, w in zip(self.others, self.factors, strict=True)]
 
     def linearise_by_autograd(self, projector: _Projector, state: CarState) -> list[TermLinearisation]:
         """The same with Jacobians by forward-mode differentiation: D tangents at once, batched over the cars."""
@@ -99,7 +99,7 @@ class TrackedEnergy:
         ]
         for term, factor, r, J_r in zip(self.others, self.factors, rows, J[len(parts) :], strict=True):
             usable = torch.where(r.usable[:, None], J_r, torch.zeros_like(J_r))
-            parts.append(_scaled(term.accumulate(r, usable), factor))
+            parts.append(scaled(term.accumulate(r, usable), factor))
         return parts if self.priors is None else [*parts, self.priors.linearise(state)]
 
     def follow(self, accepted: Tensor) -> None:
@@ -125,10 +125,3 @@ def _stacked(priors: Sequence[tuple[Term, Tensor | None]], num_codes: int) -> St
         return None
     factors = [factor for _, factor in priors if factor is not None]
     return StackedPriors.from_terms(terms, num_codes, torch.stack(factors, dim=1) if factors else None)
-
-
-def _scaled(part: TermLinearisation, factor: Tensor | None) -> TermLinearisation:
-    if factor is None:
-        return part
-    w = factor
-    return TermLinearisation(w * part.cost, w[:, None] * part.gradient, *(w[:, None, None] * x for x in part[2:]))

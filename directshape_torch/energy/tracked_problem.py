@@ -9,7 +9,7 @@ from torch import Tensor
 
 from directshape_torch.config import SolverConfig
 from directshape_torch.energy.car_state import CarState, retract
-from directshape_torch.energy.stage_rules import step_limits, without_held
+from directshape_torch.energy.stage_unknowns import step_limits, without_held
 from directshape_torch.energy.term import total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy
 from directshape_torch.shape.shape_prior import ShapePrior

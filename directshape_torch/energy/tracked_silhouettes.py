@@ -25,7 +25,7 @@ from directshape_torch.tracking.silhouette import (
 )
 
 # A ray is near the contour where |zeta sdf| is below this: its weight beyond is below 5 per mille.
-_IN_PLAY_EXPONENT = 8.0
+IN_PLAY_EXPONENT = 8.0
 # And as far again as the contour may move during a stage, beyond which the next stage picks it up.
 _IN_PLAY_MARGIN_M = 0.2
 
@@ -134,7 +134,7 @@ class _Side(NamedTuple):
 def _side(term: SilhouetteTerm, view: ProjectedView, factor: Tensor | None) -> _Side:
     """The rays of one term that are near its contours."""
     crosses = view.march.crosses_bounds
-    in_play = (view.closest_sdf.abs() * term.zeta < _IN_PLAY_EXPONENT + _IN_PLAY_MARGIN_M * term.zeta) | ~crosses
+    in_play = (view.closest_sdf.abs() * term.zeta < IN_PLAY_EXPONENT + _IN_PLAY_MARGIN_M * term.zeta) | ~crosses
     weight = term.weight() if factor is None else term.weight() * factor.to(torch.float64)
     at_rest = torch.where(in_play, torch.zeros_like(term.zeta), term.residual_at(view))
     chosen = in_play.nonzero()[:, 0]

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from directshape_torch.batch.run_results import read_run_results
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
-from directshape_torch.io.run_manifest import RunManifest, read_manifest
 from directshape_torch.status import Status
 
 COPIED = "copied"
@@ -92,10 +92,7 @@ class RunFolder:
 
     def __init__(self, path: Path | str, frames: Iterable[str | int] | None = None) -> None:
         self.path = Path(path)
-        manifest = read_manifest(self.path / "summary.json")
-        if manifest is None:
-            raise DataFormatError(self.path, "holds no summary.json of a run", cure="give the --out folder of 'refine'")
-        self.manifest: RunManifest = manifest
+        self.manifest = manifest = read_run_results(self.path)
         done = [frame_id for frame_id in sorted(manifest.frames) if manifest.is_done(frame_id)]
         wanted = done if frames is None else [_full_id(str(one), done) for one in frames]
         missing = [frame_id for frame_id in wanted if frame_id not in set(done)]

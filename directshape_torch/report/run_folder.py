@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from directshape_torch.batch.journal import read_journals
 from directshape_torch.batch.run_file import read_run_file
+from directshape_torch.batch.run_results import read_run_results
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
-from directshape_torch.io.run_manifest import RunManifest, read_manifest
+from directshape_torch.io.run_manifest import RunManifest
 
 
 @dataclass(frozen=True)
@@ -51,15 +51,7 @@ class RunFolder:
         Raises:
             DataFormatError: the folder holds no `summary.json`.
         """
-        path = out_dir / "summary.json"
-        manifest = read_manifest(path)
-        if manifest is None:
-            raise DataFormatError(path, "is missing", cure="give the folder of --out of 'directshape refine'")
-        frames, inputs = dict(manifest.frames), dict(manifest.inputs)
-        # While a run goes on, and after one that was cut off, the latest frames stand in its journals alone.
-        for record in read_journals(out_dir).records:
-            frames[record.frame_id], inputs[record.frame_id] = record.entry, record.inputs
-        return cls(out_dir, replace(manifest, frames=frames, inputs=inputs))
+        return cls(out_dir, read_run_results(out_dir))
 
     @property
     def unfinished(self) -> str | None:

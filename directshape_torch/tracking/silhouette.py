@@ -27,7 +27,7 @@ from directshape_torch.tracking.field import BlockField, GridBlockField
 from directshape_torch.tracking.rays import BlockRays, ObjectBlockRays
 
 # Distance of the three samples that improve a depth: what the coarse samples of a march are apart, about.
-_SAMPLE_DISTANCE_M = 0.12
+SAMPLE_DISTANCE_M = 0.12
 # A vertex of their parabola further away is a guess.
 _MAX_SAMPLE_DISTANCES = 1.5
 # Of the interval with the prior's bounds.
@@ -145,7 +145,7 @@ def closest_depth(
     margin = _MARGIN_SHARE * (inside.far - inside.near)
     near, far = inside.near + margin, inside.far - margin
     depth = rays.depth_next_to(anchor_obj).clamp(near, far)
-    step = _SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=0)
+    step = SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=0)
     sdf = field.value(rays.at(torch.stack([depth - step, depth, depth + step])), rows.rays.owner)
     before, here, after = sdf.unbind(0)
     curvature, slope = before - 2 * here + after, 0.5 * (after - before)

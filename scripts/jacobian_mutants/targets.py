@@ -330,7 +330,6 @@ TARGETS: dict[str, Target] = {
             "TrackedEnergy.follow",
             "TrackedEnergy.of_objects",
             "_stacked",
-            "_scaled",
         ),
         (
             f"{_TRACKED}::test_the_terms_that_are_tracked_and_the_others",
@@ -338,6 +337,11 @@ TARGETS: dict[str, Target] = {
             *_FOLLOWING,
             f"{_TRACKED}::test_hand_derived_rows_are_those_of_autograd",
         ),
+    ),
+    "factors": Target(
+        "directshape_torch/energy/term.py",
+        ("scaled", "total_of", "sum_of"),
+        (f"{_TRACKED}::test_factors_of_single_cars",),
     ),
     "pose_rows": Target(
         "directshape_torch/energy/pose_rows.py",
@@ -374,7 +378,7 @@ TARGETS: dict[str, Target] = {
         ("tests/energy/test_point_cloud_term.py",),
     ),
     "held_unknowns": Target(
-        "directshape_torch/energy/stage_rules.py",
+        "directshape_torch/energy/stage_unknowns.py",
         ("moving_unknowns", "without_held"),
         ("tests/energy/test_point_cloud_term.py",),
     ),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import torch
 
-from directshape_torch.benchmark.needed_lookups import IN_PLAY_EXPONENT, needed_lookups
+from directshape_torch.benchmark.needed_lookups import needed_lookups
 from directshape_torch.benchmark.workloads import demo_scene
-from directshape_torch.energy import tracked_silhouettes
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
+from directshape_torch.energy.tracked_silhouettes import IN_PLAY_EXPONENT
 from directshape_torch.refiner import DirectShapeRefiner
 
 
@@ -41,7 +41,6 @@ def test_what_is_counted_is_part_of_what_an_iteration_follows() -> None:
     assert 0 < contour < rays
     assert 0 < surface <= len(photometric.pixel_set.pixel_index)
     assert (needed.num_values, needed.num_derivatives) == (3 * contour + surface, contour + surface)
-    assert IN_PLAY_EXPONENT == tracked_silhouettes._IN_PLAY_EXPONENT
 
 
 def test_a_rays_least_distance_is_not_beaten_by_its_other_samples() -> None:

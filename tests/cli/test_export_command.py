@@ -81,7 +81,7 @@ def test_wrong_use_is_named(
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(tmp_path), "--format", "kitti", "--out", str(tmp_path / "out")]) == 2
-    assert "holds no summary.json of a run" in capsys.readouterr().err
+    assert "summary.json: is missing" in capsys.readouterr().err
 
 
 def test_another_rigs_field_is_refused(
