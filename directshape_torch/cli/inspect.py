@@ -99,7 +99,7 @@ def _dataset(args: argparse.Namespace) -> StereoDataset:
 
 def _rows(loaded: LoadedFrame, line: int | None) -> list[int]:
     """Rows of the detections to draw: all, or that of a line of the detection file."""
-    lines = [loaded.input_objects[row].line_number for row in loaded.row_of_detection]
+    lines = [one.line_number for one in loaded.detected_objects]
     if line is None:
         return list(range(len(lines)))
     if line not in lines:

@@ -14,9 +14,8 @@ from tqdm import tqdm
 from directshape_torch.cli.inspect_truth import points_of_car, true_points
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
-from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.atomic_files import write_png
-from directshape_torch.io.kitti_labels import poses_cam
+from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 from directshape_torch.refiner import DirectShapeRefiner
@@ -88,20 +87,12 @@ def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int]) ->
 
 def line_of(loaded: LoadedFrame, row: int) -> int:
     """Number of the line of a detection in its file."""
-    return loaded.input_objects[loaded.row_of_detection[row]].line_number
+    return loaded.detected_objects[row].line_number
 
 
 def true_corners_cam(loaded: LoadedFrame) -> list[NDArray[np.float64] | None]:
     """Corners (8, 3) of the labelled box of each detection, or None."""
     labels = loaded.labels or []
-    partners = match_to_labels([loaded.input_objects[row] for row in loaded.row_of_detection], labels)
-    found: list[NDArray[np.float64] | None] = []
-    for partner in partners:
-        if partner < 0:
-            found.append(None)
-            continue
-        label = [labels[partner]]
-        hwl = loaded.frame.camera.t_cam_ref.new_tensor([label[0].hwl]).double()
-        T_cam_obj = poses_cam(label, loaded.frame.camera.t_cam_ref[0].double())
-        found.append(np.asarray(box_corners(T_cam_obj, hwl)[0]))
-    return found
+    partners = match_to_labels(loaded.detected_objects, labels)
+    corners = box_corners_cam(labels, loaded.frame.camera.t_cam_ref[0]).numpy()
+    return [None if partner < 0 else corners[partner] for partner in partners]

@@ -17,9 +17,9 @@ from directshape_torch.geometry.pinhole import project, rays_from_pixels
 from directshape_torch.io.frame_layout import first_disparity
 from directshape_torch.io.kitti_calibration import read_calibration
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.visualize.inspection.car_view import KnownPoints
 
-_MASK_THRESHOLD = 0.5
 # Points under the mask's edge may lie far behind the car.
 _REACH_M = 3.5
 
@@ -67,7 +67,7 @@ def points_of_car(
         return None
     mask = loaded.detections.mask_left[car].numpy()
     u, v = np.rint(points.uv).astype(np.int64).T
-    under_mask = mask[v, u] > _MASK_THRESHOLD
+    under_mask = mask[v, u] > MASK_THRESHOLD
     near = np.linalg.norm(points.points_cam - centre_cam.double().numpy(), axis=1) < _REACH_M
     return KnownPoints(points.name, points.points_cam, points.uv, np.asarray(under_mask & near))
 

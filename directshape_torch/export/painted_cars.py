@@ -14,8 +14,10 @@ from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
 from directshape_torch.export.run_folder import RefinedFrame
 from directshape_torch.export.visible_surface import FrameView, Points
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.visualize.drawing import picture_of
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,7 +31,6 @@ _EDGE_PX = 2.5
 _MOST_SUBDIVISIONS = 2
 # How far from the mirrored place a seen point may lie to lend its colour; about an edge of the mesh.
 _MIRROR_REACH_M = 0.12
-_MASK_THRESHOLD = 0.5
 _SEED = 0
 
 
@@ -126,10 +127,9 @@ class PaintedFrame:
 
 def frame_view(frame: RefinedFrame, loaded: LoadedFrame, cars: list[EstimatedCar]) -> FrameView:
     """The left image of a frame with its refined cars and the masks that were found for them."""
-    image = (255 * loaded.frame.images_left[0]).round().to(torch.uint8).permute(1, 2, 0).contiguous()
     masks = masks_of_lines(loaded)
     return FrameView(
-        image.cpu().numpy(),
+        picture_of(loaded.frame.images_left[0]),
         loaded.frame.camera.K_left[0].double().cpu().numpy(),
         cars,
         [masks.get(one.line.line_number) for one in frame.refined_cars],
@@ -141,11 +141,11 @@ def masks_of_lines(loaded: LoadedFrame) -> Mapping[int, NDArray[np.bool_]]:
     import cv2
 
     detections, masks = loaded.detections, {}
-    for row, line in enumerate(loaded.row_of_detection):
+    for row, detected in enumerate(loaded.detected_objects):
         if bool(detections.has_mask_left[row]):
-            mask = (detections.mask_left[row] > _MASK_THRESHOLD).numpy().astype(np.uint8)
+            mask = (detections.mask_left[row] > MASK_THRESHOLD).numpy().astype(np.uint8)
             inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderValue=1)
-            masks[loaded.input_objects[line].line_number] = inner.astype(bool)
+            masks[detected.line_number] = inner.astype(bool)
     return masks
 
 

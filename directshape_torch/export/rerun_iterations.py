@@ -47,7 +47,7 @@ class IterationLog:
 
     def line(self, car: int) -> int:
         """The number of a car's line in the detection file."""
-        return self.loaded.input_objects[self.loaded.row_of_detection[car]].line_number
+        return self.loaded.detected_objects[car].line_number
 
     def log_state(self, number: int) -> None:
         """Surfaces, boxes, residuals and costs of all cars in a state; what a car shares with the one before stays."""

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -15,15 +14,14 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.export.frame_source import FrameSource
 from directshape_torch.export.painted_cars import PaintedFrame
 from directshape_torch.export.rerun_stream import RerunStream
-from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE
+from directshape_torch.observation.regions import MASK_THRESHOLD
+from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, picture_of
 from directshape_torch.visualize.ground_grid import ground_grid
 
 LEFT, RIGHT = "world/cam/image", "right/image"
 _JPEG_QUALITY = 90
-_MASK_THRESHOLD = 0.5
 _MASK_OPACITY = 0.35
 _MOST_LINES = 255
 
@@ -47,9 +45,10 @@ def log_frame(stream: RerunStream, source: FrameSource, has_detections: bool) ->
     loaded = source.with_images("the pictures of a recording")
     _log_images(stream, loaded)
     _log_masks(stream, loaded)
-    lines = [loaded.input_objects[row] for row in loaded.row_of_detection]
     offset = loaded.frame.camera.t_cam_ref[0].double()
-    stream.log("world/boxes/before", boxes_of_lines(stream, lines if has_detections else [], offset, ORANGE))
+    stream.log(
+        "world/boxes/before", boxes_of_lines(stream, loaded.detected_objects if has_detections else [], offset, ORANGE)
+    )
     labels = [one for one in loaded.labels or [] if one.has_box_3d and one.type in set(source.run.classes)]
     stream.log("world/boxes/truth", boxes_of_lines(stream, labels, offset, GREEN))
     _log_refined_boxes(stream, source, offset.numpy())
@@ -119,12 +118,9 @@ def boxes_of_lines(
     stream: RerunStream, lines: Sequence[KittiObject], t_cam_ref: Tensor, colour: tuple[int, int, int]
 ) -> Any:
     """The boxes of lines of a KITTI file, labelled with their numbers."""
-    location_cam = torch.tensor([one.location_ref for one in lines], dtype=torch.float64).reshape(-1, 3) + t_cam_ref
+    T_cam_obj = poses_cam(lines, t_cam_ref).numpy()
     hwl = np.array([one.hwl for one in lines], dtype=np.float64).reshape(-1, 3)
-    T_cam_obj = pose_from_kitti(
-        location_cam, torch.tensor([one.rotation_y for one in lines], dtype=torch.float64)
-    ).numpy()
-    centres_cam = location_cam.numpy() - 0.5 * hwl[:, :1] * T_cam_obj[:, :3, 1]
+    centres_cam = T_cam_obj[:, :3, 3] - 0.5 * hwl[:, :1] * T_cam_obj[:, :3, 1]
     labels = [f"{one.line_number}" for one in lines]
     return boxes(stream, centres_cam, T_cam_obj[:, :3, :3], hwl, [colour] * len(lines), labels)
 
@@ -151,26 +147,20 @@ def _log_refined_boxes(stream: RerunStream, source: FrameSource, t_cam_ref: NDAr
 def _log_images(stream: RerunStream, loaded: LoadedFrame) -> None:
     rr, frame = stream.rr, loaded.frame
     height, width = frame.sizes[0].tolist()
-    for entity, K, image in (
-        ("world/cam", frame.camera.K_left[0], frame.images_left[0]),
-        ("right", frame.camera.K_right[0], frame.images_right[0]),
-    ):
-        K_image = K.double().cpu().numpy().copy()
-        # Rerun's pixels have their corners at whole numbers, ours their centres.
-        K_image[:2, 2] += 0.5
-        if entity != "right":
-            camera = rr.Pinhole(
-                image_from_camera=K_image, resolution=[width, height], camera_xyz=rr.ViewCoordinates.RDF
-            )
-            stream.log(entity, camera)
-        stream.log(f"{entity}/image", rr.EncodedImage(contents=_jpeg(image), media_type="image/jpeg"))
+    K_image = frame.camera.K_left[0].double().cpu().numpy().copy()
+    # Rerun's pixels have their corners at whole numbers, ours their centres.
+    K_image[:2, 2] += 0.5
+    axes = rr.ViewCoordinates.RDF
+    stream.log("world/cam", rr.Pinhole(image_from_camera=K_image, resolution=[width, height], camera_xyz=axes))
+    for entity, image in ((LEFT, frame.images_left[0]), (RIGHT, frame.images_right[0])):
+        stream.log(entity, rr.EncodedImage(contents=_jpeg(image), media_type="image/jpeg"))
 
 
 def _jpeg(image: Tensor) -> bytes:
     """(3, H, W) in [0, 1] as JPEG."""
     import cv2
 
-    rgb = (255 * image.nan_to_num().clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).contiguous().cpu().numpy()
+    rgb = picture_of(image)
     encoded, content = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not encoded:
         raise DataFormatError("image", f"OpenCV cannot encode shape {rgb.shape} as JPEG")
@@ -182,6 +172,6 @@ def _log_masks(stream: RerunStream, loaded: LoadedFrame) -> None:
     rr, detections = stream.rr, loaded.detections
     for entity, masks in ((LEFT, detections.mask_left), (RIGHT, detections.mask_right)):
         numbers = np.zeros(tuple(masks.shape[1:]), dtype=np.uint16)
-        for row, line in enumerate(loaded.row_of_detection):
-            numbers[(masks[row] > _MASK_THRESHOLD).cpu().numpy()] = loaded.input_objects[line].line_number
+        for mask, detected in zip(masks, loaded.detected_objects, strict=True):
+            numbers[(mask > MASK_THRESHOLD).cpu().numpy()] = detected.line_number
         stream.log(f"{entity}/masks", rr.SegmentationImage(numbers, opacity=_MASK_OPACITY))

@@ -40,7 +40,7 @@ def stereo_points(loaded: LoadedFrame, view: FrameView) -> Mapping[int, StereoPo
     samples = car_points(frames, loaded.detections, replace(PointCloudConfig(), max_points=_ALL_POINTS))
     rows, points_cam = samples.object_index.numpy(), samples.points_cam.double().numpy()
     found = {}
-    for row, line in enumerate(loaded.row_of_detection):
+    for row, detected in enumerate(loaded.detected_objects):
         own = points_cam[rows == row]
-        found[loaded.input_objects[line].line_number] = StereoPoints(own, view.colours(own))
+        found[detected.line_number] = StereoPoints(own, view.colours(own))
     return found

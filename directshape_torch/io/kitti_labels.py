@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.text_files import Line, read_lines
 
 _COLUMNS = "type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
@@ -139,6 +139,21 @@ def poses_cam(
     """
     T_ref_obj = poses_ref(objects).to(t_cam_ref.device)
     return shift_frame(T_ref_obj, t_cam_ref.double()).to(t_cam_ref.dtype)
+
+
+def box_corners_cam(
+    objects: Sequence[KittiObject],
+    t_cam_ref: Tensor,  # (3,) metres
+) -> Tensor:
+    """Corners (B, 8, 3) of the 3D boxes in the left camera frame, float64, in the order of `box_corners`.
+
+    Example:
+        >>> line = Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0", "")
+        >>> box_corners_cam([parse_object("labels", line)], torch.tensor([0.06, 0.0, 0.0])).mean(dim=1)
+        tensor([[ 1.0600,  0.8500, 20.0000]], dtype=torch.float64)
+    """
+    dimensions_hwl = torch.tensor([o.hwl for o in objects], dtype=torch.float64).reshape(-1, 3)
+    return box_corners(poses_cam(objects, t_cam_ref.double()), dimensions_hwl)
 
 
 def shift_frame(

@@ -43,6 +43,11 @@ class LoadedFrame:
         """For each detection the index of its input line."""
         return tuple(row for row, detection in enumerate(self.refined_rows) if detection >= 0)
 
+    @property
+    def detected_objects(self) -> tuple[KittiObject, ...]:
+        """For each detection its input line."""
+        return tuple(self.input_objects[row] for row in self.row_of_detection)
+
 
 class StereoDataset(Protocol):
     """Frames with detections and masks; every layout of files is one (docs/inputs.md)."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from directshape_torch.batch.mesh_files import T_GLTF_CAM
 from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
 from directshape_torch.report.car_rows import is_refined
 from directshape_torch.report.run_folder import FrameResult
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
@@ -66,7 +66,7 @@ def states_before(
 ) -> list[CarState]:
     """The mean shape at the place of each detection, with the detection's box."""
     T_cam_obj = poses_cam(detections, t_cam_ref.double())
-    corners = _corners(detections, T_cam_obj)
+    corners = box_corners_cam(detections, t_cam_ref).numpy()
     code = np.zeros(num_codes)
     return [CarState(T, box, code, mean) for T, box in zip(T_cam_obj.numpy(), corners, strict=True)]
 
@@ -104,7 +104,7 @@ def _refined_mesh(result: FrameResult, car: int, prior: ShapePrior | None, T_cam
 def true_corners(labels: Sequence[KittiObject], classes: Sequence[str], t_cam_ref: Tensor) -> list[Array]:
     """(8, 3) of each labelled box of the refined classes."""
     chosen = [label for label in labels if label.type in classes and label.has_box_3d]
-    return list(_corners(chosen, poses_cam(chosen, t_cam_ref.double())))
+    return list(box_corners_cam(chosen, t_cam_ref).numpy())
 
 
 def decoded_mesh(prior: ShapePrior, code: Array) -> ObjectMesh:
@@ -141,9 +141,3 @@ def frame_t_cam_ref(result: FrameResult) -> Tensor:
         return torch.zeros(3, dtype=torch.float64)
     offset = np.asarray(shapes.T_cam_obj, np.float64)[:, :3, 3] - np.asarray(shapes.T_ref_obj, np.float64)[:, :3, 3]
     return torch.from_numpy(np.median(offset, axis=0))
-
-
-def _corners(objects: Sequence[KittiObject], T_cam_obj: Tensor) -> Array:
-    dimensions = torch.tensor([o.hwl for o in objects], dtype=torch.float64).reshape(-1, 3)
-    corners: Array = box_corners(T_cam_obj, dimensions).numpy()
-    return corners

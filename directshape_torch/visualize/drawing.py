@@ -9,6 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from directshape_torch.geometry.box3d import BOX_EDGES
 
@@ -24,6 +26,17 @@ NEAR_PLANE_M = 0.3
 _SHIFT = 4
 # Beyond this OpenCV's fixed-point coordinates would overflow.
 _FARTHEST_PX = 1e5
+
+
+def picture_of(image: Tensor) -> Picture:
+    """An image (3, h, w) in [0, 1] as a picture (h, w, 3); what is not a number is black.
+
+    Example:
+        >>> picture_of(torch.tensor([0.0, 0.5, torch.nan]).view(3, 1, 1)).tolist()
+        [[[0, 128, 0]]]
+    """
+    levels = (255 * image.detach().nan_to_num().clamp(0, 1)).round().to(torch.uint8)
+    return np.ascontiguousarray(levels.permute(1, 2, 0).cpu().numpy())
 
 
 @dataclass(frozen=True)

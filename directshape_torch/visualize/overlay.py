@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_dataset import LoadedFrame
-from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.result import RefinementResult
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.visualize.birds_eye import Footprint, birds_eye_picture
@@ -30,6 +28,7 @@ from directshape_torch.visualize.drawing import (
     draw_contour,
     draw_legend,
     draw_text,
+    picture_of,
 )
 
 _LEAST_WIDTH_PX = 1000
@@ -69,9 +68,8 @@ def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult, first_row: i
         (h, w, 3) RGB uint8.
     """
     frame = loaded.frame
-    image = (255 * frame.images_left[0].nan_to_num().clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0)
     return overlay_picture(
-        np.ascontiguousarray(image.cpu().numpy()),
+        picture_of(frame.images_left[0]),
         frame.camera.K_left[0].double().cpu().numpy(),
         before=_initial_cars(loaded, result),
         after=_refined_cars(loaded, result, first_row),
@@ -160,10 +158,10 @@ def _initial_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCa
     corners = box_corners(T_cam_obj, detections.dimensions_hwl.double()).numpy()
     mean = sdf_to_mesh(prior.values(prior.initial_code(1))[0], prior.origin, prior.spacing_m)
     cars = []
-    for car, line in enumerate(loaded.row_of_detection):
+    for car, detected in enumerate(loaded.detected_objects):
         T = T_cam_obj[car].numpy()
         surface = Surface(mean.vertices @ T[:3, :3].T + T[:3, 3], mean.faces)
-        cars.append(DrawnCar(corners[car], surface, str(loaded.input_objects[line].line_number)))
+        cars.append(DrawnCar(corners[car], surface, str(detected.line_number)))
     return cars
 
 
@@ -190,11 +188,6 @@ def _refined_cars(loaded: LoadedFrame, result: RefinementResult, first_row: int)
 
 def _true_corners(loaded: LoadedFrame) -> list[Array]:
     """Corners of the labelled boxes of the classes that were refined."""
-    classes = {loaded.input_objects[row].type for row in loaded.row_of_detection}
+    classes = {one.type for one in loaded.detected_objects}
     labels = [label for label in loaded.labels or () if label.type in classes and label.has_box_3d]
-    return list(_corners_cam(labels, loaded.frame.camera.t_cam_ref[0]).numpy())
-
-
-def _corners_cam(objects: Sequence[KittiObject], t_cam_ref: Tensor) -> Tensor:
-    dimensions = torch.tensor([o.hwl for o in objects], dtype=torch.float64).reshape(-1, 3)
-    return box_corners(poses_cam(objects, t_cam_ref.double()), dimensions)
+    return list(box_corners_cam(labels, loaded.frame.camera.t_cam_ref[0]).numpy())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
@@ -19,8 +18,7 @@ from directshape_torch.observation.occlusion import (
 from directshape_torch.observation.pixel_sampling import PixelSelection
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections, FrameBatch
-
-Picture = npt.NDArray[np.uint8]
+from directshape_torch.visualize.drawing import Picture, picture_of
 
 GREEN, RED, YELLOW, BLUE = (0, 230, 0), (255, 40, 40), (255, 220, 0), (70, 130, 255)
 OCCLUDER_COLOURS = ((255, 120, 0), (200, 60, 255), (0, 200, 200), (255, 80, 160), (150, 200, 0))
@@ -129,9 +127,7 @@ def _crop(
 ) -> Picture:
     images = frames.images_left if side == "left" else frames.images_right
     u0, v0, u1, v1 = region
-    crop = images[int(detections.frame_index[object_number]), :, v0:v1, u0:u1].detach()
-    levels = (255 * crop.nan_to_num().clamp(0, 1)).round().to(torch.uint8)
-    return np.ascontiguousarray(levels.permute(1, 2, 0).cpu().numpy())
+    return picture_of(images[int(detections.frame_index[object_number]), :, v0:v1, u0:u1])
 
 
 def _masks_in_front(detections: Detections, object_number: int, side: Side, order: OcclusionOrder) -> list[Tensor]:

@@ -23,7 +23,7 @@ from directshape_torch.observation.packing import car_regions
 from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
-from directshape_torch.visualize.drawing import Picture
+from directshape_torch.visualize.drawing import Picture, picture_of
 from directshape_torch.visualize.inspection.shape_in_image import (
     PixelGrid,
     SeenShape,
@@ -89,7 +89,7 @@ class CarView:
     @property
     def title(self) -> str:
         """Frame, car and how it ended."""
-        line = self.loaded.input_objects[self.loaded.row_of_detection[self.car]].line_number
+        line = self.loaded.detected_objects[self.car].line_number
         status = self.trace.result.status[self.car]
         return f"frame {self.loaded.frame_id}, car {line}: {status.name}"
 
@@ -105,9 +105,7 @@ class CarView:
     def image(self, side: Side) -> Picture:
         """(H, W, 3) RGB uint8."""
         frame = self.loaded.frame
-        image = frame.images_left if side == "left" else frame.images_right
-        levels = (255 * image[0].nan_to_num().clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0)
-        return np.ascontiguousarray(levels.cpu().numpy())
+        return picture_of((frame.images_left if side == "left" else frame.images_right)[0])
 
     @cached_property
     def regions(self) -> tuple[Window, Window]:
