@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from directshape_torch.batch.journal import read_journals
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.run_manifest import RunManifest, read_manifest
 
 
@@ -24,3 +25,31 @@ def read_run_results(out_dir: Path) -> RunManifest:
     for record in read_journals(out_dir).records:
         frames[record.frame_id], inputs[record.frame_id] = record.entry, record.inputs
     return replace(manifest, frames=frames, inputs=inputs)
+
+
+def finished_frames(out_dir: Path, manifest: RunManifest, wanted: Iterable[str | int] | None = None) -> list[str]:
+    """The frames that a run has refined, in order.
+
+    Args:
+        out_dir: the folder, for messages.
+        manifest: of `read_run_results`.
+        wanted: only these, by id, or by number with leading zeros or without; None: all.
+
+    Raises:
+        InputError: one of these is not finished.
+    """
+    done = sorted(name for name in manifest.frames if manifest.is_done(name))
+    if wanted is None:
+        return done
+    # The ids after the numbers, so that they win.
+    known = {_number(name): name for name in done} | {name: name for name in done}
+    words = [str(one) for one in wanted]
+    missing = [word for word in words if word not in known and _number(word) not in known]
+    if missing:
+        raise InputError("frames", f"finished frames of {out_dir}", ", ".join(missing[:5]))
+    return sorted({known[word] if word in known else known[_number(word)] for word in words})
+
+
+def _number(word: str) -> str:
+    """A number without leading zeros; other names as they are."""
+    return str(int(word)) if word.isdecimal() else word

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.batch.run_results import read_run_results
+from directshape_torch.batch.run_results import finished_frames, read_run_results
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.box3d import rotation_about_y
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
@@ -34,7 +34,6 @@ class ExportedObject:
         R_ref_obj: (3, 3) axes of the object (forward, down, left) in `ref`; of a refined car with its tilt.
         bottom_ref: (3,) bottom centre of the box in `ref`, metres.
         hwl: (3,) height, width, length, metres.
-        rotation_y: heading about the y axis of `ref`, radians.
     """
 
     line: KittiObject
@@ -43,7 +42,6 @@ class ExportedObject:
     R_ref_obj: NDArray[np.float64]
     bottom_ref: NDArray[np.float64]
     hwl: NDArray[np.float64]
-    rotation_y: float
 
     @property
     def is_refined(self) -> bool:
@@ -92,13 +90,10 @@ class RunFolder:
 
     def __init__(self, path: Path | str, frames: Iterable[str | int] | None = None) -> None:
         self.path = Path(path)
-        self.manifest = manifest = read_run_results(self.path)
-        done = [frame_id for frame_id in sorted(manifest.frames) if manifest.is_done(frame_id)]
-        wanted = done if frames is None else [_full_id(str(one), done) for one in frames]
-        missing = [frame_id for frame_id in wanted if frame_id not in set(done)]
-        if missing or not done:
-            raise InputError("frames", f"finished frames of {self.path}", ", ".join(missing[:5]) or "none")
-        self.frame_ids = tuple(dict.fromkeys(wanted))
+        self.manifest = read_run_results(self.path)
+        self.frame_ids = tuple(finished_frames(self.path, self.manifest, frames))
+        if not self.frame_ids:
+            raise InputError("frames", f"finished frames of {self.path}", "none")
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -131,12 +126,6 @@ class RunFolder:
         return RefinedFrame(frame_id, tuple(lines), tuple(objects), shapes)
 
 
-def _full_id(word: str, known: Sequence[str]) -> str:
-    """The frame of that number, however many zeros stand before it; the word itself where there is none."""
-    same = (one for one in known if word.isdecimal() and one.isdecimal() and int(one) == int(word))
-    return word if word in known else next(same, word)
-
-
 def _nearest_rotation(R: NDArray[Any]) -> NDArray[np.float64]:
     """A rotation kept in float32 is one to seven digits; other programs check more of them."""
     from scipy.spatial.transform import Rotation
@@ -147,9 +136,7 @@ def _nearest_rotation(R: NDArray[Any]) -> NDArray[np.float64]:
 def _exported(line: KittiObject, car: int, shapes: ShapeArrays) -> ExportedObject:
     if car < 0:
         R_ref_obj = rotation_about_y(torch.tensor(line.rotation_y, dtype=torch.float64)).numpy()
-        return ExportedObject(
-            line, COPIED, car, R_ref_obj, np.array(line.location_ref), np.array(line.hwl), line.rotation_y
-        )
+        return ExportedObject(line, COPIED, car, R_ref_obj, np.array(line.location_ref), np.array(line.hwl))
     return ExportedObject(
         line=line,
         status=shapes.statuses[car],
@@ -157,5 +144,4 @@ def _exported(line: KittiObject, car: int, shapes: ShapeArrays) -> ExportedObjec
         R_ref_obj=_nearest_rotation(shapes.T_ref_obj[car, :3, :3]),
         bottom_ref=shapes.boxes_location_ref[car].astype(np.float64),
         hwl=shapes.boxes_hwl[car].astype(np.float64),
-        rotation_y=float(shapes.boxes_rotation_y[car]),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -64,17 +64,17 @@ class FrameInputs:
 
 @dataclass
 class InputReader:
-    """Reads inputs of the frames of a run and counts what it could not use.
+    """Reads inputs of the frames of a run and keeps in mind what it could not use.
 
     Attributes:
         sources: where to look.
         manifest: of the run, with the hashes of its inputs.
-        problems: what is wrong, and for how many frames.
+        problems: what is wrong, and with which frames.
     """
 
     sources: InputSources
     manifest: RunManifest
-    problems: Counter[str] = field(default_factory=Counter)
+    problems: defaultdict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
 
     def detections(self, frame_id: str) -> list[KittiObject] | None:
         """All lines that went in."""
@@ -97,7 +97,7 @@ class InputReader:
         roles = ("image_left", "image_right")
         left, right = (self._image(frame_id, *pair) for pair in zip(roles, layout.images(frame_id), strict=True))
         if left is not None and right is not None and left.shape != right.shape:
-            self.problems["left and right image differ in size"] += 1
+            self.problems["left and right image differ in size"].add(frame_id)
             right = None
         camera = self._camera(layout, frame_id)
         ground = None if camera is None else self._ground(layout, frame_id, camera, left, right)
@@ -108,11 +108,11 @@ class InputReader:
     def _is_unchanged(self, frame_id: str, role: str, path: Path) -> bool:
         """Whether the file is the one that the run read."""
         if not path.is_file():
-            self.problems[f"{_words(role)} not found"] += 1
+            self.problems[f"{_words(role)} not found"].add(frame_id)
             return False
         known = self.manifest.inputs.get(frame_id, {}).get(role)
         if known is not None and known != hash_file(path):
-            self.problems[f"{_words(role)} not used: the file has changed since the run"] += 1
+            self.problems[f"{_words(role)} not used: the file has changed since the run"].add(frame_id)
             return False
         return True
 
@@ -153,7 +153,7 @@ class InputReader:
             paths = source.files(frame_id)
         except DataFormatError:
             # The files of a frame stand in its first one.
-            self.problems["masks not found or damaged"] += 1
+            self.problems["masks not found or damaged"].add(frame_id)
             return ()
         for index, path in enumerate(paths):
             if not self._is_unchanged(frame_id, f"masks_{index}", path):

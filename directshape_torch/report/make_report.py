@@ -9,6 +9,7 @@ from typing import IO, Any, cast, get_args
 
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver, SilentObserver
+from directshape_torch.batch.run_results import finished_frames
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.observation.occlusion import OcclusionOrder
@@ -109,11 +110,9 @@ class _PageOfRun:
         self._prior_was_given = prior_was_given
 
     def write(self, page: Path, options: ReportOptions, observer: RunObserver) -> ReportOutcome:
-        frame_ids = self._choose(options.frames)
+        frame_ids = finished_frames(self._run.out_dir, self._run.manifest, options.frames)
         rows = [row for number, name in enumerate(frame_ids) for row in self._rows(number, name)]
         detailed = choose_frames(rows, len(frame_ids), options.most_frames)
-        # What the first pass could not use it will not be able to use again.
-        self._reader.problems.clear()
         frame = page_frame(f"{self._run.out_dir.resolve().name}: refined cars")
         with replaced_text_file(page) as file:
             file.write(frame.head)
@@ -122,18 +121,6 @@ class _PageOfRun:
             self._write_tables(file, frame_ids, detailed, rows, notes)
             file.write(frame.foot)
         return ReportOutcome(page, page.stat().st_size, len(frame_ids), len(detailed), len(rows), tuple(notes))
-
-    def _choose(self, frames: Sequence[str] | None) -> list[str]:
-        done = self._run.done
-        if frames is None:
-            return done
-        # Numbers name frames with leading zeros or without.
-        by_number = {int(name): name for name in done if name.isdecimal()}
-        known = {word: word if word in done else by_number.get(_number(word)) for word in frames}
-        missing = sorted(word for word, name in known.items() if name is None)
-        if missing:
-            raise InputError("frames", f"frames that {self._run.out_dir} has finished", ", ".join(missing[:5]))
-        return sorted({name for name in known.values() if name is not None})
 
     def _rows(self, number: int, frame_id: str) -> list[CarRow]:
         material = self._results(frame_id)
@@ -196,7 +183,7 @@ class _PageOfRun:
             notes.append("photometric residuals without the run's disparity field, so biased (--stereo-bias)")
         if num_detailed < num_frames:
             notes.append(f"pictures and 3D views of {num_detailed} of {num_frames} frames (--max-frames)")
-        return [*notes, *problem_notes(self._reader.problems, num_detailed)]
+        return [*notes, *problem_notes(self._reader.problems, num_frames)]
 
     def _write_tables(
         self,
@@ -209,11 +196,6 @@ class _PageOfRun:
         file.write(data_block("frames", {"ids": list(frame_ids), "detailed": list(detailed)}))
         file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [as_json(row) for row in rows]}))
         file.write(data_block("run", run_facts(self._run, frame_ids, rows, notes)))
-
-
-def _number(word: str) -> int:
-    """-1 for what is no number."""
-    return int(word) if word.isdecimal() else -1
 
 
 @dataclass(frozen=True)
@@ -229,12 +211,9 @@ class _Results:
 def map_settings(refiner: dict[str, Any]) -> MapSettings:
     """Settings of residual maps from those of a run; what a run does not say has its default."""
     stages, silhouette = refiner.get("stages", ()), refiner.get("silhouette", {})
-    given = {
-        name: silhouette[name] for name in ("min_zeta_per_m", "max_zeta_per_m", "saturation") if name in silhouette
-    }
+    names = ("min_zeta_per_m", "max_zeta_per_m", "saturation", "probability_floor")
+    given = {name: silhouette[name] for name in names if name in silhouette}
     if stages:
         given["contour_width_px"] = stages[-1].get("contour_width_px", MapSettings.contour_width_px)
-    if "probability_floor" in silhouette:
-        given["probability_floor"] = silhouette["probability_floor"]
     brightness = refiner.get("photometric", {}).get("brightness", "gain")
     return MapSettings(**given, matches_brightness=brightness != "none")

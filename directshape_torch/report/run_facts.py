@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from directshape_torch.io.run_manifest import flatten
@@ -33,7 +33,7 @@ def run_facts(run: RunFolder, frame_ids: Sequence[str], rows: Sequence[CarRow], 
         "statuses": _statuses(rows),
         "ground_sources": dict(Counter(str(manifest.frames[name].get("ground_source")) for name in frame_ids)),
         "sha256": dict(manifest.sha256),
-        "settings": {name: _text(value) for name, value in sorted(flatten(manifest.config).items())},
+        "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),
         "notes": list(notes),
     }
@@ -62,15 +62,11 @@ def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
     return {"cars": len(counted), **means}
 
 
-def problem_notes(problems: Mapping[str, int], num_frames: int) -> list[str]:
+def problem_notes(problems: Mapping[str, Collection[str]], num_frames: int) -> list[str]:
     """What could not be used, as sentences.
 
     Example:
-        >>> problem_notes({"left image not found": 2}, 5)
+        >>> problem_notes({"left image not found": {"000003", "000004"}}, 5)
         ['left image not found (2 of 5 frames)']
     """
-    return [f"{what} ({count} of {num_frames} frames)" for what, count in sorted(problems.items())]
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else str(value)
+    return [f"{what} ({len(frames)} of {num_frames} frames)" for what, frames in sorted(problems.items())]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from directshape_torch.batch.run_file import read_run_file
-from directshape_torch.batch.run_results import read_run_results
+from directshape_torch.batch.run_results import finished_frames, read_run_results
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
@@ -64,7 +64,7 @@ class RunFolder:
     @property
     def done(self) -> list[str]:
         """Frames that were refined, in order."""
-        return sorted(name for name in self.manifest.frames if self.manifest.is_done(name))
+        return finished_frames(self.out_dir, self.manifest)
 
     @property
     def classes(self) -> tuple[str, ...]:
