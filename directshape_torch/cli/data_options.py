@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 # As in io/open_dataset.py, which is not imported for it loads PyTorch; a test holds the two together.
 LAYOUTS = ("kitti", "raw", "tracking", "stereo2015", "folder")
+_EITHER = "either a folder (--masks DIR) or COCO files (--masks-left FILE, --masks-right FILE)"
 
 
 def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = True, required: bool = True) -> None:
@@ -29,9 +30,7 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     group.add_argument(
         "--detections", type=Path, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data (folder: default ROOT/frames)"
     )
-    group.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
-    group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
-    group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
+    add_mask_options(group)
     group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
     group.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
     group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
@@ -53,6 +52,13 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
 
 
+def add_mask_options(group: argparse._ActionsContainer) -> None:
+    """The ways to name instance masks, for `mask_source`."""
+    group.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
+    group.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
+    group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
+
+
 def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
     """The data set that the options describe.
 
@@ -63,11 +69,14 @@ def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
     from directshape_torch.geometry.disparity_field import DisparityField
     from directshape_torch.io.open_dataset import open_dataset
 
+    masks = mask_source(args)
+    if masks is None and args.layout != "folder":
+        raise InputError("--masks", _EITHER, "neither")
     return open_dataset(
         args.layout,
         args.data,
         args.detections,
-        _mask_source(args),
+        masks,
         split=args.split,
         frames=args.frames,
         classes=args.classes,
@@ -83,17 +92,17 @@ def frame_id_of(word: str) -> int | str:
     return int(word) if word.isdecimal() else word
 
 
-def _mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
+def mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
+    """The masks that the options name, or None.
+
+    Raises:
+        InputError: a folder and COCO files.
+    """
     from directshape_torch.io.instance_masks import CocoFileMasks
 
     files = (args.masks_left, args.masks_right)
-    given = (args.masks is not None) + (files != (None, None))
-    if given == 2 or (given == 0 and args.layout != "folder"):
-        raise InputError(
-            "--masks",
-            "either a folder (--masks DIR) or COCO files (--masks-left FILE, --masks-right FILE)",
-            "both" if given else "neither",
-        )
+    if args.masks is not None and files != (None, None):
+        raise InputError("--masks", _EITHER, "both")
     if files != (None, None):
         return CocoFileMasks(*files)
     masks: Path | None = args.masks

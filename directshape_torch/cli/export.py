@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import LAYOUTS
+from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, mask_source
+from directshape_torch.cli.run_inputs import check_data_is_not_needed, field_of_run
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,11 +48,13 @@ def _add_inputs(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument("--layout", choices=LAYOUTS, default="kitti", help="of that data set (default: kitti)")
     group.add_argument("--detections", type=Path, metavar="DIR", help="detections of the run (default: its results)")
-    group.add_argument("--masks", type=Path, metavar="DIR", help="masks of the run: only their pixels lend colours")
+    add_mask_options(group)
     group.add_argument(
         "--disparity", type=Path, metavar="DIR", help="disparity maps, for the stereo points of 'points'"
     )
-    group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of the run, for the stereo points")
+    group.add_argument(
+        "--stereo-bias", type=Path, metavar="FILE", help="field of the run, for stereo points and iterations"
+    )
     group.add_argument("--prior", metavar="FILE|NAME", help="shape prior of the run, where it was not a bundled one")
 
 
@@ -111,8 +114,11 @@ def _make_refiner(args: argparse.Namespace, folder: RunFolder, priors: Mapping[s
     from directshape_torch.config_files import config_from_mapping
     from directshape_torch.refiner import DirectShapeRefiner
 
-    for name in ("data", "detections", "masks"):
-        if getattr(args, name) is None and (name == "data" or args.layout != "folder"):
+    if "rerun" not in args.format:
+        raise InputError("--iterations", "--format rerun, which alone records them", " ".join(args.format))
+    given = {"data": args.data, "detections": args.detections, "masks": mask_source(args)}
+    for name, value in given.items():
+        if value is None and (name == "data" or args.layout != "folder"):
             raise InputError(f"--{name}", "that of the run, for --iterations", "nothing")
     sha256 = str(folder.manifest.sha256["prior"])
     if sha256 not in priors:
@@ -135,10 +141,8 @@ def _make_dataset(args: argparse.Namespace, folder: RunFolder) -> StereoDataset 
 
     field = _disparity_field(args, folder)
     if args.data is None:
-        names = ("detections", "masks", "disparity", "stereo_bias")
-        given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]
-        if given:
-            raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
+        names = ("detections", "masks", "masks_left", "masks_right", "disparity", "stereo_bias")
+        check_data_is_not_needed(args, *names)
         return None
     # A plain folder keeps its detections beside its images.
     own = None if args.layout == "folder" else folder.path
@@ -146,7 +150,7 @@ def _make_dataset(args: argparse.Namespace, folder: RunFolder) -> StereoDataset 
         args.layout,
         args.data,
         own if args.detections is None else args.detections,
-        args.masks,
+        mask_source(args),
         frames=folder.frame_ids,
         classes=folder.classes,
         ground=folder.setting("ground"),
@@ -157,20 +161,15 @@ def _make_dataset(args: argparse.Namespace, folder: RunFolder) -> StereoDataset 
 
 
 def _disparity_field(args: argparse.Namespace, folder: RunFolder) -> DisparityField | None:
-    """The field that the run was made with; without it only stereo points would be wrong.
+    """The field that the run was made with; without it stereo points and iterations would be wrong.
 
     Raises:
         InputError: it is another one, or missing where it is needed.
     """
-    from directshape_torch.batch.content_hashes import hash_field
-    from directshape_torch.geometry.disparity_field import DisparityField
-
-    noted = folder.manifest.sha256.get("stereo_bias")
-    if args.stereo_bias is None:
-        if noted is not None and args.data is not None and "points" in args.format:
-            raise InputError("--stereo-bias", "the field that the run was made with, for stereo points", "nothing")
-        return None
-    field = DisparityField.load(args.stereo_bias)
-    if hash_field(field) != noted:
-        raise InputError("--stereo-bias", "the field that the run was made with", f"another one in {args.stereo_bias}")
-    return field
+    if args.stereo_bias is not None:
+        return field_of_run(args.stereo_bias, folder.manifest)
+    needs_field = args.data is not None and (args.iterations or "points" in args.format)
+    if needs_field and folder.manifest.sha256.get("stereo_bias") is not None:
+        purpose = "stereo points" if "points" in args.format else "--iterations"
+        raise InputError("--stereo-bias", f"the field that the run was made with, for {purpose}", "nothing")
+    return None

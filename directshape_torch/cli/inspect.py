@@ -76,7 +76,8 @@ def _inspect_frames(args: argparse.Namespace) -> int:
     refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
-        inspect_frame(loaded, refiner, _rows(loaded, args.car), args.data or DEMO_FOLDER, args.out)
+        rows = _rows(loaded, args.car)
+        inspect_frame(loaded, refiner, rows, args.data or DEMO_FOLDER, args.out, must_refine=args.car is not None)
     print(f"figures  {args.out}")
     return 0
 

@@ -27,24 +27,31 @@ from directshape_torch.visualize.overlay import overlay_of_frame
 
 
 def inspect_frame(
-    loaded: LoadedFrame, refiner: DirectShapeRefiner, rows: Sequence[int], root: Path, out_dir: Path
+    loaded: LoadedFrame,
+    refiner: DirectShapeRefiner,
+    rows: Sequence[int],
+    root: Path,
+    out_dir: Path,
+    *,
+    must_refine: bool = False,
 ) -> None:
     """Refine all cars of a frame and draw some: `FRAME.png`, and a folder `FRAME_LINE` a car.
 
     Args:
         loaded: the frame, on the CPU.
         refiner: on the CPU too.
-        rows: of the detections to draw. A single one must be a car that can be refined.
+        rows: of the detections to draw.
         root: folder of the data set, for scans and other truth.
         out_dir: made where it is missing.
+        must_refine: draw nothing where one of them cannot be refined.
 
     Raises:
-        InputError: the single car was not refined; says why.
+        InputError: such a car was not refined; says why.
     """
     # Matched once, for the point figure and for the methods that fit points; the others do not look at it.
     loaded = replace(loaded, frame=with_disparity(loaded.frame, refiner.config.point_cloud.matcher))
     trace = trace_refinement(refiner, loaded.frame, loaded.detections)
-    _report(loaded, trace, rows)
+    _report(loaded, trace, rows, must_refine)
     write_png(out_dir / f"{loaded.frame_id}.png", overlay_of_frame(loaded, trace.result))
     drawn = [row for row in rows if trace.place_of(row) >= 0]
     silhouettes = silhouette_trace(refiner, loaded) if drawn else None
@@ -69,14 +76,14 @@ def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> Refine
     return trace_refinement(without_photometry(refiner), loaded.frame, loaded.detections)
 
 
-def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int]) -> None:
+def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int], must_refine: bool) -> None:
     """A line a car: how it ended, its cost before and after."""
     result = trace.result
     for row in rows:
         status = result.status[row]
         name = f"frame {loaded.frame_id} car {line_of(loaded, row)}"
         if trace.place_of(row) < 0:
-            if len(rows) == 1:
+            if must_refine:
                 raise InputError("--car", "a car that can be refined", f"{status.name} ({status.value})")
             print(f"{name}: not refined, {status.name}: {status.value}")
             continue

@@ -7,14 +7,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import LAYOUTS
-from directshape_torch.errors import InputError
+from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, mask_source
+from directshape_torch.cli.run_inputs import check_data_is_not_needed, field_of_run
 
 if TYPE_CHECKING:
-    from directshape_torch.geometry.disparity_field import DisparityField
-    from directshape_torch.io.instance_masks import MaskSource
     from directshape_torch.report.frame_inputs import InputSources
-    from directshape_torch.report.run_folder import RunFolder
 
 _DESCRIPTION = """
 Write one self-contained HTML page about a run of 'directshape refine': summary, sortable table of cars, distributions,
@@ -33,9 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     inputs.add_argument("--data", type=Path, metavar="ROOT", help="folder of the data set")
     inputs.add_argument("--layout", choices=LAYOUTS, default="kitti", help="of that data set (default: kitti)")
     inputs.add_argument("--detections", type=Path, metavar="DIR", help="detections (folder: default those in ROOT)")
-    inputs.add_argument("--masks", type=Path, metavar="DIR", help="NNNNNN.json, or instance_2 and instance_3 with PNG")
-    inputs.add_argument("--masks-left", type=Path, metavar="FILE", help="COCO results of the left images")
-    inputs.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
+    add_mask_options(inputs)
     inputs.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
     inputs.add_argument(
         "--prior", metavar="FILE|NAME", help="the shape prior of the run; default: that bundled one which it used"
@@ -78,58 +73,22 @@ def _sources(args: argparse.Namespace) -> InputSources:
 
     run = RunFolder.open(args.out)
     if args.data is None:
-        _check_data_is_not_needed(args)
+        check_data_is_not_needed(args, "detections", "masks", "masks_left", "masks_right", "stereo_bias")
         return InputSources()
     if not run.done:
         return InputSources()
     is_folder = args.layout == "folder"
     # Without detections a layout still needs a folder of them; the result files stand in, and are not read as such.
     stand_in = None if is_folder else args.out
-    field = _disparity_field(args.stereo_bias, run)
+    masks = mask_source(args)
+    field = None if args.stereo_bias is None else field_of_run(args.stereo_bias, run.manifest)
     dataset = open_dataset(
         args.layout,
         args.data,
         stand_in if args.detections is None else args.detections,
-        _mask_source(args),
+        masks,
         frames=run.done,
         classes=run.classes,
         disparity_field=field,
     )
-    has_own_masks = args.masks is None and args.masks_left is None and args.masks_right is None
-    return InputSources(dataset.layout, is_folder or args.detections is not None, dataset.masks, has_own_masks, field)
-
-
-def _check_data_is_not_needed(args: argparse.Namespace) -> None:
-    names = ("detections", "masks", "masks_left", "masks_right", "stereo_bias")
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]
-    if given:
-        raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
-
-
-def _disparity_field(path: Path | None, run: RunFolder) -> DisparityField | None:
-    """The field that the run was made with.
-
-    Raises:
-        InputError: it is another one.
-    """
-    from directshape_torch.batch.content_hashes import hash_field
-    from directshape_torch.geometry.disparity_field import DisparityField
-
-    if path is None:
-        return None
-    field = DisparityField.load(path)
-    if hash_field(field) != run.manifest.sha256.get("stereo_bias"):
-        raise InputError("--stereo-bias", "the field that the run was made with", f"another one in {path}")
-    return field
-
-
-def _mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
-    from directshape_torch.io.instance_masks import CocoFileMasks
-
-    files = (args.masks_left, args.masks_right)
-    if args.masks is not None and files != (None, None):
-        raise InputError("--masks", "either a folder or COCO files", "both")
-    if files != (None, None):
-        return CocoFileMasks(*files)
-    masks: Path | None = args.masks
-    return masks
+    return InputSources(dataset.layout, is_folder or args.detections is not None, dataset.masks, masks is None, field)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -63,6 +66,11 @@ def test_masks_and_grey_change_the_colours(finished: FinishedRun, tmp_path: Path
     [
         (("--format", "coco3d"), "--data: expected the data set of the run, for the sizes"),
         (("--format", "ply", "--masks", "x"), "--data: expected the data set of the run, because of --masks"),
+        (("--format", "ply", "--masks-left", "x"), "because of --masks-left"),
+        (
+            ("--format", "ply", "--iterations"),
+            "--iterations: expected --format rerun, which alone records them, got ply",
+        ),
         (("--format", "ply", "--frames", "7"), "frames: expected finished frames of"),
         (("--format", "points", "--points", "0"), "points_per_car: expected at least 1, got 0"),
         (("--format", "ply", "--prior", "pca"), "was made with another shape prior"),
@@ -77,6 +85,37 @@ def test_wrong_use_is_named(
 ) -> None:
     assert main(command(finished, tmp_path, *words)) == 2
     assert message in capsys.readouterr().err
+
+
+def test_plain_coco_files_lend_the_same_colours(finished: FinishedRun, tmp_path: Path) -> None:
+    entries = [
+        {**{key: value for key, value in entry.items() if key != "image"}, "image_id": int(path.stem)}
+        for path in sorted((finished.root / "masks").iterdir())
+        for entry in json.loads(path.read_text())
+        if entry["image"] == "left"
+    ]
+    (tmp_path / "left.json").write_text(json.dumps(entries))
+    data = ("--format", "ply", "--data", finished.root)
+    assert main(command(finished, tmp_path / "a", *data, "--masks", finished.root / "masks")) == 0
+    assert main(command(finished, tmp_path / "b", *data, "--masks-left", tmp_path / "left.json")) == 0
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+@pytest.mark.parametrize(
+    ("words", "purpose"), [(("points",), "stereo points"), (("rerun", "--iterations"), "--iterations")]
+)
+def test_what_depends_on_the_runs_field_asks_for_it(
+    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], purpose: str
+) -> None:
+    out = Path(shutil.copytree(finished.out, tmp_path / "out"))
+    summary = json.loads((out / "summary.json").read_text())
+    summary["sha256"]["stereo_bias"] = "0" * 64
+    (out / "summary.json").write_text(json.dumps(summary))
+    run = replace(finished, out=out)
+    inputs = ("--data", run.root, "--detections", run.root / "detections", "--masks", run.root / "masks")
+    assert main(command(run, tmp_path / "export", "--format", *words, *inputs)) == 2
+    said = capsys.readouterr().err
+    assert f"--stereo-bias: expected the field that the run was made with, for {purpose}, got nothing" in said
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

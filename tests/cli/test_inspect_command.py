@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.cli.inspect_cars import silhouette_trace
+from directshape_torch.cli.inspect_cars import inspect_frame, silhouette_trace
 from directshape_torch.cli.inspect_truth import points_of_car, true_points
 from directshape_torch.cli.main import main
 from directshape_torch.config_files import load_config
+from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -72,6 +73,17 @@ def test_cars_that_cannot_be_refined_are_named_and_passed_by(
     assert main(words) == 0
     assert capsys.readouterr().out.count("not refined, too_few_pixels") == 6
     assert [path.name for path in tmp_path.iterdir()] == ["000000.png"]
+
+
+def test_the_only_car_of_a_frame_may_fail_unless_it_was_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", "sampling.min_usable_pixels=100000"]))
+    inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, tmp_path)
+    assert "car 2: not refined, too_few_pixels" in capsys.readouterr().out
+    with pytest.raises(InputError, match="too_few_pixels"):
+        inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, tmp_path, must_refine=True)
 
 
 def test_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

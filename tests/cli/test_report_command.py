@@ -50,7 +50,7 @@ def test_notes_say_what_is_missing(run: FinishedRun, tmp_path: Path, capsys: pyt
         (["--stereo-bias", "field.json"], "--data"),
         (["--prior", "neural"], "the prior of the run"),
         (["--data", "nowhere"], "training"),
-        (["--masks", "a", "--masks-left", "b", "--data", "{root}"], "either a folder or COCO files"),
+        (["--masks", "a", "--masks-left", "b", "--data", "{root}"], "either a folder (--masks DIR) or COCO files"),
     ],
 )
 def test_wrong_usage(

@@ -80,9 +80,9 @@ def three_places(count: int) -> tuple[int, int, int]:
 
     Example:
         >>> three_places(12), three_places(2)
-        ((0, 3, 11), (0, 0, 1))
+        ((0, 3, 11), (0, 1, 1))
     """
-    return 0, min(count // 4, count - 2) if count > 1 else 0, count - 1
+    return 0, min(max(count // 4, 1), count - 1), count - 1
 
 
 def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:

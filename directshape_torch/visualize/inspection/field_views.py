@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 
 COLOURS = "RdBu_r"
 """Red outside, blue inside."""
+SURFACE_LIMIT_M, FIELD_LIMIT_M = 0.25, 1.0
+"""Where the colours of surfaces that differ a little, and of fields, are full."""
 FRONT_VIEW, REAR_VIEW = (35.0, 18.0), (215.0, 18.0)
 """Azimuth and elevation of a viewer, degrees."""
 

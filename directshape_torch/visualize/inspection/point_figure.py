@@ -91,7 +91,7 @@ def write_point_figure(path: Path | str, view: CarView) -> None:
             places = [origin[k] + spacing * np.arange(n) for k, n in zip((0, vertical), outline.shape, strict=True)]
             axes[row, column].contour(*places, outline.T, levels=[0.0], colors=["black"], linewidths=1.0)
             _scatter(axes[row, column], points, vertical)
-            _frame(axes[row, column], places, "y, down [m]" if vertical == 1 else "z, left [m]", column == 0)
+            _frame(axes[row, column], places, vertical, column == 0)
     if len(sets) > 1:
         scale = distance_scale(_LIMIT_M)
         figure.colorbar(scale, ax=axes, label="signed distance to the refined shape [m]", shrink=0.8, extend="both")
@@ -120,13 +120,12 @@ def _scatter(axes: Any, points: PointSet, vertical: int) -> None:
     axes.scatter(p[~away, 0], p[~away, vertical], c=c, s=size, cmap=COLOURS, **limits)
 
 
-def _frame(axes: Any, places: list[Array], label: str, is_first: bool) -> None:
+def _frame(axes: Any, places: list[Array], vertical: int, is_first: bool) -> None:
     # Points far behind the car would make it a speck: they lie beyond the frame.
-    room = _ROOM_M
-    axes.set(xlim=(places[0][0] - room, places[0][-1] + room), aspect="equal", xlabel="x, forward [m]")
-    low, high = places[1][0], places[1][-1]
-    axes.set_ylim((high + 0.2, low - 0.2) if "down" in label else (low - room, high + room))
+    (x0, *_, x1), (low, *_, high) = places
+    axes.set(xlim=(x0 - _ROOM_M, x1 + _ROOM_M), aspect="equal", xlabel="x, forward [m]")
+    axes.set_ylim((high + 0.2, low - 0.2) if vertical == 1 else (low - _ROOM_M, high + _ROOM_M))
     if is_first:
-        axes.set_ylabel(label)
+        axes.set_ylabel("y, down [m]" if vertical == 1 else "z, left [m]")
     axes.set_facecolor("0.93")
     axes.grid(alpha=0.4)

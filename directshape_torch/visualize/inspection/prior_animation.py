@@ -12,10 +12,16 @@ from torch import Tensor
 from directshape_torch.io.figure_files import figure_picture, new_figure, write_animation
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import Picture
-from directshape_torch.visualize.inspection.field_views import FRONT_VIEW, REAR_VIEW, coloured_surface, show_section
+from directshape_torch.visualize.inspection.field_views import (
+    FIELD_LIMIT_M,
+    FRONT_VIEW,
+    REAR_VIEW,
+    SURFACE_LIMIT_M,
+    coloured_surface,
+    show_section,
+)
 
 _SIZE_INCHES = (9.0, 2.6)
-_SURFACE_LIMIT_M, _FIELD_LIMIT_M = 0.25, 1.0
 _LARGEST, _STEPS_A_CODE, _SECONDS_A_STEP = 2.0, 12, 0.12
 
 
@@ -62,9 +68,9 @@ def code_frames(prior: ShapePrior, codes: Tensor) -> list[Picture]:
 
 def _draw(axes: Any, prior: ShapePrior, values: Tensor, mean: Tensor, code: Tensor) -> None:
     for part, direction in zip(axes[:2], (FRONT_VIEW, REAR_VIEW), strict=True):
-        part.imshow(coloured_surface(prior, values, mean, direction, _SURFACE_LIMIT_M))
+        part.imshow(coloured_surface(prior, values, mean, direction, SURFACE_LIMIT_M))
         part.axis("off")
-    show_section(axes[2], prior, values, _FIELD_LIMIT_M)
+    show_section(axes[2], prior, values, FIELD_LIMIT_M)
     axes[3].bar(range(1, len(code) + 1), code.tolist(), color="royalblue")
     axes[3].set(ylim=(-2.2, 2.2), xticks=range(1, len(code) + 1), xlabel="code", yticks=[-2, 0, 2])
     axes[3].grid(alpha=0.3)

@@ -9,7 +9,9 @@ from typing import Any
 from directshape_torch.io.figure_files import new_figure
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.inspection.field_views import (
+    FIELD_LIMIT_M,
     FRONT_VIEW,
+    SURFACE_LIMIT_M,
     coloured_surface,
     distance_scale,
     draw_zero_level,
@@ -18,7 +20,6 @@ from directshape_torch.visualize.inspection.field_views import (
 from directshape_torch.visualize.inspection.panels import TRUTH_INK, write_figure
 from directshape_torch.visualize.inspection.prior_fit import FittedCar
 
-_SURFACE_LIMIT_M, _FIELD_LIMIT_M = 0.25, 1.0
 _FIT_LIMIT_M = 0.15
 _NUM_SIGMA = 2.0
 _CARS_A_ROW = 4
@@ -39,13 +40,13 @@ def write_code_figure(path: Path | str, prior: ShapePrior) -> None:
             code = prior.initial_code(1)
             code[0, k] = sigma
             values = prior.values(code)[0].detach()
-            row[column].imshow(coloured_surface(prior, values, mean, FRONT_VIEW, _SURFACE_LIMIT_M))
+            row[column].imshow(coloured_surface(prior, values, mean, FRONT_VIEW, SURFACE_LIMIT_M))
             row[column].axis("off")
             row[column].set_title(f"code {k + 1}: {sigma:+.0f} sigma", fontsize=9)
-            field = show_section(row[2 + column], prior, values, _FIELD_LIMIT_M)
+            field = show_section(row[2 + column], prior, values, FIELD_LIMIT_M)
             draw_zero_level(row[2 + column], prior, mean, "0.4", linestyles="dotted")
     axes[0, 2].set_title("fields; dotted: the mean shape", fontsize=9)
-    _add_scales(figure, axes, field, _SURFACE_LIMIT_M, "outside of the mean shape [m]")
+    _add_scales(figure, axes, field, SURFACE_LIMIT_M, "outside of the mean shape [m]")
     write_figure(path, figure)
 
 
@@ -69,7 +70,7 @@ def write_fit_figure(path: Path | str, prior: ShapePrior, cars: Sequence[FittedC
         car = cars[place]
         surface.imshow(coloured_surface(prior, car.values, car.truth, FRONT_VIEW, _FIT_LIMIT_M))
         surface.set_title(f"{car.name}: {car.error_cm:.1f} cm", fontsize=9)
-        field = show_section(section, prior, car.values, _FIELD_LIMIT_M)
+        field = show_section(section, prior, car.values, FIELD_LIMIT_M)
         draw_zero_level(section, prior, car.truth, TRUTH_INK, linestyles="dashed")
     _add_scales(figure, axes, field, _FIT_LIMIT_M, "outside of the true car [m]")
     write_figure(path, figure)
