@@ -272,7 +272,7 @@ TARGETS: dict[str, Target] = {
             "_is_hidden",
             "_huber_of",
         ),
-        ("tests/tracking/test_tracking_photometric.py",),
+        tuple(f"tests/tracking/test_tracking_{name}.py" for name in ("surface", "residuals", "photometric")),
     ),
     "tracked_silhouettes": Target(
         "directshape_torch/energy/tracked_silhouettes.py",
