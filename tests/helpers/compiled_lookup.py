@@ -1,0 +1,44 @@
+"""A small lookup to compile, with two varying sizes, as the hot functions have them."""
+
+from __future__ import annotations
+
+import types
+
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch import compilation
+from directshape_torch.compilation import Compilable, compilable
+from directshape_torch.compiler_state import compiler_problem
+
+SIZES = {"points": 0, "grid": 0, "car": 0}
+Nearest = Compilable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+needs_compiler = pytest.mark.skipif(compiler_problem() is not None, reason=f"no C++ compiler: {compiler_problem()}")
+
+
+def nearest_values(points: Tensor, grid: Tensor, car: Tensor) -> tuple[Tensor, Tensor]:
+    """The plain function."""
+    node = torch.fmin((points * 4).clamp_min(0).floor(), torch.tensor(3.0)).long()
+    value = grid[car, node[:, 0], node[:, 1]] + points.sum(-1)
+    return value, value.double().cumsum(0)
+
+
+def nearest_inputs(num_points: int, num_cars: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Arguments for it."""
+    generator = torch.Generator().manual_seed(num_points)
+    car = torch.arange(num_points) % num_cars
+    return torch.rand(num_points, 2, generator=generator), torch.rand(num_cars, 4, 4, generator=generator), car
+
+
+def new_nearest() -> Nearest:
+    """The function to be compiled. Compiled code hangs on the code object, so each test has one of its own."""
+    code = nearest_values.__code__.replace()
+    return compilable(sizes=SIZES)(types.FunctionType(code, nearest_values.__globals__, "nearest_values"))
+
+
+def without_disk(monkeypatch: pytest.MonkeyPatch, on_disk: bool = False) -> None:
+    """Nothing is looked up in the compiler's folder, nor noted there."""
+    monkeypatch.setattr(compilation, "is_on_disk", lambda *_: on_disk)
+    monkeypatch.setattr(compilation, "note_on_disk", lambda *_: None)

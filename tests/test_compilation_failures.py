@@ -1,0 +1,164 @@
+"""Where nothing can be compiled: no compiler, one that fails, no folder for its files, a forked process."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.compiled_lookup import Nearest, nearest_inputs, nearest_values, new_nearest, without_disk
+from torch import Tensor
+
+from directshape_torch import compilation
+from directshape_torch.compilation import (
+    CARS_WORTH_COMPILING,
+    CARS_WORTH_LOADING,
+    Compilable,
+    cars_ahead,
+    compilable,
+    compiling,
+)
+from directshape_torch.compiler_inputs import variant_of
+from directshape_torch.errors import CompilationError
+
+
+@pytest.fixture
+def nearest() -> Nearest:
+    return new_nearest()
+
+
+class TestWithoutCompiler:
+    @pytest.fixture(autouse=True)
+    def _no_compiler(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        without_disk(monkeypatch)
+        monkeypatch.setattr(compilation, "compiler_problem", lambda: "none was found")
+
+    def test_auto_says_so_once_and_stays_plain(self, nearest, caplog) -> None:
+        with caplog.at_level(logging.INFO):
+            for _ in range(3):
+                with compiling("auto", 2 * CARS_WORTH_COMPILING):
+                    inputs = nearest_inputs(20, 10)
+                    assert torch.equal(nearest(*inputs)[0], nearest_values(*inputs)[0])
+        assert [r.levelname for r in caplog.records] == ["WARNING"]
+        assert "none was found" in caplog.text
+
+    def test_auto_says_nothing_where_it_would_not_compile(self, nearest, caplog) -> None:
+        with compiling("auto", 3):
+            nearest(*nearest_inputs(20, 3))
+        assert not caplog.records
+
+    def test_on_raises(self) -> None:
+        with pytest.raises(CompilationError, match=r"needs a working C\+\+ compiler, but none was found; set compile"):
+            compiling("on", 3).__enter__()
+
+
+class TestFailure:
+    """The compiler is there but fails at a function: data-dependent control flow cannot be one graph."""
+
+    @staticmethod
+    def branching(x: Tensor) -> Tensor:
+        return x + 1 if bool(x.sum() > 0) else x - 1
+
+    @pytest.fixture
+    def function(self, monkeypatch: pytest.MonkeyPatch) -> Compilable[[Tensor], Tensor]:
+        without_disk(monkeypatch)
+        monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+        return compilable(sizes={"x": 0})(self.branching)
+
+    def test_auto_goes_on_and_says_so_once(self, function, caplog) -> None:
+        for _ in range(2):
+            with cars_ahead(CARS_WORTH_COMPILING), compiling("auto", 1):
+                assert torch.equal(function(torch.ones(3)), torch.full((3,), 2.0))
+        messages = [r.getMessage() for r in caplog.records if r.name == compilation.__name__]
+        assert len(messages) == 1
+        assert "branching could not be compiled" in messages[0]
+
+    def test_on_raises(self, function) -> None:
+        with compiling("on", 1), pytest.raises(CompilationError, match="branching could not be compiled"):
+            function(torch.ones(3))
+
+    def test_a_folder_that_cannot_be_written_is_such_a_failure(self, function, monkeypatch, caplog) -> None:
+        def no_space(*_: object) -> object:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(Compilable, "_compile", no_space)
+        with cars_ahead(CARS_WORTH_COMPILING), compiling("auto", 1):
+            assert torch.equal(function(torch.ones(3)), torch.full((3,), 2.0))
+        assert "could not be compiled: [Errno 28] No space left on device" in caplog.text
+        with compiling("on", 1), pytest.raises(CompilationError, match="No space left on device"):
+            function(torch.ones(3))
+
+    def test_a_later_call_that_is_compiled_anew_and_fails_is_such_a_failure_too(self, function, caplog) -> None:
+        def anew(*_: object) -> Tensor:
+            raise torch._dynamo.exc.FailOnRecompileLimitHit("hit its limit")
+
+        x, calls = torch.ones(3), []
+        function._compiled = anew
+        function._variants.add(variant_of((x,), ((0,),)))
+        with (
+            compiling("on", 1),
+            pytest.raises(CompilationError, match="branching could not be compiled: hit its limit"),
+        ):
+            function(x)
+        function._variants.add(variant_of((x,), ((0,),)))
+        for _ in range(2):
+            with compiling("auto", 1):
+                calls.append(function(x))
+        assert all(torch.equal(call, torch.full((3,), 2.0)) for call in calls)
+        assert caplog.text.count("hit its limit") == 1
+        assert function.num_variants == 0
+
+
+NO_FOLDER = """
+import logging, torch
+from directshape_torch import compilation
+from directshape_torch.errors import CompilationError
+logging.basicConfig()
+compilation._process.cars = {cars}
+doubled = compilation.compilable(sizes={{"x": 0}})(lambda x: 2 * x)
+for _ in range(2):
+    with compilation.compiling("auto", 1):
+        assert doubled(torch.ones(3)).tolist() == [2, 2, 2]
+for _ in range(2):
+    try:
+        compilation.compiling("on", 1).__enter__()
+    except CompilationError as error:
+        print(error)
+"""
+
+
+@pytest.mark.parametrize("cars", [CARS_WORTH_LOADING, CARS_WORTH_COMPILING])
+def test_where_the_compiler_can_have_no_folder_auto_says_so_once_and_on_raises(cars, tmp_path: Path) -> None:
+    # In a process of its own: the folder is made, or not, when the compiler is imported.
+    (tmp_path / "file").touch()
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "file" / "cache"), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", NO_FOLDER.format(cars=cars)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("compile: auto goes on without compiling") == 1
+    assert done.stderr.count("Not a directory") == 1
+    refused = done.stdout.splitlines()
+    assert len(refused) == 2
+    assert all("Not a directory" in line and line.endswith("set compile to auto or off") for line in refused)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_stays_plain(nearest, tmp_path: Path) -> None:
+    answer = tmp_path / "answer"
+    child = os.fork()
+    if child == 0:
+        with compiling("auto", 2 * CARS_WORTH_COMPILING):
+            nearest(*nearest_inputs(20, 10))
+        answer.write_text(f"{compilation._process.forked} {nearest.num_variants}")
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert answer.read_text() == "True 0"
