@@ -9,9 +9,9 @@ from typing import Any
 
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.io.atomic_files import write_png
-from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
 from directshape_torch.io.run_manifest import hash_bytes
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 
 

@@ -6,7 +6,6 @@ import errno
 import gc
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -160,9 +159,9 @@ class _GroupStep:
         try:
             inputs = hash_files(self.job.dataset.input_files(frame_id))
             return _Ready(self.job.dataset.load(frame_id), inputs)
+        except _STOPS_THE_RUN:
+            raise
         except (DirectShapeError, OSError) as error:
-            if isinstance(error, _STOPS_THE_RUN):
-                raise
             self._fail(frame_id, _reason(error))
             return None
 
@@ -180,9 +179,9 @@ class _GroupStep:
         loaded, job = ready.loaded, self.job
         try:
             files = write_frame_outputs(job.out_dir, loaded, result, first_row, job.prior_sha256, job.options)
+        except _STOPS_THE_RUN:
+            raise
         except (DirectShapeError, OSError) as error:
-            if isinstance(error, _STOPS_THE_RUN):
-                raise
             if isinstance(error, OSError) and error.errno in _DISK_IS_FULL:
                 raise self._lost(error) from error
             self._fail(loaded.frame_id, _reason(error))
@@ -247,13 +246,13 @@ def _reason(error: Exception) -> str:
 
 
 def _with_memory_advice(error: Exception, num_frames: int) -> str:
-    if not is_out_of_memory(error):
+    if not _is_out_of_memory(error):
         return _reason(error)
     what = "1 frame" if num_frames == 1 else f"{num_frames} frames"
     return f"too little memory for {what} in a call ({_reason(error)[:200]})"
 
 
-def is_out_of_memory(error: BaseException) -> bool:
+def _is_out_of_memory(error: BaseException) -> bool:
     """Whether memory was lacking; on the CPU PyTorch and OpenCV have no class of exception for that."""
     if isinstance(error, (MemoryError, torch.OutOfMemoryError)):
         return True
@@ -263,6 +262,6 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 def _free_memory(device: torch.device) -> None:
     gc.collect()
-    with torch.cuda.device(device) if device.type == "cuda" else nullcontext():
-        if device.type == "cuda":
+    if device.type == "cuda":
+        with torch.cuda.device(device):
             torch.cuda.empty_cache()

@@ -10,7 +10,7 @@ import numpy as np
 
 from directshape_torch.batch.options import MeshFormat
 from directshape_torch.io.atomic_files import write_bytes
-from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 
 if TYPE_CHECKING:

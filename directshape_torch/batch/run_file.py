@@ -66,6 +66,11 @@ class RunFile:
     failed: Mapping[str, str] = field(default_factory=dict)
     reason: str | None = None
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether it said so; a run that was killed did not."""
+        return self.state in ("finished", "stopped")
+
     def refining(self, num_resumed: int, todo: Sequence[str]) -> RunFile:
         """After the check of what earlier runs left."""
         return replace(self, state="running", num_resumed=num_resumed, todo=list(todo), refining_since=time.time())
@@ -122,16 +127,14 @@ def digit_warnings(before: RunFile | None, now: RunFile) -> tuple[str, ...]:
     Example:
         >>> run = RunFile("r", "finished", 0.0, {"torch": "2.13.0"}, "x", {}, {"threads": 1}, 5)
         >>> digit_warnings(run, replace(run, work={"threads": 2}))
-        ('threads were 1 in the previous run and are 2 now: the last digits of results may differ',)
+        ('threads: 1 in the previous run, 2 now; the last digits of results may differ',)
     """
     if before is None:
         return ()
     was = {**before.versions, **{name: before.work.get(name) for name in _DIGITS}}
     is_now = {**now.versions, **{name: now.work.get(name) for name in _DIGITS}}
     return tuple(
-        f"{name} {'were' if name in ('threads', 'batch_frames') else 'was'} {was.get(name)} in the previous run and "
-        f"{'are' if name in ('threads', 'batch_frames') else 'is'} {is_now[name]} now: the last digits of results may "
-        "differ"
+        f"{name}: {was.get(name)} in the previous run, {is_now[name]} now; the last digits of results may differ"
         for name in is_now
         if was.get(name) != is_now[name]
     )

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import alpha_from_kitti
-from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.result_files import RefinedBox, ShapeArrays, write_result_text, write_shapes
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 
 

@@ -221,6 +221,6 @@ def test_other_threads_than_before_are_a_warning(root: Path, tmp_path: Path, und
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     (out / "data" / "000002.txt").unlink()
     assert any(
-        "batch_frames were 1 in the previous run and are 2 now: the last digits" in warning
+        "batch_frames: 1 in the previous run, 2 now; the last digits" in warning
         for warning in refine(root, out, RefineOptions(batch_frames=2)).warnings
     )
