@@ -13,6 +13,7 @@ import os
 import platform
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -105,11 +106,13 @@ def read_journals(out_dir: Path, run_id: str | None = None) -> JournalContents:
     """The journals of all runs, or of one; also while they are written."""
     records, num_damaged = [], 0
     for path in sorted(journal_folder(out_dir).glob(f"{'' if run_id is None else run_id}*.jsonl")):
-        for record in _read(path):
-            if record is None:
-                num_damaged += 1
-            else:
-                records.append(record)
+        # A run that ends takes its journals away.
+        with suppress(FileNotFoundError):
+            for record in _read(path):
+                if record is None:
+                    num_damaged += 1
+                else:
+                    records.append(record)
     return JournalContents(sorted(records, key=lambda record: record.finished_at), num_damaged)
 
 

@@ -17,7 +17,7 @@ from directshape_torch.batch.content_hashes import hash_field, hash_prior
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import GroupRefiner, GroupReport, RunJob, limit_threads
-from directshape_torch.batch.journal import FrameRecord, Journal, read_journals
+from directshape_torch.batch.journal import FrameRecord, Journal, read_journals, remove_journals
 from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver, WorkerOptions
 from directshape_torch.batch.run_file import RunFile, digit_warnings, read_run_file, run_path, versions
 from directshape_torch.batch.run_lock import RunLock
@@ -176,13 +176,14 @@ class _Run:
             self.observer.finished(frame_id, reason)
 
     def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
-        """Write what is known at the end of the run, whatever end that is."""
+        """Write what is known at the end of the run, whatever end that is; only then the journals go."""
         self.record.take_in_journals()
         if self.timings.calls:
             write_timings(self.out_dir / _TIMINGS, self.timings)
         summary = self._summary(resumed)
         num_done = len(summary.frames) - len(summary.failed)
         self.file.ended(num_done, summary.failed, reason).write(self.out_dir)
+        remove_journals(self.out_dir)
         return summary
 
     def _summary(self, resumed: Sequence[str]) -> RunSummary:

@@ -11,6 +11,7 @@ from typing import Any
 
 from directshape_torch.batch.frame_outputs import overlay_path
 from directshape_torch.batch.journal import FrameRecord, journal_folder, read_journals, remove_journals
+from directshape_torch.batch.run_results import add_record, summary_path
 from directshape_torch.errors import DataFormatError, ResumeError
 from directshape_torch.io.image_files import read_file_bytes
 from directshape_torch.io.refinement_files import result_path, shapes_path
@@ -41,7 +42,6 @@ class RunRecord:
     Attributes:
         manifest: with the frames of earlier runs.
         remade: frames whose files have been removed or damaged since they were finished, after `finished_frames`.
-        num_damaged_lines: of the journals of runs that were cut off.
 
     Raises:
         ResumeError: the folder holds results of other settings, or results without a summary.
@@ -51,7 +51,6 @@ class RunRecord:
         self.out_dir = out_dir
         self.path = summary_path(out_dir)
         self.remade: list[str] = []
-        self.num_damaged_lines = 0
         previous = read_manifest(self.path)
         if previous is None:
             if not is_cleared:
@@ -84,35 +83,22 @@ class RunRecord:
         ]
         return [frame_id for frame_id, is_whole in zip(done, whole, strict=True) if is_whole]
 
-    def add(self, record: FrameRecord) -> None:
-        """Note how a frame ended; outputs of an earlier run that are still valid stay listed."""
-        earlier, entry = self.manifest.frames.get(record.frame_id, {}), record.entry
-        if entry["state"] == "done" and self.manifest.is_done(record.frame_id):
-            lists = ("outputs", "mesh_files")
-            entry = {**entry, **{name: sorted({*earlier.get(name, ()), *entry[name]}) for name in lists}}
-            entry["files"] = {**earlier.get("files", {}), **entry["files"]}
-        self.manifest.inputs[record.frame_id] = record.inputs
-        self.manifest.frames[record.frame_id] = entry
-
     def take_in_journals(self) -> None:
-        """Add what was noted since, write `summary.json`, and only then forget the journals.
+        """Add what was noted since, and write `summary.json`.
 
         Raises:
-            OSError: it could not be written; the journals are still there for the next run.
+            OSError: it could not be written.
         """
         self._add_journals()
         self.write()
-        remove_journals(self.out_dir)
 
     def write(self) -> None:
         """Write `summary.json`."""
         write_manifest(self.path, self.manifest)
 
     def _add_journals(self) -> None:
-        journals = read_journals(self.out_dir)
-        self.num_damaged_lines = journals.num_damaged
-        for record in journals.records:
-            self.add(record)
+        for record in read_journals(self.out_dir).records:
+            add_record(self.manifest, record)
 
     def _check_empty(self) -> None:
         for name in ("data", "shapes"):
@@ -146,11 +132,6 @@ class RunRecord:
                 f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}"
             ) from error
         check_inputs(self.manifest, frame_id, hashes)
-
-
-def summary_path(out_dir: Path) -> Path:
-    """The summary of an output folder."""
-    return out_dir / "summary.json"
 
 
 def remove_unfinished_files(out_dir: Path) -> None:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 
-from directshape_torch.batch.journal import read_journals
+from directshape_torch.batch.journal import FrameRecord, read_journals
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.run_manifest import RunManifest, read_manifest
+
+
+def summary_path(out_dir: Path) -> Path:
+    """The summary of an output folder."""
+    return out_dir / "summary.json"
 
 
 def read_run_results(out_dir: Path) -> RunManifest:
@@ -17,14 +21,26 @@ def read_run_results(out_dir: Path) -> RunManifest:
     Raises:
         DataFormatError: the folder holds no `summary.json`, or a damaged one.
     """
-    path = out_dir / "summary.json"
+    # Before the summary: a journal that goes in between was taken into it.
+    records = read_journals(out_dir).records
+    path = summary_path(out_dir)
     manifest = read_manifest(path)
     if manifest is None:
         raise DataFormatError(path, "is missing", cure="give the folder of --out of 'directshape refine'")
-    frames, inputs = dict(manifest.frames), dict(manifest.inputs)
-    for record in read_journals(out_dir).records:
-        frames[record.frame_id], inputs[record.frame_id] = record.entry, record.inputs
-    return replace(manifest, frames=frames, inputs=inputs)
+    for record in records:
+        add_record(manifest, record)
+    return manifest
+
+
+def add_record(manifest: RunManifest, record: FrameRecord) -> None:
+    """Note in a manifest how a frame ended; outputs of an earlier run that are still valid stay listed."""
+    earlier, entry = manifest.frames.get(record.frame_id, {}), record.entry
+    if entry["state"] == "done" and manifest.is_done(record.frame_id):
+        lists = ("outputs", "mesh_files")
+        entry = {**entry, **{name: sorted({*earlier.get(name, ()), *entry[name]}) for name in lists}}
+        entry["files"] = {**earlier.get("files", {}), **entry["files"]}
+    manifest.inputs[record.frame_id] = record.inputs
+    manifest.frames[record.frame_id] = entry
 
 
 def finished_frames(out_dir: Path, manifest: RunManifest, wanted: Iterable[str | int] | None = None) -> list[str]:

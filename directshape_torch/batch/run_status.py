@@ -65,13 +65,20 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
         DataFormatError: no run has been there.
     """
     out_dir = Path(out_dir)
+    run = _latest_run(out_dir)
+    if run.has_ended:
+        return _ended(run)
+    status = _going_on(run, out_dir, time.time() if now is None else now)
+    # It may have ended meanwhile, and taken its lock and its journals away.
+    run = _latest_run(out_dir)
+    return _ended(run) if run.has_ended else status
+
+
+def _latest_run(out_dir: Path) -> RunFile:
     run = read_run_file(out_dir)
     if run is None:
         raise DataFormatError(out_dir, "has no run.json, so no run of 'directshape refine' is or was here")
-    owner = read_lock_owner(out_dir)
-    if run.state in ("finished", "stopped"):
-        return _ended(run)
-    return _going_on(run, out_dir, owner, time.time() if now is None else now)
+    return run
 
 
 def _ended(run: RunFile) -> RunStatus:
@@ -91,7 +98,8 @@ def _ended(run: RunFile) -> RunStatus:
     )
 
 
-def _going_on(run: RunFile, out_dir: Path, owner: LockOwner | None, now: float) -> RunStatus:
+def _going_on(run: RunFile, out_dir: Path, now: float) -> RunStatus:
+    owner = read_lock_owner(out_dir)
     is_alive = owner is not None and owner.is_alive is not False
     journals = read_journals(out_dir, run.run_id)
     latest = {record.frame_id: record for record in journals.records}

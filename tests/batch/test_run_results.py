@@ -1,14 +1,16 @@
-"""Which frames of an output folder are finished, and how they can be named."""
+"""What summary and journals of a folder say together, which frames are finished, and how they can be named."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from directshape_torch.batch.run_results import finished_frames
-from directshape_torch.errors import InputError
-from directshape_torch.io.run_manifest import RunManifest
+from directshape_torch.batch.journal import FrameRecord, Journal, journal_folder
+from directshape_torch.batch.run_results import finished_frames, read_run_results, summary_path
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.io.run_manifest import RunManifest, write_manifest
 
 OUT = Path("out")
 
@@ -36,3 +38,32 @@ def test_an_id_is_itself_before_it_is_a_number() -> None:
 def test_frames_that_are_not_finished_are_named() -> None:
     with pytest.raises(InputError, match=r"frames: expected finished frames of out, got 8, x, 99"):
         finished_frames(OUT, manifest("000007"), ["7", "8", "x", "99"])
+
+
+def entry(mesh_format: str) -> dict[str, Any]:
+    name = f"meshes/000000_1.{mesh_format}"
+    return {"state": "done", "outputs": [f"meshes_{mesh_format}"], "mesh_files": [name], "files": {name: "hash"}}
+
+
+def test_journals_add_to_the_summary(tmp_path: Path) -> None:
+    write_manifest(summary_path(tmp_path), RunManifest("0.1.0", {}, {}, {"000000": {}}, {"000000": entry("ply")}))
+    journal = Journal(tmp_path, "r1")
+    journal.add(FrameRecord("000000", {"image_left": "a"}, entry("glb")))
+    journal.add(FrameRecord("000001", {}, {"state": "failed", "reason": "cut short"}))
+    results = read_run_results(tmp_path)
+    assert results.frames["000000"]["outputs"] == ["meshes_glb", "meshes_ply"]
+    assert sorted(results.frames["000000"]["files"]) == ["meshes/000000_1.glb", "meshes/000000_1.ply"]
+    assert results.inputs["000000"] == {"image_left": "a"}
+    assert results.frames["000001"] == {"state": "failed", "reason": "cut short"}
+
+
+def test_a_journal_that_goes_while_it_is_read_is_none(tmp_path: Path) -> None:
+    write_manifest(summary_path(tmp_path), RunManifest("0.1.0", {}, {}))
+    journal_folder(tmp_path).mkdir()
+    (journal_folder(tmp_path) / "gone.jsonl").symlink_to(tmp_path / "nothing")
+    assert read_run_results(tmp_path).frames == {}
+
+
+def test_a_folder_without_a_summary(tmp_path: Path) -> None:
+    with pytest.raises(DataFormatError, match=r"summary\.json: is missing"):
+        read_run_results(tmp_path)

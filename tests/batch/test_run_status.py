@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from directshape_torch.batch.journal import FrameRecord, Journal, journal_folder
+from directshape_torch.batch.journal import FrameRecord, Journal, JournalContents, journal_folder
 from directshape_torch.batch.run_file import RunFile, read_run_file, run_path
 from directshape_torch.batch.run_lock import RunLock, lock_path
 from directshape_torch.batch.run_status import RunStatus, format_status, read_status
@@ -89,6 +89,19 @@ def test_states(tmp_path: Path) -> None:
     assert (status.state, status.num_done, len(status.failed), status.num_left) == ("finished", 10, 2, 0)
     run_file().ended(7, {}, "the disk is full").write(tmp_path)
     assert "stopped: the disk is full; the same command again goes on" in format_status(read_status(tmp_path))
+
+
+def test_a_run_that_ends_while_it_is_asked_is_not_taken_for_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ends(out: Path, _: str) -> JournalContents:
+        run_file().ended(12, {}, None).write(out)
+        return JournalContents([], 0)
+
+    run_file().write(tmp_path)
+    monkeypatch.setattr("directshape_torch.batch.run_status.read_journals", ends)
+    status = read_status(tmp_path)
+    assert (status.state, status.num_done, status.num_left) == ("finished", 12, 0)
 
 
 def test_many_failures_are_counted_and_few_shown(tmp_path: Path) -> None:
