@@ -62,16 +62,16 @@ def _report(args: argparse.Namespace) -> CheckReport:
     """A data set that cannot even be opened has one finding, and that says why."""
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.data_check.check_dataset import check_dataset, spread
-    from directshape_torch.data_check.finding import CheckReport, Finding
+    from directshape_torch.data_check.finding import CheckReport, unreadable
     from directshape_torch.errors import DataFormatError
 
     max_frames = None if args.all_frames else args.max_frames
     try:
         dataset = dataset_of(args)
     except DataFormatError as error:
-        measured, _, cure = " ".join(str(error).split()).partition("; ")
         expected = f"data in the layout {args.layout!r} (docs/inputs.md)"
-        return CheckReport((Finding("layout", "error", "all frames", measured, expected, cure),), 0, 0, 0)
+        found = unreadable("layout", "all frames", expected, error, "check the path and the layout")
+        return CheckReport((found,), 0, 0, 0)
     with ProgressBar("check") as progress:
         progress.started(spread(dataset.frame_ids, max_frames))
         return check_dataset(dataset, max_frames, lambda frame_id: progress.finished(frame_id, None))

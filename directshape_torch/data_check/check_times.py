@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from directshape_torch.data_check.finding import Finding, Severity
-from directshape_torch.errors import DirectShapeError
+from directshape_torch.data_check.finding import Finding, Severity, unreadable
+from directshape_torch.errors import DataFormatError
 from directshape_torch.io.stereo_files import FileStereoDataset
 
 # At 15 m/s a car moves 7 cm in 5 ms.
@@ -16,12 +16,18 @@ PAIR_WARNING_S, PAIR_ERROR_S = 0.005, 0.02
 
 def check_times(dataset: FileStereoDataset, frame_ids: Sequence[str]) -> list[Finding]:
     """Differences between left and right times, and times that do not grow from frame to frame of a sequence."""
-    try:
-        known = {frame_id: dataset.layout.times_s(frame_id) for frame_id in frame_ids}
-    except DirectShapeError as error:
-        cure = "write one time a frame, or remove the file"
-        return [Finding("time_file", "error", "all frames", str(error), "a time for each frame", cure)]
-    times = {frame_id: both for frame_id, both in known.items() if both is not None}
+    times: dict[str, tuple[float, float]] = {}
+    for frame_id in frame_ids:
+        try:
+            both = dataset.layout.times_s(frame_id)
+        except DataFormatError as error:
+            # A frame's own file is looked into when the frame is read.
+            if error.path != dataset.detection_path(frame_id):
+                cure = "write one time a frame, or remove the file"
+                return [unreadable("time_file", "all frames", "a time for each frame", error, cure)]
+            continue
+        if both is not None:
+            times[frame_id] = both
     return _check_pairs(times) + _check_order(times)
 
 

@@ -31,6 +31,17 @@ class Finding:
     cure: str
 
 
+def unreadable(check: str, where: str, expected: str, error: Exception, cure: str) -> Finding:
+    """A file that cannot be used, in the words of its error, which ends with a cure of its own or is given one.
+
+    Example:
+        >>> unreadable("mask_file", "frame 1", "a list", ValueError("a.json: is empty; write it"), "?").cure
+        'write it'
+    """
+    measured, _, own_cure = " ".join(str(error).split()).partition("; ")
+    return Finding(check, "error", where, measured, expected, own_cure or cure)
+
+
 @dataclass(frozen=True)
 class CheckReport:
     """All findings about a data set.

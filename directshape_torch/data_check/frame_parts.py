@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.data_check.finding import Finding
+from directshape_torch.data_check.finding import Finding, unreadable
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
@@ -57,9 +57,11 @@ def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, l
         try:
             return read()
         except (DirectShapeError, OSError) as error:
-            # That a file is missing is found for all frames at once.
-            if not (isinstance(error, DataFormatError) and not error.path.exists()):
-                findings.append(_unreadable(check, frame_id, expected, error))
+            is_missing = isinstance(error, DataFormatError) and not error.path.exists()
+            found = _unreadable(check, frame_id, expected, error)
+            # That a file is missing is found for all frames at once, and one file may hold several parts.
+            if not is_missing and found.measured not in {finding.measured for finding in findings}:
+                findings.append(found)
             return None
 
     layout = dataset.layout
@@ -71,15 +73,22 @@ def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, l
         left = right = None
     if left is None or right is None:
         left = right = None
-    calibration = attempt("calibration_file", "P2 and P3, 12 finite numbers each", lambda: layout.calibration(frame_id))
-    objects = attempt("detection_file", "lines of 15 or 16 columns", lambda: dataset.objects(frame_id))
+    calibration = attempt(
+        "calibration_file",
+        "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md",
+        lambda: layout.calibration(frame_id),
+    )
+    objects = attempt(
+        "detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", lambda: dataset.objects(frame_id)
+    )
     size_hw = None if left is None else (left.shape[0], left.shape[1])
     masks = None
     if dataset.masks is not None and size_hw is not None:
         source = dataset.masks
         masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, size_hw))
-    if layout.plane_path(frame_id) is not None:
-        attempt("plane_file", "a x + b y + c z + d = 0 with |b| near 1", lambda: layout.plane_ref(frame_id))
+    plane = "a x + b y + c z + d = 0 with |b| near 1"
+    if attempt("plane_file", plane, lambda: layout.plane_path(frame_id)) is not None:
+        attempt("plane_file", plane, lambda: layout.plane_ref(frame_id))
     refined = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
     parts = FrameParts(frame_id, left, right, calibration, _camera(calibration), refined, masks)
     return parts, findings
@@ -94,11 +103,9 @@ def _camera(calibration: KittiCalibration | None) -> StereoCamera | None:
 
 
 def _unreadable(check: str, frame_id: str, expected: str, error: Exception) -> Finding:
-    text = " ".join(str(error).split())
-    measured, _, cure = text.partition("; ")
     if isinstance(error, MaskSizeError):
         check, expected = "mask_size", "masks of the size of their image"
-    return Finding(check, "error", f"frame {frame_id}", measured, expected, cure or "check the path and the file")
+    return unreadable(check, f"frame {frame_id}", expected, error, "check the path and the file")
 
 
 def _other_size(frame_id: str, left: tuple[int, ...], right: tuple[int, ...]) -> Finding:

@@ -201,6 +201,20 @@ def test_layouts_without_times_have_none(kitti: Path, tmp_path: Path) -> None:
     assert check_times(folder, folder.frame_ids)[0].measured.startswith("left and right image are up to 500.0 ms apart")
 
 
+def test_a_damaged_frame_of_a_folder_is_one_finding_and_hides_no_other(kitti: Path, tmp_path: Path) -> None:
+    """Its file holds detections, masks, plane and times."""
+    write_folder(kitti, tmp_path, ("000000", "000001"))
+    path = tmp_path / "frames" / "000001.json"
+    path.write_text(path.read_text()[:300])
+    (tmp_path / "right" / "000000.png").write_bytes(b"no image")
+    report = check_dataset(open_dataset("folder", tmp_path))
+    assert [(finding.check, finding.where) for finding in report.findings if finding.severity == "error"] == [
+        ("right_image", "frame 000000"),
+        ("detection_file", "frame 000001"),
+    ]
+    assert report.num_cars == 2
+
+
 def test_report_in_words() -> None:
     first = Finding("images_swapped", "error", "frame 1", "m", "e", "c")
     report = CheckReport((first, Finding("images_swapped", "error", "frame 2", "m", "e", "c")), 9, 2, 5)

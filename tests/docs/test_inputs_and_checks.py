@@ -43,7 +43,7 @@ def test_every_finding_is_in_the_table() -> None:
     sources = [path.read_text() for path in (ROOT / "directshape_torch" / "data_check").glob("*.py")]
     sources.append((ROOT / "directshape_torch" / "cli" / "check_data.py").read_text())
     text = "\n".join(sources)
-    named = set(re.findall(r'Finding\(\s*\(?"([a-z0-9_]{2,})"', text)) | set(re.findall(r'attempt\("([a-z_]+)"', text))
+    named = set(re.findall(r'(?:Finding|unreadable|attempt)\(\s*"([a-z0-9_]{2,})"', text))
     of_parts = {f"box_{part}" for part in ("axes", "origin", "yaw", "order")}
     assert named | of_parts | {"mask_size"} == first_column(CHECKS.split("## Findings")[1].split("## Conventions")[0])
     assert f"in {len(list(all_conventions())) - 1} other ways" in CHECKS
