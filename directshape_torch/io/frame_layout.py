@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -14,8 +15,6 @@ from directshape_torch.io.image_files import IMAGE_ENDINGS
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.kitti_labels import KittiObject
-
-DISPARITY_ENDING = ".png"
 
 
 class FrameLayout(Protocol):
@@ -97,6 +96,17 @@ def existing_folder(path: Path, problem: str, cure: str = "check the path") -> P
     return path
 
 
+def detection_stems(folder: Path) -> list[str]:
+    """Names without ending of the result files in a folder, or in its folder `data` where there is one, sorted."""
+    nested = folder / "data"
+    return sorted(path.stem for path in (nested if nested.is_dir() else folder).glob("*.txt"))
+
+
+def first_existing(paths: Sequence[Path]) -> Path:
+    """The first file that exists, else the first of all."""
+    return next((path for path in paths if path.is_file()), paths[0])
+
+
 def image_stems(folder: Path) -> list[str]:
     """Names without ending of the images in a folder, sorted."""
     return sorted({path.stem for path in folder.glob("*") if path.suffix.lstrip(".") in IMAGE_ENDINGS})
@@ -104,5 +114,5 @@ def image_stems(folder: Path) -> list[str]:
 
 def first_disparity(folder: Path, stem: str) -> Path:
     """`NNNNNN_10.png`, as submissions to KITTI Stereo 2015 call the first pair of a scene, else `NNNNNN.png`."""
-    first_pair = folder / f"{stem}_10{DISPARITY_ENDING}"
-    return first_pair if first_pair.is_file() else folder / f"{stem}{DISPARITY_ENDING}"
+    first_pair = folder / f"{stem}_10.png"
+    return first_pair if first_pair.is_file() else folder / f"{stem}.png"

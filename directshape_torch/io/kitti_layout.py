@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.frame_detections import GivenMasks
-from directshape_torch.io.frame_layout import existing_folder, first_disparity
-from directshape_torch.io.ground_plane_files import read_plane
+from directshape_torch.io.frame_layout import detection_stems, existing_folder, first_disparity
 from directshape_torch.io.image_files import find_image
-from directshape_torch.io.instance_masks import MaskSource, file_of_frame, mask_source
-from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration
+from directshape_torch.io.instance_masks import file_of_frame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.kitti_text_layout import KittiTextLayout
 
 
-class KittiObjectLayout:
+class KittiObjectLayout(KittiTextLayout):
     """`root/training` with image_2, image_3, calib, label_2, planes; detections apart.
 
     Args:
@@ -38,8 +33,7 @@ class KittiObjectLayout:
 
     def frame_ids(self) -> list[str]:
         """Every frame that has a detection file."""
-        folder = self.detections_dir / "data"
-        return sorted(path.stem for path in (folder if folder.is_dir() else self.detections_dir).glob("*.txt"))
+        return detection_stems(self.detections_dir)
 
     def frame_id(self, number: int) -> str:
         """Six digits."""
@@ -53,22 +47,9 @@ class KittiObjectLayout:
         """One calibration a frame."""
         return self.training / "calib" / f"{frame_id}.txt"
 
-    def calibration(self, frame_id: str) -> KittiCalibration:
-        """The matrices of that file."""
-        return read_calibration(self.calibration_path(frame_id))
-
-    def plane_path(self, frame_id: str) -> Path | None:
-        """The plane file, where there is one."""
-        path = self.plane_file(frame_id)
-        return path if path.is_file() else None
-
     def plane_file(self, frame_id: str) -> Path:
-        """Where the plane file would be."""
+        """One plane a frame."""
         return self.training / "planes" / f"{frame_id}.txt"
-
-    def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
-        """(a, b, c, d) in ref."""
-        return read_plane(self.plane_file(frame_id))
 
     def detection_path(self, frame_id: str) -> Path:
         """One file a frame."""
@@ -86,15 +67,3 @@ class KittiObjectLayout:
     def disparity_path(self, folder: Path, frame_id: str) -> Path:
         """The map of the first pair of a scene, or of the frame."""
         return first_disparity(folder, frame_id)
-
-    def times_s(self, frame_id: str) -> tuple[float, float] | None:
-        """None: no file of this layout says so."""
-        return None
-
-    def masks(self, directory: Path | None) -> MaskSource | None:
-        """See `mask_source`; no masks come with the layout itself."""
-        return None if directory is None else mask_source(directory)
-
-    def given_masks(self, frame_id: str) -> GivenMasks | None:
-        """None: masks are matched by overlap."""
-        return None

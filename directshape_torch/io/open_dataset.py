@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, Unpack, get_args
 
 from directshape_torch.errors import InputError
 from directshape_torch.io.folder_layout import FolderLayout
@@ -12,7 +12,7 @@ from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.sequence_layout import raw_layout, tracking_layout
 from directshape_torch.io.stereo2015_layout import Stereo2015Layout
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_files import DatasetOptions, FileStereoDataset
 
 LayoutName = Literal["kitti", "raw", "tracking", "stereo2015", "folder"]
 
@@ -22,7 +22,7 @@ def open_dataset(
     root: Path | str,
     detections_dir: Path | str | None = None,
     masks: Path | str | MaskSource | None = None,
-    **options: Any,
+    **options: Unpack[DatasetOptions],
 ) -> FileStereoDataset:
     """The data set of that layout (docs/inputs.md).
 

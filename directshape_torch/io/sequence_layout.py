@@ -6,17 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.frame_detections import GivenMasks
-from directshape_torch.io.frame_layout import existing_folder, first_disparity, image_stems
-from directshape_torch.io.ground_plane_files import read_plane
+from directshape_torch.io.frame_layout import (
+    detection_stems,
+    existing_folder,
+    first_disparity,
+    first_existing,
+    image_stems,
+)
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import FrameJsonMasks, InstanceMask, MaskSource, file_of_frame, mask_source
-from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.kitti_text_layout import KittiTextLayout
 from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
 
@@ -41,7 +42,7 @@ class SequenceFolders:
     labels: Path | None
 
 
-class SequenceLayout:
+class SequenceLayout(KittiTextLayout):
     """One sequence, whose frames are called as their images are, or several, with `SEQUENCE_` before that.
 
     Args:
@@ -69,7 +70,8 @@ class SequenceLayout:
 
     def frame_ids(self) -> list[str]:
         """The frames with a detection file, or all of the sequences that have one of the tracking benchmark."""
-        return [self._join(name, stem) for name in sorted(self._sequences) for stem in self._stems(name)]
+        stems = detection_stems(self.detections_dir)
+        return [self._join(name, stem) for name in sorted(self._sequences) for stem in self._stems(name, stems)]
 
     def frame_id(self, number: int) -> str:
         """Of one sequence; of several, a number alone names no frame."""
@@ -91,18 +93,10 @@ class SequenceLayout:
         """One calibration a sequence, or a day."""
         return self._split(frame_id)[0].calibration
 
-    def calibration(self, frame_id: str) -> KittiCalibration:
-        """The matrices of that file."""
-        return read_calibration(self.calibration_path(frame_id))
-
-    def plane_path(self, frame_id: str) -> Path | None:
-        """The plane file, where there is one."""
-        path = self._plane_file(frame_id)
-        return path if path.is_file() else None
-
-    def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
-        """(a, b, c, d) in ref."""
-        return read_plane(self._plane_file(frame_id))
+    def plane_file(self, frame_id: str) -> Path:
+        """One plane a frame."""
+        sequence, stem = self._split(frame_id)
+        return sequence.planes / f"{stem}.txt"
 
     def detection_path(self, frame_id: str) -> Path:
         """The frame's own file where there is one, else its sequence's."""
@@ -110,7 +104,7 @@ class SequenceLayout:
         own = [] if self._single else [file_of_frame(self.detections_dir / sequence.name, f"{stem}.txt")]
         own.append(file_of_frame(self.detections_dir, f"{frame_id}.txt"))
         whole = file_of_frame(self.detections_dir, f"{sequence.name}.txt")
-        return next((path for path in (*own, whole) if path.is_file()), own[0])
+        return first_existing([*own, whole])
 
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The detections of a frame."""
@@ -142,25 +136,19 @@ class SequenceLayout:
     def masks(self, directory: Path | None) -> MaskSource | None:
         """See `mask_source` for one sequence, `SequenceMasks` for several."""
         if directory is None or self._single:
-            return None if directory is None else mask_source(directory)
+            return super().masks(directory)
         return SequenceMasks(existing_folder(directory, "is not a folder of masks"), tuple(self._sequences))
 
-    def given_masks(self, frame_id: str) -> GivenMasks | None:
-        """None: masks are matched by overlap."""
-        return None
-
-    def _stems(self, name: str) -> list[str]:
-        """The frames of a sequence that have detections."""
+    def _stems(self, name: str, all_stems: list[str]) -> list[str]:
+        """The frames of a sequence that have detections, of which `all_stems` lie directly in their folder."""
         sequence = self._sequences[name]
         if file_of_frame(self.detections_dir, f"{name}.txt").is_file():
             return image_stems(sequence.left)
-        found = {
-            path.stem for path in _detection_files(self.detections_dir if self._single else self.detections_dir / name)
-        }
-        if not self._single:
-            prefix = f"{name}_"
-            files = _detection_files(self.detections_dir)
-            found |= {path.stem.removeprefix(prefix) for path in files if path.stem.startswith(prefix)}
+        if self._single:
+            return all_stems
+        prefix = f"{name}_"
+        found = set(detection_stems(self.detections_dir / name))
+        found |= {stem.removeprefix(prefix) for stem in all_stems if stem.startswith(prefix)}
         return sorted(found)
 
     def _tracked(self, path: Path, stem: str) -> list[KittiObject]:
@@ -176,10 +164,6 @@ class SequenceLayout:
         if number >= len(times_s):
             raise DataFormatError(path, f"has {len(times_s)} times, none for frame {number}", cure="one line a frame")
         return times_s[number]
-
-    def _plane_file(self, frame_id: str) -> Path:
-        sequence, stem = self._split(frame_id)
-        return sequence.planes / f"{stem}.txt"
 
     def _stem(self, number: int) -> str:
         return f"{number:0{self._digits}d}"
@@ -288,8 +272,3 @@ def _drive(folder: Path) -> SequenceFolders:
     inside = folder / "calib_cam_to_cam.txt"
     calibration = inside if inside.is_file() else folder.resolve().parent / "calib_cam_to_cam.txt"
     return SequenceFolders(folder.resolve().name, *images, calibration, folder / "planes", None)
-
-
-def _detection_files(folder: Path) -> list[Path]:
-    nested = folder / "data"
-    return sorted((nested if nested.is_dir() else folder).glob("*.txt"))

@@ -5,13 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.frame_detections import GivenMasks
-from directshape_torch.io.frame_layout import existing_folder
-from directshape_torch.io.ground_plane_files import read_plane
+from directshape_torch.io.frame_layout import detection_stems, existing_folder, first_existing
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import (
     InstanceMask,
@@ -20,13 +15,13 @@ from directshape_torch.io.instance_masks import (
     file_of_frame,
     mask_source,
 )
-from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.kitti_text_layout import KittiTextLayout
 
 FIRST_PAIR = "_10"
 
 
-class Stereo2015Layout:
+class Stereo2015Layout(KittiTextLayout):
     """`root/training` (or `testing`) with image_2, image_3 and calib_cam_to_cam; frames are called `NNNNNN_10`.
 
     Detections, masks and planes of the first pair may be called by the scene alone, `NNNNNN`, too.
@@ -55,9 +50,7 @@ class Stereo2015Layout:
 
     def frame_ids(self) -> list[str]:
         """Every pair that has a detection file."""
-        nested = self.detections_dir / "data"
-        files = (nested if nested.is_dir() else self.detections_dir).glob("*.txt")
-        return sorted({_full_name(path.stem) for path in files})
+        return sorted({_full_name(stem) for stem in detection_stems(self.detections_dir)})
 
     def frame_id(self, number: int) -> str:
         """The first pair of a scene."""
@@ -71,23 +64,9 @@ class Stereo2015Layout:
         """One calibration a scene."""
         return self.folder / "calib_cam_to_cam" / f"{frame_id.partition('_')[0]}.txt"
 
-    def calibration(self, frame_id: str) -> KittiCalibration:
-        """The matrices of that file."""
-        return read_calibration(self.calibration_path(frame_id))
-
-    def plane_path(self, frame_id: str) -> Path | None:
-        """The plane file, where there is one."""
-        path = self._plane_file(frame_id)
-        return path if path.is_file() else None
-
-    def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
-        """(a, b, c, d) in ref."""
-        return read_plane(self._plane_file(frame_id))
-
     def detection_path(self, frame_id: str) -> Path:
         """One file a pair."""
-        paths = [file_of_frame(self.detections_dir, f"{name}.txt") for name in names_of(frame_id)]
-        return next((path for path in paths if path.is_file()), paths[0])
+        return first_existing([file_of_frame(self.detections_dir, f"{name}.txt") for name in names_of(frame_id)])
 
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The detections of a pair."""
@@ -101,21 +80,13 @@ class Stereo2015Layout:
         """As in submissions to the benchmark, `NNNNNN_10.png`."""
         return folder / f"{frame_id}.png"
 
-    def times_s(self, frame_id: str) -> tuple[float, float] | None:
-        """None: no file of this layout says so."""
-        return None
-
     def masks(self, directory: Path | None) -> MaskSource | None:
         """See `mask_source`; no masks come with the layout itself."""
         return None if directory is None else SceneMasks(directory, mask_source(directory))
 
-    def given_masks(self, frame_id: str) -> GivenMasks | None:
-        """None: masks are matched by overlap."""
-        return None
-
-    def _plane_file(self, frame_id: str) -> Path:
-        paths = [self.folder / "planes" / f"{name}.txt" for name in names_of(frame_id)]
-        return next((path for path in paths if path.is_file()), paths[0])
+    def plane_file(self, frame_id: str) -> Path:
+        """One plane a pair."""
+        return first_existing([self.folder / "planes" / f"{name}.txt" for name in names_of(frame_id)])
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import TypedDict, get_args
 
 import numpy as np
 import torch
@@ -26,6 +26,19 @@ from directshape_torch.io.text_files import read_lines
 from directshape_torch.scene import FrameBatch, GroundPlane, StereoCamera
 
 DEFAULT_CAMERA_HEIGHT_M = 1.65
+
+
+class DatasetOptions(TypedDict, total=False):
+    """The keyword arguments of `FileStereoDataset`, for functions that pass them on."""
+
+    split: Path | str | None
+    frames: Iterable[str | int] | None
+    classes: Sequence[str]
+    ground: GroundSource
+    camera_height_m: float
+    disparity_field: DisparityField | None
+    disparity_dir: Path | str | None
+    dtype: torch.dtype
 
 
 class FileStereoDataset:
@@ -150,8 +163,8 @@ class FileStereoDataset:
         if frames is not None:
             names = (self.layout.frame_id(frame) if isinstance(frame, int) else frame for frame in frames)
             # A frame that is named twice is one frame.
-            wanted = list(dict.fromkeys(names))
-            missing = [frame for frame in wanted if frame not in set(known)]
+            wanted, existing = list(dict.fromkeys(names)), set(known)
+            missing = [frame for frame in wanted if frame not in existing]
             if missing:
                 where = split if split is not None else self.detections_dir
                 raise InputError("frames", f"ids that occur in {where}", ", ".join(missing[:5]))
