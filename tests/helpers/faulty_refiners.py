@@ -18,11 +18,9 @@ from directshape_torch.result import RefinementResult
 from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
-FEW_STEPS = (
-    "stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]",
-    # The model of trust does not know toys that have not converged.
-    "acceptance.min_probability_not_worse=0",
-)
+# The model of trust does not know toys that have not converged.
+EVERY_RESULT = "acceptance.min_probability_not_worse=0"
+FEW_STEPS = ("stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 2}]", EVERY_RESULT)
 
 
 def few_steps() -> RefinerConfig:

@@ -1,0 +1,27 @@
+"""Runs over the data set of `helpers.kitti_folder`, a few iterations a car."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from directshape_torch.batch.options import RefineOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.run_summary import RunSummary
+from directshape_torch.config import RefinerConfig
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from helpers.faulty_refiners import few_steps
+
+
+def dataset(root: Path, **options: Any) -> KittiStereoDataset:
+    return KittiStereoDataset(root, root / "detections", root / "masks", **options)
+
+
+def refiner(root: Path, config: RefinerConfig | None = None) -> DirectShapeRefiner:
+    return DirectShapeRefiner(PCAShapePrior.load(root / "prior.npz"), config or few_steps())
+
+
+def refine(root: Path, out: Path, *, config: RefinerConfig | None = None, **options: Any) -> RunSummary:
+    return refine_dataset(dataset(root), refiner(root, config), out, RefineOptions(**options))
