@@ -17,7 +17,7 @@ from directshape_torch.io.folder_json import FolderFrame, FolderObject, FolderRi
 from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.frame_layout import existing_folder, first_disparity
 from directshape_torch.io.ground_plane_files import upright_plane
-from directshape_torch.io.image_files import find_image, read_single_channel
+from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import (
     COCO_CAR_IDS,
     SIDES,
@@ -26,6 +26,7 @@ from directshape_torch.io.instance_masks import (
     Side,
     check_size,
     mask_source,
+    read_soft_mask,
     tight_box,
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
@@ -212,9 +213,7 @@ class FolderMasks:
     ) -> NDArray[np.bool_] | NDArray[np.float32]:
         mask = entry.masks[side]
         if isinstance(mask, str):
-            grey = read_single_channel(self.root / mask)
-            check_size(self.root / mask, "the mask", grey.shape, size_hw)
-            return grey.astype(np.float32) / np.float32(np.iinfo(grey.dtype).max)
+            return read_soft_mask(self.root / mask, size_hw)
         decoded = decode_segmentation(path, index, mask, size_hw)
         check_size(path, f"mask_{side} of objects[{index}]", decoded.shape, size_hw)
         return decoded

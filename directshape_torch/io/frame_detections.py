@@ -140,7 +140,7 @@ def _stack(masks: Sequence[InstanceMask], matches: MaskMatches, size_hw: tuple[i
     stacked = torch.zeros((len(matches.mask_of_detection), *size_hw), dtype=dtype)
     for row, index in enumerate(matches.mask_of_detection):
         if index >= 0:
-            stacked[row] = torch.from_numpy(masks[index].probability).to(dtype)
+            stacked[row] = torch.from_numpy(masks[index].probability)
     return stacked
 
 
@@ -181,7 +181,7 @@ def _occluders(
     ]
     stacked = {side: torch.zeros((len(rest), *size_hw), dtype=dtype) for side in SIDES}
     for row, (mask, _) in enumerate(rest):
-        stacked[mask.side][row] = torch.from_numpy(mask.probability).to(dtype)
+        stacked[mask.side][row] = torch.from_numpy(mask.probability)
     return Occluders(
         frame_index=torch.zeros(len(rest), dtype=torch.int64),
         mask_left=stacked["left"],

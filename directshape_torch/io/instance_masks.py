@@ -240,6 +240,18 @@ def tight_box(probability: NDArray[Any]) -> tuple[float, float, float, float] | 
     return float(columns[0]), float(rows[0]), float(columns[-1]), float(rows[-1])
 
 
+def read_soft_mask(path: Path, size_hw: tuple[int, int]) -> NDArray[np.float32]:
+    """A PNG of foreground probability x 255 (or x 65535, with 16 bits), (H, W) in [0, 1].
+
+    Raises:
+        DataFormatError: it is missing, damaged, or has several channels.
+        MaskSizeError: it has another size than its image.
+    """
+    grey = read_single_channel(path)
+    check_size(path, "the soft mask", grey.shape, size_hw)
+    return np.asarray(grey.astype(np.float32) / np.float32(np.iinfo(grey.dtype).max))
+
+
 def check_size(path: Path, what: str, got_hw: Iterable[int], expected_hw: tuple[int, int]) -> None:
     """Raise `MaskSizeError` naming both sizes unless a mask has the size of its image."""
     got = tuple(int(n) for n in got_hw)
@@ -285,10 +297,7 @@ def _probability(
 ) -> NDArray[np.bool_] | NDArray[np.float32]:
     soft = entry.get("soft_probability")
     if soft:
-        soft_path = path.parent / str(soft)
-        grey = read_single_channel(soft_path)
-        check_size(soft_path, "the soft mask", grey.shape, size_hw)
-        return grey.astype(np.float32) / np.float32(np.iinfo(grey.dtype).max)
+        return read_soft_mask(path.parent / str(soft), size_hw)
     mask = decode_segmentation(path, index, entry.get("segmentation"), size_hw)
     check_size(path, f"the mask of entry {index}", mask.shape, size_hw)
     return mask

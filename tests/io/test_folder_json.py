@@ -93,7 +93,7 @@ def test_masks_are_probabilities(root: Path) -> None:
     assert mask.probability.max() == pytest.approx(200 / 255)
     assert mask.mask_box == (20, 15, 39, 24)
     assert FolderMasks(root, root / "frames").files("a") == (root / "masks" / "a.png",)
-    with pytest.raises(MaskSizeError, match="the mask has 60 x 40 pixels"):
+    with pytest.raises(MaskSizeError, match="the soft mask has 60 x 40 pixels"):
         FolderMasks(root, root / "frames").read("a", (80, 60))
 
 
