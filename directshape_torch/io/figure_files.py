@@ -46,6 +46,8 @@ def new_figure(width_inches: float, height_inches: float, purpose: str) -> Any:
 
 def figure_png(figure: Any) -> bytes:
     """A figure of `new_figure` as PNG; equal figures give equal bytes."""
+    # Where panels keep an aspect, labels may reach out of the picture until the parts have found their places twice.
+    figure.draw_without_rendering()
     content = io.BytesIO()
     # Without the software's version, which would make the bytes differ.
     figure.savefig(content, format="png", dpi=_DOTS_PER_INCH, metadata={"Software": None})

@@ -20,7 +20,7 @@ from directshape_torch.visualize.inspection.residual_values import (
 _PANEL_INCHES = 3.6
 _WIDTH_INCHES = 3 * _PANEL_INCHES + 0.4
 # Of titles and colour bars.
-_ROOM_INCHES = 1.9
+_ROOM_INCHES = 2.3
 # -log 0.01: what a pixel pays whose mask is certain and wrong.
 _WORST_SILHOUETTE = 4.6
 _CONTOUR_INK = "cyan"

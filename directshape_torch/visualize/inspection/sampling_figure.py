@@ -75,11 +75,13 @@ def write_occlusion_picture(path: Path | str, view: CarView) -> None:
     detections = without_empty_masks(view.loaded.detections)
     config = view.trace.problem.config.sampling
     regions = car_regions(view.loaded.frame, detections, config)
+    # One scale for both images, or the car would seem to change its size.
+    scale = max(2, round(_LEAST_HEIGHT_PX / max(v1 - v0 for _, v0, _, v1 in view.regions)))
     rows = []
     for side, region in zip(_SIDES, regions, strict=True):
         u0, v0, u1, v1 = region[view.car].tolist()
         if u1 > u0 and v1 > v0:
-            order, scale = config.occlusion_order, max(2, round(_LEAST_HEIGHT_PX / (v1 - v0)))
+            order = config.occlusion_order
             rows.append(occlusion_picture(view.loaded.frame, detections, region, view.car, side, order, scale))
     width = max(row.shape[1] for row in rows)
     padded = [np.pad(row, ((0, PANEL_GAP_PX), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in rows]
