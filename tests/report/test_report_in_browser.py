@@ -160,6 +160,34 @@ def test_3d_draws_turns_and_opens_cars(opened: Chrome) -> None:
     assert scene.get_attribute("data-car") in find(opened, "#car-dialog h2").text
 
 
+def test_3d_shows_a_car_of_another_frame(opened: Chrome) -> None:
+    from selenium.webdriver import ActionChains
+
+    opened.execute_script(
+        """window.contexts = 0;
+        const { getContext } = HTMLCanvasElement.prototype;
+        HTMLCanvasElement.prototype.getContext = function (...words) {
+          window.contexts += 1;
+          return getContext.apply(this, words);
+        };"""
+    )
+    scene = find(opened, "#scene")
+    # First with no viewer yet, then with one that shows another frame.
+    for number in (-1, 0):
+        car = opened.find_elements("css selector", ".open-car")[number]
+        name = opened.execute_script("return arguments[0].textContent", car)
+        frame = opened.execute_script("return arguments[0].firstChild.textContent", car)
+        opened.execute_script("arguments[0].click()", car)
+        opened.execute_script("document.getElementById('show-in-3d').click()")
+        until(lambda name=name: (scene.get_attribute("data-car") or "").replace(",", "") == name)
+        assert frame in scene.get_attribute("data-ready")
+        time.sleep(0.3)
+        ActionChains(opened).move_to_element(scene).click().perform()
+        assert find(opened, "#car-dialog h2").text == f"Car {scene.get_attribute('data-car')}"
+        find(opened, "#close-car").click()
+    assert opened.execute_script("return window.contexts") == 1
+
+
 def test_3d_turns_by_a_finger(opened: Chrome) -> None:
     set_viewport(opened, 390, 844)
     scene = show_scene(opened)

@@ -13,6 +13,7 @@ const caption = element("p", { class: "quiet", role: "status", id: "frame-captio
 let current = null;
 let openCar = null;
 let viewer = null;
+let started = null;
 
 // `open` shows a car in full; the dialog itself needs this module.
 export function showFrames(open) {
@@ -51,31 +52,38 @@ function viewControls() {
     element("span", { class: "quiet" }, "Drag to turn, wheel or pinch to come nearer, right button or two fingers to move; arrow keys move, with Shift they turn. Select a car to open it."));
 }
 
-async function startViewer() {
+// Whoever asks first starts the viewer; the others wait for the same one.
+const startViewer = () => started ??= start();
+
+async function start() {
   try {
     const { Viewer } = await import("report/scene3d");
     viewer = new Viewer(host, (place) => openCar(carsOfFrame(current)[place]));
-    await viewer.show(sceneOf(current), shown, `Frame ${frames.ids[current]} in 3D`);
+    await drawScene();
   } catch (error) {
+    viewer = null;
     console.warn(error);
     host.replaceChildren(element("p", { class: "notice" }, `No 3D view: ${error.message}`));
   }
 }
 
-export function showFrame(number) {
+const drawScene = () => viewer?.show(sceneOf(current), shown, `Frame ${frames.ids[current]} in 3D`);
+
+async function showFrame(number) {
   current = number;
   choice.value = String(number);
-  redraw();
-  viewer?.lookFrom("behind");
+  await redraw();
+  if (current === number) viewer?.lookFrom("behind");
 }
 
+// Resolves when the 3D view has caught up.
 function redraw() {
   const scene = sceneOf(current), inFrame = carsOfFrame(current);
   picture.replaceChildren(scene.image === null
     ? element("p", { class: "quiet" }, "The image of this frame is not in the page.")
     : framePicture(scene, inFrame, shown, openCar));
   caption.textContent = `Frame ${frames.ids[current]}: ${counted(inFrame.length, "car")}. ${groundWords(scene)}`;
-  viewer?.show(scene, shown, `Frame ${frames.ids[current]} in 3D`);
+  return drawScene();
 }
 
 function groundWords(scene) {
@@ -84,9 +92,9 @@ function groundWords(scene) {
     : `Grid: 5 m, on the ground plane (from ${scene.ground_source}).`;
 }
 
-export function showCarInFrame(car) {
-  if (current !== car.frame) showFrame(car.frame);
+export async function showCarInFrame(car) {
   byId("scene").scrollIntoView({ block: "center" });
-  if (viewer === null) startViewer().then(() => viewer?.lookAtCar(car.place, carName(car)));
-  else viewer.lookAtCar(car.place, carName(car));
+  await startViewer();
+  if (current !== car.frame) await showFrame(car.frame);
+  if (current === car.frame) viewer?.lookAtCar(car.place, carName(car));
 }
