@@ -82,8 +82,8 @@ class RunFile:
         return replace(self, state=state, todo=[], ended_at=time.time(), **changes)  # type: ignore[arg-type]
 
     def write(self, out_dir: Path) -> None:
-        """Write `run.json`."""
-        write_json(run_path(out_dir), {"schema_version": RUN_SCHEMA_VERSION, **asdict(self)})
+        """Write `run.json`, and wait for the disk: the next run refuses one that was cut short."""
+        write_json(run_path(out_dir), {"schema_version": RUN_SCHEMA_VERSION, **asdict(self)}, durable=True)
 
 
 def run_path(out_dir: Path) -> Path:
