@@ -35,8 +35,8 @@ const KEYS = [["before", "before"], ["after", "after"]];
 function histogram(title, rows, first, second, low, high, unit, keys = KEYS, stacked = false) {
   const series = [first, second].map((name) => rows.map((row) => row[name]).filter((value) => value !== null));
   const all = series.flat().sort((a, b) => a - b);
-  // The few far-off ones go to the last bar, which says so.
-  const top = high ?? niceCeiling(all[Math.floor(0.97 * (all.length - 1))] ?? 1);
+  // Of many the few far-off ones go to the last bar, which says so.
+  const top = high ?? niceCeiling(all[Math.ceil(0.97 * (all.length - 1))] ?? 1);
   const open = (all[all.length - 1] ?? 0) > top;
   const counts = series.map((values) => binned(values, low, top, 14));
   return figure(title, unit, keys.filter((_, index) => series[index].length),

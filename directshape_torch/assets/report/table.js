@@ -40,7 +40,7 @@ const heads = new Map();
 export function showTable() {
   byId("cars").append(controls(), counter,
     element("div", { class: "scroller", tabindex: "0", role: "region", "aria-label": "Table of cars" },
-      element("table", { class: "cars" }, element("caption", { class: "quiet" }, "Select a heading to sort; select a car for its pictures, residual maps and figures."),
+      element("table", { class: "cars" }, element("caption", { class: "quiet" }, element("span", {}, "Select a heading to sort; select a car for its pictures, residual maps and figures.")),
         element("thead", {}, element("tr", {}, head(nameColumn),
           element("th", { scope: "col" }, "Before"), element("th", { scope: "col" }, "After"), ...columns.map(head))), body)),
     more);

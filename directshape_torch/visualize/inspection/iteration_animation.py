@@ -71,4 +71,5 @@ def _draw_costs(axes: Any, view: CarView) -> None:
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set(xlabel="iteration", title="cost")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, loc="upper right")
+    # Costs may stay high or fall to nothing, but hardly stay half-way.
+    axes.legend(fontsize=7, loc="center right")
