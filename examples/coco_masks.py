@@ -19,8 +19,8 @@ from pycocotools import mask as coco_mask
 
 import directshape_torch
 from directshape_torch import DirectShapeRefiner, RefinementResult
-from directshape_torch.io.instance_masks import CocoFileMasks
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.mask_files import CocoFileMasks
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DETECTIONS = ROOT / "detections" / "noisy_stereo"

@@ -98,7 +98,7 @@ def mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
     Raises:
         InputError: a folder and COCO files.
     """
-    from directshape_torch.io.instance_masks import CocoFileMasks
+    from directshape_torch.io.mask_files import CocoFileMasks
 
     files = (args.masks_left, args.masks_right)
     if args.masks is not None and files != (None, None):

@@ -19,18 +19,17 @@ from directshape_torch.io.frame_layout import existing_folder, first_disparity
 from directshape_torch.io.ground_plane_files import upright_plane
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import (
-    COCO_CAR_IDS,
     SIDES,
     InstanceMask,
     MaskSource,
     Side,
     check_size,
-    mask_source,
     read_soft_mask,
     tight_box,
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
+from directshape_torch.io.mask_files import COCO_CAR_IDS, mask_source
 from directshape_torch.io.mask_matching import project_boxes
 from directshape_torch.io.text_files import Line
 

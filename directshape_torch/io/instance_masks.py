@@ -1,28 +1,20 @@
-"""Instance masks of both images of a frame, from the files that instance segmentation tools write."""
+"""Instances of one image and their masks, whatever files they come from (`mask_files`)."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.coco_segmentation import decode_segmentation
-from directshape_torch.io.image_files import find_image, read_file_bytes, read_single_channel
+from directshape_torch.errors import DataFormatError
+from directshape_torch.io.image_files import read_single_channel
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
-
-COCO_CAR_IDS = frozenset({3})
-# KITTI MOTS numbers its classes 1 car, 2 pedestrian, 10 ignore; Cityscapes from 24 on, 26 being car.
-PNG_CAR_IDS = frozenset({1, 26})
-_MOTS_IGNORE_CLASS = 10
-_IDS_PER_CLASS = 1000
 
 
 class MaskSizeError(DataFormatError):
@@ -66,164 +58,10 @@ class MaskSource(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class FrameJsonMasks:
-    """A folder with one `NNNNNN.json` a frame: COCO results, each with `image`: "left" or "right".
-
-    An entry may carry `soft_probability`, the path (from the folder of the json file) of an 8-bit PNG of the
-    foreground probability x 255, which then stands in for the binary mask.
-
-    Attributes:
-        directory: the folder, or the one above a folder `data`.
-        car_ids: category ids that are cars.
-    """
-
-    directory: Path
-    car_ids: frozenset[int] = COCO_CAR_IDS
-
-    def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
-        path = self._path(frame_id)
-        masks = []
-        for index, entry in enumerate(read_coco_list(path)):
-            side = entry.get("image")
-            if side not in SIDES:
-                raise DataFormatError(path, f"entry {index}: 'image' is {side!r}, expected 'left' or 'right'")
-            masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))
-        return [mask for mask in masks if mask is not None]
-
-    def files(self, frame_id: str) -> tuple[Path, ...]:
-        path = self._path(frame_id)
-        entries = read_coco_list(path)
-        soft = [path.parent / str(entry["soft_probability"]) for entry in entries if entry.get("soft_probability")]
-        return (path, *soft)
-
-    def _path(self, frame_id: str) -> Path:
-        return file_of_frame(self.directory, f"{frame_id}.json")
-
-
-@dataclass(frozen=True)
-class InstancePngMasks:
-    """Folders `instance_2` (left) and `instance_3` (right) of PNG files with `class * 1000 + instance`.
-
-    KITTI MOTS (1 car, 2 pedestrian, 10000 ignored) and Cityscapes (26 car; values below 1000 are not instances).
-
-    Attributes:
-        directory: the folder that holds both.
-        car_ids: classes that are cars.
-        folders: names of the two; `instance_02` and `instance_03` in the layout of tracking sequences.
-    """
-
-    directory: Path
-    car_ids: frozenset[int] = PNG_CAR_IDS
-    folders: tuple[str, str] = ("instance_2", "instance_3")
-
-    def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
-        masks: list[InstanceMask] = []
-        for side, path in zip(SIDES, self.files(frame_id), strict=True):
-            ids = read_single_channel(path)
-            check_size(path, "the instance image", ids.shape, size_hw)
-            masks += self._instances(side, ids)
-        return masks
-
-    def files(self, frame_id: str) -> tuple[Path, ...]:
-        return tuple(find_image(self.directory / folder, frame_id) for folder in self.folders)
-
-    def _instances(self, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask]:
-        for value in np.unique(ids).tolist():
-            category = value // _IDS_PER_CLASS
-            if category in (0, _MOTS_IGNORE_CLASS):
-                continue
-            mask = ids == value
-            box = tight_box(mask)
-            if box is not None:
-                yield InstanceMask(side, value, category, category in self.car_ids, box, box, mask, 1.0)
-
-
-@dataclass(frozen=True)
-class CocoFileMasks:
-    """Two plain COCO result files, left and right, with `image_id` = frame number (Detectron2, mmdet).
-
-    Attributes:
-        left, right: the files; either may be None.
-        car_ids: category ids that are cars.
-    """
-
-    left: Path | None
-    right: Path | None
-    car_ids: frozenset[int] = COCO_CAR_IDS
-    _by_frame: dict[Side, dict[int, list[tuple[int, Mapping[str, Any]]]]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
-
-    def __post_init__(self) -> None:
-        if self.left is None and self.right is None:
-            raise InputError("left, right", "at least one COCO result file", "none")
-
-    def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
-        masks = []
-        for side, path in zip(SIDES, (self.left, self.right), strict=True):
-            if path is not None:
-                for index, entry in self._entries(side, path).get(_frame_number(frame_id), []):
-                    masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))
-        return [mask for mask in masks if mask is not None]
-
-    def files(self, frame_id: str) -> tuple[Path, ...]:  # the same two files serve all frames
-        return tuple(path for path in (self.left, self.right) if path is not None)
-
-    def _entries(self, side: Side, path: Path) -> dict[int, list[tuple[int, Mapping[str, Any]]]]:
-        """The entries of a file by frame; such files hold a whole data set, so each is read once."""
-        if side not in self._by_frame:
-            frames: dict[int, list[tuple[int, Mapping[str, Any]]]] = {}
-            for index, entry in enumerate(read_coco_list(path)):
-                try:
-                    number = int(entry["image_id"])
-                except (KeyError, TypeError, ValueError) as error:
-                    raise DataFormatError(
-                        path,
-                        f"entry {index}: 'image_id' is {entry.get('image_id')!r}, expected the frame's number",
-                    ) from error
-                frames.setdefault(number, []).append((index, entry))
-            self._by_frame[side] = frames
-        return self._by_frame[side]
-
-
-def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> MaskSource:
-    """The reader that fits a folder of masks: instance PNG if it holds `instance_2` (or `instance_02`), else one json
-    a frame.
-
-    Raises:
-        DataFormatError: it is no folder.
-    """
-    directory = Path(directory)
-    if not directory.is_dir():
-        raise DataFormatError(directory, "is not a folder of masks", cure="give the folder of NNNNNN.json files")
-    for folders in (("instance_2", "instance_3"), ("instance_02", "instance_03")):
-        if (directory / folders[0]).is_dir():
-            return InstancePngMasks(directory, PNG_CAR_IDS if car_ids is None else frozenset(car_ids), folders)
-    return FrameJsonMasks(directory, COCO_CAR_IDS if car_ids is None else frozenset(car_ids))
-
-
 def file_of_frame(directory: Path, name: str) -> Path:
     """`directory/name`, or `directory/data/name` where that exists."""
     nested = directory / "data" / name
     return nested if nested.is_file() else directory / name
-
-
-def read_coco_list(path: Path) -> list[Mapping[str, Any]]:
-    """The entries of a COCO result file.
-
-    Raises:
-        DataFormatError: it is missing, no JSON, or no list of objects.
-    """
-    try:
-        entries = json.loads(read_file_bytes(path))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataFormatError(path, f"is not valid JSON ({error})") from error
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise DataFormatError(
-            path, "is not a list of COCO results", cure='write [{"image_id": .., "segmentation": ..}, ..]'
-        )
-    return entries
 
 
 def tight_box(probability: NDArray[Any]) -> tuple[float, float, float, float] | None:
@@ -261,58 +99,3 @@ def check_size(path: Path, what: str, got_hw: Iterable[int], expected_hw: tuple[
             f"{what} has {got[1]} x {got[0]} pixels (width x height), its image {expected_hw[1]} x {expected_hw[0]}",
             cure="make masks at the size of the images",
         )
-
-
-def _from_coco(
-    path: Path,
-    index: int,
-    entry: Mapping[str, Any],
-    side: Side,
-    size_hw: tuple[int, int],
-    car_ids: frozenset[int],
-) -> InstanceMask | None:
-    """One instance, or None where its mask has no pixel: an empty mask says nothing about a car."""
-    probability = _probability(path, index, entry, size_hw)
-    mask_box = tight_box(probability)
-    if mask_box is None:
-        return None
-    try:
-        category = int(entry["category_id"])
-        return InstanceMask(
-            side=side,
-            instance_id=int(entry.get("instance_id", index)),
-            category_id=category,
-            is_car=category in car_ids,
-            box=_file_box(entry) or mask_box,
-            mask_box=mask_box,
-            probability=probability,
-            score=float(entry.get("score", 1.0)),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataFormatError(path, f"entry {index}: bad or missing field ({error!r})") from error
-
-
-def _probability(
-    path: Path, index: int, entry: Mapping[str, Any], size_hw: tuple[int, int]
-) -> NDArray[np.bool_] | NDArray[np.float32]:
-    soft = entry.get("soft_probability")
-    if soft:
-        return read_soft_mask(path.parent / str(soft), size_hw)
-    mask = decode_segmentation(path, index, entry.get("segmentation"), size_hw)
-    check_size(path, f"the mask of entry {index}", mask.shape, size_hw)
-    return mask
-
-
-def _file_box(entry: Mapping[str, Any]) -> tuple[float, float, float, float] | None:
-    """COCO's [x, y, width, height], whose pixel k spans k .. k + 1, as (u_min, v_min, u_max, v_max) of centres."""
-    if entry.get("bbox") is None:
-        return None
-    x, y, width, height = (float(value) for value in entry["bbox"])
-    return x, y, x + width - 1, y + height - 1
-
-
-def _frame_number(frame_id: str) -> int:
-    # `int` would take 000046_10 for 4610.
-    if not frame_id.isdecimal():
-        raise InputError("frame_id", "a number, as COCO's image_id is one", repr(frame_id), "give one file a frame")
-    return int(frame_id)

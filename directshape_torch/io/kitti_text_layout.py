@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.ground_plane_files import read_plane
-from directshape_torch.io.instance_masks import MaskSource, mask_source
+from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration
+from directshape_torch.io.mask_files import mask_source
 
 
 class KittiTextLayout(ABC):

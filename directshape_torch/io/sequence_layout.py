@@ -15,9 +15,10 @@ from directshape_torch.io.frame_layout import (
     image_stems,
 )
 from directshape_torch.io.image_files import find_image
-from directshape_torch.io.instance_masks import FrameJsonMasks, InstanceMask, MaskSource, file_of_frame, mask_source
+from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_of_frame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.kitti_text_layout import KittiTextLayout
+from directshape_torch.io.mask_files import FrameJsonMasks, mask_source
 from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
 

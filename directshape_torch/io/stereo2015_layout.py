@@ -8,15 +8,10 @@ from pathlib import Path
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.frame_layout import detection_stems, existing_folder, first_existing
 from directshape_torch.io.image_files import find_image
-from directshape_torch.io.instance_masks import (
-    InstanceMask,
-    InstancePngMasks,
-    MaskSource,
-    file_of_frame,
-    mask_source,
-)
+from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_of_frame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.kitti_text_layout import KittiTextLayout
+from directshape_torch.io.mask_files import InstancePngMasks, mask_source
 
 FIRST_PAIR = "_10"
 

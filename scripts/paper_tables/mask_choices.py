@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from directshape_torch.errors import InputError
-from directshape_torch.io.instance_masks import COCO_CAR_IDS, InstanceMask, MaskSource, file_of_frame, mask_source
+from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_of_frame
 from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.io.mask_files import COCO_CAR_IDS, mask_source
 from paper_tables.data_sets import DataSet
 from paper_tables.settings import Masks
 

@@ -27,9 +27,9 @@ from directshape_torch.evaluation.shape_error_scores import ShapeScores
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.io.atomic_files import write_png
-from directshape_torch.io.instance_masks import FrameJsonMasks
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
+from directshape_torch.io.mask_files import FrameJsonMasks
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior

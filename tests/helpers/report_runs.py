@@ -8,9 +8,9 @@ from pathlib import Path
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.config_files import load_config
-from directshape_torch.io.instance_masks import mask_source
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_layout import KittiObjectLayout
+from directshape_torch.io.mask_files import mask_source
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.report.frame_inputs import InputSources
 from directshape_torch.shape.pca_prior import PCAShapePrior

@@ -15,13 +15,8 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.coco_segmentation import decode_segmentation
-from directshape_torch.io.instance_masks import (
-    CocoFileMasks,
-    FrameJsonMasks,
-    InstancePngMasks,
-    mask_source,
-    tight_box,
-)
+from directshape_torch.io.instance_masks import tight_box
+from directshape_torch.io.mask_files import CocoFileMasks, FrameJsonMasks, InstancePngMasks, mask_source
 
 SIZE_HW = (6, 9)
 # Rows 1..3 of columns 4..5: off-diagonal in every sense, so a transposed mask shows.
