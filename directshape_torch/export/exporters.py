@@ -33,7 +33,7 @@ class Exporter(Protocol):
         ...
 
     def abandon(self) -> None:
-        """A frame failed: leave nothing half-written behind."""
+        """A frame failed, or another exporter's end: leave nothing half-written behind."""
         ...
 
 
@@ -116,9 +116,9 @@ def feed(
             for exporter in exporters:
                 exporter.add(source)
             observer.finished(frame_id, None)
+        for exporter in exporters:
+            exporter.finish()
         stack.pop_all()
-    for exporter in exporters:
-        exporter.finish()
 
 
 def write_glb(folder: Path, source: FrameSource) -> None:

@@ -56,6 +56,8 @@ class RerunExporter:
         """Move the file to its place."""
         if self._stream is not None:
             self._stream.close()
+            # What is in its place is not for `abandon`.
+            self._stream = None
 
     def abandon(self) -> None:
         """Leave no file behind."""

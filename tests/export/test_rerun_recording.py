@@ -20,8 +20,10 @@ from scipy.spatial.transform import Rotation
 from directshape_torch.config import RefinerConfig
 from directshape_torch.config_files import config_from_mapping
 from directshape_torch.errors import DataFormatError, InputError, MissingDependencyError
+from directshape_torch.export.export_run import ExportFormat, export_run
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.export.rerun_recording import record_run
+from directshape_torch.export.run_folder import RunFolder
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
@@ -262,6 +264,18 @@ def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -
     with pytest.raises(DataFormatError, match="000001"):
         record_run(tmp_path / "out" / "a.rrd", finished.folder, replace(finished.inputs(), dataset=dataset))
     assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("recording_first", [True, False])
+def test_an_end_that_fails_leaves_nothing_half_written(
+    finished: FinishedRun, tmp_path: Path, recording_first: bool
+) -> None:
+    (tmp_path / "coco3d.json").mkdir()
+    formats: list[ExportFormat] = ["rerun", "coco3d"] if recording_first else ["coco3d", "rerun"]
+    with pytest.raises(OSError, match=r"coco3d\.json"):
+        export_run(RunFolder(finished.out, [0]), tmp_path, formats, finished.inputs())
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == ({"coco3d.json", "recording.rrd"} if recording_first else {"coco3d.json"})
 
 
 def test_without_images_there_is_no_recording(finished: FinishedRun, tmp_path: Path) -> None:
