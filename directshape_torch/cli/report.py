@@ -12,6 +12,7 @@ from directshape_torch.cli.run_inputs import check_data_is_not_needed, field_of_
 
 if TYPE_CHECKING:
     from directshape_torch.report.frame_inputs import InputSources
+    from directshape_torch.report.run_folder import RunFolder
 
 _DESCRIPTION = """
 Write one self-contained HTML page about a run of 'directshape refine': summary, sortable table of cars, distributions,
@@ -51,13 +52,15 @@ def run(args: argparse.Namespace) -> int:
     """
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.report.make_report import ReportOptions, make_report
+    from directshape_torch.report.run_folder import RunFolder
     from directshape_torch.report.run_prior import prior_of_run
 
     page = args.out / "report.html" if args.html is None else args.html
     options = ReportOptions(args.frames, args.max_frames)
-    prior = prior_of_run(args.out, args.prior)
+    run_folder = RunFolder.open(args.out)
+    prior, sources = prior_of_run(run_folder.manifest, args.prior), _sources(args, run_folder)
     with ProgressBar("report") as progress:
-        outcome = make_report(args.out, page, _sources(args), prior, options, progress)
+        outcome = make_report(args.out, page, sources, prior, options, progress)
     for note in outcome.notes:
         print(f"note: {note}", file=sys.stderr)
     print(f"page     {outcome.path}  {outcome.num_bytes / 1e6:.1f} MB")
@@ -65,13 +68,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _sources(args: argparse.Namespace) -> InputSources:
+def _sources(args: argparse.Namespace, run: RunFolder) -> InputSources:
     """Where the inputs lie; a plain folder keeps its detections beside its images."""
     from directshape_torch.io.open_dataset import open_dataset
     from directshape_torch.report.frame_inputs import InputSources
-    from directshape_torch.report.run_folder import RunFolder
 
-    run = RunFolder.open(args.out)
     if args.data is None:
         check_data_is_not_needed(args, "detections", "masks", "masks_left", "masks_right", "stereo_bias")
         return InputSources()

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.errors import InputError
-from directshape_torch.report.run_folder import RunFolder
+from directshape_torch.io.run_manifest import RunManifest
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
-def prior_of_run(out_dir: Path, source: str | None) -> ShapePrior | None:
+def prior_of_run(manifest: RunManifest, source: str | None) -> ShapePrior | None:
     """The named prior, or else that bundled one which the run used, or None where it used another.
 
     Raises:
-        DataFormatError: no run there, or a file that is no prior.
+        DataFormatError: a file that is no prior.
         InputError: the named prior is not that of the run.
     """
-    wanted = RunFolder.open(out_dir).manifest.sha256.get("prior")
+    wanted = manifest.sha256.get("prior")
     if source is not None:
         prior = load_prior(source)
         if wanted is not None and hash_prior(prior) != wanted:
