@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from helpers.faulty_refiners import QuickRefiner
-from helpers.kitti_folder import FRAMES
+from helpers.kitti_folder import FRAMES, write_data_set
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
@@ -22,6 +23,19 @@ from directshape_torch.errors import DirectShapeError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import FrameBatch
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root)
+    return root
+
+
+@pytest.fixture
+def root(source: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(source, tmp_path / "kitti"))
 
 
 def test_a_truncated_image_is_reported_and_the_others_go_on(root: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.faulty_refiners import EVERY_RESULT, FEW_STEPS
-from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN
+from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN, write_data_set
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine
 
@@ -24,6 +25,19 @@ from directshape_torch.io.result_files import read_shapes
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root)
+    return root
+
+
+@pytest.fixture
+def root(source: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(source, tmp_path / "kitti"))
 
 
 def test_cars_come_nearer_to_the_truth(source: Path, tmp_path: Path) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.faulty_refiners import FEW_STEPS
-from helpers.kitti_folder import FRAMES
+from helpers.kitti_folder import FRAMES, write_data_set
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
@@ -17,6 +18,19 @@ from directshape_torch.config_files import load_config
 from directshape_torch.errors import ResumeError
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root)
+    return root
+
+
+@pytest.fixture
+def root(source: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    return Path(shutil.copytree(source, tmp_path / "kitti"))
 
 
 def test_a_second_run_does_nothing(source: Path, tmp_path: Path) -> None:
