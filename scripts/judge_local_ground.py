@@ -40,8 +40,9 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import height_above
 from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.io.atomic_files import write_text
-from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes
 from directshape_torch.stereo_matching.disparity import match_disparity

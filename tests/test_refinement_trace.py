@@ -10,7 +10,8 @@ import torch
 from directshape_torch.cli.demo import DEMO_FOLDER
 from directshape_torch.config_files import load_config
 from directshape_torch.geometry import se3
-from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections

@@ -31,7 +31,7 @@ from directshape_torch.benchmark.rows import Goal, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import time_interleaved
 from directshape_torch.benchmark.workloads import load_scenes
-from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.laboratory.scenes import select_detections
 from directshape_torch.refiner import DirectShapeRefiner
 

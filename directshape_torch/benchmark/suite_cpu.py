@@ -14,7 +14,7 @@ from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_in
 from directshape_torch.benchmark.workloads import Scene, load_scenes
 from directshape_torch.compiler_state import compiler_problem
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 

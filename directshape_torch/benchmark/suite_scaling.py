@@ -15,7 +15,7 @@ from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Repetitions, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import demo_scene, enlarged, with_cars
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior

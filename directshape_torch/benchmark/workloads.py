@@ -15,7 +15,8 @@ from directshape_torch.calibration.kitti_observations import observe_frame, trut
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.scene import Detections, FrameBatch
 
 # The frame that the README fits the rig of the KITTI frames from.

@@ -7,10 +7,7 @@ from typing import Unpack
 
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_layout import KittiObjectLayout
-from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.io.stereo_files import DatasetOptions, FileStereoDataset
-
-__all__ = ["KittiStereoDataset", "LoadedFrame"]
 
 
 class KittiStereoDataset(FileStereoDataset):

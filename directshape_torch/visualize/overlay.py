@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.kitti_labels import box_corners_cam
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.visualize.birds_eye import Footprint, birds_eye_picture

@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from paper_tables.settings import Exposure
 
 

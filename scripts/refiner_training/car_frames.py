@@ -16,8 +16,8 @@ from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.scene import Detections, FrameBatch
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 
 pytestmark = pytest.mark.skipif(
     not os.environ.get("DIRECTSHAPE_DATA"), reason="DIRECTSHAPE_DATA does not name the folder of the data"

@@ -13,10 +13,10 @@ from directshape_torch.disparity_profile import DisparityProfile
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.frame_detections import MatchingSummary
-from directshape_torch.io.kitti_dataset import LoadedFrame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observability import Observability
 from directshape_torch.quality import FitQuality
 from directshape_torch.result import RefinementResult

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 import directshape_torch
-from directshape_torch.io.kitti_dataset import KittiStereoDataset, LoadedFrame
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DETECTIONS, MASKS = DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks"
