@@ -14,7 +14,7 @@ from directshape_torch.energy.method import method_stages
 from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
 from directshape_torch.energy.stage_unknowns import moving_unknowns, step_limits, without_held
 from directshape_torch.energy.term import Term, TermLinearisation, scaled, total_of
-from directshape_torch.energy.tracked_energy import TrackedEnergy
+from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
 from directshape_torch.energy.tracked_problem import TrackedProblem
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -53,7 +53,6 @@ class CarProblem:
         self.config = config
         self.term_weights = term_weights
         self.unknowns = unknowns
-        self._tracked: TrackedEnergy | None = None
         self._projections: list[tuple[_Versions, ProjectedState]] = []
         self._costs: list[tuple[_Versions, ProjectedState, Tensor]] = []  # of the present stage
 
@@ -68,14 +67,18 @@ class CarProblem:
         # What is differentiated afterwards is `linearise_differentiably`, so its root must be found.
         if self.config.solver.rays == "marched" or self.config.backward.mode != "none":
             return self
-        self._tracked = TrackedEnergy.of_terms(self.terms, projected, self.term_weights)
-        if self._tracked.others or self.config.solver.jacobian == "autograd":
-            return self
-        return TrackedProblem(self.prior, self._tracked, self.config.solver, self.unknowns)
+        energy = TrackedEnergy.of_terms(self.terms, projected, self.term_weights)
+        others = [number for number, tracked in enumerate(are_tracked(self.terms)) if not tracked]
+        marched = self._of_terms(others) if others else None
+        return TrackedProblem(self.prior, energy, marched, self.config.solver, self.unknowns)
+
+    def _of_terms(self, numbers: Sequence[int]) -> CarProblem:
+        terms = [self.terms[number] for number in numbers]
+        weights = None if self.term_weights is None else self.term_weights[:, list(numbers)]
+        return CarProblem(self.prior, terms, self.left, self.right, self.config, weights, self.unknowns)
 
     def follow(self, accepted: Tensor) -> None:
-        if self._tracked is not None:
-            self._tracked.follow(accepted)
+        """Nothing is followed: every state is evaluated by itself."""
 
     def project(
         self,
@@ -138,18 +141,8 @@ class CarProblem:
         return costs if self.term_weights is None else costs * self.term_weights.to(torch.float64)
 
     def linearise(self, state: CarState) -> Linearisation:
-        """See `StageProblem`.
-
-        With tracked rays it depends on where the stage began and on what was followed since, and `follow` changes it.
-        By itself a state is evaluated by `cost` and `linearise_terms`, which march.
-        """
-        if self._tracked is None:
-            return self._without_held(total_of(self.linearise_terms(state)))
-        if self.config.solver.jacobian == "autograd":
-            return self._without_held(total_of(self._tracked.linearise_by_autograd(self, state)))
-        projected = self._new_projection(state, None, ROOT_ITERATIONS, False)
-        parts = self._tracked.linearise(projected.shape, state) + self._tracked.linearise_others(projected)
-        return self._without_held(total_of(parts))
+        """See `StageProblem`; with every ray marched."""
+        return self._without_held(total_of(self.linearise_terms(state)))
 
     def linearise_terms(self, state: CarState, with_fisher: bool = False) -> list[TermLinearisation]:
         """The linearisation of each term by itself."""
@@ -187,8 +180,8 @@ class CarProblem:
         return step_limits(self.config.solver, self.prior.num_codes, self.left.uv.device)
 
     def compact(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarProblem:
-        """The problem of the cars where `keep` (B,) holds; `numbers` of them, where the host knows."""
-        part = CarProblem(
+        """The problem of the cars where `keep` (B,) holds."""
+        return CarProblem(
             self.prior,
             [term.of_objects(keep) for term in self.terms],
             self.left.of_objects(keep),
@@ -197,8 +190,6 @@ class CarProblem:
             None if self.term_weights is None else self.term_weights[keep],
             self.unknowns,
         )
-        part._tracked = None if self._tracked is None else self._tracked.of_objects(keep, numbers)
-        return part
 
 
 _Versions = tuple[int, ...]

@@ -83,7 +83,7 @@ def scaled(part: TermLinearisation, factor: Tensor | None) -> TermLinearisation:
     return TermLinearisation(factor * part.cost, factor[:, None] * part.gradient, *matrices)
 
 
-def total_of(parts: Sequence[TermLinearisation]) -> Linearisation:
+def total_of(parts: Sequence[Linearisation | TermLinearisation]) -> Linearisation:
     """What the solver sees of the terms of an energy."""
     return Linearisation(
         sum_of([p.cost for p in parts]), sum_of([p.gradient for p in parts]), sum_of([p.hessian for p in parts])

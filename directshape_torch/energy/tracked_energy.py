@@ -1,10 +1,9 @@
-"""The terms of a stage as the iterations evaluate them: rays are followed, only the rest is projected anew."""
+"""The terms of a stage whose rays the iterations follow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -14,109 +13,87 @@ from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.energy.stacked_priors import StackedPriors
-from directshape_torch.energy.term import ResidualRows, Term, TermLinearisation, scaled
+from directshape_torch.energy.term import Term, TermLinearisation
 from directshape_torch.energy.tracked_photometric import TrackedPhotometric
 from directshape_torch.energy.tracked_silhouettes import TrackedSilhouettes
 from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
+from directshape_torch.solver.problem import Linearisation
 from directshape_torch.tracking.field import block_field
-
-
-class _Projector(Protocol):
-    """What projects the rays of the terms that are not tracked (`CarProblem`)."""
-
-    @property
-    def prior(self) -> ShapePrior: ...
-
-    def project(
-        self, state: CarState, *, frozen: ProjectedState | None = None, root_iterations: int = 0
-    ) -> ProjectedState: ...
 
 
 @dataclass
 class TrackedEnergy:
-    """Tracked terms and the others, each with the factors (B,) that single cars give it."""
+    """The terms of a stage whose rays are followed, and the priors, each with the factors (B,) of single cars."""
 
     silhouettes: TrackedSilhouettes | None
     photometric: TrackedPhotometric | None
     priors: StackedPriors | None
-    others: list[Term]
-    factors: list[Tensor | None]  # of the others
 
     @classmethod
     def of_terms(cls, terms: Sequence[Term], projected: ProjectedState, weights: Tensor | None) -> TrackedEnergy:
-        """From the terms of a stage at the state where it begins, and factors (B, T) of them."""
+        """From those of the terms that `are_tracked`, at the state where a stage begins, and factors (B, T) of all."""
         columns = [None] * len(terms) if weights is None else list(weights.to(torch.float64).unbind(dim=1))
-        pairs = list(zip(terms, columns, strict=True))
-        # One of each kind and side; what is more is evaluated as any other term.
-        sides = [(t, w) for t, w in pairs if isinstance(t, SilhouetteTerm) and t.config.form == "closest_approach"]
-        sides = [(t, w) for t, w in sides if t.config == sides[0][0].config][:2]
-        photometric = [(t, w) for t, w in pairs if isinstance(t, PhotometricTerm)][:1]
+        pairs = [(t, w) for t, w, is_tracked in zip(terms, columns, are_tracked(terms), strict=True) if is_tracked]
+        sides = [(t, w) for t, w in pairs if isinstance(t, SilhouetteTerm)]
+        photometric = [(t, w) for t, w in pairs if isinstance(t, PhotometricTerm)]
         priors = [(t, w) for t, w in pairs if StackedPriors.takes(t)]
-        tracked = [term for term, _ in [*sides, *photometric, *priors]]
-        others = [(t, w) for t, w in pairs if not any(t is known for known in tracked)]
         return cls(
             TrackedSilhouettes.of_terms([t for t, _ in sides], projected, [w for _, w in sides]) if sides else None,
             TrackedPhotometric.of_term(photometric[0][0], projected, photometric[0][1]) if photometric else None,
             _stacked(priors, projected.state.code.shape[1]),
-            [t for t, _ in others],
-            [w for _, w in others],
         )
 
     @property
     def _tracked(self) -> list[TrackedSilhouettes | TrackedPhotometric]:
         return [t for t in (self.silhouettes, self.photometric) if t is not None]
 
-    def linearise(self, shape: BoundShape, state: CarState) -> list[TermLinearisation]:
-        """The tracked terms and the priors at a state with these shapes, with hand-derived Jacobians."""
+    def linearise(self, shape: BoundShape, state: CarState) -> list[Linearisation | TermLinearisation]:
+        """All parts at a state with these shapes, with hand-derived Jacobians."""
         field = block_field(shape)
-        parts = [tracked.linearise(field, state.T_obj_cam) for tracked in self._tracked]
-        return parts if self.priors is None else [*parts, self.priors.linearise(state)]
+        return self._with_priors([tracked.linearise(field, state.T_obj_cam) for tracked in self._tracked], state)
 
-    def linearise_others(self, projected: ProjectedState) -> list[TermLinearisation]:
-        """The terms that are not tracked, at a projected state."""
-        return [scaled(t.linearise(projected), w) for t, w in zip(self.others, self.factors, strict=True)]
+    def linearise_by_autograd(self, prior: ShapePrior, state: CarState) -> list[Linearisation | TermLinearisation]:
+        """The same with the rays' Jacobians by forward-mode differentiation: D tangents at once, over all cars."""
+        if not self._tracked:
+            return self._with_priors([], state)
+        field = block_field(prior.bind(state.code))
+        fixed = [tracked.fixed_rows(field, state.T_obj_cam) for tracked in self._tracked]
 
-    def linearise_by_autograd(self, projector: _Projector, state: CarState) -> list[TermLinearisation]:
-        """The same with Jacobians by forward-mode differentiation: D tangents at once, batched over the cars."""
-        at_state = projector.project(state)
-        field = block_field(at_state.shape)
-        fixed = [tracked.fixed_depths(field, state.T_obj_cam) for tracked in self._tracked]
-
-        def values(delta: Tensor) -> tuple[list[Tensor], tuple[list[Tensor], list[ResidualRows]]]:
+        def values(delta: Tensor) -> tuple[list[Tensor], list[Tensor]]:
             moved = retract(state, delta.expand(len(state.code), len(delta)))
-            projected = projector.project(moved, frozen=at_state, root_iterations=0)
-            at = block_field(projected.shape)
-            pairs = zip(self._tracked, fixed, strict=True)
-            followed = [tracked.residuals(at, moved.T_obj_cam, f) for tracked, f in pairs]  # type: ignore[arg-type]
-            rows = [term.residuals(projected) for term in self.others]
-            return [*followed, *(r.value for r in rows)], (followed, rows)
+            at = block_field(prior.bind(moved.code))
+            residuals = [rows.residuals(at, moved.T_obj_cam) for rows in fixed]
+            return residuals, residuals
 
         zero = torch.zeros(6 + state.code.shape[1], dtype=state.code.dtype, device=state.code.device)
-        J, (followed, rows) = torch.func.jacfwd(values, has_aux=True)(zero)
-        parts = [
-            tracked.accumulate(r, J_r, state.T_obj_cam, f)  # type: ignore[arg-type]
-            for tracked, r, J_r, f in zip(self._tracked, followed, J, fixed, strict=False)
-        ]
-        for term, factor, r, J_r in zip(self.others, self.factors, rows, J[len(parts) :], strict=True):
-            usable = torch.where(r.usable[:, None], J_r, torch.zeros_like(J_r))
-            parts.append(scaled(term.accumulate(r, usable), factor))
-        return parts if self.priors is None else [*parts, self.priors.linearise(state)]
+        J, residuals = torch.func.jacfwd(values, has_aux=True)(zero)
+        parts = [rows.accumulate(r, J_r) for rows, r, J_r in zip(fixed, residuals, J, strict=True)]
+        return self._with_priors(parts, state)
+
+    def _with_priors(self, parts: list[Linearisation], state: CarState) -> list[Linearisation | TermLinearisation]:
+        return [*parts] if self.priors is None else [*parts, self.priors.linearise(state)]
 
     def follow(self, accepted: Tensor) -> None:
         """The objects (B,) that are now at the state of the latest evaluation."""
         for tracked in self._tracked:
             tracked.follow(accepted)
 
-    def of_objects(self, keep: Tensor, numbers: Sequence[int] | None = None) -> TrackedEnergy:
-        """Those of the objects where `keep` (B,) holds; `numbers` of them, or the host asks for them."""
-        kept = keep.nonzero()[:, 0].tolist() if numbers is None else numbers
+    def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> TrackedEnergy:
+        """Those of the objects where `keep` (B,) holds: `numbers` of them, as the host knows them."""
         return TrackedEnergy(
-            None if self.silhouettes is None else self.silhouettes.of_objects(keep, kept),
-            None if self.photometric is None else self.photometric.of_objects(keep, kept),
-            None if self.priors is None else self.priors.of_objects(keep, len(kept)),
-            [term.of_objects(keep) for term in self.others],
-            [None if w is None else w[keep] for w in self.factors],
+            None if self.silhouettes is None else self.silhouettes.of_objects(keep, numbers),
+            None if self.photometric is None else self.photometric.of_objects(keep, numbers),
+            None if self.priors is None else self.priors.of_objects(keep, len(numbers)),
         )
+
+
+def are_tracked(terms: Sequence[Term]) -> list[bool]:
+    """Which of the terms are part of a `TrackedEnergy`: two silhouettes of one form, one photometric term, priors."""
+    # Not by `isinstance`: a class made from one of these has residuals of its own.
+    sides = [t for t in terms if type(t) is SilhouetteTerm and t.config.form == "closest_approach"]
+    sides = [t for t in sides if t.config == sides[0].config][:2]
+    photometric = [t for t in terms if type(t) is PhotometricTerm][:1]
+    return [StackedPriors.takes(t) or any(t is known for known in (*sides, *photometric)) for t in terms]
 
 
 def _stacked(priors: Sequence[tuple[Term, Tensor | None]], num_codes: int) -> StackedPriors | None:

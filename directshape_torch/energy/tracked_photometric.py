@@ -9,10 +9,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
-from directshape_torch.energy.term import TermLinearisation
 from directshape_torch.residuals.photometric_profile import warp_lines
+from directshape_torch.solver.problem import Linearisation
 from directshape_torch.tracking.blocks import Blocks, PackedBlocks
 from directshape_torch.tracking.field import BlockField
 from directshape_torch.tracking.photometric import (
@@ -76,7 +77,7 @@ class TrackedPhotometric:
         rows, hits = _rows(term, packed), _hits(term, projected, packed)
         return cls(packed.blocks, rows, settings, weight[packed.blocks.owner], hits)
 
-    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> TermLinearisation:
+    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> Linearisation:
         """Cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
         return self._noted(
             linearise_photometric(field, self.rows, self.settings, self._of_blocks(T_obj_cam), self.hits)
@@ -91,10 +92,18 @@ class TrackedPhotometric:
         """Residuals (M, 64, N), differentiable."""
         return self._residual(depth_of_state(field, self.rows, self._of_blocks(T_obj_cam), fixed.surface)).value
 
-    def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: FixedSurface) -> TermLinearisation:
+    def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: FixedSurface) -> Linearisation:
         """The linearisation with any Jacobian (M, 64, N, D) of the residuals."""
         hits = fixed.surface.hits
         return self._noted(accumulate_photometric(self.rows, self.settings, residual, J, fixed.usable, hits))
+
+    def fixed_rows(self, field: BlockField, T_obj_cam: Tensor) -> FixedRows:
+        """With what Jacobians at a state hold constant: the surface, and which pixels count."""
+        fixed = self.fixed_depths(field, T_obj_cam)
+        return FixedRows(
+            lambda at, T: self.residuals(at, T, fixed),
+            lambda residual, J: self.accumulate(residual, J, T_obj_cam, fixed),
+        )
 
     def follow(self, accepted: Tensor) -> None:
         """The objects (B,) that are now at the state of the latest evaluation."""
@@ -114,10 +123,10 @@ class TrackedPhotometric:
     def _residual(self, depth: Tensor) -> Residual:
         return photometric_residuals(self.rows, self.settings, depth)
 
-    def _noted(self, sums: PhotometricSums) -> TermLinearisation:
+    def _noted(self, sums: PhotometricSums) -> Linearisation:
         self.latest = Hits(sums.points_obj, sums.normal_obj)
         cost, gradient, hessian = self.blocks.sums(self.weight, sums.cost, sums.products)
-        return TermLinearisation(cost, gradient, hessian, torch.zeros_like(hessian))
+        return Linearisation(cost, gradient, hessian)
 
 
 def _rows(term: PhotometricTerm, packed: PackedBlocks) -> PhotometricRows:

@@ -1,39 +1,56 @@
-"""A stage whose every ray is tracked, as the iterations see it: no pixel list, no projection, nothing but blocks."""
+"""A stage whose rays are followed, as the iterations see it: blocks, and what must be marched all the same."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, Self
 
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.stage_unknowns import step_limits, without_held
-from directshape_torch.energy.term import total_of
+from directshape_torch.energy.term import TermLinearisation, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.problem import Linearisation, Unknowns
 
 
-@dataclass(frozen=True)
+class MarchedTerms(Protocol):
+    """Terms that are evaluated anew at every state (`CarProblem`)."""
+
+    def linearise_terms(self, state: CarState) -> list[TermLinearisation]: ...
+
+    def compact(self, keep: Tensor, numbers: Sequence[int]) -> Self: ...
+
+
+@dataclass
 class TrackedProblem:
     """A `StageProblem[CarState]`: the cars of a `CarProblem` that still move, in the stage that has begun.
 
     Attributes:
         prior: the family of shapes.
-        energy: without terms that are not tracked.
-        config: trust region.
+        energy: what is followed.
+        others: the terms that are not; None without any.
+        config: trust region and Jacobians.
         unknowns: which of them move.
     """
 
     prior: ShapePrior
     energy: TrackedEnergy
+    others: MarchedTerms | None
     config: SolverConfig
     unknowns: Unknowns
 
     def linearise(self, state: CarState) -> Linearisation:
-        return without_held(total_of(self.energy.linearise(self.prior.bind(state.code), state)), self.unknowns)
+        if self.config.jacobian == "autograd":
+            parts = self.energy.linearise_by_autograd(self.prior, state)
+        else:
+            parts = self.energy.linearise(self.prior.bind(state.code), state)
+        if self.others is not None:
+            parts += self.others.linearise_terms(state)
+        return without_held(total_of(parts), self.unknowns)
 
     def follow(self, accepted: Tensor) -> None:
         self.energy.follow(accepted)
@@ -45,4 +62,5 @@ class TrackedProblem:
         return step_limits(self.config, self.prior.num_codes, self.prior.origin.device)
 
     def compact(self, keep: Tensor, numbers: Sequence[int]) -> TrackedProblem:
-        return TrackedProblem(self.prior, self.energy.of_objects(keep, numbers), self.config, self.unknowns)
+        others = None if self.others is None else self.others.compact(keep, numbers)
+        return TrackedProblem(self.prior, self.energy.of_objects(keep, numbers), others, self.config, self.unknowns)

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
-from directshape_torch.energy.term import TermLinearisation
+from directshape_torch.solver.problem import Linearisation
 from directshape_torch.tracking.blocks import Blocks, PackedBlocks
 from directshape_torch.tracking.field import BlockField
 from directshape_torch.tracking.rays import BlockRays
@@ -79,7 +80,7 @@ class TrackedSilhouettes:
             anchor_obj=torch.cat([side.anchor_obj for side in sides], dim=1),
         )
 
-    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> TermLinearisation:
+    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> Linearisation:
         """Cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
         return self._noted(linearise_silhouettes(field, self.rows, self._of_blocks(T_obj_cam), self.anchor_obj))
 
@@ -91,15 +92,21 @@ class TrackedSilhouettes:
         """Residuals (M, 64) at fixed depths, differentiable."""
         return silhouette_residuals(field, self.rows, self._of_blocks(T_obj_cam), *fixed)
 
-    def accumulate(
-        self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: tuple[Tensor, Tensor]
-    ) -> TermLinearisation:
+    def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: tuple[Tensor, Tensor]) -> Linearisation:
         """The linearisation with any Jacobian (M, 64, D) of the residuals."""
         depth, crosses = fixed
         points = self.rows.rays.in_objects(self._of_blocks(T_obj_cam)).at(depth)
         J = torch.where(crosses[..., None], J, torch.zeros_like(J))
         sums = accumulate_silhouettes(self.rows, residual, J, torch.where(crosses, points, self.anchor_obj))
         return self._noted(sums)
+
+    def fixed_rows(self, field: BlockField, T_obj_cam: Tensor) -> FixedRows:
+        """With what Jacobians at a state hold constant: depths, and which rays cross the bounds."""
+        fixed = self.fixed_depths(field, T_obj_cam)
+        return FixedRows(
+            lambda at, T: self.residuals(at, T, fixed),
+            lambda residual, J: self.accumulate(residual, J, T_obj_cam, fixed),
+        )
 
     def follow(self, accepted: Tensor) -> None:
         """The objects (B,) that are now at the state of the latest evaluation."""
@@ -115,10 +122,10 @@ class TrackedSilhouettes:
     def _of_blocks(self, T_obj_cam: Tensor) -> Tensor:
         return self.rows.rays.of_blocks(T_obj_cam)
 
-    def _noted(self, sums: SilhouetteSums) -> TermLinearisation:
+    def _noted(self, sums: SilhouetteSums) -> Linearisation:
         self.latest = sums.points_obj
         cost, gradient, hessian = self.blocks.sums(self.weight, sums.cost, sums.products)
-        return TermLinearisation(cost + self.constant, gradient, hessian, torch.zeros_like(hessian))
+        return Linearisation(cost + self.constant, gradient, hessian)
 
 
 class _Side(NamedTuple):

@@ -52,18 +52,12 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("_hidden", "nowhere", "(-nowhere)", _OF_ZERO),
     Equivalent("_hidden", "nowhere[:, :1]", "(-nowhere[:, :1])", _OF_ZERO),
     Equivalent("_hidden", "nowhere[:, :1]", "nowhere[:, 1:2]", "another column of the same zeros"),
-    *(
-        Equivalent("TrackedEnergy.of_terms", "[*sides, *photometric, *priors]", after, "only membership is asked")
-        for after in ("[*photometric, *sides, *priors]", "[*sides, *priors, *photometric]")
-    ),
-    *(
-        Equivalent(
-            f"TrackedEnergy.{function}",
-            "[*parts, self.priors.linearise(state)]",
-            "[self.priors.linearise(state), *parts]",
-            "the order of the parts, which are added",
-        )
-        for function in ("linearise", "linearise_by_autograd")
+    Equivalent("are_tracked", "(*sides, *photometric)", "(*photometric, *sides)", "only membership is asked"),
+    Equivalent(
+        "TrackedEnergy._with_priors",
+        "[*parts, self.priors.linearise(state)]",
+        "[self.priors.linearise(state), *parts]",
+        "the order of the parts, which are added",
     ),
     Equivalent(
         "_Dimensions.rows",

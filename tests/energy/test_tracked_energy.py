@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.prior_terms import PriorTerm
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.energy.term import Term, TermLinearisation, total_of
-from directshape_torch.energy.tracked_energy import TrackedEnergy
+from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
 from directshape_torch.geometry import se3
 from directshape_torch.solver.problem import Linearisation
 from directshape_torch.tracking.field import block_field
@@ -319,23 +319,37 @@ def test_the_terms_that_are_tracked_and_the_others() -> None:
     weights = {name: torch.rand(5, generator=generator, dtype=torch.float64) + 0.3 for name in names}
     for factors in (None, weights):
         problem, stage, state = begun_stage(mixed, term_weights=factors)
-        assert stage is problem
         energy = tracked(problem, state, list(problem.terms))
-        assert [term.name for term in energy.others] == ["silhouette_left", "silhouette_right"]
+        others = [t.name for t, followed in zip(problem.terms, are_tracked(problem.terms), strict=True) if not followed]
+        assert others == ["silhouette_left", "silhouette_right"]
         assert energy.silhouettes is None
         assert energy.photometric is not None
         reference, _, _ = begun_stage(replace(mixed, solver=PAPER.solver), term_weights=factors)
         assert max(errors(stage.linearise(state), reference.linearise(state))) < 1e-9
-        by_autograd, _, _ = begun_stage(with_solver(mixed, jacobian="autograd"), term_weights=factors)
+        _, by_autograd, _ = begun_stage(with_solver(mixed, jacobian="autograd"), term_weights=factors)
         assert max(errors(by_autograd.linearise(state), reference.linearise(state))) < 1e-8
 
 
-def test_the_iterations_see_what_the_problem_says() -> None:
-    """`TrackedProblem` is the problem without what the iterations never ask for, to the bit."""
+def test_a_class_made_from_a_term_is_asked_itself() -> None:
+    """It has residuals of its own, which nothing that is followed knows."""
+
+    class Twice(PhotometricTerm):
+        def weight(self) -> Tensor:
+            return 2 * super().weight()
+
+    problem, _, _ = begun_stage()
+    (term,) = kind_of(problem, PhotometricTerm)
+    assert are_tracked([term]) == [True]
+    assert are_tracked([Twice(**{f.name: getattr(term, f.name) for f in fields(term)})]) == [False]
+
+
+def test_what_was_followed_is_no_matter_of_the_problem() -> None:
     problem, stage, state = begun_stage()
-    assert stage is not problem
     there = moved(state, step_of(5, 0.01, 0.1))
-    for found, expected in zip(stage.linearise(there), problem.linearise(there), strict=True):
+    before = problem.linearise(there)
+    stage.linearise(there)
+    stage.follow(torch.ones(5, dtype=torch.bool))
+    for found, expected in zip(problem.linearise(there), before, strict=True):
         assert torch.equal(found, expected)
     assert torch.equal(stage.step_limits(), problem.step_limits())
     step = step_of(5, 1.0, 9.0)
@@ -345,7 +359,7 @@ def test_the_iterations_see_what_the_problem_says() -> None:
 
 @pytest.mark.parametrize("unknowns", ["pose", "shape"])
 def test_unknowns_that_a_stage_holds(unknowns: str) -> None:
-    both, _, _ = begun_stage()
+    _, both, _ = begun_stage()
     config = replace(DEFAULT, stages=tuple(replace(s, unknowns=unknowns) for s in DEFAULT.stages))
     _, stage, state = begun_stage(config)
     found, free = stage.linearise(state), both.linearise(state)
