@@ -34,11 +34,11 @@ def normal(value: object) -> object:
 
 
 def is_unusual_call() -> bool:
-    """Inside jacfwd, vmap, ..., a region of forward-mode differentiation, autocast, or a mode that sees every call."""
+    """Inside jacfwd, vmap, ..., a region of forward-mode differentiation, autocast, or a mode that sees every step."""
     forward_mode = torch.autograd.forward_ad._current_level >= 0
     if torch._C._are_functorch_transforms_active() or forward_mode or torch._C._is_any_autocast_enabled():
         return True
-    if not torch._C._is_torch_function_enabled():
+    if not torch._C._is_torch_function_enabled() or torch._C._len_torch_dispatch_stack() > 0:
         return True
     return any(not isinstance(mode, DeviceContext) for mode in _function_modes())
 

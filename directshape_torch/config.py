@@ -39,7 +39,8 @@ class SolverConfig:
         block_iterations: iterations between two looks at which cars go on.
         max_step_translation_m, max_step_rotation_rad, max_step_code: trust region; the whole step is scaled.
         max_code: bound of |code|, in standard deviations.
-        jacobian: "analytic" (hand-derived) or "autograd" (forward mode, several times slower): the same steps.
+        jacobian: "analytic" (hand-derived) or "autograd" (forward mode, several times slower; but for the priors beside
+            followed rays, which stay hand-derived): the same steps.
         rays: "tracked" (each ray follows its closest point and its surface from iteration to iteration) or "marched"
             (each ray is sampled anew at each state: the slow reference).
     """

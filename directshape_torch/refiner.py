@@ -79,6 +79,7 @@ class DirectShapeRefiner(nn.Module):
         Raises:
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
                 wanted of a prior that has none.
+            CompilationError: `compile: on` where no compiler works.
         """
         if torch.compiler.is_compiling():
             # One break in the graph of a compiled model around it: the loop decides by values all the time.

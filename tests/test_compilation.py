@@ -15,6 +15,7 @@ from helpers.compiled_lookup import (
 )
 from torch import Tensor
 from torch._dynamo.utils import counters
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch.compilation import compiling
 from directshape_torch.compiler_state import compiler_problem
@@ -188,4 +189,19 @@ def test_a_mode_that_watches_every_function_sees_the_plain_one(nearest) -> None:
     with compiling("on", 3) if compiler_problem() is None else compiling("auto", 3), Watching():
         nearest(*nearest_inputs(40, 3))
     assert torch.fmin in seen
+    assert nearest.num_variants == 0
+
+
+def test_a_mode_that_watches_every_operation_sees_the_plain_one(nearest: Nearest) -> None:
+    """As `FlopCounterMode` does: the compiler refuses to trace under one."""
+    seen = []
+
+    class Watching(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+            seen.append(function.overloadpacket)
+            return function(*args, **(kwargs or {}))
+
+    with compiling("on", 3) if compiler_problem() is None else compiling("auto", 3), Watching():
+        nearest(*nearest_inputs(40, 3))
+    assert torch.ops.aten.fmin in seen
     assert nearest.num_variants == 0

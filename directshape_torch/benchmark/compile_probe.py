@@ -50,11 +50,12 @@ class ProbeResult:
 
 def probe(refiner: DirectShapeRefiner, frames: Sequence[LoadedFrame]) -> ProbeResult:
     """Refine every frame, then every frame again and as many cars as there were not before."""
+    before = _compiled_graphs()
     first_s = _refine_all(refiner, frames)
     graphs = _compiled_graphs()
     again_s = _refine_all(refiner, frames)
     refiner(*with_cars(frames, len(frames[0].detections) + 2))
-    return ProbeResult(first_s, again_s, graphs, _compiled_graphs() - graphs, peak_memory_mb())
+    return ProbeResult(first_s, again_s, graphs - before, _compiled_graphs() - graphs, peak_memory_mb())
 
 
 def _refine_all(refiner: DirectShapeRefiner, frames: Sequence[LoadedFrame]) -> float:

@@ -58,11 +58,6 @@ _LIMITS = {
 }
 
 
-def run_peers(settings: SuiteSettings) -> list[Row]:
-    """The rows of `run_peers_suite`."""
-    return list(run_peers_suite(settings).rows)
-
-
 def run_peers_suite(settings: SuiteSettings) -> SuiteResult:
     """Our solver with analytic and forward-mode Jacobians and with marched rays, PyPose's and Theseus' solvers.
 

@@ -69,10 +69,10 @@ _OUTCOME = r"outcome|quality|covariance|observability|evidence|disparity_profile
 RULES = (
     Rule(r"observation\..*|initial_search", _ANY, "sampling"),
     Rule(r"stereo_matching\..*", _ANY, "sampling"),
-    Rule(r"energy\.photometric_term", r"at_stage|_fix|thinned", "sampling"),
+    Rule(r"energy\.photometric_term", r"at_stage|_fix", "sampling"),
     Rule(r"energy\.photometric_pixels", _ANY, "sampling"),
     Rule(r"shape\..*", r"\bbind\b|initial_code", "shape binding"),
-    Rule(r"shape\.raycast", r"march|closest|_interval|_least|_vertex", "silhouette value"),
+    Rule(r"shape\.raycast", r"march|closest|_least", "silhouette value"),
     Rule(r"shape\.raycast", r"crossing|false_position|polished|depth|newton", "ray depth"),
     Rule(r"energy\.projected_state", r"surface", "ray depth"),
     Rule(r"energy\.projected_state", _ANY, "silhouette value"),

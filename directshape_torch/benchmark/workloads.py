@@ -121,11 +121,6 @@ def first_cars(loaded: LoadedFrame, count: int) -> LoadedFrame:
     return replace(loaded, detections=_rows(loaded.detections, slice(0, count)))
 
 
-def one_car(loaded: LoadedFrame, index: int) -> LoadedFrame:
-    """A frame of which only one car is refined, as in `first_cars`."""
-    return replace(loaded, detections=_rows(loaded.detections, slice(index, index + 1)))
-
-
 def _rows(detections: Detections, rows: slice) -> Detections:
     names = ("frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right")
     kept = {name: getattr(detections, name)[rows] for name in (*names, "has_mask_left", "has_mask_right")}

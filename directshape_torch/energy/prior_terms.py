@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PriorConfig, RefinerConfig
+from directshape_torch.device_constants import constant_like
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.projected_state import ProjectedState
@@ -72,7 +73,7 @@ class DimensionsResidual:
 
     def __call__(self, cars: CarBatch, at: AtState) -> PriorResidual:
         code = at.state.code
-        sigma = torch.tensor(self.sigma_hwl_m, dtype=code.dtype, device=code.device)
+        sigma = constant_like(self.sigma_hwl_m, code)
         return dimensions_prior(self.prior.dimensions_and_derivative(code), cars.detector_hwl, sigma)
 
 

@@ -25,7 +25,7 @@ from directshape_torch.tracking.silhouette import (
     silhouette_residuals,
 )
 
-# A ray is near the contour where |zeta sdf| is below this: its weight beyond is below 5 per mille.
+# A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
 IN_PLAY_EXPONENT = 8.0
 # And as far again as the contour may move during a stage, beyond which the next stage picks it up.
 _IN_PLAY_MARGIN_M = 0.2

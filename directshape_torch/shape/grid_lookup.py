@@ -8,6 +8,7 @@ overestimates the true distance, so ray marching never steps by it.)
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -145,17 +146,20 @@ def _interpolated_basis(field: GridField, cells: _Cells) -> Tensor:
 
 
 def _summed_basis(field: GridField, cells: _Cells) -> Tensor:
-    """`_interpolated_basis` as one weighted sum of table rows: half the time without compilation."""
-    if torch.compiler.is_compiling():  # where the corners fuse with what follows, and a table lookup does not
-        return _interpolated_basis(field, cells)
+    """`_interpolated_basis` as one weighted sum of table rows: one pass instead of three."""
     upper = cells.fraction
     (x0, y0, z0), (x1, y1, z1) = (1 - upper).unbind(0), upper.unbind(0)
     xy = (x0 * y0, x0 * y1, x1 * y0, x1 * y1)
-    weight = torch.stack([w * z for w in xy for z in (z0, z1)], dim=-1)
+    weights = [w * z for w in xy for z in (z0, z1)]
+    table = field.basis.flatten(0, 2)
+    if torch.compiler.is_compiling():
+        return functools.reduce(
+            torch.add,
+            (w[..., None] * table[cells.lower_node + c] for w, c in zip(weights, _corners(field), strict=True)),
+        )
     node = (cells.lower_node[..., None] + _offsets(field, cells.lower_node)).view(-1, 8)
-    rows = torch.nn.functional.embedding_bag(
-        node, field.basis.flatten(0, 2), mode="sum", per_sample_weights=weight.view(-1, 8)
-    )
+    weight = torch.stack(weights, dim=-1).view(-1, 8)
+    rows = torch.nn.functional.embedding_bag(node, table, mode="sum", per_sample_weights=weight)
     return rows.view(*cells.lower_node.shape, rows.shape[-1])
 
 

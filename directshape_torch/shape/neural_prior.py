@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.checks import check_shape
+from directshape_torch.device_constants import constant_like
 from directshape_torch.errors import InputError
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
@@ -100,7 +101,7 @@ class NeuralShapePrior(nn.Module):
     @property
     def bounds_obj(self) -> Tensor:
         """Lower and upper corner of the region that the network was trained for, (2, 3), metres."""
-        last_node = torch.tensor(self.grid_shape, dtype=self.origin.dtype, device=self.origin.device) - 1
+        last_node = constant_like(self.grid_shape, self.origin) - 1
         return torch.stack([self.origin, self.origin + self.spacing_m * last_node])
 
     @property

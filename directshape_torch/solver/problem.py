@@ -21,12 +21,6 @@ class Linearisation(NamedTuple):
     hessian: Tensor  # (B, D, D)
 
 
-class State(Protocol):
-    """A named tuple of tensors whose first dimension is the problem."""
-
-    def __iter__(self) -> object: ...
-
-
 @dataclass(frozen=True)
 class Stage:
     """A part of a minimisation during which pixel sets, counts and zeta are fixed, so that costs are comparable.

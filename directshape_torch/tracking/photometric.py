@@ -244,8 +244,8 @@ def _norm_and_weight(
 
 def _cost(rows: PhotometricRows, settings: PhotometricSettings, rho: Tensor, usable: Tensor) -> Tensor:
     """Cost (M,) of each block from the norms (M, 64, N): a pixel that cannot be compared pays a constant."""
-    lost = _huber_of(settings.lost_grey_levels, settings.huber_grey_levels)
-    rho = torch.where(usable[..., None], rho, torch.full_like(rho, lost))
+    lost = robust.huber(rho.new_full((), settings.lost_grey_levels), settings.huber_grey_levels).rho
+    rho = torch.where(usable[..., None], rho, lost)
     per_pixel = (rho * rows.neighbour_weight.movedim(0, -1)).sum(dim=-1) * rows.pixel_weight
     return per_pixel.to(torch.float64).sum(dim=1)
 
@@ -336,7 +336,3 @@ def _is_hidden(right: RightView, u_level: Tensor, v_level: Tensor) -> Tensor:
     entry = torch.where(inside, entry + row * width + column, 0)
     covering = right.covering.index_select(0, entry.reshape(-1)).view(*entry.shape, right.covering.shape[1])
     return ((covering & right.in_front[:, None]) != 0).any(dim=-1) & inside
-
-
-def _huber_of(residual: float, corner: float) -> float:
-    return 0.5 * residual**2 if abs(residual) <= corner else corner * (abs(residual) - 0.5 * corner)

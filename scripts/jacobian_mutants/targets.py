@@ -270,7 +270,6 @@ TARGETS: dict[str, Target] = {
             "depth_of_state",
             "photometric_residuals",
             "_is_hidden",
-            "_huber_of",
         ),
         tuple(f"tests/tracking/test_tracking_{name}.py" for name in ("surface", "residuals", "photometric")),
     ),
