@@ -23,6 +23,7 @@ from directshape_torch.visualize.drawing import Surface, View, silhouette_mask
 from directshape_torch.visualize.inspection.car_view import CarView, KnownPoints
 from directshape_torch.visualize.inspection.cost_figure import costs_of_car
 from directshape_torch.visualize.inspection.drift_figure import distance_course
+from directshape_torch.visualize.inspection.iteration_animation import animation_frames
 from directshape_torch.visualize.inspection.known_point_figure import write_known_point_figure
 from directshape_torch.visualize.inspection.point_figure import point_sets, shape_points_cam, stereo_points
 from directshape_torch.visualize.inspection.residual_values import photometric_residuals, silhouette_residuals
@@ -157,6 +158,18 @@ def test_known_points_are_one_of_the_sets(view: CarView) -> None:
     sets = point_sets(replace(view, known_points=known))
     assert (sets[-1].name, len(sets[-1].points_obj)) == ("a scan", 3)
     np.testing.assert_allclose(np.abs(sets[-1].points_obj[:, 0]), sets[-1].points_obj[:, 0].max(), atol=0.1)
+
+
+def test_animation_moves_the_contour_in_both_images(view: CarView) -> None:
+    frames = animation_frames(view)
+    assert len(frames) == len(view.steps)
+    # Without the caption, whose number changes.
+    first, last = (frame[frame.shape[0] // 6 :].astype(int) for frame in (frames[0], frames[-1]))
+    moved = np.abs(last - first).max(axis=(0, 2)) > 100
+    # The images take more than half of the width, the left one first.
+    width = frames[0].shape[1]
+    assert moved[: width * 3 // 10].any()
+    assert moved[width * 32 // 100 : width * 55 // 100].any()
 
 
 def test_scan_figure_needs_a_scan(view: CarView, tmp_path: Path) -> None:

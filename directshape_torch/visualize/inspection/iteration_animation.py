@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from directshape_torch.io.figure_files import figure_picture, new_figure, write_animation
+from directshape_torch.observation.occlusion import Side
 from directshape_torch.visualize.drawing import Picture
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.cost_figure import costs_of_car
@@ -18,12 +20,13 @@ from directshape_torch.visualize.inspection.panels import (
     show_crop,
 )
 
-_SIZE_INCHES = (10.5, 3.5)
+_SIZE_INCHES = (13.5, 3.3)
+_SIDES: tuple[Side, Side] = ("left", "right")
 _SECONDS_A_STEP, _SECONDS_AT_END = 0.35, 2.5
 
 
 def write_iteration_animation(path: Path | str, view: CarView) -> None:
-    """Write the GIF: contour in the image, box from above, and costs, for every state that the car moved to.
+    """Write the GIF: contour in both images, box from above, and costs, for every state that the car moved to.
 
     Raises:
         MissingDependencyError: matplotlib or Pillow is not installed.
@@ -36,22 +39,27 @@ def write_iteration_animation(path: Path | str, view: CarView) -> None:
 def animation_frames(view: CarView) -> list[Picture]:
     """One picture (h, w, 3) for each of `view.steps`."""
     figure = new_figure(*_SIZE_INCHES, "drawing an animation")
-    image, above, costs = figure.subplots(1, 3, width_ratios=[3, 1.9, 1.7])
-    show_crop(image, view.image("left"), view.window("left"), view.title)
-    draw_lines(image, view.mask_lines("left"), MASK_INK, linewidth=1.2, linestyle=":")
+    panels = figure.subplots(1, 4, width_ratios=[2.7, 2.7, 1.9, 1.7])
+    *images, above, costs = panels
+    for axes, side in zip(images, _SIDES, strict=True):
+        show_crop(axes, view.image(side), view.window(side), side)
+        draw_lines(axes, view.mask_lines(side), MASK_INK, linewidth=1.2, linestyle=":")
+    figure.suptitle(view.title, fontsize=9)
     show_birds_eye(above, view, [view.footprint(k) for k in view.steps])
     _draw_costs(costs, view)
     # The parts find their places once: they would dance if every picture were laid out anew.
     figure_picture(figure)
     figure.set_layout_engine("none")
-    return [_frame(figure, image, above, costs, view, place) for place in range(len(view.steps))]
+    return [_frame(figure, panels, view, place) for place in range(len(view.steps))]
 
 
-def _frame(figure: Any, image: Any, above: Any, costs: Any, view: CarView, place: int) -> Picture:
+def _frame(figure: Any, panels: Sequence[Any], view: CarView, place: int) -> Picture:
     inks, number = iteration_inks(len(view.steps)), view.steps[place]
-    known = [(axes, len(axes.lines)) for axes in (image, above, costs)]
-    image.set_title(f"{view.title}, iteration {number}", fontsize=9)
-    draw_lines(image, view.contours("left", number), inks[place], linewidth=2.0)
+    known = [(axes, len(axes.lines)) for axes in panels]
+    *images, above, costs = panels
+    figure.suptitle(f"{view.title}, iteration {number}", fontsize=9)
+    for axes, side in zip(images, _SIDES, strict=True):
+        draw_lines(axes, view.contours(side, number), inks[place], linewidth=2.0)
     for earlier in range(place):
         draw_footprint(above, view.footprint(view.steps[earlier]), inks[earlier], linewidth=0.5)
     draw_footprint(above, view.footprint(number), inks[place], linewidth=2.0)
