@@ -12,7 +12,8 @@ from directshape_torch.cli.refine import add_config_option
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
-    from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+    from directshape_torch.io.stereo_dataset import LoadedFrame
+    from directshape_torch.io.stereo_files import FileStereoDataset
 
 _DESCRIPTION = """
 Refine the cars of a frame and draw the course of every one: sampled pixels, occlusion, residuals, contour and box of
@@ -77,12 +78,13 @@ def _inspect_frames(args: argparse.Namespace) -> int:
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
         rows = _rows(loaded, args.car)
-        inspect_frame(loaded, refiner, rows, args.data or DEMO_FOLDER, args.out, must_refine=args.car is not None)
+        root, must = args.data or DEMO_FOLDER, args.car is not None
+        inspect_frame(loaded, refiner, rows, root, dataset.layout, args.out, must_refine=must)
     print(f"figures  {args.out}")
     return 0
 
 
-def _dataset(args: argparse.Namespace) -> StereoDataset:
+def _dataset(args: argparse.Namespace) -> FileStereoDataset:
     from directshape_torch.io.kitti_dataset import KittiStereoDataset
 
     if args.demo:

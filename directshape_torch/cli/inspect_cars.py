@@ -15,6 +15,7 @@ from directshape_torch.cli.inspect_truth import points_of_car, true_points
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.io.atomic_files import write_png
+from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
@@ -31,6 +32,7 @@ def inspect_frame(
     refiner: DirectShapeRefiner,
     rows: Sequence[int],
     root: Path,
+    layout: FrameLayout,
     out_dir: Path,
     *,
     must_refine: bool = False,
@@ -41,7 +43,8 @@ def inspect_frame(
         loaded: the frame, on the CPU.
         refiner: on the CPU too.
         rows: of the detections to draw.
-        root: folder of the data set, for scans and other truth.
+        root: folder of the data set, for true disparity and the like.
+        layout: of that folder, for scans.
         out_dir: made where it is missing.
         must_refine: draw nothing where one of them cannot be refined.
 
@@ -56,7 +59,7 @@ def inspect_frame(
     drawn = [row for row in rows if trace.place_of(row) >= 0]
     silhouettes = silhouette_trace(refiner, loaded) if drawn else None
     clouds = stereo_points(loaded.frame, loaded.detections, refiner.config.point_cloud) if drawn else []
-    truth, known = true_corners_cam(loaded), true_points(root, loaded)
+    truth, known = true_corners_cam(loaded), true_points(root, layout, loaded)
     for row in tqdm(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
         line = line_of(loaded, row)
         centre_cam = trace.T_cam_obj[-1][row, :3, 3]

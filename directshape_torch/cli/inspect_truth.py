@@ -14,8 +14,7 @@ from directshape_torch.calibration.observations_disparity import FOLDERS, known_
 from directshape_torch.calibration.observations_lidar import known_depth_from_lidar
 from directshape_torch.evaluation.shape_error_surface import SurfaceSource
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.io.frame_layout import first_disparity
-from directshape_torch.io.kitti_calibration import read_calibration
+from directshape_torch.io.frame_layout import FrameLayout, first_disparity
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.visualize.inspection.car_view import KnownPoints
@@ -32,18 +31,22 @@ class TruePoints(NamedTuple):
     uv: NDArray[np.float64]  # (P, 2) pixels
 
 
-def true_points(root: Path, loaded: LoadedFrame) -> TruePoints | None:
-    """The scan, true disparity or true surfaces of a frame in KITTI's folder layout, the first that there is.
+def true_points(root: Path, layout: FrameLayout, loaded: LoadedFrame) -> TruePoints | None:
+    """The scan of a frame, or true disparity or surfaces in KITTI's folder `training`, the first that there is.
+
+    Args:
+        root: folder of the data set.
+        layout: knows where the scan is.
+        loaded: the frame.
 
     Raises:
         DataFormatError: a file is there and cannot be used.
     """
     training, frame_id, camera = root / "training", loaded.frame_id, loaded.frame.camera
     height, width = loaded.frame.sizes[0].tolist()
-    scan = training / "velodyne" / f"{frame_id}.bin"
-    if scan.is_file():
-        calibration = read_calibration(training / "calib" / f"{frame_id}.txt")
-        return _of_depth("LiDAR", known_depth_from_lidar(scan, calibration, (width, height), camera), loaded)
+    scan = layout.scan(frame_id)
+    if scan is not None:
+        return _of_depth("LiDAR", known_depth_from_lidar(*scan, (width, height), camera), loaded)
     for folder in FOLDERS:
         disparity = first_disparity(training / folder, frame_id)
         if disparity.is_file():

@@ -125,6 +125,9 @@ class FolderLayout:
         """`folder/ID.png`."""
         return first_disparity(folder, frame_id)
 
+    def scan(self, frame_id: str) -> None:
+        """None: this layout has no scans."""
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """Those of the frame's file, where it has them."""
         return self._frame(frame_id).times_s

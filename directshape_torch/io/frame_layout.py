@@ -72,6 +72,10 @@ class FrameLayout(Protocol):
         """The disparity map of a frame in a folder of such maps."""
         ...
 
+    def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
+        """The LiDAR scan of a frame and a calibration that places it in the camera, or None where there is no scan."""
+        ...
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """When the left and the right image were taken, seconds from any start, or None where no file says so."""
         ...

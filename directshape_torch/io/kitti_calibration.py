@@ -68,6 +68,26 @@ def read_calibration(path: Path | str) -> KittiCalibration:
     return KittiCalibration(Path(path), **matrices)
 
 
+def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
+    """LiDAR to camera 0, (3, 4), metres, from `calib_velo_to_cam.txt` of the raw recordings (lines `R:` and `T:`).
+
+    Raises:
+        DataFormatError: one of them is missing or does not hold its numbers.
+    """
+    found: dict[str, NDArray[np.float64]] = {}
+    for line in read_lines(path):
+        words = line.text.split()
+        shape = {"R:": (3, 3), "T:": (3, 1)}.get(words[0])
+        if shape is not None:
+            found[words[0]] = _parse_matrix(path, line.number, line.text, words[1:], shape)
+    for name in ("R:", "T:"):
+        if name not in found:
+            raise DataFormatError(
+                path, f"has no line {name}", cure="a scan needs rotation and translation of its LiDAR"
+            )
+    return np.concatenate([found["R:"], found["T:"]], axis=1)
+
+
 def _parse_matrix(
     path: Path | str, number: int, text: str, words: Sequence[str], shape: tuple[int, int]
 ) -> NDArray[np.float64]:

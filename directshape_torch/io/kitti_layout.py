@@ -51,6 +51,10 @@ class KittiObjectLayout(KittiTextLayout):
         """One plane a frame."""
         return self.training / "planes" / f"{frame_id}.txt"
 
+    def scan_file(self, frame_id: str) -> Path:
+        """One scan a frame."""
+        return self.training / "velodyne" / f"{frame_id}.bin"
+
     def detection_path(self, frame_id: str) -> Path:
         """One file a frame."""
         return file_of_frame(self.detections_dir, f"{frame_id}.txt")

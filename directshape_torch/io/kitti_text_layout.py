@@ -38,6 +38,15 @@ class KittiTextLayout(ABC):
         """(a, b, c, d) in ref."""
         return read_plane(self.plane_file(frame_id))
 
+    def scan_file(self, frame_id: str) -> Path | None:
+        """Where the LiDAR scan of a frame is or would be; None: this layout has none."""
+        return None
+
+    def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
+        """The scan, where there is one, with the matrices of the calibration file."""
+        path = self.scan_file(frame_id)
+        return None if path is None or not path.is_file() else (path, self.calibration(frame_id))
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """None: no file of this layout says so."""
         return None

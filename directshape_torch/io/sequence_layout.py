@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, InputError
@@ -16,6 +16,7 @@ from directshape_torch.io.frame_layout import (
 )
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_of_frame
+from directshape_torch.io.kitti_calibration import KittiCalibration, read_velo_to_cam
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.kitti_text_layout import KittiTextLayout
 from directshape_torch.io.mask_files import FrameJsonMasks, mask_source
@@ -32,7 +33,9 @@ class SequenceFolders:
         left, right: folders of images.
         calibration: file with P2 and P3, or P_rect_02 and P_rect_03.
         planes: folder of plane files, which need not exist.
+        scans: folder of LiDAR scans, which need not exist.
         labels: label file of the tracking benchmark, which need not exist; None where the layout has none.
+        velo_to_cam: file that places the LiDAR; None: the calibration does.
     """
 
     name: str
@@ -40,7 +43,9 @@ class SequenceFolders:
     right: Path
     calibration: Path
     planes: Path
-    labels: Path | None
+    scans: Path
+    labels: Path | None = None
+    velo_to_cam: Path | None = None
 
 
 class SequenceLayout(KittiTextLayout):
@@ -98,6 +103,19 @@ class SequenceLayout(KittiTextLayout):
         """One plane a frame."""
         sequence, stem = self._split(frame_id)
         return sequence.planes / f"{stem}.txt"
+
+    def scan_file(self, frame_id: str) -> Path:
+        """One scan a frame."""
+        sequence, stem = self._split(frame_id)
+        return sequence.scans / f"{stem}.bin"
+
+    def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
+        """Raw recordings have a file of its own for the place of the LiDAR."""
+        found, velo_to_cam = super().scan(frame_id), self._split(frame_id)[0].velo_to_cam
+        if found is None or velo_to_cam is None:
+            return found
+        path, calibration = found
+        return path, replace(calibration, Tr_velo_to_cam=read_velo_to_cam(velo_to_cam))
 
     def detection_path(self, frame_id: str) -> Path:
         """The frame's own file where there is one, else its sequence's."""
@@ -223,6 +241,7 @@ def tracking_layout(root: Path | str, detections_dir: Path | str) -> SequenceLay
             root / "image_03",
             root / "calib.txt",
             root / "planes",
+            root / "velodyne",
             root / "label_02.txt",
         )
         return SequenceLayout([own], detections_dir, single=True, digits=6)
@@ -241,6 +260,7 @@ def tracking_layout(root: Path | str, detections_dir: Path | str) -> SequenceLay
             base / "image_03" / name,
             base / "calib" / f"{name}.txt",
             base / "planes" / name,
+            base / "velodyne" / name,
             base / "label_02" / f"{name}.txt",
         )
         for name in names
@@ -272,4 +292,11 @@ def _drive(folder: Path) -> SequenceFolders:
     images = (folder / "image_02" / "data", folder / "image_03" / "data")
     inside = folder / "calib_cam_to_cam.txt"
     calibration = inside if inside.is_file() else folder.resolve().parent / "calib_cam_to_cam.txt"
-    return SequenceFolders(folder.resolve().name, *images, calibration, folder / "planes", None)
+    return SequenceFolders(
+        folder.resolve().name,
+        *images,
+        calibration,
+        folder / "planes",
+        folder / "velodyne_points" / "data",
+        velo_to_cam=calibration.with_name("calib_velo_to_cam.txt"),
+    )

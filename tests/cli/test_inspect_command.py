@@ -80,10 +80,10 @@ def test_the_only_car_of_a_frame_may_fail_unless_it_was_asked_for(
 ) -> None:
     data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
     refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", "sampling.min_usable_pixels=100000"]))
-    inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, tmp_path)
+    inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, data.layout, tmp_path)
     assert "car 2: not refined, too_few_pixels" in capsys.readouterr().out
     with pytest.raises(InputError, match="too_few_pixels"):
-        inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, tmp_path, must_refine=True)
+        inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, data.layout, tmp_path, must_refine=True)
 
 
 def test_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,8 +108,9 @@ def test_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: 
 )
 def test_true_points_lie_on_the_labelled_car(folder: str, detections: str, frame: str, car: int, name: str) -> None:
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / folder
-    loaded = KittiStereoDataset(root, root / "detections" / detections, root / "training/masks").load(frame)
-    points = true_points(root, loaded)
+    data = KittiStereoDataset(root, root / "detections" / detections, root / "training/masks")
+    loaded = data.load(frame)
+    points = true_points(root, data.layout, loaded)
     assert points is not None
     assert points.name == name
     found = points_of_car(points, loaded, car, loaded.detections.T_cam_obj[car, :3, 3])
