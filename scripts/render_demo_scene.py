@@ -17,13 +17,15 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from command_line import run_command
 from demo_scene.frame import RenderSettings, render_frame
 from demo_scene.frame_files import write_frame
 from demo_scene.layout import sample_layout
+from demo_scene.rendering import import_mitsuba
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Command line; see the module's description."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line and run; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder that gets training/ and detections/")
     parser.add_argument("--frames", type=int, default=1, help="number of frames (default 1)")
@@ -31,7 +33,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cars", type=int, choices=(4, 5, 6), default=None, help="cars a frame (default: 4 to 6)")
     parser.add_argument("--paths-per-pixel", type=int, default=16, help="samples of the path tracer (default 16)")
     parser.add_argument("--variant", default="scalar_rgb", help="Mitsuba's variant (default scalar_rgb)")
-    options = parser.parse_args(arguments)
+    return run_command(parser, run, arguments)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Render and write every frame.
+
+    Raises:
+        MissingDependencyError: Mitsuba is not installed.
+    """
+    import_mitsuba()
     settings = RenderSettings(options.paths_per_pixel, options.variant)
     for k in range(options.frames):
         started = time.perf_counter()
@@ -41,4 +52,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    raise SystemExit(main())

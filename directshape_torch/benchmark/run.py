@@ -21,6 +21,7 @@ from directshape_torch.benchmark.rows import SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.config_files import config_to_mapping, load_config
 from directshape_torch.errors import InputError
+from directshape_torch.io.figure_files import check_figures
 
 _PACKAGE = "directshape_torch.benchmark"
 
@@ -76,6 +77,8 @@ def run_benchmark(options: BenchmarkOptions, progress: Progress) -> int:
     if options.write_baseline and options.quick:
         raise InputError("--write-baseline", "a run without --quick", "--quick", "quick figures are no baseline")
     baseline = read_baseline(options.baseline_path) if options.check else {}
+    if options.plots_dir is not None:
+        check_figures("benchmark.py --plots")
     machine = describe_machine()
     print(format_machine(machine), flush=True)
     settings = SuiteSettings.make(options.data_root, options.quick, progress)

@@ -54,6 +54,9 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         DirectShapeError: wrong options or input, no such frame or car; for the main program to show.
     """
+    from directshape_torch.io.figure_files import check_figures
+
+    check_figures("directshape inspect")
     if args.prior == "default":
         args.prior = "pca"
     if args.demo or args.data is not None:

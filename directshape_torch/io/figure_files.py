@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,21 @@ from directshape_torch.io import atomic_files
 
 _DOTS_PER_INCH, _ANIMATION_DOTS_PER_INCH = 110, 80
 _GIF_COLOURS = 255
+
+
+def check_figures(purpose: str) -> None:
+    """Find out before the work is done that its pictures could not be drawn.
+
+    Args:
+        purpose: what is drawn, for the message.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    try:
+        importlib.import_module("matplotlib.figure")
+    except ImportError as error:
+        raise MissingDependencyError("matplotlib", "plot", purpose) from error
 
 
 def new_figure(width_inches: float, height_inches: float, purpose: str) -> Any:

@@ -6,6 +6,7 @@ needs an LLVM library of version 19 (Debian: `apt-get install libllvm19`); older
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from demo_scene.camera import IMAGE_HEIGHT_PX, IMAGE_WIDTH_PX, Array, K
 from demo_scene.surfaces import Indices, Material, Picture, Surface
+from directshape_torch.errors import MissingDependencyError
 
 _MAX_RADIANCE = 12.0
 _MAX_INSTANCES = 64
@@ -49,6 +51,18 @@ class PixelTruth:
     depth_m: Array
 
 
+def import_mitsuba() -> Any:
+    """The renderer.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    try:
+        return importlib.import_module("mitsuba")
+    except ImportError as error:
+        raise MissingDependencyError("mitsuba", "render", "rendering") from error
+
+
 class Renderer:
     """Mitsuba with one scene loaded.
 
@@ -59,8 +73,7 @@ class Renderer:
     """
 
     def __init__(self, surfaces: list[Surface], light: Light | None, variant: str = "scalar_rgb") -> None:
-        import mitsuba
-
+        mitsuba = import_mitsuba()
         mitsuba.set_variant(variant)
         self._mi: Any = mitsuba
         self._shows_instances = light is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from directshape_torch.errors import MissingDependencyError
-from directshape_torch.io.figure_files import figure_png, new_figure
+from directshape_torch.io.figure_files import check_figures, figure_png, new_figure
 
 
 def _png(last_value: float) -> bytes:
@@ -34,3 +34,5 @@ def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MissingDependencyError, match=r"^a test needs .*pip install 'directshape_torch\[plot\]'"):
         new_figure(4, 2, "a test")
+    with pytest.raises(MissingDependencyError, match=r"^a command needs .*pip install 'directshape_torch\[plot\]'"):
+        check_figures("a command")

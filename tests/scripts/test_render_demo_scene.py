@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import render_demo_scene
 import torch
 from demo_scene import camera, car_surfaces, frame_files, labels, layout, sensor, surfaces
 
@@ -187,6 +189,16 @@ def test_bundled_masks_lie_in_the_projected_boxes() -> None:
         assert v.min() >= box[1] - 0.02
         assert u.max() <= box[2] + 0.02
         assert v.max() <= box[3] + 0.02
+
+
+def test_without_the_renderer_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    assert render_demo_scene.main(["--out", str(tmp_path / "frames")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("pip install 'directshape_torch[render]'")
+    assert not (tmp_path / "frames").exists()
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mitsuba") is None, reason="needs the extra `render` (mitsuba)")
