@@ -59,7 +59,8 @@ class CompilationError(DirectShapeError, RuntimeError):
 class MissingDependencyError(DirectShapeError, ImportError):
     """An optional package is needed for what was asked."""
 
-    def __init__(self, package: str, extra: str, purpose: str) -> None:
+    def __init__(self, package: str, extra: str, purpose: str, *, environment: str = "") -> None:
+        command = f"{environment} pip install" if environment else "pip install"
         super().__init__(
-            f"{purpose} needs the package {package!r}; install it with: pip install 'directshape_torch[{extra}]'"
+            f"{purpose} needs the package {package!r}; install it with: {command} 'directshape_torch[{extra}]'"
         )

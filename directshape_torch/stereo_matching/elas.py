@@ -43,5 +43,9 @@ def _elas_module() -> Any:
         return importlib.import_module("elas")
     except ImportError as error:
         raise MissingDependencyError(
-            "pyelas", "elas", "point_cloud.matcher elas (GPL-3.0; built from source, see docs/file_formats.md)"
+            "pyelas",
+            "elas",
+            "point_cloud.matcher elas (GPL-3.0, built from source)",
+            # Its source does not find numpy's headers by itself.
+            environment=f"CPLUS_INCLUDE_PATH={np.get_include()}",
         ) from error

@@ -60,7 +60,9 @@ def test_only_frames_that_are_needed_are_matched() -> None:
 
 def test_elas_is_asked_for_by_name_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "elas", None)
-    with pytest.raises(MissingDependencyError, match=r"matcher elas .*needs the package .pyelas.; .*\[elas\]"):
+    with pytest.raises(
+        MissingDependencyError, match=r"matcher elas .*pyelas.; .*CPLUS_INCLUDE_PATH=\S*include pip .*\[elas\]"
+    ):
         with_disparity(cached_street()[1].frames, "elas")
 
 
