@@ -202,4 +202,6 @@ def _report_text(out: Path, report: PriorReport) -> str:
         f"(mean over {report.leave_one_out_num_cars} cars)",
         "height, width, length, m: " + ", ".join(f"{mean:.2f} +- {std:.2f}" for mean, std in sizes),
     ]
-    return "\n".join(lines + [f"skipped {name}: {reason}" for name, reason in report.skipped.items()])
+    return "\n".join(
+        lines + [f"skipped {name}: {reason.removeprefix(f'{name}: ')}" for name, reason in report.skipped.items()]
+    )

@@ -150,6 +150,9 @@ def _pairs_of_frame(folders: tuple[Path, Path, Path], frame_id: str, counted: Co
     """Counted labels of a frame that have a detection, and the number of those that count at all."""
     label_path, before_path, after_path = (file_of_frame(folder, f"{frame_id}.txt") for folder in folders)
     labels = read_objects(label_path)
+    if not after_path.is_file():
+        cure = "was it refined? name the frames that were with --frames or --split"
+        raise DataFormatError(after_path, f"there is no result of frame {frame_id}", cure=cure)
     before, after = read_objects(before_path), read_objects(after_path)
     _check_same_lines(before_path, before, after_path, after)
     rows = [row for row, o in enumerate(before) if o.type in counted.types and o.has_box_3d]
