@@ -135,6 +135,7 @@ TARGETS: dict[str, Target] = {
             "clamp_foreground",
             "silhouette_residual",
             "residual_derivative_closest_approach",
+            "_sigmoids",
             "residual_derivative_product",
         ),
         ("tests/residuals/test_silhouette.py", "tests/residuals/test_silhouette_dilation.py"),
