@@ -5,9 +5,10 @@
 
 Frame k has seed S + k and holds: left and right images (1242 x 375), calibration, labels, ground plane, exact instance
 masks (COCO RLE), a description of the scene (`meta`: exact poses and measures), and noisy detections as of a stereo
-detector. The same seed gives the same scene; the pixels are the same on the same renderer version and variant.
-Needs Mitsuba 3 and pyoidn (without the latter a simpler, rougher denoiser is used). `--variant scalar_rgb` runs as
-installed; `llvm_ad_rgb` needs an LLVM library of version 19 (Debian: `apt-get install libllvm19`), older ones crash.
+detector. The same seed gives the same scene; the pixels are the same on the same renderer version and variant. A frame
+takes minutes (6 with `--cars 4 --paths-per-pixel 1` on two busy cores). Needs Mitsuba 3 and pyoidn (without the latter
+a simpler, rougher denoiser is used). `--variant scalar_rgb` runs as installed; `llvm_ad_rgb` needs an LLVM library of
+version 19 (Debian: `apt-get install libllvm19`), older ones crash.
 """
 
 from __future__ import annotations
