@@ -7,6 +7,7 @@ Run it after changing a default; a test compares the two.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import re
 import textwrap
@@ -27,6 +28,7 @@ HEADER = """\
 
 def main() -> None:
     """Write the file."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     TARGET.write_text(default_yaml(), encoding="utf-8")
 
 
