@@ -18,6 +18,7 @@ from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.direct_terms import stacked_weights
 from directshape_torch.energy.method import method_terms
+from directshape_torch.full_precision import full_precision
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
 from directshape_torch.observation.mask_extents import scene_extents
@@ -91,10 +92,9 @@ class DirectShapeRefiner(nn.Module):
     ) -> RefinementResult:
         check_fit(frames, detections, self.prior)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
-        # Half precision cannot hold pixel coordinates: under autocast everything here stays in the inputs' precision.
         with (
             torch.set_grad_enabled(differentiate),
-            torch.autocast(frames.images_left.device.type, enabled=False),
+            full_precision(frames.images_left.device.type),
             compiling(self.config.compile, len(detections)),
         ):
             return self._refine(frames, detections, term_weights)
