@@ -95,7 +95,8 @@ def _draw_grid(picture: Picture, ground: _Map) -> None:
     for z in _multiples(step, ground.lowest_z_m, ground.lowest_z_m + depth):
         v = round(float(ground.pixels(np.array([[0.0, z]]))[0, 1]))
         cv2.line(picture, (0, v), (width, v), _GRID, 1)
-        draw_text(picture, f"{z} m", (4, v - 3), GREY, 0.38)
+        # On the right: a legend stands on the left.
+        draw_text(picture, f"{z} m", (width - 40, v - 3), GREY, 0.38)
     for x in _multiples(step, ground.middle_x_m - breadth / 2, ground.middle_x_m + breadth / 2):
         u = round(float(ground.pixels(np.array([[x, 0.0]]))[0, 0]))
         cv2.line(picture, (u, 0), (u, height), _GRID, 1)
