@@ -11,6 +11,7 @@ from directshape_torch.compilation import compiling
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
+from directshape_torch.full_precision import full_precision
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
 from directshape_torch.refiner import DirectShapeRefiner
@@ -80,6 +81,13 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
         InputError: frames, detections and prior do not fit together.
     """
     result = refiner(frames, detections)
+    with full_precision(frames.images_left.device.type):
+        return _traced(refiner, frames, detections, result)
+
+
+def _traced(
+    refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections, result: RefinementResult
+) -> RefinementTrace:
     took_part = result.cost_before.isfinite().all(dim=1)
     rows = took_part.nonzero()[:, 0]
     everyone, initial = refiner.problem(frames, detections)

@@ -16,6 +16,7 @@ CUDA, CPU = torch.backends.cuda.matmul, torch.backends.mkldnn.matmul
 @pytest.fixture(autouse=True)
 def _as_it_was() -> Iterator[None]:
     yield
+    torch.backends.fp32_precision = CUDA.fp32_precision = CPU.fp32_precision = "none"
     torch.set_float32_matmul_precision("highest")
     CUDA.fp32_precision = CPU.fp32_precision = "none"
 
@@ -40,6 +41,23 @@ def test_the_newer_name_of_the_setting() -> None:
     with full_precision("cpu"):
         assert CUDA.fp32_precision == "ieee"
     assert CUDA.fp32_precision == "tf32"
+
+
+def test_what_follows_the_setting_of_all_backends_goes_on_following_it() -> None:
+    torch.backends.fp32_precision = "tf32"
+    with full_precision("cpu"):
+        assert seen() == ("ieee", "ieee")
+    assert seen() == ("tf32", "tf32")
+    torch.backends.fp32_precision = "ieee"
+    assert seen() == ("ieee", "ieee")
+
+
+def test_the_older_names_can_be_read_inside() -> None:
+    torch.set_float32_matmul_precision("high")
+    with full_precision("cpu"):
+        assert torch.get_float32_matmul_precision() == "highest"
+        assert not CUDA.allow_tf32
+    assert CUDA.allow_tf32
 
 
 def test_after_an_error_too() -> None:

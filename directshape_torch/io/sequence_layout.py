@@ -110,10 +110,12 @@ class SequenceLayout(KittiTextLayout):
         return sequence.scans / f"{stem}.bin"
 
     def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
-        """Raw recordings have a file of its own for the place of the LiDAR."""
+        """Raw recordings have a file of its own for the place of the LiDAR; without it a scan is of no use."""
         found, velo_to_cam = super().scan(frame_id), self._split(frame_id)[0].velo_to_cam
         if found is None or velo_to_cam is None:
             return found
+        if not velo_to_cam.is_file():
+            return None
         path, calibration = found
         return path, replace(calibration, Tr_velo_to_cam=read_velo_to_cam(velo_to_cam))
 

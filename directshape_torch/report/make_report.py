@@ -105,7 +105,8 @@ def _right_prior(run: RunFolder, prior: ShapePrior | None) -> ShapePrior | None:
 class _PageOfRun:
     def __init__(self, run: RunFolder, sources: InputSources, prior: ShapePrior | None, prior_was_given: bool) -> None:
         self._run = run
-        self._reader = InputReader(sources, run.manifest)
+        # One for all frames and one for those with details: each counts what it could not use.
+        self._reader, self._detail_reader = (InputReader(sources, run.manifest) for _ in range(2))
         self._prior = prior
         self._prior_was_given = prior_was_given
 
@@ -150,7 +151,9 @@ class _PageOfRun:
         observer.started(names)
         for number, name in zip(detailed, names, strict=True):
             known = self._results(name)
-            material = FrameMaterial(known.result, self._reader.read(name), known.lines, known.detections, known.labels)
+            material = FrameMaterial(
+                known.result, self._detail_reader.read(name), known.lines, known.detections, known.labels
+            )
             details = frame_details(material, settings)
             file.write(data_block(f"thumbnails-{number}", details.thumbnails))
             file.write(data_block(f"maps-{number}", details.maps))
@@ -183,7 +186,8 @@ class _PageOfRun:
             notes.append("photometric residuals without the run's disparity field, so biased (--stereo-bias)")
         if num_detailed < num_frames:
             notes.append(f"pictures and 3D views of {num_detailed} of {num_frames} frames (--max-frames)")
-        return [*notes, *problem_notes(self._reader.problems, num_frames)]
+        notes += problem_notes(self._reader.problems, num_frames)
+        return notes + problem_notes(self._detail_reader.problems, num_detailed)
 
     def _write_tables(
         self,

@@ -101,12 +101,14 @@ def residual_derivative_closest_approach(
         (tensor([0.6931]), tensor([0.5000]))
     """
     x = zeta * closest_sdf
-    smaller, larger = _sigmoids(x.abs().clamp_max(saturation))
     is_outside = x > 0
+    # Not `abs`, whose derivative at zero is zero: on the contour itself the residual has one.
+    distance = torch.where(is_outside, x, -x)
+    smaller, larger = _sigmoids(distance.clamp_max(saturation))
     hit, miss = torch.where(is_outside, smaller, larger), torch.where(is_outside, larger, smaller)
     likelihood = hit * foreground + miss * (1 - foreground)
     derivative = zeta * smaller * larger * (2 * foreground - 1) / likelihood
-    return -likelihood.log(), torch.where(x.abs() < saturation, derivative, torch.zeros_like(derivative))
+    return -likelihood.log(), torch.where(distance < saturation, derivative, torch.zeros_like(derivative))
 
 
 def _sigmoids(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -141,6 +141,15 @@ def test_changed_detections_are_named_for_frames_without_pictures_too(run: Finis
     assert "detections not used: the file has changed since the run (2 of 2 frames)" in outcome.notes
 
 
+def test_images_are_looked_for_where_there_are_pictures(run: FinishedRun, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(run.root, tmp_path / "kitti"))
+    for name in ("000000.png", "000001.png"):
+        (root / "training" / "image_2" / name).unlink()
+    sources = FinishedRun(root, run.out).sources
+    outcome = make_report(run.out, tmp_path / "page.html", sources, run.prior, ReportOptions(most_frames=1))
+    assert "left image not found (1 of 1 frames)" in outcome.notes
+
+
 def test_another_prior_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
     outcome = make_report(run.out, tmp_path / "page.html", run.sources, PCAShapePrior.load_bundled())
     assert any("the prior is not that of the run" in note for note in outcome.notes)
