@@ -34,11 +34,10 @@ def huber(residual: Tensor, corner: float) -> RobustValue:
         tensor(4.)
     """
     magnitude = residual.abs()
-    inside = magnitude <= corner
-    safe = torch.where(inside, torch.full_like(magnitude, corner), magnitude)
-    rho = torch.where(inside, 0.5 * residual * residual, corner * (magnitude - 0.5 * corner))
-    weight = torch.where(inside, torch.ones_like(safe), corner / safe)
-    return RobustValue(rho, weight * residual, weight)
+    # Both pieces in one, without a choice: up to the corner the magnitude itself stands for it.
+    inner, outer = magnitude.clamp_max(corner), magnitude.clamp_min(corner)
+    weight = corner / outer
+    return RobustValue(inner * (magnitude - 0.5 * inner), weight * residual, weight)
 
 
 def truncated_huber(residual: Tensor, corner: float, limit: float) -> RobustValue:

@@ -101,7 +101,8 @@ def _corner_values(field: GridField, cells: _Cells, object_index: Tensor) -> _Co
     nx, ny, nz, _ = field.basis.shape
     base = cells.lower_node + object_index * (nx * ny * nz)
     if torch.compiler.is_compiling() or (base.device.type == "cpu" and base.numel() > _FEW_POINTS):
-        return [_take(field.values, base + corner) for corner in _corners(field)]
+        flat = base.reshape(-1)
+        return [field.values.index_select(0, flat + corner).view(base.shape) for corner in _corners(field)]
     # Corner first, so that each step runs over whole rows: fewer operations, and several times as fast as (..., 8).
     return _take(field.values, base + _offsets(field, base).view(8, *(1,) * base.ndim))
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from directshape_torch.io.figure_files import figure_picture, new_figure, write_animation
-from directshape_torch.observation.occlusion import Side
+from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.visualize.drawing import Picture
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.cost_figure import costs_of_car
@@ -21,7 +21,6 @@ from directshape_torch.visualize.inspection.panels import (
 )
 
 _SIZE_INCHES = (13.5, 3.3)
-_SIDES: tuple[Side, Side] = ("left", "right")
 _SECONDS_A_STEP, _SECONDS_AT_END = 0.35, 2.5
 
 
@@ -41,7 +40,7 @@ def animation_frames(view: CarView) -> list[Picture]:
     figure = new_figure(*_SIZE_INCHES, "drawing an animation")
     panels = figure.subplots(1, 4, width_ratios=[2.7, 2.7, 1.9, 1.7])
     *images, above, costs = panels
-    for axes, side in zip(images, _SIDES, strict=True):
+    for axes, side in zip(images, SIDES, strict=True):
         show_crop(axes, view.image(side), view.window(side), side)
         draw_lines(axes, view.mask_lines(side), MASK_INK, linewidth=1.2, linestyle=":")
     figure.suptitle(view.title, fontsize=9)
@@ -58,7 +57,7 @@ def _frame(figure: Any, panels: Sequence[Any], view: CarView, place: int) -> Pic
     known = [(axes, len(axes.lines)) for axes in panels]
     *images, above, costs = panels
     figure.suptitle(f"{view.title}, iteration {number}", fontsize=9)
-    for axes, side in zip(images, _SIDES, strict=True):
+    for axes, side in zip(images, SIDES, strict=True):
         draw_lines(axes, view.contours(side, number), inks[place], linewidth=2.0)
     for earlier in range(place):
         draw_footprint(above, view.footprint(view.steps[earlier]), inks[earlier], linewidth=0.5)

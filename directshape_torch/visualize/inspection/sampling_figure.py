@@ -13,6 +13,7 @@ from directshape_torch.admission import without_empty_masks
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
 from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.figure_files import new_figure
+from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.observation.occlusion import Side, hidden_pixels
 from directshape_torch.observation.packing import car_regions, sampling_settings
 from directshape_torch.observation.pixel_sampling import select_pixels
@@ -24,7 +25,6 @@ _PANEL_INCHES, _ROOM_INCHES = 6.0, 0.8
 _STRONG_INK, _FILL_INK = "lime", "red"
 # Of the region of a far car in the occlusion picture.
 _LEAST_HEIGHT_PX = 180
-_SIDES: tuple[Side, Side] = ("left", "right")
 
 
 class SampledPixels(NamedTuple):
@@ -58,7 +58,7 @@ def write_sampling_figure(path: Path | str, view: CarView) -> None:
     """
     figure = new_figure(2 * _PANEL_INCHES, _PANEL_INCHES * view.panel_aspect() + _ROOM_INCHES, "drawing sampled pixels")
     figure.suptitle(view.title)
-    for axes, side in zip(figure.subplots(1, 2), _SIDES, strict=True):
+    for axes, side in zip(figure.subplots(1, 2), SIDES, strict=True):
         pixels = sampled_pixels(view, side)
         strong = pixels.above_threshold
         title = f"{side}: {strong.sum()} by their gradient, {(~strong).sum()} to fill cells, {pixels.num_hidden} hidden"
@@ -78,7 +78,7 @@ def write_occlusion_picture(path: Path | str, view: CarView) -> None:
     # One scale for both images, or the car would seem to change its size.
     scale = max(2, round(_LEAST_HEIGHT_PX / max(v1 - v0 for _, v0, _, v1 in view.regions)))
     rows = []
-    for side, region in zip(_SIDES, regions, strict=True):
+    for side, region in zip(SIDES, regions, strict=True):
         u0, v0, u1, v1 = region[view.car].tolist()
         if u1 > u0 and v1 > v0:
             order = config.occlusion_order
