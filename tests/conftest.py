@@ -10,6 +10,9 @@ import torch
 
 from directshape_torch import compilation
 
+# Fixtures that several files share.
+pytest_plugins = ("helpers.compiled_lookup", "helpers.run_fixtures")
+
 # The same examples in every run: a failure that comes and goes helps nobody.
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("repeatable")

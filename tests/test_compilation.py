@@ -11,7 +11,6 @@ from helpers.compiled_lookup import (
     nearest_inputs,
     nearest_values,
     needs_compiler,
-    new_nearest,
 )
 from torch import Tensor
 from torch._dynamo.utils import counters
@@ -20,15 +19,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from directshape_torch.compilation import compiling
 from directshape_torch.compiler_state import compiler_problem
 
-
-@pytest.fixture(autouse=True)
-def _no_counts() -> None:
-    counters.clear()
-
-
-@pytest.fixture
-def nearest() -> Nearest:
-    return new_nearest()
+pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 
 
 @needs_compiler

@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.compiled_lookup import Nearest, nearest_inputs, new_nearest, without_disk
+from helpers.compiled_lookup import nearest_inputs, without_disk
 from torch import Tensor
 
 from directshape_torch import compilation
 from directshape_torch.compilation import CARS_WORTH_COMPILING, CARS_WORTH_LOADING, Compilable, cars_ahead, compiling
-
-
-@pytest.fixture
-def nearest() -> Nearest:
-    return new_nearest()
 
 
 class TestAuto:

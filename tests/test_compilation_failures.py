@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.compiled_lookup import Nearest, nearest_inputs, nearest_values, new_nearest, without_disk
+from helpers.compiled_lookup import nearest_inputs, nearest_values, without_disk
 from torch import Tensor
 
 from directshape_torch import compilation
@@ -24,11 +24,6 @@ from directshape_torch.compilation import (
 )
 from directshape_torch.compiler_inputs import variant_of
 from directshape_torch.errors import CompilationError
-
-
-@pytest.fixture
-def nearest() -> Nearest:
-    return new_nearest()
 
 
 class TestWithoutCompiler:

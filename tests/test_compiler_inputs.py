@@ -8,21 +8,13 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import torch
-from helpers.compiled_lookup import Nearest, nearest_inputs, nearest_values, new_nearest, without_disk
+from helpers.compiled_lookup import nearest_inputs, nearest_values, without_disk
 from torch._dynamo.utils import counters
 
 from directshape_torch import compilation
 from directshape_torch.compilation import compilable, compiling
 
-
-@pytest.fixture(autouse=True)
-def _no_counts() -> None:
-    counters.clear()
-
-
-@pytest.fixture
-def nearest() -> Nearest:
-    return new_nearest()
+pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 
 
 @contextlib.contextmanager

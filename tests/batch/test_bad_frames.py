@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from helpers.faulty_refiners import QuickRefiner
-from helpers.kitti_folder import FRAMES, write_data_set
+from helpers.kitti_folder import FRAMES
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
@@ -25,25 +24,12 @@ from directshape_torch.result import RefinementResult
 from directshape_torch.scene import FrameBatch
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root)
-    return root
-
-
-@pytest.fixture
-def root(source: Path, tmp_path: Path) -> Path:
-    """A copy that a test may damage."""
-    return Path(shutil.copytree(source, tmp_path / "kitti"))
-
-
-def test_a_truncated_image_is_reported_and_the_others_go_on(root: Path, tmp_path: Path) -> None:
-    refine(root, tmp_path / "whole")
-    image = root / "training" / "image_3" / "000001.png"
+def test_a_truncated_image_is_reported_and_the_others_go_on(kitti_copy: Path, tmp_path: Path) -> None:
+    refine(kitti_copy, tmp_path / "whole")
+    image = kitti_copy / "training" / "image_3" / "000001.png"
     content = image.read_bytes()
     image.write_bytes(content[: len(content) // 2])
-    summary = refine(root, tmp_path / "out")
+    summary = refine(kitti_copy, tmp_path / "out")
     assert summary.exit_code == 1
     assert list(summary.failed) == ["000001"]
     assert "image_3/000001.png" in summary.failed["000001"]
@@ -54,22 +40,22 @@ def test_a_truncated_image_is_reported_and_the_others_go_on(root: Path, tmp_path
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     # Mended, the frame is tried again, and all is as if nothing had happened.
     image.write_bytes(content)
-    assert refine(root, tmp_path / "out").resumed == ("000000", "000002")
+    assert refine(kitti_copy, tmp_path / "out").resumed == ("000000", "000002")
     assert result_files(tmp_path / "out") == result_files(tmp_path / "whole")
 
 
-def test_a_line_of_14_columns_is_reported_with_its_text(root: Path, tmp_path: Path) -> None:
-    path = root / "detections" / "data" / "000002.txt"
+def test_a_line_of_14_columns_is_reported_with_its_text(kitti_copy: Path, tmp_path: Path) -> None:
+    path = kitti_copy / "detections" / "data" / "000002.txt"
     path.write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1.6 20\n")
-    reason = refine(root, tmp_path / "out").failed["000002"]
+    reason = refine(kitti_copy, tmp_path / "out").failed["000002"]
     assert f"{path}, line 1" in reason
     assert "14" in reason
-    (root / "training" / "label_2" / "000001.txt").write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1.6 20\n")
-    assert "label_2/000001.txt, line 1" in refine(root, tmp_path / "other").failed["000001"]
+    (kitti_copy / "training" / "label_2" / "000001.txt").write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1.6 20\n")
+    assert "label_2/000001.txt, line 1" in refine(kitti_copy, tmp_path / "other").failed["000001"]
 
 
-def test_a_field_of_another_rig_fails_its_frames(source: Path, tmp_path: Path) -> None:
-    camera = dataset(source).load("000000").frame.camera
+def test_a_field_of_another_rig_fails_its_frames(shared_kitti: Path, tmp_path: Path) -> None:
+    camera = dataset(shared_kitti).load("000000").frame.camera
     rig = DisparityField(
         coefficients=torch.zeros(10),
         hull_uv=torch.tensor([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]),
@@ -78,30 +64,30 @@ def test_a_field_of_another_rig_fails_its_frames(source: Path, tmp_path: Path) -
         K_right=camera.K_right[0],
         T_right_cam=camera.T_right_cam[0],
     )
-    summary = refine_dataset(dataset(source, disparity_field=rig), refiner(source), tmp_path)
+    summary = refine_dataset(dataset(shared_kitti, disparity_field=rig), refiner(shared_kitti), tmp_path)
     assert list(summary.failed) == list(FRAMES)
     assert "1242" in summary.failed["000000"]
     assert not (tmp_path / "data").exists()
 
 
-def test_an_unforeseen_error_fails_its_frame_alone(source: Path, tmp_path: Path) -> None:
+def test_an_unforeseen_error_fails_its_frame_alone(shared_kitti: Path, tmp_path: Path) -> None:
     class Sensitive(QuickRefiner):
         def forward(self, frames: FrameBatch, *args: Any) -> RefinementResult:
             if FRAMES[1] in frames.frame_ids:
                 raise ZeroDivisionError("of this frame alone")
             return super().forward(frames, *args)
 
-    summary = refine_dataset(dataset(source), Sensitive(source), tmp_path, RefineOptions(batch_frames=3))
+    summary = refine_dataset(dataset(shared_kitti), Sensitive(shared_kitti), tmp_path, RefineOptions(batch_frames=3))
     assert summary.failed == {FRAMES[1]: "ZeroDivisionError: of this frame alone"}
 
 
-def test_too_little_memory_says_what_to_do(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_says_what_to_do(shared_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_memory(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    too_big = refiner(source)
+    too_big = refiner(shared_kitti)
     monkeypatch.setattr(too_big, "forward", no_memory)
-    summary = refine_dataset(dataset(source), too_big, tmp_path, RefineOptions(batch_frames=2))
+    summary = refine_dataset(dataset(shared_kitti), too_big, tmp_path, RefineOptions(batch_frames=2))
     assert summary.exit_code == 1
     assert list(summary.failed) == list(FRAMES)
     assert "too little memory for 1 frame in a call (OutOfMemoryError: CUDA" in summary.failed["000002"]
@@ -109,39 +95,43 @@ def test_too_little_memory_says_what_to_do(source: Path, tmp_path: Path, monkeyp
     assert any(warning.startswith("1 calls did not work with all of their frames") for warning in summary.warnings)
 
 
-def test_a_call_that_does_not_fit_is_halved(source: Path, tmp_path: Path) -> None:
+def test_a_call_that_does_not_fit_is_halved(shared_kitti: Path, tmp_path: Path) -> None:
     class Small(QuickRefiner):
         def forward(self, frames: FrameBatch, *args: Any) -> RefinementResult:
             if len(frames) > 1:
                 raise RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory")
             return super().forward(frames, *args)
 
-    summary = refine_dataset(dataset(source), Small(source), tmp_path / "halved", RefineOptions(batch_frames=3))
+    summary = refine_dataset(
+        dataset(shared_kitti), Small(shared_kitti), tmp_path / "halved", RefineOptions(batch_frames=3)
+    )
     assert summary.exit_code == 0
     # 3 = 2 + 1, and 2 = 1 + 1.
     assert any(warning.startswith("2 calls did not work with all of their frames") for warning in summary.warnings)
-    refine(source, tmp_path / "single")
+    refine(shared_kitti, tmp_path / "single")
     assert result_files(tmp_path / "halved") == result_files(tmp_path / "single")
 
 
-def test_a_file_that_cannot_be_written_is_reported_and_the_others_go_on(source: Path, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_reported_and_the_others_go_on(shared_kitti: Path, tmp_path: Path) -> None:
     (tmp_path / "data" / "000001.txt").mkdir(parents=True)
-    (tmp_path / "summary.json").write_text(empty_summary(source, tmp_path / "elsewhere"))
-    summary = refine(source, tmp_path)
+    (tmp_path / "summary.json").write_text(empty_summary(shared_kitti, tmp_path / "elsewhere"))
+    summary = refine(shared_kitti, tmp_path)
     assert summary.exit_code == 1
     assert list(summary.failed) == ["000001"]
     assert "data/000001.txt" in summary.failed["000001"]
     assert (tmp_path / "data" / "000002.txt").is_file()
 
 
-def empty_summary(source: Path, out: Path) -> str:
+def empty_summary(shared_kitti: Path, out: Path) -> str:
     """What a run leaves that was stopped before its first frame."""
-    run = RunRecord(out, run_manifest(dataset(source), refiner(source), hash_prior(refiner(source).prior)))
+    run = RunRecord(
+        out, run_manifest(dataset(shared_kitti), refiner(shared_kitti), hash_prior(refiner(shared_kitti).prior))
+    )
     return run.path.read_text()
 
 
 def test_a_full_disk_stops_the_run_and_the_next_goes_on(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    shared_kitti: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -151,7 +141,7 @@ def test_a_full_disk_stops_the_run_and_the_next_goes_on(
             monkeypatch.setattr("directshape_torch.batch.group_refinement.write_frame_outputs", full)
 
     with pytest.raises(DirectShapeError, match=r"cannot write to .*No space left.*run the same command again"):
-        refine_dataset(dataset(source), refiner(source), tmp_path, observer=Filler())
+        refine_dataset(dataset(shared_kitti), refiner(shared_kitti), tmp_path, observer=Filler())
     monkeypatch.undo()
-    summary = refine(source, tmp_path)
+    summary = refine(shared_kitti, tmp_path)
     assert (summary.resumed, summary.exit_code) == (FRAMES[:1], 0)

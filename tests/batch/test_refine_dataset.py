@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.faulty_refiners import EVERY_RESULT, FEW_STEPS
-from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN, write_data_set
+from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine
 
@@ -27,21 +26,8 @@ from directshape_torch.result import RefinementResult
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root)
-    return root
-
-
-@pytest.fixture
-def root(source: Path, tmp_path: Path) -> Path:
-    """A copy that a test may damage."""
-    return Path(shutil.copytree(source, tmp_path / "kitti"))
-
-
-def test_cars_come_nearer_to_the_truth(source: Path, tmp_path: Path) -> None:
-    summary = refine(source, tmp_path, config=load_config(None, [EVERY_RESULT]))
+def test_cars_come_nearer_to_the_truth(shared_kitti: Path, tmp_path: Path) -> None:
+    summary = refine(shared_kitti, tmp_path, config=load_config(None, [EVERY_RESULT]))
     assert summary.exit_code == 0
     assert summary.num_cars == 2 * len(FRAMES)
     assert sum(summary.statuses.values()) == 2 * len(FRAMES)
@@ -50,7 +36,11 @@ def test_cars_come_nearer_to_the_truth(source: Path, tmp_path: Path) -> None:
     for frame_id in FRAMES:
         label, before, after = (
             [o for o in read_objects(folder / f"{frame_id}.txt") if o.type == "Car"]
-            for folder in (source / "training" / "label_2", source / "detections" / "data", tmp_path / "data")
+            for folder in (
+                shared_kitti / "training" / "label_2",
+                shared_kitti / "detections" / "data",
+                tmp_path / "data",
+            )
         )
         for true, first, last in zip(label, before, after, strict=True):
             distances.append([np.linalg.norm(np.subtract(o.location_ref, true.location_ref)) for o in (first, last)])
@@ -58,10 +48,10 @@ def test_cars_come_nearer_to_the_truth(source: Path, tmp_path: Path) -> None:
     assert after_m < 0.5 * before_m
 
 
-def test_lines_keep_their_order_and_other_classes_their_bytes(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path)
+def test_lines_keep_their_order_and_other_classes_their_bytes(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path)
     lines = (tmp_path / "data" / "000000.txt").read_text().split("\n")
-    given = (source / "detections" / "data" / "000000.txt").read_text().split("\n")
+    given = (shared_kitti / "detections" / "data" / "000000.txt").read_text().split("\n")
     assert len(lines) == len(given) == 4
     assert lines[1] == PEDESTRIAN
     for refined, rough in ((lines[0], given[0]), (lines[2], given[2])):
@@ -70,8 +60,8 @@ def test_lines_keep_their_order_and_other_classes_their_bytes(source: Path, tmp_
         assert new[:3] + new[4:8] + new[15:] == old[:3] + old[4:8] + old[15:]
 
 
-def test_shapes_hold_states_of_the_refined_lines(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path)
+def test_shapes_hold_states_of_the_refined_lines(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path)
     shapes = read_shapes(tmp_path / "shapes" / "000001.npz")
     assert shapes.input_lines.tolist() == [1, 3]
     assert shapes.codes.shape == np.shape(CODE)
@@ -81,9 +71,9 @@ def test_shapes_hold_states_of_the_refined_lines(source: Path, tmp_path: Path) -
     assert summary["sha256"]["prior"] == shapes.prior_sha256
 
 
-def test_equal_runs_write_equal_bytes(source: Path, tmp_path: Path) -> None:
+def test_equal_runs_write_equal_bytes(shared_kitti: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        refine(source, tmp_path / name, meshes="ply", overlays=True)
+        refine(shared_kitti, tmp_path / name, meshes="ply", overlays=True)
     first = result_files(tmp_path / "a")
     assert first == result_files(tmp_path / "b")
     assert {
@@ -95,9 +85,9 @@ def test_equal_runs_write_equal_bytes(source: Path, tmp_path: Path) -> None:
     } <= set(first)
 
 
-def test_frames_in_one_call_give_the_results_of_single_calls(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path / "single")
-    refine(source, tmp_path / "together", batch_frames=2)
+def test_frames_in_one_call_give_the_results_of_single_calls(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path / "single")
+    refine(shared_kitti, tmp_path / "together", batch_frames=2)
     for frame_id in FRAMES:
         single, together = (
             read_shapes(tmp_path / name / "shapes" / f"{frame_id}.npz") for name in ("single", "together")
@@ -108,16 +98,16 @@ def test_frames_in_one_call_give_the_results_of_single_calls(source: Path, tmp_p
     assert [call["frames"] for call in calls] == [["000000", "000001"], ["000002"]]
 
 
-def test_detections_are_not_overwritten(root: Path) -> None:
+def test_detections_are_not_overwritten(kitti_copy: Path) -> None:
     with pytest.raises(InputError, match="overwrite its own input"):
-        refine(root, root / "detections")
+        refine(kitti_copy, kitti_copy / "detections")
 
 
 @pytest.mark.parametrize("content", ["", f"{PEDESTRIAN}\n"])
-def test_a_frame_without_cars_is_copied(root: Path, tmp_path: Path, content: str) -> None:
+def test_a_frame_without_cars_is_copied(kitti_copy: Path, tmp_path: Path, content: str) -> None:
     for frame_id in FRAMES:
-        (root / "detections" / "data" / f"{frame_id}.txt").write_text(content)
-    summary = refine(root, tmp_path, meshes="glb", overlays=True)
+        (kitti_copy / "detections" / "data" / f"{frame_id}.txt").write_text(content)
+    summary = refine(kitti_copy, tmp_path, meshes="glb", overlays=True)
     assert summary.exit_code == 0
     assert summary.num_cars == 0
     assert (tmp_path / "data" / "000000.txt").read_text() == content
@@ -125,23 +115,23 @@ def test_a_frame_without_cars_is_copied(root: Path, tmp_path: Path, content: str
     assert len(summary.warnings) == (1 if content else 0)
 
 
-def test_cars_without_masks_stay_as_they_were_and_a_warning_says_so(root: Path, tmp_path: Path) -> None:
+def test_cars_without_masks_stay_as_they_were_and_a_warning_says_so(kitti_copy: Path, tmp_path: Path) -> None:
     for frame_id in FRAMES:
-        (root / "masks" / f"{frame_id}.json").write_text("[]")
-    summary = refine(root, tmp_path)
+        (kitti_copy / "masks" / f"{frame_id}.json").write_text("[]")
+    summary = refine(kitti_copy, tmp_path)
     assert summary.statuses == {"no_mask": 2 * len(FRAMES)}
     assert any("none of the 6 cars has a mask" in warning for warning in summary.warnings)
     name = "data/000000.txt"
-    assert (tmp_path / name).read_bytes() == (root / "detections" / name).read_bytes()
+    assert (tmp_path / name).read_bytes() == (kitti_copy / "detections" / name).read_bytes()
 
 
 def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kitti_copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert expected_cars(dataset(root), FRAMES) == 2 * len(FRAMES)
-    assert expected_cars(dataset(root), FRAMES[:1] * 400) == 800
-    (root / "detections" / "data" / "000002.txt").write_text("damaged")
-    assert expected_cars(dataset(root), FRAMES) == 2 * (len(FRAMES) - 1)
+    assert expected_cars(dataset(kitti_copy), FRAMES) == 2 * len(FRAMES)
+    assert expected_cars(dataset(kitti_copy), FRAMES[:1] * 400) == 800
+    (kitti_copy / "detections" / "data" / "000002.txt").write_text("damaged")
+    assert expected_cars(dataset(kitti_copy), FRAMES) == 2 * (len(FRAMES) - 1)
     counts = []
 
     class Watched(DirectShapeRefiner):
@@ -152,8 +142,8 @@ def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
 
     monkeypatch.setattr("directshape_torch.batch.refine_dataset.expected_cars", lambda *_: 5000)
     # The number is what counts here; compiling for it would take minutes.
-    watched = Watched(PCAShapePrior.load(root / "prior.npz"), load_config(None, [*FEW_STEPS, "compile=off"]))
-    refine_dataset(dataset(root), watched, tmp_path)
+    watched = Watched(PCAShapePrior.load(kitti_copy / "prior.npz"), load_config(None, [*FEW_STEPS, "compile=off"]))
+    refine_dataset(dataset(kitti_copy), watched, tmp_path)
     # The same for every call: neither the calls before nor an interruption change what is compiled.
     assert counts == [5000, 5000]
     assert compilation._job.get() is None
@@ -166,8 +156,8 @@ def test_options_are_checked() -> None:
         RefineOptions(batch_frames=0)
 
 
-def test_overlay_is_a_picture(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path, overlays=True)
+def test_overlay_is_a_picture(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path, overlays=True)
     picture = cv2.imread(str(tmp_path / "overlays" / "000000.png"))
     assert picture is not None
     assert picture.shape[1] > 1000

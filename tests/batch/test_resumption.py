@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 from helpers.faulty_refiners import FEW_STEPS
-from helpers.kitti_folder import FRAMES, write_data_set
+from helpers.kitti_folder import FRAMES
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
@@ -20,31 +19,18 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root)
-    return root
-
-
-@pytest.fixture
-def root(source: Path, tmp_path: Path) -> Path:
-    """A copy that a test may damage."""
-    return Path(shutil.copytree(source, tmp_path / "kitti"))
-
-
-def test_a_second_run_does_nothing(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path)
+def test_a_second_run_does_nothing(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path)
     (tmp_path / "timings.json").unlink()
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.txt")}
-    summary = refine(source, tmp_path)
+    summary = refine(shared_kitti, tmp_path)
     assert summary.resumed == FRAMES
     assert summary.timings.calls == []
     assert not (tmp_path / "timings.json").exists()
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.txt")} == before
 
 
-def test_an_interrupted_run_continues_to_the_same_files(source: Path, tmp_path: Path) -> None:
+def test_an_interrupted_run_continues_to_the_same_files(shared_kitti: Path, tmp_path: Path) -> None:
     class Impatient:
         def started(self, frame_ids: Any) -> None:
             pass
@@ -54,66 +40,66 @@ def test_an_interrupted_run_continues_to_the_same_files(source: Path, tmp_path: 
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        refine_dataset(dataset(source), refiner(source), tmp_path / "a", observer=Impatient())
+        refine_dataset(dataset(shared_kitti), refiner(shared_kitti), tmp_path / "a", observer=Impatient())
     assert not (tmp_path / "a" / "data" / f"{FRAMES[1]}.txt").exists()
-    summary = refine(source, tmp_path / "a")
+    summary = refine(shared_kitti, tmp_path / "a")
     assert summary.resumed == (FRAMES[0],)
-    refine(source, tmp_path / "b")
+    refine(shared_kitti, tmp_path / "b")
     assert result_files(tmp_path / "a") == result_files(tmp_path / "b")
 
 
-def test_further_outputs_are_added_to_finished_frames(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path)
+def test_further_outputs_are_added_to_finished_frames(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path)
     results = result_files(tmp_path / "data")
-    assert refine(source, tmp_path, overlays=True).resumed == ()
+    assert refine(shared_kitti, tmp_path, overlays=True).resumed == ()
     assert (tmp_path / "overlays" / "000000.png").is_file()
     assert result_files(tmp_path / "data") == results
-    assert refine(source, tmp_path).resumed == FRAMES
+    assert refine(shared_kitti, tmp_path).resumed == FRAMES
 
 
 @pytest.mark.parametrize("name", ["data/000001.txt", "shapes/000001.npz", "overlays/000001.png", "meshes/000001_1.ply"])
-def test_outputs_that_were_removed_are_made_again(source: Path, tmp_path: Path, name: str) -> None:
-    refine(source, tmp_path, overlays=True, meshes="ply")
+def test_outputs_that_were_removed_are_made_again(shared_kitti: Path, tmp_path: Path, name: str) -> None:
+    refine(shared_kitti, tmp_path, overlays=True, meshes="ply")
     content = (tmp_path / name).read_bytes()
     (tmp_path / name).unlink()
-    assert refine(source, tmp_path, overlays=True, meshes="ply").resumed == ("000000", "000002")
+    assert refine(shared_kitti, tmp_path, overlays=True, meshes="ply").resumed == ("000000", "000002")
     assert (tmp_path / name).read_bytes() == content
 
 
-def test_removed_meshes_of_a_format_that_is_not_asked_for_stay_removed(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path, meshes="ply")
-    refine(source, tmp_path, meshes="glb")
+def test_removed_meshes_of_a_format_that_is_not_asked_for_stay_removed(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path, meshes="ply")
+    refine(shared_kitti, tmp_path, meshes="glb")
     entry = json.loads((tmp_path / "summary.json").read_text())["frames"]["000000"]
     assert entry["mesh_files"] == [f"meshes/000000_{line}.{kind}" for line in (1, 3) for kind in ("glb", "ply")]
     (tmp_path / "meshes" / "000000_3.ply").unlink()
-    assert refine(source, tmp_path).resumed == refine(source, tmp_path, meshes="glb").resumed == FRAMES
+    assert refine(shared_kitti, tmp_path).resumed == refine(shared_kitti, tmp_path, meshes="glb").resumed == FRAMES
 
 
-def test_another_setting_is_named_and_nothing_is_written(source: Path, tmp_path: Path) -> None:
-    refine(source, tmp_path)
+def test_another_setting_is_named_and_nothing_is_written(shared_kitti: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path)
     before = result_files(tmp_path)
     with pytest.raises(ResumeError, match=r"refiner\.silhouette\.weight' was 12\.0, now is 6\.0"):
-        refine(source, tmp_path, config=load_config(None, [*FEW_STEPS, "silhouette.weight=6"]))
+        refine(shared_kitti, tmp_path, config=load_config(None, [*FEW_STEPS, "silhouette.weight=6"]))
     assert result_files(tmp_path) == before
 
 
-def test_another_prior_or_input_is_named(root: Path, tmp_path: Path) -> None:
-    refine(root, tmp_path / "out")
-    prior = PCAShapePrior.load(root / "prior.npz")
+def test_another_prior_or_input_is_named(kitti_copy: Path, tmp_path: Path) -> None:
+    refine(kitti_copy, tmp_path / "out")
+    prior = PCAShapePrior.load(kitti_copy / "prior.npz")
     prior.mean += 0.001
     with pytest.raises(ResumeError, match="sha256 of 'prior'"):
-        refine_dataset(dataset(root), DirectShapeRefiner(prior, load_config(None, FEW_STEPS)), tmp_path / "out")
-    (root / "masks" / "000001.json").write_text("[]")
+        refine_dataset(dataset(kitti_copy), DirectShapeRefiner(prior, load_config(None, FEW_STEPS)), tmp_path / "out")
+    (kitti_copy / "masks" / "000001.json").write_text("[]")
     with pytest.raises(ResumeError, match="frame 000001: sha256 of 'masks_0'"):
-        refine(root, tmp_path / "out")
-    (root / "masks" / "000001.json").unlink()
+        refine(kitti_copy, tmp_path / "out")
+    (kitti_copy / "masks" / "000001.json").unlink()
     with pytest.raises(ResumeError, match=r"000001 was refined from a file that is gone.*000001\.json"):
-        refine(root, tmp_path / "out")
+        refine(kitti_copy, tmp_path / "out")
 
 
-def test_results_without_a_summary_are_not_overwritten(source: Path, tmp_path: Path) -> None:
+def test_results_without_a_summary_are_not_overwritten(shared_kitti: Path, tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "000000.txt").write_text("mine\n")
     with pytest.raises(ResumeError, match=r"summary\.json is missing"):
-        refine(source, tmp_path)
+        refine(shared_kitti, tmp_path)
     assert (tmp_path / "data" / "000000.txt").read_text() == "mine\n"

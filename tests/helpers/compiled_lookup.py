@@ -7,6 +7,7 @@ import types
 import pytest
 import torch
 from torch import Tensor
+from torch._dynamo.utils import counters
 
 from directshape_torch import compilation
 from directshape_torch.compilation import Compilable, compilable
@@ -42,3 +43,15 @@ def without_disk(monkeypatch: pytest.MonkeyPatch, on_disk: bool = False) -> None
     """Nothing is looked up in the compiler's folder, nor noted there."""
     monkeypatch.setattr(compilation, "is_on_disk", lambda *_: on_disk)
     monkeypatch.setattr(compilation, "note_on_disk", lambda *_: None)
+
+
+@pytest.fixture
+def nearest() -> Nearest:
+    """The function to be compiled, as yet plain."""
+    return new_nearest()
+
+
+@pytest.fixture
+def fresh_compiler_counts() -> None:
+    """What the compiler has counted in other tests is forgotten."""
+    counters.clear()

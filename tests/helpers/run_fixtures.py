@@ -1,0 +1,24 @@
+"""Fixtures of runs over a data set; `tests/conftest.py` makes them known."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from helpers.kitti_folder import write_data_set
+
+
+@pytest.fixture(scope="session")
+def shared_kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set in KITTI's folders that no test writes to."""
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root)
+    return root
+
+
+@pytest.fixture
+def kitti_copy(shared_kitti: Path, tmp_path: Path) -> Path:
+    """A copy of it that a test may damage."""
+    return Path(shutil.copytree(shared_kitti, tmp_path / "kitti"))
