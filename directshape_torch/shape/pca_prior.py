@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.checks import check_shape
+from directshape_torch.device_constants import constant_like
 from directshape_torch.errors import InputError
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative
@@ -106,8 +107,7 @@ class PCAShapePrior(nn.Module):
     @property
     def bounds_obj(self) -> Tensor:
         """Lower and upper corner of the grid, (2, 3), metres."""
-        # Filled on the device: a list would be copied there, and the host would wait.
-        last_node = torch.cat([self.origin.new_full((1,), count - 1) for count in self.mean.shape])
+        last_node = constant_like(tuple(self.mean.shape), self.origin) - 1
         return torch.stack([self.origin, self.origin + self.spacing_m * last_node])
 
     @property
