@@ -263,8 +263,8 @@ def compilable(
     Inside a `compiling` region it is compiled once for all values of the named sizes; each combination of the other
     sizes, dtypes, devices and values of arguments that are not tensors is a compilation of its own. Calls with
     gradients, in float64, inside a functorch transform, a forward-mode region, autocast, a `TorchDispatchMode`, a
-    `TorchFunctionMode` that is not a default device, or the user's own `torch.compile`, or with a named size below 2 take
-    the plain form.
+    `TorchFunctionMode` that is not a default device, or the user's own `torch.compile`, or with a named size below 2
+    take the plain form.
 
     Args:
         sizes: dimensions of the arguments, by name, whose sizes vary from call to call.
