@@ -1,8 +1,8 @@
 """The photometric term, followed from iteration to iteration.
 
 A stage begins with the surface hit of every pixel of its set. At the next state the hit's tangent plane, carried along
-in the object's frame, gives a first depth; two secant steps and the Newton step that the lookup of the derivatives gives
-away for nothing bring it onto the surface. A pixel whose surface is not found so is lost at that state, and keeps its
+in the object's frame, gives a first depth; two secant steps and the Newton step that comes with the lookup of the
+derivatives bring it onto the surface. A pixel whose surface is not found so is lost at that state, and keeps its
 last hit for the states that follow.
 """
 
