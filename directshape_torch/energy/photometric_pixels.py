@@ -8,6 +8,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from directshape_torch.energy.car_batch import CarBatch
+from directshape_torch.geometry.lengths import all_along
 from directshape_torch.image.pyramid import halve, halve_sizes
 from directshape_torch.solver.normal_equations import Segments
 
@@ -72,7 +73,7 @@ def neighbours_on_car(
     car away from its surface.
     """
     last_of_frame = sizes[cars.frame_index[object_index]].flip(-1)[:, None] - 1
-    inside = ((uv >= -0.5) & (uv <= last_of_frame + 0.5)).all(dim=-1)
+    inside = all_along((uv >= -0.5) & (uv <= last_of_frame + 0.5), dim=-1)
     u, v = uv.round().long().clamp_min(0).minimum(last_of_frame).unbind(-1)
     on_car = mask_left[cars.detection_row[object_index][:, None], v, u] > 0.5
     return (inside & on_car).to(uv.dtype)

@@ -96,7 +96,7 @@ class ProjectedView:
         if self._frozen is not None:
             root = self._frozen.surface(rows)[1]
             return rays, root._replace(depth=polished_depth(self._shape, rays, root, self._root_iterations))
-        root = Root(*(x[rows] for x in self._entry))
+        root = Root(*(x.index_select(0, rows) for x in self._entry))
         if self._moving_depths:
             root = root._replace(depth=attached_depth(self._shape, rays, root.depth, root.found))
         return rays, root
@@ -104,7 +104,7 @@ class ProjectedView:
     def at_surface(self, rows: Tensor, rays: ObjectRays, depth: Tensor) -> SdfDerivatives:
         """The field at the points of `surface`: looked up once for all terms where nothing is differentiated."""
         if self._frozen is None and not self._moving_depths and not torch.is_grad_enabled():
-            return SdfDerivatives(*(x[rows] for x in self._at_entry))
+            return SdfDerivatives(*(x.index_select(0, rows) for x in self._at_entry))
         return self._shape.value_and_derivatives(rays.at(depth), rays.object_index)
 
 

@@ -41,5 +41,6 @@ def ray_box_interval(
     leave = torch.where(parallel, torch.where(inside_slab, infinity, -infinity), torch.maximum(to_lower, to_upper))
     near = entry.amax(dim=-1).clamp_min(minimum)
     far = leave.amin(dim=-1)
-    hit = (far > near) & near.isfinite() & far.isfinite()
+    # `near` is finite where it is below something: no `minimum` is minus infinity.
+    hit = (far > near) & (far < torch.inf)
     return RayInterval(near, far, hit)

@@ -57,8 +57,8 @@ class PixelSamples:
         return len(self.object_index)
 
     def select(self, index: Tensor) -> PixelSamples:
-        """Some of the pixels."""
-        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+        """Some of the pixels, by their numbers (Q,)."""
+        return replace(self, **{f.name: getattr(self, f.name).index_select(0, index) for f in fields(self)})
 
     def of_objects(self, keep: Tensor) -> PixelSamples:
         """The pixels of the objects where `keep` (B,) holds, renumbered."""

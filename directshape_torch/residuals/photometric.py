@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.geometry.lengths import all_along, length
 from directshape_torch.geometry.stereo import warp_to_right
 from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.residuals.state_chain import sdf_state_jacobian
@@ -30,7 +31,7 @@ class SurfaceDepth(NamedTuple):
 def surface_slope(gradient: Tensor, direction_obj: Tensor, min_cosine: float) -> tuple[Tensor, Tensor]:
     """`slope = grad . ray_obj` (P,) and where it is grazing: `|slope| <= min_cosine |grad| |ray|`."""
     slope = (gradient * direction_obj).sum(-1)
-    grazing = slope.abs() <= min_cosine * gradient.norm(dim=-1) * direction_obj.norm(dim=-1)
+    grazing = slope.abs() <= min_cosine * length(gradient, dim=-1) * length(direction_obj, dim=-1)
     return slope, grazing
 
 
@@ -85,5 +86,5 @@ def photometric_residual(
     uv_level = (warped.uv_right + 0.5) * level_scale - 0.5
     intensity, gradient, in_image = bilinear_with_gradient(image_right, frame_index[:, None], uv_level, sizes)
     J_residual_depth = (gradient * warped.J_pixel_depth).sum(-1) * level_scale
-    inside = (in_image & warped.in_front).all(dim=1)
+    inside = all_along(in_image & warped.in_front, dim=1)
     return PhotometricResidual(intensity - intensity_left, J_residual_depth, inside, warped.uv_right[:, centre])

@@ -12,6 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.geometry.lengths import all_along
+
 # Depths in the right camera are at least this; what is not in front is not inside, wherever it would land.
 _LEAST_DEPTH_M = 1e-6
 
@@ -79,7 +81,7 @@ def residuals_on_lines(
     in_front = (z.amin(dim=1) > 0) & (inverse_depth > 0)
     uv = uv * z.clamp_min(_LEAST_DEPTH_M).reciprocal()
     last_uv = (sizes - 1)[frame_index].to(uv.dtype).mT.flip(0)[:, None]
-    on_image = ((uv.amin(dim=2) >= 0) & (uv.amax(dim=2) <= last_uv)).all(dim=0)
+    on_image = all_along((uv.amin(dim=2) >= 0) & (uv.amax(dim=2) <= last_uv), dim=0)
     right = _lookup(image_right, frame_index, uv)
     residual = (right - intensity_left.mT).mT
     uv_right = (uv[:, :, centre] + 0.5) / level_scale - 0.5

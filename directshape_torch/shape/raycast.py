@@ -37,7 +37,7 @@ class ObjectRays:
         return self.origin_obj + depth[:, None] * self.direction_obj
 
     def select(self, index: Tensor) -> ObjectRays:
-        return ObjectRays(self.origin_obj[index], self.direction_obj[index], self.object_index[index])
+        return ObjectRays(*(x.index_select(0, index) for x in (self.origin_obj, self.direction_obj, self.object_index)))
 
 
 # Of a march on a processor: 400 kB of coordinates.

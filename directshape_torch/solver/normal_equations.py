@@ -16,7 +16,8 @@ def sum_over_blocks(
 ) -> Tensor:
     """Sums (B, ...) over the blocks of each object, pairwise: empty places change no bit."""
     padded = torch.cat([per_block, per_block.new_zeros(1, *per_block.shape[1:])])
-    part = padded[object_blocks]
+    # In less time than `padded[object_blocks]`.
+    part = padded.index_select(0, object_blocks.reshape(-1)).view(*object_blocks.shape, *per_block.shape[1:])
     while part.shape[1] > 1:
         part = part[:, 0::2] + part[:, 1::2]
     return part[:, 0]

@@ -14,8 +14,8 @@ from directshape_torch.shape.shape_prior import BoundShape
 class BlockField(Protocol):
     """Signed distances of the objects of M blocks."""
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
-        """(..., M, 64) metres at points (3, ..., M, 64) of the objects (M,)."""
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
+        """(..., M, 64) metres at points (3, ..., M, 64) of the objects (M,); `constant`: not to be differentiated."""
         ...
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
@@ -28,8 +28,8 @@ class GridBlockField(NamedTuple):
 
     grids: GridField
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
-        return value_at(self.grids, points_obj, owner[:, None])
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
+        return value_at(self.grids, points_obj, owner[:, None], constant)
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
         return derivatives_at(self.grids, points_obj, owner[:, None], constant)
@@ -40,7 +40,7 @@ class PackedBlockField(NamedTuple):
 
     shape: BoundShape
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
         return self.shape.value(*_packed(points_obj, owner)).view(points_obj.shape[1:])
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.compilation import compilable
+from directshape_torch.geometry.lengths import all_along
 from directshape_torch.image.interpolate import bilinear_patch
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.photometric import DSO_PATTERN, depth_state_jacobian
@@ -261,11 +262,11 @@ def surface_under(
     to_plane = ((points - rays.centre_obj) * normal).sum(0) / slope
     next_to = rays.depth_next_to(points)
     depth = next_to + (to_plane - next_to).clamp(-_MAX_STEP_M, _MAX_STEP_M)
-    sdf = field.value(rays.at(depth), rows.rays.owner)
+    sdf = field.value(rays.at(depth), rows.rays.owner, constant=True)
     step = -(sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
     depth = depth + step
     # The old slope was that of another point: after a long step of the car only the second secant reaches the surface.
-    before, sdf = sdf, field.value(rays.at(depth), rows.rays.owner)
+    before, sdf = sdf, field.value(rays.at(depth), rows.rays.owner, constant=True)
     slope = _secant_slope(step, before, sdf, slope)
     depth = depth - (sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
     near = rays.at(depth)
@@ -303,7 +304,9 @@ def photometric_residuals(rows: PhotometricRows, settings: PhotometricSettings, 
     The warp is one line in homogeneous pixels, `h = along_ray depth + along_baseline`, cameras, residual field and
     pyramid level included.
     """
-    x, y, z = (rows.along_ray[i] * depth + rows.along_baseline[i] for i in range(3))
+    along_x, along_y, along_z = rows.along_ray.unbind(0)
+    lines = zip(rows.along_baseline.unbind(0), (along_x, along_y, along_z), strict=True)
+    x, y, z = (torch.addcmul(start, along, depth) for start, along in lines)
     in_front = z > _LEAST_DEPTH_M
     inverse = 1 / torch.where(in_front, z, torch.ones_like(z))
     u, v = x * inverse, y * inverse
@@ -311,8 +314,8 @@ def photometric_residuals(rows: PhotometricRows, settings: PhotometricSettings, 
     at = bilinear_patch(
         rows.right.pixels, first_pixel[:, None], row_step[:, None], u, v, last_column[:, None], last_row[:, None]
     )
-    d_u = (rows.along_ray[0] - u * rows.along_ray[2]) * inverse
-    d_v = (rows.along_ray[1] - v * rows.along_ray[2]) * inverse
+    d_u = torch.addcmul(along_x, u, along_z, value=-1) * inverse
+    d_v = torch.addcmul(along_y, v, along_z, value=-1) * inverse
     plain = (at.value - rows.intensity_left).movedim(0, -1)
     patches = (
         plain,
@@ -323,14 +326,14 @@ def photometric_residuals(rows: PhotometricRows, settings: PhotometricSettings, 
     )
     J = patch_derivative((at.d_u * d_u + at.d_v * d_v).movedim(0, -1), *patches)
     hidden = _is_hidden(rows.right, u[_CENTRE].detach(), v[_CENTRE].detach())
-    return Residual(patch_residual(*patches), J, (at.inside & in_front).all(dim=0) & ~hidden)
+    return Residual(patch_residual(*patches), J, all_along(at.inside & in_front, dim=0) & ~hidden)
 
 
 def _is_hidden(right: RightView, u_level: Tensor, v_level: Tensor) -> Tensor:
     """Whether a nearer instance hides the object at pixels (M, 64) of its frame's right image (`OcclusionCrops.at`)."""
-    scale, first = right.to_full.unbind(1)
-    u, v = (torch.round(x * scale[:, None] + first[:, None]) for x in (u_level, v_level))
-    u0, v0, u1, v1, entry, width = (x[:, None] for x in right.crop.unbind(1))
+    scale, first = right.to_full[..., None].unbind(1)
+    u, v = (torch.round(torch.addcmul(first, x, scale)) for x in (u_level, v_level))
+    u0, v0, u1, v1, entry, width = right.crop[..., None].unbind(1)
     inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
     column, row = (torch.where(inside, x, torch.zeros_like(x)).long() for x in (u, v))
     entry = torch.where(inside, entry + row * width + column, 0)

@@ -37,7 +37,8 @@ class BlockRays(NamedTuple):
         """The rays in the frames of their objects, by the poses (M, 3, 4) of the blocks."""
         R = T_obj_cam[:, :, :3].permute(1, 2, 0)[..., None]  # (3, 3, M, 1)
         centre = (T_obj_cam[:, :, :3] * self.centre_cam[:, None]).sum(-1) + T_obj_cam[:, :, 3]
-        direction = R[:, 0] * self.ray_cam[0] + R[:, 1] * self.ray_cam[1] + R[:, 2] * self.ray_cam[2]
+        (x_axis, y_axis, z_axis), (x, y, z) = R.unbind(1), self.ray_cam.unbind(0)
+        direction = torch.addcmul(torch.addcmul(x_axis * x, y_axis, y), z_axis, z)
         return ObjectBlockRays(centre.mT[..., None], direction)
 
 
@@ -49,8 +50,10 @@ class ObjectBlockRays(NamedTuple):
 
     def at(self, depth: Tensor) -> Tensor:
         """Points (3, ..., M, 64) at depths (..., M, 64)."""
-        between = (slice(None),) + (None,) * (depth.ndim - 2)
-        return self.centre_obj[between] + depth * self.direction_obj[between]
+        centre, direction = self.centre_obj, self.direction_obj
+        for _ in range(depth.ndim - 2):
+            centre, direction = centre[:, None], direction[:, None]
+        return torch.addcmul(centre, depth, direction)
 
     def depth_next_to(self, points_obj: Tensor) -> Tensor:
         """Depths (M, 64) at which the rays come closest to points (3, M, 64)."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.compilation import compilable
+from directshape_torch.geometry.lengths import length
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.silhouette import (
     project_closest_approach,
@@ -145,8 +146,9 @@ def closest_depth(
     margin = _MARGIN_SHARE * (inside.far - inside.near)
     near, far = inside.near + margin, inside.far - margin
     depth = rays.depth_next_to(anchor_obj).clamp(near, far)
-    step = SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=0)
-    sdf = field.value(rays.at(torch.stack([depth - step, depth, depth + step])), rows.rays.owner)
+    step = SAMPLE_DISTANCE_M / length(rays.direction_obj, dim=0)
+    samples = rays.at(torch.stack([depth - step, depth, depth + step]))
+    sdf = field.value(samples, rows.rays.owner, constant=True)
     before, here, after = sdf.unbind(0)
     curvature, slope = before - 2 * here + after, 0.5 * (after - before)
     # Where the field does not curve upwards the slope tells the side, and no more: the same as of ever less curvature.

@@ -146,8 +146,8 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     ),
     Equivalent(
         "closest_depth",
-        "SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=0)",
-        "(-(SAMPLE_DISTANCE_M / rays.direction_obj.norm(dim=0)))",
+        "SAMPLE_DISTANCE_M / length(rays.direction_obj, dim=0)",
+        "(-(SAMPLE_DISTANCE_M / length(rays.direction_obj, dim=0)))",
         "the three samples lie symmetric about the depth, so the slope changes its sign with the step",
     ),
     Equivalent("_residual_and_jacobian", "at.value", "(-at.value)", _VALUE_UNUSED),

@@ -78,6 +78,8 @@ TARGETS: dict[str, Target] = {
             "value_at",
             "derivatives_at",
             "_cells",
+            "_flat_index",
+            "_distance",
             "_corners",
             "_corner_values",
             "_ends",
@@ -88,6 +90,11 @@ TARGETS: dict[str, Target] = {
             "_safe_norm",
         ),
         ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_many_lookups.py"),
+    ),
+    "lengths": Target(
+        "directshape_torch/geometry/lengths.py",
+        ("length", "all_along"),
+        ("tests/geometry/test_lengths.py",),
     ),
     "ray_depth": Target(
         "directshape_torch/shape/raycast.py",

@@ -31,7 +31,7 @@ class QuadraticField:
     centre: Tensor  # (B, 3)
     offset: Tensor  # (B,)
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
         slope, away = self._at(points_obj, owner)
         bend = 0.5 * self.curvature[owner][:, None] * (away * away).sum(0)
         return self.offset[owner][:, None] + (slope * points_obj).sum(0) + bend

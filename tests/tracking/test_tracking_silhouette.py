@@ -148,7 +148,7 @@ class _Beyond(NamedTuple):
     depth: Tensor
     sign: float
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
         along = ((points_obj - self.rays.centre_obj[:, None]) * self.rays.direction_obj[:, None]).sum(0)
         length = self.rays.direction_obj.norm(dim=0)
         return self.sign * (along / length**2 - self.depth).abs() * length
@@ -310,7 +310,7 @@ class _Sphere(NamedTuple):
     paraboloid: QuadraticField
     radius: float
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
         return (2 * self.paraboloid.value(points_obj, owner)).sqrt() - self.radius
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> None:

@@ -48,7 +48,7 @@ class _Prescribed:
     last: Tensor  # (M, 64)
     gradient: Tensor  # (3, M, 64)
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
         return next(self.values)
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
@@ -200,7 +200,7 @@ class _Sphere:
     centres: Tensor
     radius: float
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
         return self.derivatives(points_obj, owner).value
 
     def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
