@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 
@@ -11,6 +12,7 @@ from directshape_torch.errors import DirectShapeError
 
 EXIT_WRONG_INPUT = 2
 EXIT_INTERRUPTED = 130
+EXIT_OUTPUT_CLOSED = 141
 
 # Each module has `add_parser(subparsers)` and `run(args) -> int`, and imports what is heavy inside `run`.
 COMMANDS = (
@@ -43,7 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = make_parser().parse_args(arguments)
     try:
         code: int = args.run(args)
+        sys.stdout.flush()
     except (DirectShapeError, OSError) as error:
+        if isinstance(error, BrokenPipeError) and _output_was_closed():
+            return EXIT_OUTPUT_CLOSED
         # OSError: a full disk or a folder that may not be written, for which a traceback helps nobody.
         print(f"directshape: error: {' '.join(str(error).split())}", file=sys.stderr)
         return EXIT_WRONG_INPUT
@@ -51,6 +56,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("directshape: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     return code
+
+
+def _output_was_closed() -> bool:
+    """Whether nobody reads the output any more, as after `| head`; what is left of it then goes nowhere."""
+    try:
+        # What failed to be written is forgotten: only one more try tells whether it was this pipe that broke.
+        print(flush=True)
+    except BrokenPipeError:
+        # Else the interpreter would try once more as it ends, and complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -154,7 +154,8 @@ def _take(flat: Tensor, index: Tensor) -> Tensor:
 def _interpolated_basis(field: GridField, cells: _Cells) -> Tensor:
     fx, fy, fz = (f[..., None] for f in cells.fraction.unbind(0))
     node = cells.lower_node + _offsets(field, cells.lower_node).view(8, *(1,) * cells.lower_node.ndim)
-    along_z = _along(fz, *_ends(field.basis.flatten(0, 2)[node]))
+    rows = field.basis.flatten(0, 2).index_select(0, node.reshape(-1)).view(*node.shape, field.basis.shape[3])
+    along_z = _along(fz, *_ends(rows))
     (basis,) = _along(fx, *_ends(_along(fy, *_ends(along_z))))
     return basis
 

@@ -84,3 +84,28 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         program.main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out.strip()
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(tmp_path: Path) -> None:
+    """`directshape ... | head -1`: quiet, with the exit code that a shell gives to such an end."""
+    print_much = "lambda _: [print('line', n) for n in range(100_000)] and 0"
+    code = (
+        f"from directshape_torch.cli import demo, main; demo.run = {print_much}; raise SystemExit(main.main(['demo']))"
+    )
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "line 0\n"
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait(60) == program.EXIT_OUTPUT_CLOSED
+
+
+def test_another_broken_pipe_is_an_error(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> int:
+        raise BrokenPipeError("a worker is gone")
+
+    monkeypatch.setattr("directshape_torch.cli.demo.run", fail)
+    assert program.main(["demo"]) == program.EXIT_WRONG_INPUT
+    assert capsys.readouterr().err == "directshape: error: a worker is gone\n"
