@@ -116,12 +116,11 @@ def device_name(device: torch.device) -> str:
 def peak_memory_mb() -> float | None:
     """The largest resident memory of the process so far, MB, or None where the system does not tell."""
     status = Path("/proc/self/status")
-    if status.exists():  # with the name of the program, cut at some byte
+    if status.exists():
+        # The program's name stands there, maybe cut within a character.
+        lines = status.read_text(errors="replace").splitlines()
         # Not what `getrusage` says: there a new process begins with the peak of the one that started it.
-        kib = next(
-            (line.split()[1] for line in status.read_text(errors="replace").splitlines() if line.startswith("VmHWM:")),
-            None,
-        )
+        kib = next((line.split()[1] for line in lines if line.startswith("VmHWM:")), None)
         if kib is not None:
             return round(int(kib) / 2**10, 1)
     try:

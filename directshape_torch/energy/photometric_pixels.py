@@ -8,7 +8,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.geometry.lengths import all_along
+from directshape_torch.geometry.short_axes import all_along
 from directshape_torch.image.pyramid import halve, halve_sizes
 from directshape_torch.solver.normal_equations import Segments
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.lengths import all_along, length
+from directshape_torch.geometry.short_axes import all_along, length
 from directshape_torch.geometry.stereo import warp_to_right
 from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.residuals.state_chain import sdf_state_jacobian

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.lengths import all_along
+from directshape_torch.geometry.short_axes import all_along
 
 # Depths in the right camera are at least this; what is not in front is not inside, wherever it would land.
 _LEAST_DEPTH_M = 1e-6

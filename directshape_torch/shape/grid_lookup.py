@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.device_constants import constant_like
-from directshape_torch.geometry.lengths import length
+from directshape_torch.geometry.short_axes import length
 
 
 class GridField(NamedTuple):
@@ -86,21 +86,14 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
 
 def _cells(field: GridField, points_obj: Tensor) -> _Cells:
     column = (3,) + (1,) * (points_obj.ndim - 1)
+    ny, nz = field.basis.shape[1:3]
     last_node = field.last_node.view(column)
     position = (points_obj - field.origin.view(column)) * (1 / field.spacing_m)
     clamped = torch.minimum(position.clamp_min(0), last_node)
     # `fmin` and not `minimum`: a NaN point gets a valid cell and a NaN value, so it cannot disturb other points.
     lower = torch.fmin(clamped.detach().floor(), last_node - 1)
-    return _Cells(_flat_index(field, lower), clamped - lower, position - clamped)
-
-
-def _flat_index(field: GridField, node: Tensor) -> Tensor:
-    """Index (...) within one grid of nodes (3, ...), which are whole numbers in floating point."""
-    ny, nz = field.basis.shape[1:3]
-    if torch.compiler.is_compiling():
-        return (node[0] * (ny * nz) + (node[1] * nz + node[2])).long()
-    steps = constant_like((ny * nz, nz, 1), node)
-    return (node * steps.view(3, *(1,) * (node.ndim - 1))).sum(0).long()
+    flat = (lower[0] * (ny * nz) + (lower[1] * nz + lower[2])).long()
+    return _Cells(flat, clamped - lower, position - clamped)
 
 
 def _corners(field: GridField) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.compilation import compilable
-from directshape_torch.geometry.lengths import all_along
+from directshape_torch.geometry.short_axes import all_along
 from directshape_torch.image.interpolate import bilinear_patch
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.photometric import DSO_PATTERN, depth_state_jacobian
@@ -304,9 +304,8 @@ def photometric_residuals(rows: PhotometricRows, settings: PhotometricSettings, 
     The warp is one line in homogeneous pixels, `h = along_ray depth + along_baseline`, cameras, residual field and
     pyramid level included.
     """
-    along_x, along_y, along_z = rows.along_ray.unbind(0)
-    lines = zip(rows.along_baseline.unbind(0), (along_x, along_y, along_z), strict=True)
-    x, y, z = (torch.addcmul(start, along, depth) for start, along in lines)
+    along = rows.along_ray.unbind(0)
+    x, y, z = (torch.addcmul(*line, depth) for line in zip(rows.along_baseline.unbind(0), along, strict=True))
     in_front = z > _LEAST_DEPTH_M
     inverse = 1 / torch.where(in_front, z, torch.ones_like(z))
     u, v = x * inverse, y * inverse
@@ -314,8 +313,8 @@ def photometric_residuals(rows: PhotometricRows, settings: PhotometricSettings, 
     at = bilinear_patch(
         rows.right.pixels, first_pixel[:, None], row_step[:, None], u, v, last_column[:, None], last_row[:, None]
     )
-    d_u = torch.addcmul(along_x, u, along_z, value=-1) * inverse
-    d_v = torch.addcmul(along_y, v, along_z, value=-1) * inverse
+    d_u = torch.addcmul(along[0], u, along[2], value=-1) * inverse
+    d_v = torch.addcmul(along[1], v, along[2], value=-1) * inverse
     plain = (at.value - rows.intensity_left).movedim(0, -1)
     patches = (
         plain,

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.compilation import compilable
-from directshape_torch.geometry.lengths import length
+from directshape_torch.geometry.short_axes import length
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.silhouette import (
     project_closest_approach,

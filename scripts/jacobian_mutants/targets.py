@@ -78,7 +78,6 @@ TARGETS: dict[str, Target] = {
             "value_at",
             "derivatives_at",
             "_cells",
-            "_flat_index",
             "_distance",
             "_corners",
             "_corner_values",
@@ -91,10 +90,10 @@ TARGETS: dict[str, Target] = {
         ),
         ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_many_lookups.py"),
     ),
-    "lengths": Target(
-        "directshape_torch/geometry/lengths.py",
+    "short_axes": Target(
+        "directshape_torch/geometry/short_axes.py",
         ("length", "all_along"),
-        ("tests/geometry/test_lengths.py",),
+        ("tests/geometry/test_short_axes.py",),
     ),
     "ray_depth": Target(
         "directshape_torch/shape/raycast.py",

@@ -1,7 +1,6 @@
-"""Lengths of vectors, and flags of a few neighbours together, in operations that are fast for few components.
+"""Reductions along axes of a few entries, in operations that are fast for them.
 
-PyTorch's own reductions (`norm`, `all`) take ten to fifty times as long as these where the axis is short and does not
-lie innermost in memory.
+PyTorch's own `norm` and `all` take many times as long where such an axis does not lie innermost in memory.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.geometry.lengths import all_along, length
+from directshape_torch.geometry.short_axes import all_along, length
 
 
 @pytest.mark.parametrize("dim", [0, 1, -1])
