@@ -17,7 +17,7 @@ from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.photometric import DSO_PATTERN, surface_slope
 from directshape_torch.residuals.photometric_patch import patch_residual
-from directshape_torch.residuals.photometric_profile import DisparityResiduals, disparity_residuals
+from directshape_torch.residuals.photometric_profile import DisparityResiduals, residuals_on_lines
 
 _CENTRE = DSO_PATTERN.index((0, 0))
 # Of many offsets at once: 8 MB in single precision.
@@ -105,23 +105,10 @@ def agreement(term: PhotometricTerm, projected: ProjectedState) -> tuple[Tensor,
 def _residuals(
     term: PhotometricTerm, fixed: PixelSet, rows: Tensor | slice, depth: Tensor, offsets_px: Tensor
 ) -> DisparityResiduals:
-    cars, pixels = term.cars, term.pixels
-    packed, car = fixed.pixel_index[rows], fixed.object_index[rows]
-    return disparity_residuals(
-        fixed.images.right,
-        fixed.images.sizes,
-        fixed.images.scale,
-        cars.frame_index[car],
-        fixed.intensity_left[rows],
-        fixed.rays_left[rows],
-        depth,
-        cars.K_right[car],
-        cars.T_right_cam[car],
-        pixels.bias_px[packed],
-        pixels.vertical_px[packed],
-        _CENTRE,
-        offsets_px,
-    )
+    images, frame = fixed.images, term.cars.frame_index[fixed.object_index[rows]]
+    right = (images.right, images.sizes, images.scale, frame)
+    lines, left = fixed.lines.select(rows), fixed.intensity_left[rows]
+    return residuals_on_lines(lines, depth, *right, left, _CENTRE, offsets_px)
 
 
 def _norm(residual: Tensor, config: PhotometricConfig) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.geometry.short_axes import all_along
 from directshape_torch.image.pyramid import halve, halve_sizes
+from directshape_torch.residuals.photometric_profile import WarpLines
 from directshape_torch.solver.normal_equations import Segments
 
 
@@ -34,6 +35,7 @@ class PixelSet(NamedTuple):
     object_index: Tensor  # (Q,)
     intensity_left: Tensor  # (Q, N) brought to the brightness of the right image, as far as the settings say
     rays_left: Tensor  # (Q, N, 3)
+    lines: WarpLines  # where they land in the right image
     gradient_weight: Tensor  # (Q,)
     neighbour_weight: Tensor  # (Q, N) zero for neighbours that the mask says are not on the car
     images: GreyPair
@@ -53,6 +55,7 @@ class PixelSet(NamedTuple):
             object_index,
             self.intensity_left[chosen],
             self.rays_left[chosen],
+            self.lines.select(chosen),
             self.gradient_weight[chosen],
             self.neighbour_weight[chosen],
             self.images,

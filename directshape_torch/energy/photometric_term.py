@@ -32,7 +32,7 @@ from directshape_torch.residuals.photometric import (
     surface_slope,
 )
 from directshape_torch.residuals.photometric_patch import PatchForm, patch_derivative, patch_residual
-from directshape_torch.residuals.photometric_profile import disparity_residuals
+from directshape_torch.residuals.photometric_profile import residuals_on_lines, warp_lines
 from directshape_torch.shape.raycast import attached_depth
 from directshape_torch.solver.normal_equations import Segments
 from directshape_torch.solver.problem import Stage
@@ -106,7 +106,10 @@ class PhotometricTerm:
 
     def _compared(self, depth: Tensor, on_surface: Tensor) -> tuple[Tensor, Tensor]:
         """Which pixels (Q,) of the set are usable, and right minus left (Q, N): values alone, without derivatives."""
-        here = disparity_residuals(*self._residual_inputs(depth), depth.new_zeros(1))
+        fixed = self.pixel_set
+        images, frame = fixed.images, self.cars.frame_index[fixed.object_index]
+        right = (images.right, images.sizes, images.scale, frame)
+        here = residuals_on_lines(fixed.lines, depth, *right, fixed.intensity_left, _CENTRE, depth.new_zeros(1))
         return self._is_usable(on_surface, here.inside[0], here.uv_right[0]), here.residual[0]
 
     def residuals(self, projected: ProjectedState) -> ResidualRows:
@@ -230,7 +233,9 @@ class PhotometricTerm:
         if self.config.pixel_set != "hit":  # the paper's keeps those that are not on the car
             sizes = self.pyramid[0].sizes
             neighbours = neighbours_on_car(self.mask_left, self.cars, sizes, chosen.object_index, uv_full)
-        return PixelSet(pixel_index, chosen.object_index, intensity, rays, weight, neighbours, images, segments)
+        K_right, T_right_cam = (x[chosen.object_index] for x in (self.cars.K_right, self.cars.T_right_cam))
+        lines = warp_lines(images.scale, rays, K_right, T_right_cam, chosen.bias_px, chosen.vertical_px)
+        return PixelSet(pixel_index, chosen.object_index, intensity, rays, lines, weight, neighbours, images, segments)
 
     def _residual(self, depth: Tensor) -> PhotometricResidual:
         plain = photometric_residual(*self._residual_inputs(depth))

@@ -12,21 +12,19 @@ from torch import Tensor
 from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
-from directshape_torch.residuals.photometric_profile import warp_lines
 from directshape_torch.solver.problem import Linearisation
-from directshape_torch.tracking.blocks import Blocks, PackedBlocks
+from directshape_torch.tracking.blocks import Blocks, ObjectSums, PackedBlocks, object_sums
 from directshape_torch.tracking.field import BlockField
 from directshape_torch.tracking.photometric import (
     Hits,
     PhotometricRows,
     PhotometricSettings,
-    PhotometricSums,
     Residual,
     RightView,
     Surface,
     accumulate_photometric,
     depth_of_state,
-    linearise_photometric,
+    photometric_of_objects,
     photometric_residuals,
     surface_under,
 )
@@ -48,7 +46,7 @@ class TrackedPhotometric:
         blocks: M blocks of B objects.
         rows: what an evaluation needs.
         settings: numbers of the configuration.
-        weight: (M,) float64, of the term and of the object.
+        weight: (M,) of the term and of the object.
         hits: at the state of each object.
         latest: at the latest evaluation.
     """
@@ -75,13 +73,12 @@ class TrackedPhotometric:
         )
         weight = term.weight() if factor is None else term.weight() * factor.to(torch.float64)
         rows, hits = _rows(term, packed), _hits(term, projected, packed)
-        return cls(packed.blocks, rows, settings, weight[packed.blocks.owner], hits)
+        return cls(packed.blocks, rows, settings, weight[packed.blocks.owner].to(rows.pixel_weight), hits)
 
     def linearise(self, field: BlockField, T_obj_cam: Tensor) -> Linearisation:
         """Cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
-        return self._noted(
-            linearise_photometric(field, self.rows, self.settings, self._of_blocks(T_obj_cam), self.hits)
-        )
+        T, table = self._of_blocks(T_obj_cam), self.blocks.of_object
+        return self._noted(*photometric_of_objects(field, self.rows, self.settings, T, self.hits, self.weight, table))
 
     def fixed_depths(self, field: BlockField, T_obj_cam: Tensor) -> FixedSurface:
         """The surface at a state, with the set of its usable pixels."""
@@ -95,7 +92,8 @@ class TrackedPhotometric:
     def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: FixedSurface) -> Linearisation:
         """The linearisation with any Jacobian (M, 64, N, D) of the residuals."""
         hits = fixed.surface.hits
-        return self._noted(accumulate_photometric(self.rows, self.settings, residual, J, fixed.usable, hits))
+        sums = accumulate_photometric(self.rows, self.settings, residual, J, fixed.usable, hits)
+        return self._noted(object_sums(self.weight, self.blocks.of_object, sums.cost, sums.products), hits)
 
     def fixed_rows(self, field: BlockField, T_obj_cam: Tensor) -> FixedRows:
         """With what Jacobians at a state hold constant: the surface, and which pixels count."""
@@ -123,32 +121,19 @@ class TrackedPhotometric:
     def _residual(self, depth: Tensor) -> Residual:
         return photometric_residuals(self.rows, self.settings, depth)
 
-    def _noted(self, sums: PhotometricSums) -> Linearisation:
-        self.latest = Hits(sums.points_obj, sums.normal_obj)
-        cost, gradient, hessian = self.blocks.sums(self.weight, sums.cost, sums.products)
-        return Linearisation(cost, gradient, hessian)
+    def _noted(self, sums: ObjectSums, hits: Hits) -> Linearisation:
+        self.latest = hits
+        return Linearisation(*sums)
 
 
 def _rows(term: PhotometricTerm, packed: PackedBlocks) -> PhotometricRows:
-    fixed, cars = term.pixel_set, term.cars
-    pixels = term.pixels.select(fixed.pixel_index)
-    per_pixel = packed.rows.flatten()
-    owner = fixed.object_index[per_pixel]
-    lines = warp_lines(
-        fixed.images.scale,
-        fixed.rays_left[per_pixel],
-        torch.ones_like(pixels.bias_px[per_pixel]),
-        cars.K_right[owner],
-        cars.T_right_cam[owner],
-        pixels.bias_px[per_pixel],
-        pixels.vertical_px[per_pixel],
-    )
-    places = packed.rows.shape
+    fixed = term.pixel_set
+    pixels, lines = term.pixels.select(fixed.pixel_index), fixed.lines
     pixel_weight = fixed.gradient_weight[packed.rows]
     return PhotometricRows(
         rays=BlockRays.of_pixels(pixels, packed),
-        along_ray=lines.along_ray.reshape(*lines.along_ray.shape[:2], *places).contiguous(),
-        along_baseline=lines.along_baseline.reshape(3, *places).contiguous(),
+        along_ray=lines.along_ray[..., packed.rows],
+        along_baseline=lines.along_baseline[:, 0, packed.rows],
         intensity_left=fixed.intensity_left[packed.rows].movedim(-1, 0).contiguous(),
         pixel_weight=torch.where(packed.filled, pixel_weight, torch.zeros_like(pixel_weight)),
         neighbour_weight=fixed.neighbour_weight[packed.rows].movedim(-1, 0).contiguous(),

@@ -27,18 +27,20 @@ class DisparityResiduals(NamedTuple):
 
 
 class WarpLines(NamedTuple):
-    """Where P pixels and their N neighbours land in the right image, as functions of the offset."""
+    """Where P pixels and their N neighbours land in the right image, as functions of the inverse depth."""
 
     along_ray: Tensor  # (3, N, P) homogeneous pixels of the pyramid level at infinite depth
     along_baseline: Tensor  # (3, 1, P) what a unit of inverse depth adds
-    inverse_depth: Tensor  # (P,)
     per_offset: Tensor  # (P,) inverse depth of a pixel of disparity
+
+    def select(self, chosen: Tensor | slice) -> WarpLines:
+        """Those of some of the pixels: rows (R,), (P,) bool, or a slice."""
+        return WarpLines(*(x[..., chosen] for x in self))
 
 
 def warp_lines(
     level_scale: float,  # pixels of the level per full-resolution pixel
     rays_left: Tensor,  # (P, N, 3) K^-1 [u, v, 1] of the neighbourhood pixels
-    depth: Tensor,  # (P,)
     K_right: Tensor,  # (P, 3, 3)
     T_right_cam: Tensor,  # (P, 4, 4)
     bias_px: Tensor | None,  # (P,)
@@ -57,11 +59,12 @@ def warp_lines(
     rays = rays_left.permute(2, 1, 0).contiguous()
     along_ray = (line[:, :3, None] * rays).sum(dim=1)
     per_offset = -1 / (K_right[:, 0, 0] * T_right_cam[:, 0, 3])
-    return WarpLines(along_ray, line[:, 3:], 1 / depth, per_offset)
+    return WarpLines(along_ray, line[:, 3:], per_offset)
 
 
 def residuals_on_lines(
     lines: WarpLines,
+    depth: Tensor,  # (P,)
     image_right: Tensor,  # (F, H, W) grey levels, at some pyramid level
     sizes: Tensor,  # (F, 2) height, width at that level
     level_scale: float,
@@ -74,7 +77,7 @@ def residuals_on_lines(
 
     A depth that an offset moves to infinity or beyond is not inside.
     """
-    inverse_depth = lines.inverse_depth + offsets_px[:, None] * lines.per_offset
+    inverse_depth = 1 / depth + offsets_px[:, None] * lines.per_offset
     # (2, n, N, P): one tensor for u and v, and one for the depths.
     uv = torch.addcmul(lines.along_ray[:2, None], lines.along_baseline[:2, None], inverse_depth[:, None])
     z = torch.addcmul(lines.along_ray[2], lines.along_baseline[2], inverse_depth[:, None])
@@ -86,26 +89,6 @@ def residuals_on_lines(
     residual = (right - intensity_left.mT).mT
     uv_right = (uv[:, :, centre] + 0.5) / level_scale - 0.5
     return DisparityResiduals(residual, in_front & on_image, uv_right.permute(1, 2, 0))
-
-
-def disparity_residuals(
-    image_right: Tensor,  # (F, H, W) grey levels, at some pyramid level
-    sizes: Tensor,  # (F, 2) height, width at that level
-    level_scale: float,  # pixels of the level per full-resolution pixel
-    frame_index: Tensor,  # (P,)
-    intensity_left: Tensor,  # (P, N) grey levels, already brought to the right image's brightness
-    rays_left: Tensor,  # (P, N, 3) K^-1 [u, v, 1] of the neighbourhood pixels
-    depth: Tensor,  # (P,)
-    K_right: Tensor,  # (P, 3, 3)
-    T_right_cam: Tensor,  # (P, 4, 4)
-    bias_px: Tensor | None,  # (P,)
-    vertical_px: Tensor | None,  # (P,)
-    centre: int,  # which neighbourhood pixel is the pixel itself
-    offsets_px: Tensor,  # (n,) of the disparity, full-resolution pixels
-) -> DisparityResiduals:
-    """`warp_lines` and `residuals_on_lines` in one, for arguments in the order of `photometric_residual`."""
-    lines = warp_lines(level_scale, rays_left, depth, K_right, T_right_cam, bias_px, vertical_px)
-    return residuals_on_lines(lines, image_right, sizes, level_scale, frame_index, intensity_left, centre, offsets_px)
 
 
 def _lookup(images: Tensor, frame_index: Tensor, uv: Tensor) -> Tensor:

@@ -58,22 +58,69 @@ class Blocks(NamedTuple):
         new_block.index_copy_(0, kept, torch.arange(len(kept), device=kept.device))
         return Blocks(new_object[self.owner[kept]], new_block[self.of_object[objects]], counts), kept
 
-    def sums(self, weight: Tensor, cost: Tensor, products: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Weighted sums over the blocks of each object.
 
-        Args:
-            weight: (M,) of each block.
-            cost: (M,).
-            products: (M, D + 1, D) of `weighted_products`.
+class ObjectSums(NamedTuple):
+    """What the blocks of each object add up to, float64."""
 
-        Returns:
-            Cost (B,), gradient (B, D) and Gauss-Newton matrix (B, D, D).
-        """
-        _, rows, unknowns = products.shape
-        both = torch.cat([products.flatten(1), cost[:, None]], dim=1) * weight[:, None]
-        total = sum_over_blocks(both, self.of_object)
-        of_object = total[:, :-1].reshape(-1, rows, unknowns)
-        return total[:, -1], of_object[:, -1], of_object[:, :-1]
+    cost: Tensor  # (B,)
+    gradient: Tensor  # (B, D)
+    hessian: Tensor  # (B, D, D)
+
+    def of_first(self, num_objects: int) -> ObjectSums:
+        """Those of the first so many objects."""
+        return ObjectSums(*(x[:num_objects] for x in self))
+
+
+def object_sums(
+    weight: Tensor,  # (M,) of each block
+    of_object: Tensor,  # (B, W) of `Blocks`, or the table of them that compiled code takes
+    cost: Tensor,  # (M,) float64
+    products: Tensor,  # (M, D + 1, D) of `weighted_products`
+) -> ObjectSums:
+    """Weighted sums over the blocks of each object, which do not depend on how many blocks the others have."""
+    if torch.compiler.is_compiling():
+        return sums_by_table(weight, of_object, cost, products)
+    _, rows, unknowns = products.shape
+    both = torch.cat([products.flatten(1), cost[:, None]], dim=1) * weight[:, None]
+    total = sum_over_blocks(both, of_object.flatten(1))
+    matrix = total[:, :-1].reshape(-1, rows, unknowns)
+    return ObjectSums(total[:, -1], matrix[:, -1], matrix[:, :-1])
+
+
+# Blocks that compiled code adds in one expression.
+_ADDENDS = 8
+
+
+def table_to_compile(of_object: Tensor, num_blocks: int) -> Tensor:
+    """`Blocks.of_object` (B, W) of M blocks as compiled sums take it: (B, V, 8), with at least two rows and columns.
+
+    Sizes below two would be compilations of their own. Rows that are added stand for objects without blocks.
+    """
+    num_objects, width = of_object.shape
+    missing = max(2 * _ADDENDS - width, 0), max(2 - num_objects, 0)
+    if any(missing):
+        of_object = torch.nn.functional.pad(of_object, (0, missing[0], 0, missing[1]), value=num_blocks)
+    return of_object.view(len(of_object), -1, _ADDENDS)
+
+
+def sums_by_table(weight: Tensor, table: Tensor, cost: Tensor, products: Tensor) -> ObjectSums:
+    """`object_sums` by a table (B, V, 8), in the form in which compiled code is fast: nothing but sums is written."""
+    matrix = _sum_by_table(weight, table, products)
+    return ObjectSums(_sum_by_table(weight, table, cost), matrix[:, -1], matrix[:, :-1])
+
+
+def _sum_by_table(weight: Tensor, table: Tensor, per_block: Tensor) -> Tensor:
+    parts = []
+    for block in table.unbind(2):
+        filled = block < len(weight)
+        block = torch.where(filled, block, 0)
+        column = (*block.shape, *(1,) * (per_block.ndim - 1))
+        part = per_block[block].to(torch.float64) * weight[block].view(column)
+        parts.append(torch.where(filled.view(column), part, torch.zeros_like(part)))
+    # By pairs, as in `sum_over_blocks`: empty places between the parts of an object change no bit.
+    while len(parts) > 1:
+        parts = [a + b for a, b in zip(parts[0::2], parts[1::2], strict=True)]
+    return parts[0].sum(dim=1)
 
 
 class PackedBlocks(NamedTuple):

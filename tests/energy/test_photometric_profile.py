@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.residuals.photometric import DSO_PATTERN, photometric_residual
-from directshape_torch.residuals.photometric_profile import disparity_residuals
+from directshape_torch.residuals.photometric_profile import DisparityResiduals, residuals_on_lines, warp_lines
 from directshape_torch.scene import Detections, FrameBatch
 
 OFFSETS = torch.linspace(-3, 3, 13, dtype=torch.float64)
@@ -74,12 +75,18 @@ def _residual_inputs(level_scale: float, bias: bool) -> tuple[list[Tensor | floa
     return [*before, depth, K, T.expand(count, 4, 4), *shifts, DSO_PATTERN.index((0, 0))], depth
 
 
+def _on_lines(inputs: list[Any]) -> DisparityResiduals:
+    images, sizes, level_scale, frame, left, rays, depth, *cameras, centre = inputs
+    lines = warp_lines(level_scale, rays, *cameras)
+    return residuals_on_lines(lines, depth, images, sizes, level_scale, frame, left, centre, OFFSETS)
+
+
 @pytest.mark.parametrize("level_scale", [1.0, 0.5])
 @pytest.mark.parametrize("bias", [False, True])
 def test_residuals_are_those_at_depths_moved_one_by_one(level_scale: float, bias: bool) -> None:
     """Two frames of different size, a right camera turned against the left one, half of the pixels outside."""
     inputs, depth = _residual_inputs(level_scale, bias)
-    found = disparity_residuals(*inputs, OFFSETS)  # type: ignore[arg-type]
+    found = _on_lines(inputs)
     seen_inside = []
     for i, offset in enumerate(OFFSETS):
         share = 1 + offset * depth / (150.0 * 0.53)

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.tracking.blocks import Blocks, PackedBlocks, weighted_products
+from directshape_torch.tracking.blocks import (
+    Blocks,
+    ObjectSums,
+    PackedBlocks,
+    object_sums,
+    sums_by_table,
+    table_to_compile,
+    weighted_products,
+)
 
 COUNTS = [[0], [3], [64], [65, 0, 1], [130, 64, 0, 200], [0, 0, 5], []]
 UNKNOWNS = 4
@@ -24,12 +34,21 @@ def rows_of(counts: list[int], seed: int = 0) -> tuple[Tensor, Tensor, Tensor, T
     return J, *(x[:, 0] for x in others)  # type: ignore[return-value]
 
 
-def sums_of(packed: PackedBlocks, rows: tuple[Tensor, ...], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def as_compiled(weight: Tensor, of_object: Tensor, cost: Tensor, products: Tensor) -> ObjectSums:
+    table = table_to_compile(of_object, len(weight))
+    return sums_by_table(weight, table, cost, products).of_first(len(of_object))
+
+
+FORMS = [pytest.param(object_sums, id="eager"), pytest.param(as_compiled, id="as_compiled")]
+Form = Callable[[Tensor, Tensor, Tensor, Tensor], ObjectSums]
+
+
+def sums_of(form: Form, packed: PackedBlocks, rows: tuple[Tensor, ...], weight: Tensor) -> ObjectSums:
     """Sums over objects of what the rows of `packed` hold, its empty places without a weight."""
     J, first, second, cost = (x[packed.rows] for x in rows)
     first, second, cost = (torch.where(packed.filled, x, torch.zeros_like(x)) for x in (first, second, cost))
     owner = packed.blocks.owner
-    return packed.blocks.sums(weight[owner], cost.sum(dim=1), weighted_products(J, first, second))
+    return form(weight[owner], packed.blocks.of_object, cost.sum(dim=1), weighted_products(J, first, second))
 
 
 def looped(index: Tensor, rows: tuple[Tensor, ...], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -54,11 +73,12 @@ def assert_same(found: tuple[Tensor, ...], expected: tuple[Tensor, ...]) -> None
         torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("counts", COUNTS)
-def test_sums_against_a_loop(counts: list[int]) -> None:
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("counts", [counts for counts in COUNTS if sum(counts)])
+def test_sums_against_a_loop(counts: list[int], form: Form) -> None:
     index, rows = index_of(counts), rows_of(counts)
     weight = weights(len(counts))
-    assert_same(sums_of(PackedBlocks.of_sorted(index, len(counts)), rows, weight), looped(index, rows, weight))
+    assert_same(sums_of(form, PackedBlocks.of_sorted(index, len(counts)), rows, weight), looped(index, rows, weight))
 
 
 @pytest.mark.parametrize("counts", COUNTS)
@@ -83,21 +103,22 @@ def _joined() -> tuple[Blocks, list[PackedBlocks]]:
     return Blocks.join([part.blocks for part in parts]), parts
 
 
-def _of_both(blocks: Blocks, parts: list[PackedBlocks], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _of_both(form: Form, blocks: Blocks, parts: list[PackedBlocks], weight: Tensor) -> ObjectSums:
     costs, products = [], []
     for number, (packed, counts) in enumerate(zip(parts, (LEFT, RIGHT), strict=True)):
         J, first, second, cost = (x[packed.rows] for x in rows_of(counts, number))
         first, second, cost = (torch.where(packed.filled, x, torch.zeros_like(x)) for x in (first, second, cost))
         costs.append(cost.sum(dim=1))
         products.append(weighted_products(J, first, second))
-    return blocks.sums(weight[blocks.owner], torch.cat(costs), torch.cat(products))
+    return form(weight[blocks.owner], blocks.of_object, torch.cat(costs), torch.cat(products))
 
 
-def test_joined_blocks_add_what_their_parts_give() -> None:
+@pytest.mark.parametrize("form", FORMS)
+def test_joined_blocks_add_what_their_parts_give(form: Form) -> None:
     blocks, parts = _joined()
     weight = weights(4)
     each = [looped(index_of(counts), rows_of(counts, n), weight) for n, counts in enumerate((LEFT, RIGHT))]
-    assert_same(_of_both(blocks, parts, weight), tuple(a + b for a, b in zip(*each, strict=True)))
+    assert_same(_of_both(form, blocks, parts, weight), tuple(a + b for a, b in zip(*each, strict=True)))
     assert blocks.owner.tolist() == [0, 0, 0, 2, 3, 0, 1, 1, 3, 3, 3, 3, 3]
 
 
@@ -109,8 +130,9 @@ def test_one_part_joined_is_itself() -> None:
     assert joined.counts == blocks.counts
 
 
-@pytest.mark.parametrize("keep", [[0, 1, 2, 3], [0, 3], [1], [2, 3], []])
-def test_objects_that_leave_take_their_blocks_along(keep: list[int]) -> None:
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("keep", [[0, 1, 2, 3], [0, 3], [1], [2, 3]])
+def test_objects_that_leave_take_their_blocks_along(keep: list[int], form: Form) -> None:
     """And change no bit of the others' sums."""
     blocks, parts = _joined()
     weight = weights(4)
@@ -124,30 +146,42 @@ def test_objects_that_leave_take_their_blocks_along(keep: list[int]) -> None:
     count = len(blocks.owner)
     cost = torch.randn(count, generator=generator, dtype=torch.float64)
     products = torch.randn(count, UNKNOWNS + 1, UNKNOWNS, generator=generator, dtype=torch.float64)
-    all_of_them = blocks.sums(weight[blocks.owner], cost, products)
-    some = fewer.sums(weight[kept][fewer.owner], cost[chosen], products[chosen])
+    all_of_them = form(weight[blocks.owner], blocks.of_object, cost, products)
+    some = form(weight[kept][fewer.owner], fewer.of_object, cost[chosen], products[chosen])
     for x, y in zip(some, all_of_them, strict=True):
         assert torch.equal(x, y[kept])
     assert len(parts) == 2
 
 
-def test_an_objects_sums_do_not_depend_on_how_many_blocks_the_others_have() -> None:
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("own_rows", [100, 250, 500])
+def test_an_objects_sums_do_not_depend_on_how_many_blocks_the_others_have(own_rows: int, form: Form) -> None:
     """Of both sides together, to the bit: `of_object` is wider beside a large object."""
     generator = torch.Generator().manual_seed(2)
-    cost = torch.randn(4, generator=generator, dtype=torch.float64)
-    products = torch.randn(4, UNKNOWNS + 1, UNKNOWNS, generator=generator, dtype=torch.float64)
-    ones = torch.ones(4, dtype=torch.float64)
-    alone = Blocks.join([PackedBlocks.of_sorted(index_of([100]), 1).blocks] * 2)
-    beside = Blocks.join([PackedBlocks.of_sorted(index_of([100, 1000]), 2).blocks] * 2)
+    alone = Blocks.join([PackedBlocks.of_sorted(index_of([own_rows]), 1).blocks] * 2)
+    beside = Blocks.join([PackedBlocks.of_sorted(index_of([own_rows, 2000]), 2).blocks] * 2)
+    count = len(alone.owner)
+    cost = torch.randn(count, generator=generator, dtype=torch.float64)
+    products = torch.randn(count, UNKNOWNS + 1, UNKNOWNS, generator=generator, dtype=torch.float64)
+    ones = torch.ones(count, dtype=torch.float64)
     assert beside.of_object.shape[1] > alone.of_object.shape[1]
     own = (beside.owner == 0).nonzero()[:, 0]
     many = len(beside.owner)
     wide_cost = torch.full((many,), torch.nan, dtype=torch.float64).index_copy(0, own, cost)
     wide = torch.full((many, *products.shape[1:]), torch.nan, dtype=torch.float64).index_copy(0, own, products)
     weight = torch.ones(many, dtype=torch.float64)
-    for x, y in zip(alone.sums(ones, cost, products), beside.sums(weight, wide_cost, wide), strict=True):
+    of_one, of_both = form(ones, alone.of_object, cost, products), form(weight, beside.of_object, wide_cost, wide)
+    for x, y in zip(of_one, of_both, strict=True):
         assert torch.equal(x[0], y[0])
         assert not torch.isfinite(y[1]).any()
+
+
+def test_nothing_at_all_adds_up_to_nothing() -> None:
+    blocks = PackedBlocks.of_sorted(index_of([0, 0]), 2).blocks
+    sums = object_sums(
+        torch.empty(0), blocks.of_object, torch.empty(0).double(), torch.empty(0, UNKNOWNS + 1, UNKNOWNS).double()
+    )
+    assert [x.tolist() for x in sums[:2]] == [[0.0, 0.0], [[0.0] * UNKNOWNS] * 2]
 
 
 def test_products_of_single_precision_rows_leave_in_double() -> None:
