@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, Self
 
 from torch import Tensor
@@ -13,7 +13,9 @@ from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.stage_unknowns import step_limits, without_held
 from directshape_torch.energy.term import TermLinearisation, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy
-from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.sdf_grid import GridMemory
+from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
 from directshape_torch.solver.problem import Linearisation, Unknowns
 
 
@@ -35,6 +37,7 @@ class TrackedProblem:
         others: the terms that are not; None without any.
         config: trust region and Jacobians.
         unknowns: which of them move.
+        memory: for the grids of the state that is evaluated.
     """
 
     prior: ShapePrior
@@ -42,15 +45,20 @@ class TrackedProblem:
     others: MarchedTerms | None
     config: SolverConfig
     unknowns: Unknowns
+    memory: GridMemory = field(default_factory=GridMemory)
 
     def linearise(self, state: CarState) -> Linearisation:
         if self.config.jacobian == "autograd":
             parts = self.energy.linearise_by_autograd(self.prior, state)
         else:
-            parts = self.energy.linearise(self.prior.bind(state.code), state)
+            parts = self.energy.linearise(self._bound(state.code), state)
         if self.others is not None:
             parts += self.others.linearise_terms(state)
         return without_held(total_of(parts), self.unknowns)
+
+    def _bound(self, code: Tensor) -> BoundShape:
+        # Not by `isinstance`: a prior made from this one may bind in its own way.
+        return self.prior.bind(code, self.memory) if type(self.prior) is PCAShapePrior else self.prior.bind(code)
 
     def follow(self, accepted: Tensor) -> None:
         self.energy.follow(accepted)
@@ -63,4 +71,5 @@ class TrackedProblem:
 
     def compact(self, keep: Tensor, numbers: Sequence[int]) -> TrackedProblem:
         others = None if self.others is None else self.others.compact(keep, numbers)
-        return TrackedProblem(self.prior, self.energy.of_objects(keep, numbers), others, self.config, self.unknowns)
+        energy = self.energy.of_objects(keep, numbers)
+        return TrackedProblem(self.prior, energy, others, self.config, self.unknowns, self.memory)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from directshape_torch.checks import check_shape
 from directshape_torch.device_constants import constant_like
 from directshape_torch.errors import InputError
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.sdf_grid import GridMemory, GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.shape.zero_level import zero_level_extents
 
@@ -131,15 +131,22 @@ class PCAShapePrior(nn.Module):
         """Codes of the mean shape, (B, K) zeros."""
         return self.mean.new_zeros(num_objects, self.num_codes)
 
-    def values(self, code: Tensor) -> Tensor:
-        """Signed distance at the nodes, (B, nx, ny, nz), metres, for codes (B, K)."""
+    def values(self, code: Tensor, memory: GridMemory | None = None) -> Tensor:
+        """Signed distance at the nodes, (B, nx, ny, nz), metres, for codes (B, K).
+
+        With a memory, whose last values end, nothing can be differentiated.
+        """
         check_shape("code", code, ("B", self.num_codes))
-        flat = torch.addmm(self.mean.reshape(1, -1), code, self.basis.reshape(-1, self.num_codes).T)
+        room = None if memory is None else memory.room(code, self.mean.numel())
+        flat = torch.addmm(self.mean.reshape(1, -1), code, self.basis.reshape(-1, self.num_codes).T, out=room)
         return flat.reshape(-1, *self.mean.shape)
 
-    def bind(self, code: Tensor) -> GridShape:
-        """The fields of B objects with codes (B, K): the basis collapses into one grid per object."""
-        return GridShape(self.values(code), self.basis, self.origin, self.spacing_m)
+    def bind(self, code: Tensor, memory: GridMemory | None = None) -> GridShape:
+        """The fields of B objects with codes (B, K): the basis collapses into one grid per object.
+
+        With a memory the shape lives until the next one is bound with it, and cannot be differentiated by the code.
+        """
+        return GridShape(self.values(code, memory), self.basis, self.origin, self.spacing_m)
 
     def dimensions_hwl(self, code: Tensor) -> Tensor:
         """Height, width and length (B, 3), metres, that codes (B, K) have by the linear map of the training cars.

@@ -9,6 +9,28 @@ from directshape_torch.shape.grid_lookup import GridField, derivatives_at, value
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
 
+class GridMemory:
+    """Room for the grids of shapes of which each ends when the next begins.
+
+    Grids are megabytes: memory that the system must first hand out costs more than what is computed into it.
+
+    Example:
+        >>> memory = GridMemory()
+        >>> memory.room(torch.zeros(4, 1), 6).shape, memory.room(torch.zeros(2, 1), 6).shape
+        (torch.Size([4, 6]), torch.Size([2, 6]))
+    """
+
+    def __init__(self) -> None:
+        self._numbers: Tensor | None = None
+
+    def room(self, code: Tensor, num_nodes: int) -> Tensor:
+        """Memory (B, num_nodes) with any contents for the grids of codes (B, K); the room given before ends."""
+        count, numbers = len(code) * num_nodes, self._numbers
+        if numbers is None or len(numbers) < count or (numbers.dtype, numbers.device) != (code.dtype, code.device):
+            numbers = self._numbers = code.new_empty(count)
+        return numbers[:count].view(len(code), num_nodes)
+
+
 class GridShape:
     """B signed distance fields on one common grid, with the code derivative of all of them (a `BoundShape`).
 

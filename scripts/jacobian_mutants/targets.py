@@ -218,7 +218,16 @@ TARGETS: dict[str, Target] = {
     ),
     "tracking_blocks": Target(
         "directshape_torch/tracking/blocks.py",
-        ("Blocks.join", "Blocks.of_objects", "Blocks.sums", "PackedBlocks.of_sorted", "weighted_products"),
+        (
+            "Blocks.join",
+            "Blocks.of_objects",
+            "object_sums",
+            "table_to_compile",
+            "sums_by_table",
+            "_sum_by_table",
+            "PackedBlocks.of_sorted",
+            "weighted_products",
+        ),
         ("tests/tracking/test_blocks.py",),
     ),
     "tracking_rays": Target(
@@ -251,8 +260,8 @@ TARGETS: dict[str, Target] = {
         (
             "SilhouetteRows.select",
             "linearise_silhouettes",
+            "silhouettes_of_objects",
             "_of_grids",
-            "_of_any",
             "accumulate_silhouettes",
             "closest_depth",
             "silhouette_residuals",
@@ -267,8 +276,8 @@ TARGETS: dict[str, Target] = {
             "PhotometricRows.select",
             "RightView.select",
             "linearise_photometric",
+            "photometric_of_objects",
             "_of_grids",
-            "_of_any",
             "accumulate_photometric",
             "_norm_and_weight",
             "_cost",

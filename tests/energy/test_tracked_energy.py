@@ -22,6 +22,8 @@ from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.energy.term import Term, TermLinearisation, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
 from directshape_torch.geometry import se3
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.solver.problem import Linearisation
 from directshape_torch.tracking.field import block_field
 from directshape_torch.tracking.photometric import photometric_residuals
@@ -195,10 +197,13 @@ def on_grid(spacing_m: float, samples: int, stage: int) -> tuple[CarProblem, Car
     return begun_problem(ellipsoid_prior(spacing_m=spacing_m), frames, detections, config, stage)
 
 
-@pytest.mark.parametrize("stage", [0, 1])
-def test_sums_of_the_silhouettes_ray_by_ray(stage: int) -> None:
+NARROW = replace(DEFAULT, stages=tuple(replace(stage, contour_width_px=0.1) for stage in DEFAULT.stages))
+
+
+@pytest.mark.parametrize(("config", "stage"), [(DEFAULT, 0), (DEFAULT, 1), (NARROW, 1)])
+def test_sums_of_the_silhouettes_ray_by_ray(config: RefinerConfig, stage: int) -> None:
     """At the very depths that are tracked: c = lambda / number of pixels, and constants of the rays out of play."""
-    problem, _, start = begun_stage(stage=stage)
+    problem, _, start = begun_stage(config, stage=stage)
     terms = kind_of(problem, SilhouetteTerm)
     energy = tracked(problem, start, terms)
     state = moved(start, step_of(5, 0.01, 0.1))
@@ -213,7 +218,8 @@ def test_sums_of_the_silhouettes_ray_by_ray(stage: int) -> None:
         assert isinstance(term, SilhouetteTerm)
         view = term.view(problem.project(start))
         sharpness = term.zeta * view.closest_sdf.abs()
-        in_play = (sharpness < 8 + 0.2 * term.zeta) | ~view.march.crosses_bounds
+        assert bool((0.2 * term.zeta > 10).any()) == (config is NARROW)
+        in_play = (sharpness < 8 + (0.2 * term.zeta).clamp_max(10)) | ~view.march.crosses_bounds
         count = int(in_play.sum())
         assert torch.equal(crossings[:count], term.view(problem.project(state)).march.crosses_bounds[in_play])
         residual, J = residuals_by_definition(problem, term, state, in_play, depths[:count], crossings[:count])
@@ -341,6 +347,40 @@ def test_a_class_made_from_a_term_is_asked_itself() -> None:
     (term,) = kind_of(problem, PhotometricTerm)
     assert are_tracked([term]) == [True]
     assert are_tracked([Twice(**{f.name: getattr(term, f.name) for f in fields(term)})]) == [False]
+
+
+def test_grids_of_the_states_share_one_memory_that_no_result_needs() -> None:
+    """Of a prior that takes one; what a state gave is the same after others, and for fewer cars."""
+    _, stage, state = begun_stage()
+    assert type(stage.prior) is PCAShapePrior
+    before = stage.linearise(state)
+    kept = [x.clone() for x in before]
+    first = stage.memory.room(state.code, 10)
+    stage.linearise(moved(state, step_of(5, 0.05, 0.5)))
+    assert stage.memory.room(state.code, 10).data_ptr() == first.data_ptr()
+    for found, expected in zip((*before, *stage.linearise(state)), (*kept, *kept), strict=True):
+        assert torch.equal(found, expected)
+    keep = torch.tensor([False, True, False, True, True])
+    fewer = stage.compact(keep, [1, 3, 4])
+    assert fewer.memory is stage.memory
+    for found, expected in zip(fewer.linearise(CarState(*(x[keep] for x in state))), kept, strict=True):
+        torch.testing.assert_close(found, expected[keep], rtol=1e-10, atol=1e-8)
+
+
+class Larger(PCAShapePrior):
+    """Binds in its own way, and knows of no memory."""
+
+    def bind(self, code: Tensor) -> GridShape:  # type: ignore[override]
+        return GridShape(self.values(code) - 0.1, self.basis, self.origin, self.spacing_m)
+
+
+def test_a_prior_made_from_another_is_asked_itself() -> None:
+    _, stage, state = begun_stage()
+    prior = stage.prior
+    assert isinstance(prior, PCAShapePrior)
+    named = {name: buffer for name, buffer in prior.named_buffers() if name not in ("mean", "basis", "origin")}
+    larger = Larger(prior.mean, prior.basis, prior.origin, prior.spacing_m, **named, provenance=prior.provenance)
+    assert not torch.equal(replace(stage, prior=larger).linearise(state).cost, stage.linearise(state).cost)
 
 
 def test_what_was_followed_is_no_matter_of_the_problem() -> None:

@@ -1,3 +1,5 @@
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance
+from directshape_torch.shape.sdf_grid import GridMemory
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
 
@@ -132,6 +135,20 @@ def test_bind_agrees_with_the_sum_over_components(prior):
     expected = prior.mean[4, 6, 3] + (prior.basis[4, 6, 3] * code[0]).sum()
     torch.testing.assert_close(prior.bind(code).value(point[None], torch.tensor([0]))[0], expected)
     assert prior.values(prior.initial_code(0)).shape == (0, *SHAPE)
+
+
+def test_shapes_bound_one_after_the_other_with_one_memory(prior):
+    memory, codes = GridMemory(), torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    first = prior.bind(codes, memory)
+    assert torch.equal(first.values, prior.values(codes))
+    second = prior.bind(codes[1:], memory)
+    assert torch.equal(second.values, prior.values(codes[1:]))
+    assert second.values.data_ptr() == first.values.data_ptr()
+    # A memory that is too small, or of other numbers, is replaced.
+    more = prior.bind(codes.repeat(2, 1), memory)
+    assert torch.equal(more.values, prior.values(codes.repeat(2, 1)))
+    single = copy.deepcopy(prior).float().bind(codes.float(), memory)
+    assert single.values.dtype == torch.float32
 
 
 def test_fewer_codes(prior):

@@ -176,6 +176,16 @@ def test_an_objects_sums_do_not_depend_on_how_many_blocks_the_others_have(own_ro
         assert not torch.isfinite(y[1]).any()
 
 
+@pytest.mark.parametrize(("size", "expected"), [((1, 1), (2, 2, 8)), ((5, 4), (5, 2, 8)), ((3, 64), (3, 8, 8))])
+def test_tables_to_compile_have_no_size_that_would_be_compiled_anew(
+    size: tuple[int, int], expected: tuple[int, int, int]
+) -> None:
+    table = table_to_compile(torch.arange(size[0] * size[1]).view(size), 1000)
+    assert table.shape == expected
+    assert torch.equal(table[: size[0]].flatten(1)[:, : size[1]], torch.arange(size[0] * size[1]).view(size))
+    assert int((table == 1000).sum()) == table.numel() - size[0] * size[1]
+
+
 def test_nothing_at_all_adds_up_to_nothing() -> None:
     blocks = PackedBlocks.of_sorted(index_of([0, 0]), 2).blocks
     sums = object_sums(

@@ -30,6 +30,7 @@ from directshape_torch.tracking.photometric import (
     accumulate_photometric,
     depth_of_state,
     linearise_photometric,
+    photometric_of_objects,
     surface_under,
 )
 
@@ -172,6 +173,24 @@ def test_the_depth_as_a_function_of_the_state(case: Case) -> None:
         scale = surface.J_depth_state[both].norm(dim=-1)
         # The Jacobian is taken up to 3 cm beside the surface, in another grid cell for a few.
         assert float((error / scale).quantile(0.8)) < 0.02
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_sums_over_the_blocks_of_each_object(case: Case, packed: bool) -> None:
+    field = PackedBlockField(case.prior.bind(CODE)) if packed else case.field()
+    owner, weight = case.rows.rays.owner, random(4, seed=3).abs()
+    table = torch.full((3, 4), 4)
+    for m, b in enumerate(owner.tolist()):
+        table[b, m] = m
+    blocks = linearise_photometric(field, case.rows, SETTINGS["plain"], case.blocks, case.hits)
+    found, hits = photometric_of_objects(field, case.rows, SETTINGS["plain"], case.blocks, case.hits, weight, table)
+    for b in range(3):
+        own = (owner == b).nonzero()[:, 0]
+        products = (blocks.products[own] * weight[own, None, None]).sum(dim=0)
+        torch.testing.assert_close(found.cost[b], (blocks.cost[own] * weight[own]).sum())
+        torch.testing.assert_close(found.gradient[b], products[-1])
+        torch.testing.assert_close(found.hessian[b], products[:-1])
+    assert all(torch.equal(x, y) for x, y in zip(hits, blocks.hits, strict=True))
 
 
 def test_some_of_the_blocks(case: Case) -> None:
