@@ -13,18 +13,19 @@ from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.solver.problem import Linearisation
-from directshape_torch.tracking.blocks import Blocks, ObjectSums, PackedBlocks, object_sums
+from directshape_torch.tracking.blocks import Blocks, PackedBlocks
 from directshape_torch.tracking.field import BlockField
 from directshape_torch.tracking.photometric import (
     Hits,
     PhotometricRows,
     PhotometricSettings,
+    PhotometricSums,
     Residual,
     RightView,
     Surface,
     accumulate_photometric,
     depth_of_state,
-    photometric_of_objects,
+    linearise_photometric,
     photometric_residuals,
     surface_under,
 )
@@ -46,7 +47,7 @@ class TrackedPhotometric:
         blocks: M blocks of B objects.
         rows: what an evaluation needs.
         settings: numbers of the configuration.
-        weight: (M,) of the term and of the object.
+        weight: (M,) float64, of the term and of the object.
         hits: at the state of each object.
         latest: at the latest evaluation.
     """
@@ -73,12 +74,13 @@ class TrackedPhotometric:
         )
         weight = term.weight() if factor is None else term.weight() * factor.to(torch.float64)
         rows, hits = _rows(term, packed), _hits(term, projected, packed)
-        return cls(packed.blocks, rows, settings, weight[packed.blocks.owner].to(rows.pixel_weight), hits)
+        return cls(packed.blocks, rows, settings, weight[packed.blocks.owner], hits)
 
     def linearise(self, field: BlockField, T_obj_cam: Tensor) -> Linearisation:
         """Cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
-        T, table = self._of_blocks(T_obj_cam), self.blocks.of_object
-        return self._noted(*photometric_of_objects(field, self.rows, self.settings, T, self.hits, self.weight, table))
+        return self._noted(
+            linearise_photometric(field, self.rows, self.settings, self._of_blocks(T_obj_cam), self.hits)
+        )
 
     def fixed_depths(self, field: BlockField, T_obj_cam: Tensor) -> FixedSurface:
         """The surface at a state, with the set of its usable pixels."""
@@ -92,8 +94,7 @@ class TrackedPhotometric:
     def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: FixedSurface) -> Linearisation:
         """The linearisation with any Jacobian (M, 64, N, D) of the residuals."""
         hits = fixed.surface.hits
-        sums = accumulate_photometric(self.rows, self.settings, residual, J, fixed.usable, hits)
-        return self._noted(object_sums(self.weight, self.blocks.of_object, sums.cost, sums.products), hits)
+        return self._noted(accumulate_photometric(self.rows, self.settings, residual, J, fixed.usable, hits))
 
     def fixed_rows(self, field: BlockField, T_obj_cam: Tensor) -> FixedRows:
         """With what Jacobians at a state hold constant: the surface, and which pixels count."""
@@ -121,9 +122,9 @@ class TrackedPhotometric:
     def _residual(self, depth: Tensor) -> Residual:
         return photometric_residuals(self.rows, self.settings, depth)
 
-    def _noted(self, sums: ObjectSums, hits: Hits) -> Linearisation:
-        self.latest = hits
-        return Linearisation(*sums)
+    def _noted(self, sums: PhotometricSums) -> Linearisation:
+        self.latest = Hits(sums.points_obj, sums.normal_obj)
+        return Linearisation(*self.blocks.sums(self.weight, sums.cost, sums.products))
 
 
 def _rows(term: PhotometricTerm, packed: PackedBlocks) -> PhotometricRows:

@@ -13,15 +13,16 @@ from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.solver.problem import Linearisation
-from directshape_torch.tracking.blocks import Blocks, ObjectSums, PackedBlocks, object_sums
+from directshape_torch.tracking.blocks import Blocks, PackedBlocks
 from directshape_torch.tracking.field import BlockField
 from directshape_torch.tracking.rays import BlockRays
 from directshape_torch.tracking.silhouette import (
     SilhouetteRows,
+    SilhouetteSums,
     accumulate_silhouettes,
     closest_depth,
+    linearise_silhouettes,
     silhouette_residuals,
-    silhouettes_of_objects,
 )
 
 # A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
@@ -38,7 +39,7 @@ class TrackedSilhouettes:
     Attributes:
         blocks: M blocks of B objects.
         rows: what an evaluation needs.
-        weight: (M,) of the term and of the object.
+        weight: (M,) float64, of the term and of the object.
         constant: (B,) float64, cost of the rays that are not near a contour.
         anchor_obj: (3, M, 64) where each ray was closest at the state of its object.
         latest: (3, M, 64) where it was at the latest evaluation.
@@ -82,8 +83,7 @@ class TrackedSilhouettes:
 
     def linearise(self, field: BlockField, T_obj_cam: Tensor) -> Linearisation:
         """Cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
-        T, table = self._of_blocks(T_obj_cam), self.blocks.of_object
-        return self._noted(*silhouettes_of_objects(field, self.rows, T, self.anchor_obj, self.weight, table))
+        return self._noted(linearise_silhouettes(field, self.rows, self._of_blocks(T_obj_cam), self.anchor_obj))
 
     def fixed_depths(self, field: BlockField, T_obj_cam: Tensor) -> tuple[Tensor, Tensor]:
         """Depths (M, 64) of closest approach at a state, and which rays cross the bounds."""
@@ -99,7 +99,7 @@ class TrackedSilhouettes:
         points = self.rows.rays.in_objects(self._of_blocks(T_obj_cam)).at(depth)
         J = torch.where(crosses[..., None], J, torch.zeros_like(J))
         sums = accumulate_silhouettes(self.rows, residual, J, torch.where(crosses, points, self.anchor_obj))
-        return self._noted(object_sums(self.weight, self.blocks.of_object, sums.cost, sums.products), sums.points_obj)
+        return self._noted(sums)
 
     def fixed_rows(self, field: BlockField, T_obj_cam: Tensor) -> FixedRows:
         """With what Jacobians at a state hold constant: depths, and which rays cross the bounds."""
@@ -123,9 +123,10 @@ class TrackedSilhouettes:
     def _of_blocks(self, T_obj_cam: Tensor) -> Tensor:
         return self.rows.rays.of_blocks(T_obj_cam)
 
-    def _noted(self, sums: ObjectSums, points_obj: Tensor) -> Linearisation:
-        self.latest = points_obj
-        return Linearisation(sums.cost + self.constant, sums.gradient, sums.hessian)
+    def _noted(self, sums: SilhouetteSums) -> Linearisation:
+        self.latest = sums.points_obj
+        cost, gradient, hessian = self.blocks.sums(self.weight, sums.cost, sums.products)
+        return Linearisation(cost + self.constant, gradient, hessian)
 
 
 class _Side(NamedTuple):
@@ -164,4 +165,4 @@ def _side(term: SilhouetteTerm, view: ProjectedView, factor: Tensor | None) -> _
     points = view.rays.at(torch.where(crosses, view.closest_depth, by_the_middle))
     anchor = points[chosen][packed.rows].movedim(-1, 0).contiguous()
     constant = term.segments.sum(at_rest) * weight
-    return _Side(packed.blocks, rows, weight[packed.blocks.owner].to(anchor), constant, anchor)
+    return _Side(packed.blocks, rows, weight[packed.blocks.owner], constant, anchor)

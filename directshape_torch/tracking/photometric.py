@@ -21,7 +21,7 @@ from directshape_torch.residuals.photometric import DSO_PATTERN, depth_state_jac
 from directshape_torch.residuals.photometric_patch import PatchForm, patch_derivative, patch_residual
 from directshape_torch.shape.grid_lookup import GridField
 from directshape_torch.shape.shape_prior import SdfDerivatives
-from directshape_torch.tracking.blocks import ObjectSums, object_sums, table_to_compile, weighted_products
+from directshape_torch.tracking.blocks import weighted_products
 from directshape_torch.tracking.field import BlockField, GridBlockField
 from directshape_torch.tracking.rays import BlockRays
 
@@ -101,11 +101,12 @@ class RightView(NamedTuple):
 
 
 class PhotometricSums(NamedTuple):
-    """What an evaluation gives for each block."""
+    """What an evaluation gives."""
 
     cost: Tensor  # (M,) float64 sums over the blocks
     products: Tensor  # (M, D + 1, D) float64 of `weighted_products`
-    hits: Hits  # the new ones
+    points_obj: Tensor  # (3, M, 64) of the new hits
+    normal_obj: Tensor  # (3, M, 64)
 
 
 class Surface(NamedTuple):
@@ -135,38 +136,11 @@ def linearise_photometric(
     hits: Hits,
 ) -> PhotometricSums:
     """Residuals of the photometric term and their hand-derived Jacobian, summed by blocks."""
-    surface = surface_under(field, rows, settings, T_obj_cam, hits)
-    residual = photometric_residuals(rows, settings, surface.depth)
-    usable = surface.usable & residual.comparable
-    norm, weight = _norm_and_weight(rows, settings, residual.value, usable)
-    # All neighbours share one depth, so their rows are multiples of one: sum the multiples first.
-    J = torch.where(usable[..., None], residual.J_residual_depth, torch.zeros_like(residual.J_residual_depth))
-    first = (weight * norm.gradient_weight * J).sum(dim=-1)
-    second = (weight * norm.hessian_weight * J * J).sum(dim=-1)
-    products = weighted_products(surface.J_depth_state, first, second)
-    return PhotometricSums(_cost(rows, settings, norm.rho, usable), products, surface.hits)
-
-
-def photometric_of_objects(
-    field: BlockField,
-    rows: PhotometricRows,
-    settings: PhotometricSettings,
-    T_obj_cam: Tensor,  # (M, 3, 4)
-    hits: Hits,
-    weight: Tensor,  # (M,) of each block
-    of_object: Tensor,  # (B, W) of `Blocks`
-) -> tuple[ObjectSums, Hits]:
-    """The weighted sums of `linearise_photometric` over the blocks of each object, and its hits."""
-    if not isinstance(field, GridBlockField):
-        blocks = linearise_photometric(field, rows, settings, T_obj_cam, hits)
-        return object_sums(weight, of_object, blocks.cost, blocks.products), blocks.hits
-    warp = (rows.along_ray, rows.along_baseline)
-    weights = (rows.intensity_left, rows.pixel_weight, rows.neighbour_weight)
-    table = table_to_compile(of_object, len(weight))
-    sums, new = _of_grids(
-        *field.grids, *rows.rays, *warp, *weights, *rows.right, settings, T_obj_cam, *hits, weight, table
-    )
-    return sums.of_first(len(of_object)), new
+    if isinstance(field, GridBlockField):
+        warp = (rows.along_ray, rows.along_baseline)
+        weights = (rows.intensity_left, rows.pixel_weight, rows.neighbour_weight)
+        return _of_grids(*field.grids, *rows.rays, *warp, *weights, *rows.right, settings, T_obj_cam, *hits)
+    return _of_any(field, rows, settings, T_obj_cam, hits)
 
 
 @compilable(
@@ -189,8 +163,6 @@ def photometric_of_objects(
         "T_obj_cam": 0,
         "points_obj": 1,
         "normal_obj": 1,
-        "weight": 0,
-        "of_object": (0, 1),
     }
 )
 def _of_grids(
@@ -217,16 +189,28 @@ def _of_grids(
     T_obj_cam: Tensor,
     points_obj: Tensor,
     normal_obj: Tensor,
-    weight: Tensor,
-    of_object: Tensor,
-) -> tuple[ObjectSums, Hits]:
-    """`photometric_of_objects` of grids, every tensor by itself."""
+) -> PhotometricSums:
+    """`linearise_photometric` of grids, every tensor by itself."""
     field = GridBlockField(GridField(values, basis, origin, last_node, spacing_m))
     rays = BlockRays(owner, centre_cam, ray_cam)
     right = RightView(pixels, frame, to_full, crop, in_front, covering)
     rows = PhotometricRows(rays, along_ray, along_baseline, intensity_left, pixel_weight, neighbour_weight, right)
-    sums = linearise_photometric(field, rows, settings, T_obj_cam, Hits(points_obj, normal_obj))
-    return object_sums(weight, of_object, sums.cost, sums.products), sums.hits
+    return _of_any(field, rows, settings, T_obj_cam, Hits(points_obj, normal_obj))
+
+
+def _of_any(
+    field: BlockField, rows: PhotometricRows, settings: PhotometricSettings, T_obj_cam: Tensor, hits: Hits
+) -> PhotometricSums:
+    surface = surface_under(field, rows, settings, T_obj_cam, hits)
+    residual = photometric_residuals(rows, settings, surface.depth)
+    usable = surface.usable & residual.comparable
+    norm, weight = _norm_and_weight(rows, settings, residual.value, usable)
+    # All neighbours share one depth, so their rows are multiples of one: sum the multiples first.
+    J = torch.where(usable[..., None], residual.J_residual_depth, torch.zeros_like(residual.J_residual_depth))
+    first = (weight * norm.gradient_weight * J).sum(dim=-1)
+    second = (weight * norm.hessian_weight * J * J).sum(dim=-1)
+    products = weighted_products(surface.J_depth_state, first, second)
+    return PhotometricSums(_cost(rows, settings, norm.rho, usable), products, *surface.hits)
 
 
 def accumulate_photometric(
@@ -244,7 +228,7 @@ def accumulate_photometric(
     products = [
         weighted_products(J_n, a, b) for J_n, a, b in zip(J.unbind(2), first.unbind(2), second.unbind(2), strict=True)
     ]
-    return PhotometricSums(_cost(rows, settings, norm.rho, usable), torch.stack(products).sum(dim=0), hits)
+    return PhotometricSums(_cost(rows, settings, norm.rho, usable), torch.stack(products).sum(dim=0), *hits)
 
 
 def _norm_and_weight(

@@ -23,7 +23,7 @@ from directshape_torch.residuals.silhouette import (
 from directshape_torch.residuals.state_chain import sdf_state_jacobian
 from directshape_torch.shape.grid_lookup import GridField
 from directshape_torch.shape.shape_prior import SdfDerivatives
-from directshape_torch.tracking.blocks import ObjectSums, object_sums, table_to_compile, weighted_products
+from directshape_torch.tracking.blocks import weighted_products
 from directshape_torch.tracking.field import BlockField, GridBlockField
 from directshape_torch.tracking.rays import BlockRays, ObjectBlockRays
 
@@ -59,7 +59,7 @@ class SilhouetteRows(NamedTuple):
 
 
 class SilhouetteSums(NamedTuple):
-    """What an evaluation gives for each block."""
+    """What an evaluation gives."""
 
     cost: Tensor  # (M,) float64 sums of the residuals of the blocks
     products: Tensor  # (M, D + 1, D) float64 of `weighted_products`
@@ -73,30 +73,11 @@ def linearise_silhouettes(
     anchor_obj: Tensor,  # (3, M, 64) where each ray was closest at a state nearby
 ) -> SilhouetteSums:
     """Residuals of both silhouettes and their hand-derived Jacobian, summed by blocks."""
-    rays = rows.rays.in_objects(T_obj_cam)
-    depth, crosses = closest_depth(field, rows, rays, anchor_obj)
-    points = rays.at(depth)
-    residual, J = _residual_and_jacobian(field, rows, points, crosses)
-    return accumulate_silhouettes(rows, residual, J, torch.where(crosses, points, anchor_obj))
-
-
-def silhouettes_of_objects(
-    field: BlockField,
-    rows: SilhouetteRows,
-    T_obj_cam: Tensor,  # (M, 3, 4)
-    anchor_obj: Tensor,  # (3, M, 64)
-    weight: Tensor,  # (M,) of each block
-    of_object: Tensor,  # (B, W) of `Blocks`
-) -> tuple[ObjectSums, Tensor]:
-    """The weighted sums of `linearise_silhouettes` over the blocks of each object, and its points (3, M, 64)."""
-    if not isinstance(field, GridBlockField):
-        blocks = linearise_silhouettes(field, rows, T_obj_cam, anchor_obj)
-        return object_sums(weight, of_object, blocks.cost, blocks.products), blocks.points_obj
-    per_row = (rows.zeta, rows.foreground, rows.filled)
-    constants = (rows.bounds_obj, rows.saturation, rows.residual_floor)
-    table = table_to_compile(of_object, len(weight))
-    sums, points = _of_grids(*field.grids, *rows.rays, *per_row, *constants, T_obj_cam, anchor_obj, weight, table)
-    return sums.of_first(len(of_object)), points
+    if isinstance(field, GridBlockField):
+        per_row = (rows.zeta, rows.foreground, rows.filled)
+        constants = (rows.bounds_obj, rows.saturation, rows.residual_floor)
+        return _of_grids(*field.grids, *rows.rays, *per_row, *constants, T_obj_cam, anchor_obj)
+    return _of_any(field, rows, T_obj_cam, anchor_obj)
 
 
 @compilable(
@@ -110,8 +91,6 @@ def silhouettes_of_objects(
         "filled": 0,
         "T_obj_cam": 0,
         "anchor_obj": 1,
-        "weight": 0,
-        "of_object": (0, 1),
     }
 )
 def _of_grids(
@@ -131,15 +110,20 @@ def _of_grids(
     residual_floor: float,
     T_obj_cam: Tensor,
     anchor_obj: Tensor,
-    weight: Tensor,
-    of_object: Tensor,
-) -> tuple[ObjectSums, Tensor]:
-    """`silhouettes_of_objects` of grids, every tensor by itself."""
+) -> SilhouetteSums:
+    """`linearise_silhouettes` of grids, every tensor by itself."""
     field = GridBlockField(GridField(values, basis, origin, last_node, spacing_m))
     rays = BlockRays(owner, centre_cam, ray_cam)
     rows = SilhouetteRows(rays, zeta, foreground, filled, bounds_obj, saturation, residual_floor)
-    sums = linearise_silhouettes(field, rows, T_obj_cam, anchor_obj)
-    return object_sums(weight, of_object, sums.cost, sums.products), sums.points_obj
+    return _of_any(field, rows, T_obj_cam, anchor_obj)
+
+
+def _of_any(field: BlockField, rows: SilhouetteRows, T_obj_cam: Tensor, anchor_obj: Tensor) -> SilhouetteSums:
+    rays = rows.rays.in_objects(T_obj_cam)
+    depth, crosses = closest_depth(field, rows, rays, anchor_obj)
+    points = rays.at(depth)
+    residual, J = _residual_and_jacobian(field, rows, points, crosses)
+    return accumulate_silhouettes(rows, residual, J, torch.where(crosses, points, anchor_obj))
 
 
 def accumulate_silhouettes(rows: SilhouetteRows, residual: Tensor, J: Tensor, points_obj: Tensor) -> SilhouetteSums:

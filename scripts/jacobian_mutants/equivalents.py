@@ -156,12 +156,6 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         Equivalent(function, f"{owner}.contrast_floor_grey_levels", f"(-{owner}.contrast_floor_grey_levels)", _SQUARED)
         for function, owner in (("photometric_residuals", "settings"), ("TrackedPhotometric.of_term", "config"))
     ),
-    Equivalent(
-        "Blocks.join",
-        "(0, width - place.shape[1])",
-        "(width - place.shape[1], 0)",
-        "both widths are powers of two: pairs of places stay pairs, and empty places change no bit at either end",
-    ),
     Equivalent("log_one_minus_exp", "-0.5", "(0.5)", _BRANCH_NOT_TAKEN),
     Equivalent("log_one_minus_exp", "-1.0", "(1.0)", _BRANCH_NOT_TAKEN),
     *(

@@ -30,7 +30,6 @@ from directshape_torch.tracking.photometric import (
     accumulate_photometric,
     depth_of_state,
     linearise_photometric,
-    photometric_of_objects,
     surface_under,
 )
 
@@ -130,8 +129,8 @@ def test_sums_of_hand_derived_rows_against_autograd_of_single_residuals(case: Ca
     for x, y in zip(found, other, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-9)
     surface = surface_under(case.field(), case.rows, settings, case.blocks, case.hits)
-    torch.testing.assert_close(found.hits.points_obj, surface.hits.points_obj)
-    torch.testing.assert_close(found.hits.normal_obj, surface.hits.normal_obj)
+    torch.testing.assert_close(found.points_obj, surface.hits.points_obj)
+    torch.testing.assert_close(found.normal_obj, surface.hits.normal_obj)
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -140,8 +139,8 @@ def test_sums_of_given_rows(case: Case, name: str) -> None:
     expected = expected_rows(case, settings)
     found = accumulate_photometric(case.rows, settings, *expected, case.hits)
     assert_sums(found, case.rows, settings, expected)
-    assert torch.equal(found.hits.points_obj, case.hits.points_obj)
-    assert torch.equal(found.hits.normal_obj, case.hits.normal_obj)
+    assert torch.equal(found.points_obj, case.hits.points_obj)
+    assert torch.equal(found.normal_obj, case.hits.normal_obj)
 
 
 def test_the_depth_as_a_function_of_the_state(case: Case) -> None:
@@ -175,24 +174,6 @@ def test_the_depth_as_a_function_of_the_state(case: Case) -> None:
         assert float((error / scale).quantile(0.8)) < 0.02
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_sums_over_the_blocks_of_each_object(case: Case, packed: bool) -> None:
-    field = PackedBlockField(case.prior.bind(CODE)) if packed else case.field()
-    owner, weight = case.rows.rays.owner, random(4, seed=3).abs()
-    table = torch.full((3, 4), 4)
-    for m, b in enumerate(owner.tolist()):
-        table[b, m] = m
-    blocks = linearise_photometric(field, case.rows, SETTINGS["plain"], case.blocks, case.hits)
-    found, hits = photometric_of_objects(field, case.rows, SETTINGS["plain"], case.blocks, case.hits, weight, table)
-    for b in range(3):
-        own = (owner == b).nonzero()[:, 0]
-        products = (blocks.products[own] * weight[own, None, None]).sum(dim=0)
-        torch.testing.assert_close(found.cost[b], (blocks.cost[own] * weight[own]).sum())
-        torch.testing.assert_close(found.gradient[b], products[-1])
-        torch.testing.assert_close(found.hessian[b], products[:-1])
-    assert all(torch.equal(x, y) for x, y in zip(hits, blocks.hits, strict=True))
-
-
 def test_some_of_the_blocks(case: Case) -> None:
     kept, keep = torch.tensor([0, 1, 3]), torch.tensor([0, 1])
     some = case.rows.select(kept, torch.tensor([0, 0, 1]))
@@ -203,7 +184,7 @@ def test_some_of_the_blocks(case: Case) -> None:
     few = linearise_photometric(case.field(CODE[keep]), some, settings, T, hits)
     for found, whole in zip(few[:2], everything[:2], strict=True):
         assert torch.equal(found, whole[kept])
-    for found, whole in zip(few.hits, everything.hits, strict=True):
+    for found, whole in zip(few[2:], everything[2:], strict=True):
         assert torch.equal(found, whole[:, kept])
 
 
@@ -217,7 +198,7 @@ def test_a_block_whose_numbers_are_broken_disturbs_no_other(case: Case) -> None:
     assert torch.equal(broken.cost[others], clean.cost[others])
     assert torch.equal(broken.products[others], clean.products[others])
     # Nothing of it is remembered: should the object come back to a state with numbers, its hits are still there.
-    assert torch.equal(broken.hits.points_obj[:, 2], case.hits.points_obj[:, 2])
+    assert torch.equal(broken.points_obj[:, 2], case.hits.points_obj[:, 2])
 
 
 def test_residuals_that_mean_nothing_do_not_reach_the_sums(case: Case) -> None:

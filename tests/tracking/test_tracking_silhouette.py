@@ -21,7 +21,6 @@ from directshape_torch.tracking.silhouette import (
     closest_depth,
     linearise_silhouettes,
     silhouette_residuals,
-    silhouettes_of_objects,
 )
 
 OWNER = torch.tensor([0, 0, 2, 1])
@@ -244,24 +243,6 @@ def test_sums_of_hand_derived_rows_against_autograd_of_single_residuals(
     with torch.no_grad():
         found = linearise_silhouettes(field, case.rows, case.blocks, case.anchor_obj)
     assert_sums(found, case.rows, expected)
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_sums_over_the_blocks_of_each_object(case: Case, packed: bool) -> None:
-    field = PackedBlockField(case.prior.bind(CODE)) if packed else case.field()
-    owner, weight = case.rows.rays.owner, random(4, seed=3).abs()
-    table = torch.full((3, 4), 4)
-    for m, b in enumerate(owner.tolist()):
-        table[b, m] = m
-    blocks = linearise_silhouettes(field, case.rows, case.blocks, case.anchor_obj)
-    found, points = silhouettes_of_objects(field, case.rows, case.blocks, case.anchor_obj, weight, table)
-    for b in range(3):
-        own = (owner == b).nonzero()[:, 0]
-        products = (blocks.products[own] * weight[own, None, None]).sum(dim=0)
-        torch.testing.assert_close(found.cost[b], (blocks.cost[own] * weight[own]).sum())
-        torch.testing.assert_close(found.gradient[b], products[-1])
-        torch.testing.assert_close(found.hessian[b], products[:-1])
-    assert torch.equal(points, blocks.points_obj)
 
 
 def test_sums_of_given_rows(case: Case, expected: Expected) -> None:
