@@ -67,10 +67,15 @@ class CarProblem:
         # What is differentiated afterwards is `linearise_differentiably`, so its root must be found.
         if self.config.solver.rays == "marched" or self.config.backward.mode != "none":
             return self
-        energy = TrackedEnergy.of_terms(self.terms, projected, self.term_weights)
+        energy = TrackedEnergy.of_terms(self.terms, projected, self.term_weights, self._follows_a_wider(stage))
         others = [number for number, tracked in enumerate(are_tracked(self.terms)) if not tracked]
         marched = self._of_terms(others) if others else None
         return TrackedProblem(self.prior, energy, marched, self.config.solver, self.unknowns)
+
+    def _follows_a_wider(self, stage: Stage) -> bool:
+        stages = self.stages()
+        earlier = stages[: stages.index(stage)] if stage in stages else []
+        return any(other.contour_width_px > stage.contour_width_px for other in earlier)
 
     def _of_terms(self, numbers: Sequence[int]) -> CarProblem:
         terms = [self.terms[number] for number in numbers]

@@ -35,7 +35,7 @@ class PixelSet(NamedTuple):
     object_index: Tensor  # (Q,)
     intensity_left: Tensor  # (Q, N) brought to the brightness of the right image, as far as the settings say
     rays_left: Tensor  # (Q, N, 3)
-    lines: WarpLines  # where they land in the right image
+    lines: WarpLines  # where they land in the right image, at the level of `images`
     gradient_weight: Tensor  # (Q,)
     neighbour_weight: Tensor  # (Q, N) zero for neighbours that the mask says are not on the car
     images: GreyPair
@@ -45,7 +45,7 @@ class PixelSet(NamedTuple):
         """Some of the pixels.
 
         Args:
-            chosen: (R,) rows of the set, ascending, or (Q,) bool.
+            chosen: (R,) rows of the set, ascending.
             pixel_index: (R,) rows of the packed left pixels as they are then.
             object_index: (R,) numbers of the cars as they are then, ascending.
             num_objects: cars then.

@@ -183,7 +183,8 @@ class PhotometricTerm:
             return reduced
         kept_pixel = keep[self.pixels.object_index]
         new_row = torch.cumsum(kept_pixel.long(), 0) - 1
-        chosen = kept_pixel[self.fixed.pixel_index]
+        # Rows and no flags, which every indexing would count anew.
+        chosen = kept_pixel[self.fixed.pixel_index].nonzero()[:, 0]
         rows = new_row[self.fixed.pixel_index[chosen]]
         return replace(reduced, fixed=self.fixed.select(chosen, rows, pixels.object_index[rows], int(keep.sum())))
 

@@ -30,15 +30,21 @@ class TrackedEnergy:
     priors: StackedPriors | None
 
     @classmethod
-    def of_terms(cls, terms: Sequence[Term], projected: ProjectedState, weights: Tensor | None) -> TrackedEnergy:
-        """From those of the terms that `are_tracked`, at the state where a stage begins, and factors (B, T) of all."""
+    def of_terms(
+        cls, terms: Sequence[Term], projected: ProjectedState, weights: Tensor | None, after_wider: bool = False
+    ) -> TrackedEnergy:
+        """From those of the terms that `are_tracked`, at the state where a stage begins, and factors (B, T) of all.
+
+        `after_wider`: an earlier stage had a wider contour.
+        """
         columns = [None] * len(terms) if weights is None else list(weights.to(torch.float64).unbind(dim=1))
         pairs = [(t, w) for t, w, is_tracked in zip(terms, columns, are_tracked(terms), strict=True) if is_tracked]
         sides = [(t, w) for t, w in pairs if isinstance(t, SilhouetteTerm)]
         photometric = [(t, w) for t, w in pairs if isinstance(t, PhotometricTerm)]
         priors = [(t, w) for t, w in pairs if StackedPriors.takes(t)]
+        two = [t for t, _ in sides], projected, [w for _, w in sides]
         return cls(
-            TrackedSilhouettes.of_terms([t for t, _ in sides], projected, [w for _, w in sides]) if sides else None,
+            TrackedSilhouettes.of_terms(*two, after_wider) if sides else None,
             TrackedPhotometric.of_term(photometric[0][0], projected, photometric[0][1]) if photometric else None,
             _stacked(priors, projected.state.code.shape[1]),
         )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
+import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
@@ -37,7 +38,7 @@ class TrackedProblem:
         others: the terms that are not; None without any.
         config: trust region and Jacobians.
         unknowns: which of them move.
-        memory: for the grids of the state that is evaluated.
+        memory: for the grids of the state that is evaluated, of a `PCAShapePrior` and where nothing is differentiated.
     """
 
     prior: ShapePrior
@@ -58,7 +59,9 @@ class TrackedProblem:
 
     def _bound(self, code: Tensor) -> BoundShape:
         # Not by `isinstance`: a prior made from this one may bind in its own way.
-        return self.prior.bind(code, self.memory) if type(self.prior) is PCAShapePrior else self.prior.bind(code)
+        if type(self.prior) is PCAShapePrior and not torch.is_grad_enabled():
+            return self.prior.bind(code, self.memory)
+        return self.prior.bind(code)
 
     def follow(self, accepted: Tensor) -> None:
         self.energy.follow(accepted)

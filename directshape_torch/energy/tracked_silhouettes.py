@@ -27,9 +27,10 @@ from directshape_torch.tracking.silhouette import (
 
 # A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
 IN_PLAY_EXPONENT = 8.0
-# And as far again as the contour may move during a stage: of a wide one not so far that the next would not pick it up,
-# of a narrow one little more than it reaches itself.
-_IN_PLAY_MARGIN_M, _IN_PLAY_MARGIN_EXPONENT = 0.2, 10.0
+# And as far again as the contour may move during a stage, beyond which the next stage picks it up.
+_IN_PLAY_MARGIN_M = 0.2
+# Where a wider contour has gone before, what is left to move is little: no more than a narrow contour's own reach.
+_MARGIN_EXPONENT_AFTER_WIDER = 10.0
 
 
 @dataclass
@@ -54,10 +55,18 @@ class TrackedSilhouettes:
 
     @classmethod
     def of_terms(
-        cls, terms: Sequence[SilhouetteTerm], projected: ProjectedState, factors: Sequence[Tensor | None]
+        cls,
+        terms: Sequence[SilhouetteTerm],
+        projected: ProjectedState,
+        factors: Sequence[Tensor | None],
+        after_wider: bool = False,
     ) -> TrackedSilhouettes:
-        """From the two terms of a stage at the state where it begins, and factors (B,) of their weights."""
-        sides = [_side(term, term.view(projected), factor) for term, factor in zip(terms, factors, strict=True)]
+        """From the two terms of a stage at the state where it begins, and factors (B,) of their weights.
+
+        `after_wider`: an earlier stage had a wider contour, so that this one has less to move.
+        """
+        pairs = zip(terms, factors, strict=True)
+        sides = [_side(term, term.view(projected), factor, after_wider) for term, factor in pairs]
         rows = [side.rows for side in sides]
         rays = [r.rays for r in rows]
         joined = SilhouetteRows(
@@ -139,10 +148,12 @@ class _Side(NamedTuple):
     anchor_obj: Tensor
 
 
-def _side(term: SilhouetteTerm, view: ProjectedView, factor: Tensor | None) -> _Side:
+def _side(term: SilhouetteTerm, view: ProjectedView, factor: Tensor | None, after_wider: bool) -> _Side:
     """The rays of one term that are near its contours."""
     crosses = view.march.crosses_bounds
-    margin = (_IN_PLAY_MARGIN_M * term.zeta).clamp_max(_IN_PLAY_MARGIN_EXPONENT)
+    margin = _IN_PLAY_MARGIN_M * term.zeta
+    if after_wider:
+        margin = margin.clamp_max(_MARGIN_EXPONENT_AFTER_WIDER)
     in_play = (view.closest_sdf.abs() * term.zeta < IN_PLAY_EXPONENT + margin) | ~crosses
     weight = term.weight() if factor is None else term.weight() * factor.to(torch.float64)
     at_rest = torch.where(in_play, torch.zeros_like(term.zeta), term.residual_at(view))

@@ -34,7 +34,7 @@ class WarpLines(NamedTuple):
     per_offset: Tensor  # (P,) inverse depth of a pixel of disparity
 
     def select(self, chosen: Tensor | slice) -> WarpLines:
-        """Those of some of the pixels: rows (R,), (P,) bool, or a slice."""
+        """Those of some of the pixels: rows (R,), or a slice."""
         return WarpLines(*(x[..., chosen] for x in self))
 
 

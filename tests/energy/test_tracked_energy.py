@@ -42,9 +42,15 @@ def kind_of(problem: CarProblem, kind: type[Term]) -> list[Term]:
     return [term for term in problem.terms if isinstance(term, kind)]
 
 
-def tracked(problem: CarProblem, state: CarState, terms: list[Term], factors: Tensor | None = None) -> TrackedEnergy:
+def tracked(
+    problem: CarProblem,
+    state: CarState,
+    terms: list[Term],
+    factors: Tensor | None = None,
+    after_wider: bool = False,
+) -> TrackedEnergy:
     """These terms alone, tracked from a state on."""
-    return TrackedEnergy.of_terms(terms, problem.project(state), factors)
+    return TrackedEnergy.of_terms(terms, problem.project(state), factors, after_wider)
 
 
 def evaluated(energy: TrackedEnergy, problem: CarProblem, state: CarState) -> TermLinearisation:
@@ -200,12 +206,15 @@ def on_grid(spacing_m: float, samples: int, stage: int) -> tuple[CarProblem, Car
 NARROW = replace(DEFAULT, stages=tuple(replace(stage, contour_width_px=0.1) for stage in DEFAULT.stages))
 
 
-@pytest.mark.parametrize(("config", "stage"), [(DEFAULT, 0), (DEFAULT, 1), (NARROW, 1)])
-def test_sums_of_the_silhouettes_ray_by_ray(config: RefinerConfig, stage: int) -> None:
+@pytest.mark.parametrize(
+    ("config", "stage", "after_wider"),
+    [(DEFAULT, 0, False), (DEFAULT, 1, False), (NARROW, 1, False), (NARROW, 1, True)],
+)
+def test_sums_of_the_silhouettes_ray_by_ray(config: RefinerConfig, stage: int, after_wider: bool) -> None:
     """At the very depths that are tracked: c = lambda / number of pixels, and constants of the rays out of play."""
     problem, _, start = begun_stage(config, stage=stage)
     terms = kind_of(problem, SilhouetteTerm)
-    energy = tracked(problem, start, terms)
+    energy = tracked(problem, start, terms, after_wider=after_wider)
     state = moved(start, step_of(5, 0.01, 0.1))
     found = evaluated(energy, problem, state)
     assert energy.silhouettes is not None
@@ -219,7 +228,8 @@ def test_sums_of_the_silhouettes_ray_by_ray(config: RefinerConfig, stage: int) -
         view = term.view(problem.project(start))
         sharpness = term.zeta * view.closest_sdf.abs()
         assert bool((0.2 * term.zeta > 10).any()) == (config is NARROW)
-        in_play = (sharpness < 8 + (0.2 * term.zeta).clamp_max(10)) | ~view.march.crosses_bounds
+        margin = (0.2 * term.zeta).clamp_max(10 if after_wider else 1e9)
+        in_play = (sharpness < 8 + margin) | ~view.march.crosses_bounds
         count = int(in_play.sum())
         assert torch.equal(crossings[:count], term.view(problem.project(state)).march.crosses_bounds[in_play])
         residual, J = residuals_by_definition(problem, term, state, in_play, depths[:count], crossings[:count])
@@ -239,6 +249,19 @@ def test_sums_of_the_silhouettes_ray_by_ray(config: RefinerConfig, stage: int) -
     torch.testing.assert_close(found.cost, cost, rtol=1e-10, atol=0)
     torch.testing.assert_close(found.gradient, gradient, rtol=1e-8, atol=1e-9 * float(gradient.abs().max()))
     torch.testing.assert_close(found.hessian, hessian, rtol=1e-8, atol=1e-9 * float(hessian.abs().max()))
+
+
+def test_rays_leave_earlier_only_after_a_stage_with_a_wider_contour() -> None:
+    """A single narrow stage has all the way to go, and follows its rays further."""
+
+    def rows(*widths_px: float) -> int:
+        stages = tuple(replace(DEFAULT.stages[1], contour_width_px=width) for width in widths_px)
+        _, stage, _ = begun_stage(replace(DEFAULT, stages=stages), stage=len(stages) - 1)
+        assert stage.energy.silhouettes is not None
+        return int(stage.energy.silhouettes.rows.filled.sum())
+
+    assert rows(1.0, 0.1) < 0.9 * rows(0.1)
+    assert rows(0.1, 0.1) == rows(0.1)
 
 
 def residuals_by_definition(
@@ -355,9 +378,10 @@ def test_grids_of_the_states_share_one_memory_that_no_result_needs() -> None:
     assert type(stage.prior) is PCAShapePrior
     before = stage.linearise(state)
     kept = [x.clone() for x in before]
-    first = stage.memory.room(state.code, 10)
-    stage.linearise(moved(state, step_of(5, 0.05, 0.5)))
-    assert stage.memory.room(state.code, 10).data_ptr() == first.data_ptr()
+    there = moved(state, step_of(5, 0.05, 0.5))
+    room = stage.memory.room(state.code, stage.prior.mean.numel()).fill_(torch.nan)
+    stage.linearise(there)
+    assert torch.equal(room, stage.prior.values(there.code).flatten(1))
     for found, expected in zip((*before, *stage.linearise(state)), (*kept, *kept), strict=True):
         assert torch.equal(found, expected)
     keep = torch.tensor([False, True, False, True, True])
@@ -365,6 +389,14 @@ def test_grids_of_the_states_share_one_memory_that_no_result_needs() -> None:
     assert fewer.memory is stage.memory
     for found, expected in zip(fewer.linearise(CarState(*(x[keep] for x in state))), kept, strict=True):
         torch.testing.assert_close(found, expected[keep], rtol=1e-10, atol=1e-8)
+
+
+def test_with_gradients_on_a_state_is_evaluated_outside_the_memory() -> None:
+    _, stage, state = begun_stage()
+    expected = stage.linearise(state)
+    with torch.enable_grad():
+        found = stage.linearise(state._replace(code=state.code.clone().requires_grad_()))
+    torch.testing.assert_close(found.cost, expected.cost)
 
 
 class Larger(PCAShapePrior):

@@ -149,6 +149,9 @@ def test_shapes_bound_one_after_the_other_with_one_memory(prior):
     assert torch.equal(more.values, prior.values(codes.repeat(2, 1)))
     single = copy.deepcopy(prior).float().bind(codes.float(), memory)
     assert single.values.dtype == torch.float32
+    with torch.inference_mode():
+        prior.bind(codes.repeat(3, 1), memory)
+    assert torch.equal(prior.bind(codes, memory).values, prior.values(codes))
 
 
 def test_fewer_codes(prior):
