@@ -20,7 +20,7 @@ from directshape_torch.residuals.photometric_patch import patch_residual
 from directshape_torch.residuals.photometric_profile import DisparityResiduals, residuals_on_lines
 
 _CENTRE = DSO_PATTERN.index((0, 0))
-# Of many offsets at once: 4 MB in single precision, for what does not stay in the caches takes half as long again.
+# Of many offsets at once: 4 MB in single precision, for what does not stay in the caches takes longer.
 _RESIDUALS_AT_ONCE = 1_000_000
 
 

@@ -42,9 +42,9 @@ class TrackedEnergy:
         sides = [(t, w) for t, w in pairs if isinstance(t, SilhouetteTerm)]
         photometric = [(t, w) for t, w in pairs if isinstance(t, PhotometricTerm)]
         priors = [(t, w) for t, w in pairs if StackedPriors.takes(t)]
-        two = [t for t, _ in sides], projected, [w for _, w in sides]
+        of_sides = [t for t, _ in sides], projected, [w for _, w in sides]
         return cls(
-            TrackedSilhouettes.of_terms(*two, after_wider) if sides else None,
+            TrackedSilhouettes.of_terms(*of_sides, after_wider) if sides else None,
             TrackedPhotometric.of_term(photometric[0][0], projected, photometric[0][1]) if photometric else None,
             _stacked(priors, projected.state.code.shape[1]),
         )

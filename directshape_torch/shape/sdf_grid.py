@@ -26,16 +26,16 @@ class GridMemory:
     def room(self, code: Tensor, num_nodes: int) -> Tensor:
         """Memory (B, num_nodes) with any contents for the grids of codes (B, K); the room given before ends."""
         count = len(code) * num_nodes
-        if self._numbers is None or len(self._numbers) < count or not self._is_of_the_kind_of(code):
+        if self._numbers is None or not _can_hold(self._numbers, count, code):
             self._numbers = code.new_empty(count)
         return self._numbers[:count].view(len(code), num_nodes)
 
-    def _is_of_the_kind_of(self, code: Tensor) -> bool:
-        numbers = self._numbers
-        if numbers is None or (numbers.dtype, numbers.device) != (code.dtype, code.device):
-            return False
-        # What inference mode made cannot be written to outside of it.
-        return torch.is_inference_mode_enabled() or not numbers.is_inference()
+
+def _can_hold(numbers: Tensor, count: int, code: Tensor) -> bool:
+    if len(numbers) < count or (numbers.dtype, numbers.device) != (code.dtype, code.device):
+        return False
+    # What inference mode made cannot be written to outside of it.
+    return torch.is_inference_mode_enabled() or not numbers.is_inference()
 
 
 class GridShape:
