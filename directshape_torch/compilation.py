@@ -251,7 +251,8 @@ class Compilable(Generic[_P, _R]):
         _logger.info("compiling %s", self.plain.__qualname__)
         with (
             warnings.catch_warnings(),
-            torch._dynamo.config.patch(recompile_limit=_MAX_VARIANTS),
+            # Shapes that depend on sizes are not worth remembering: asking costs more than finding them again.
+            torch._dynamo.config.patch(recompile_limit=_MAX_VARIANTS, fake_tensor_cache_enabled=False),
         ):
             warnings.simplefilter("ignore")
             result: _R = self._compiled(*with_varying_sizes(values, self._varying))

@@ -6,11 +6,13 @@ it is, which takes seconds instead of the better part of a minute (`benchmark.co
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import torch
 from torch._dynamo.utils import counters
+from torch._functorch._aot_autograd.autograd_cache import check_cacheable
 
 from directshape_torch.benchmark.workloads import demo_scene, with_cars
 from directshape_torch.compiler_state import compiler_problem
@@ -28,16 +30,23 @@ FEW_STEPS = (
 
 
 @pytest.fixture
-def _traced_only(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    compile_with = torch.compile
-    monkeypatch.setattr(torch, "compile", lambda f, **_: compile_with(f, fullgraph=True, backend="aot_eager"))
+def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[torch.fx.GraphModule]]:
+    """The graphs that were traced."""
+    compile_with, seen = torch.compile, []
+    run_as_it_is = torch._dynamo.lookup_backend("aot_eager")
+
+    def note(graph: torch.fx.GraphModule, inputs: list[torch.Tensor]) -> Callable[..., Any]:
+        seen.append(graph)
+        return run_as_it_is(graph, inputs)
+
+    monkeypatch.setattr(torch, "compile", lambda f, **_: compile_with(f, fullgraph=True, backend=note))
     for function in FUNCTIONS:
         monkeypatch.setattr(function, "_compiled", None)
         monkeypatch.setattr(function, "_variants", set())
     monkeypatch.setattr("directshape_torch.compilation.note_on_disk", lambda *_: None)
     torch._dynamo.reset()
     counters.clear()
-    yield
+    yield seen
     torch._dynamo.reset()
 
 
@@ -46,8 +55,7 @@ def graphs() -> int:
 
 
 @pytest.mark.skipif(compiler_problem() is not None, reason=f"no C++ compiler: {compiler_problem()}")
-@pytest.mark.usefixtures("_traced_only")
-def test_other_numbers_of_cars_and_pixels_compile_nothing_anew() -> None:
+def test_other_numbers_of_cars_and_pixels_compile_nothing_anew(traced: list[torch.fx.GraphModule]) -> None:
     frames = demo_scene().frames
     DirectShapeRefiner(config=load_config(None, FEW_STEPS))(*with_cars(frames, 3))
     assert [function.num_variants for function in FUNCTIONS] == [1, 1, 1, 1]
@@ -56,4 +64,7 @@ def test_other_numbers_of_cars_and_pixels_compile_nothing_anew() -> None:
     for config, num_cars in ((load_config(None, FEW_STEPS), 1), (fewer_pixels, 2), (fewer_pixels, 8)):
         result = DirectShapeRefiner(config=config)(*with_cars(frames, num_cars))
         assert len(result.status) == num_cars
-    assert graphs() == len(FUNCTIONS)
+    assert graphs() == len(traced) == len(FUNCTIONS)
+    # What the disk cache refuses (such as making a tuple of a type of our own) every process would trace twice.
+    for graph in traced:
+        check_cacheable(graph)

@@ -28,4 +28,6 @@ def all_along(flags: Tensor, dim: int) -> Tensor:
         >>> all_along(torch.tensor([[True, False], [True, True]]), dim=0)
         tensor([ True, False])
     """
+    if torch.compiler.is_compiling():
+        return flags.all(dim)  # one step to trace, and the compiler writes the loop
     return functools.reduce(torch.logical_and, flags.unbind(dim))

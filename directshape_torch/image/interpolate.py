@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.table_lookup import take
 
 
 def bilinear_with_gradient(
@@ -80,9 +81,9 @@ def bilinear_patch(
 
     corner = first_pixel + row * row_step + column
     step_down = below * row_step
-    upper_left, upper_right = _take(pixels, corner), _take(pixels, corner + right)
+    upper_left, upper_right = take(pixels, corner), take(pixels, corner + right)
     corner = corner + step_down
-    lower_left, lower_right = _take(pixels, corner), _take(pixels, corner + right)
+    lower_left, lower_right = take(pixels, corner), take(pixels, corner + right)
 
     upper_slope = upper_right - upper_left
     lower_slope = lower_right - lower_left
@@ -107,13 +108,6 @@ def _cell(
         return clamped - index, inside, index, min(last, 1)
     index = torch.minimum(clamped.detach().long(), (last - 1).clamp(min=0))
     return clamped - index, inside, index, last.clamp(max=1)
-
-
-def _take(
-    flat: Tensor,  # (F * H * W,)
-    index: Tensor,  # (...)
-) -> Tensor:
-    return flat.index_select(0, index.reshape(-1)).reshape(index.shape)
 
 
 def _check(images: Tensor, frame_index: Tensor, uv: Tensor) -> None:

@@ -104,10 +104,10 @@ def probe_grids(
 
     Its rows come and go as one tensor: each is a microsecond of a compiled call.
     """
-    now = Bracket(*bracket.unbind(0))
+    now = Bracket(*bracket)
     points = torch.addcmul(rays_obj[:3], now.depth, rays_obj[3:])
     sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index)
-    return torch.stack(now.probed(sdf))
+    return torch.stack(tuple(now.probed(sdf)))
 
 
 def interval(origin_obj: Tensor, direction_obj: Tensor, bounds_obj: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,6 @@ overestimates the true distance, so ray marching never steps by it.)
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from directshape_torch.device_constants import constant_like
 from directshape_torch.geometry.short_axes import length
+from directshape_torch.table_lookup import take
 
 
 class GridField(NamedTuple):
@@ -56,7 +56,7 @@ def value_at(field: GridField, points_obj: Tensor, object_index: Tensor, constan
     With `constant` nothing will be differentiated, which takes fewer steps.
     """
     cells = _cells(field, points_obj)
-    fx, fy, fz = cells.fraction.unbind(0)
+    fx, fy, fz = cells.fraction
     along_z = _along(fz, *_ends(_corner_values(field, cells, object_index)))
     (inside,) = _along(fx, *_ends(_along(fy, *_ends(along_z))))
     return inside + field.spacing_m * _distance(cells, constant)
@@ -69,7 +69,7 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     basis vectors.
     """
     cells = _cells(field, points_obj)
-    fx, fy, fz = cells.fraction.unbind(0)
+    fx, fy, fz = cells.fraction
     lower, upper = _ends(_corner_values(field, cells, object_index))
     (d_z,) = _along(fx, *_ends(_along(fy, *_ends(_difference(lower, upper)))))
     lower, upper = _ends(_along(fz, lower, upper))
@@ -107,10 +107,9 @@ def _corner_values(field: GridField, cells: _Cells, object_index: Tensor) -> _Co
     nx, ny, nz, _ = field.basis.shape
     base = cells.lower_node + object_index * (nx * ny * nz)
     if torch.compiler.is_compiling() or (base.device.type == "cpu" and base.numel() > _FEW_POINTS):
-        flat = base.reshape(-1)
-        return [field.values.index_select(0, flat + corner).view(base.shape) for corner in _corners(field)]
+        return [take(field.values, base + corner) for corner in _corners(field)]
     # Corner first, so that each step runs over whole rows: fewer operations, and several times as fast as (..., 8).
-    return _take(field.values, base + _offsets(field, base).view(8, *(1,) * base.ndim))
+    return take(field.values, base + _offsets(field, base).view(8, *(1,) * base.ndim))
 
 
 def _ends(corners: _Corners) -> tuple[_Corners, _Corners]:
@@ -140,12 +139,8 @@ def _offsets(field: GridField, like: Tensor) -> Tensor:
     return (two[:, None, None] * (ny * nz) + two[:, None] * nz + two).flatten()
 
 
-def _take(flat: Tensor, index: Tensor) -> Tensor:
-    return flat.index_select(0, index.reshape(-1)).view(index.shape)
-
-
 def _interpolated_basis(field: GridField, cells: _Cells) -> Tensor:
-    fx, fy, fz = (f[..., None] for f in cells.fraction.unbind(0))
+    fx, fy, fz = (f[..., None] for f in cells.fraction)
     node = cells.lower_node + _offsets(field, cells.lower_node).view(8, *(1,) * cells.lower_node.ndim)
     rows = field.basis.flatten(0, 2).index_select(0, node.reshape(-1)).view(*node.shape, field.basis.shape[3])
     along_z = _along(fz, *_ends(rows))
@@ -155,18 +150,18 @@ def _interpolated_basis(field: GridField, cells: _Cells) -> Tensor:
 
 def _summed_basis(field: GridField, cells: _Cells) -> Tensor:
     """`_interpolated_basis` as one weighted sum of table rows: one pass instead of three."""
-    upper = cells.fraction
-    (x0, y0, z0), (x1, y1, z1) = (1 - upper).unbind(0), upper.unbind(0)
+    upper = cells.fraction[..., None]
+    (x0, y0, z0), (x1, y1, z1) = 1 - upper, upper
     xy = (x0 * y0, x0 * y1, x1 * y0, x1 * y1)
     weights = [w * z for w in xy for z in (z0, z1)]
     table = field.basis.flatten(0, 2)
     if torch.compiler.is_compiling():
-        return functools.reduce(
-            torch.add,
-            (w[..., None] * table[cells.lower_node + c] for w, c in zip(weights, _corners(field), strict=True)),
-        )
+        total: Tensor = weights[0] * table[cells.lower_node]
+        for weight, corner in zip(weights[1:], _corners(field)[1:], strict=True):
+            total = torch.addcmul(total, weight, table[cells.lower_node + corner])
+        return total
     node = (cells.lower_node[..., None] + _offsets(field, cells.lower_node)).view(-1, 8)
-    weight = torch.stack(weights, dim=-1).view(-1, 8)
+    weight = torch.cat(weights, dim=-1).view(-1, 8)
     rows = torch.nn.functional.embedding_bag(node, table, mode="sum", per_sample_weights=weight)
     return rows.view(*cells.lower_node.shape, rows.shape[-1])
 

@@ -304,15 +304,13 @@ def photometric_residuals(rows: PhotometricRows, settings: PhotometricSettings, 
     The warp is one line in homogeneous pixels, `h = along_ray depth + along_baseline`, cameras, residual field and
     pyramid level included.
     """
-    along = rows.along_ray.unbind(0)
-    x, y, z = (torch.addcmul(*line, depth) for line in zip(rows.along_baseline.unbind(0), along, strict=True))
+    along = tuple(rows.along_ray)
+    x, y, z = (torch.addcmul(*line, depth) for line in zip(rows.along_baseline, along, strict=True))
     in_front = z > _LEAST_DEPTH_M
     inverse = 1 / torch.where(in_front, z, torch.ones_like(z))
     u, v = x * inverse, y * inverse
-    first_pixel, row_step, last_column, last_row = rows.right.frame.unbind(1)
-    at = bilinear_patch(
-        rows.right.pixels, first_pixel[:, None], row_step[:, None], u, v, last_column[:, None], last_row[:, None]
-    )
+    first_pixel, row_step, last_column, last_row = rows.right.frame.mT[..., None]
+    at = bilinear_patch(rows.right.pixels, first_pixel, row_step, u, v, last_column, last_row)
     d_u = torch.addcmul(along[0], u, along[2], value=-1) * inverse
     d_v = torch.addcmul(along[1], v, along[2], value=-1) * inverse
     plain = (at.value - rows.intensity_left).movedim(0, -1)
@@ -330,11 +328,12 @@ def photometric_residuals(rows: PhotometricRows, settings: PhotometricSettings, 
 
 def _is_hidden(right: RightView, u_level: Tensor, v_level: Tensor) -> Tensor:
     """Whether a nearer instance hides the object at pixels (M, 64) of its frame's right image (`OcclusionCrops.at`)."""
-    scale, first = right.to_full[..., None].unbind(1)
+    scale, first = right.to_full.mT[..., None]
     u, v = (torch.round(torch.addcmul(first, x, scale)) for x in (u_level, v_level))
-    u0, v0, u1, v1, entry, width = right.crop[..., None].unbind(1)
+    u0, v0, u1, v1, entry, width = right.crop.mT[..., None]
     inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
     column, row = (torch.where(inside, x, torch.zeros_like(x)).long() for x in (u, v))
     entry = torch.where(inside, entry + row * width + column, 0)
     covering = right.covering.index_select(0, entry.reshape(-1)).view(*entry.shape, right.covering.shape[1])
-    return ((covering & right.in_front[:, None]) != 0).any(dim=-1) & inside
+    covered: Tensor = ((covering & right.in_front[:, None]) != 0).any(dim=-1) & inside
+    return covered

@@ -35,10 +35,9 @@ class BlockRays(NamedTuple):
 
     def in_objects(self, T_obj_cam: Tensor) -> ObjectBlockRays:
         """The rays in the frames of their objects, by the poses (M, 3, 4) of the blocks."""
-        R = T_obj_cam[:, :, :3].permute(1, 2, 0)[..., None]  # (3, 3, M, 1)
         centre = (T_obj_cam[:, :, :3] * self.centre_cam[:, None]).sum(-1) + T_obj_cam[:, :, 3]
-        x_axis, y_axis, z_axis = R.unbind(1)
-        x, y, z = self.ray_cam.unbind(0)
+        x_axis, y_axis, z_axis = T_obj_cam[:, :, :3].permute(2, 1, 0)[..., None]  # columns of R, (3, M, 1) each
+        x, y, z = self.ray_cam
         direction = torch.addcmul(torch.addcmul(x_axis * x, y_axis, y), z_axis, z)
         return ObjectBlockRays(centre.mT[..., None], direction)
 

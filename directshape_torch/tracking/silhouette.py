@@ -149,7 +149,7 @@ def closest_depth(
     step = SAMPLE_DISTANCE_M / length(rays.direction_obj, dim=0)
     samples = rays.at(torch.stack([depth - step, depth, depth + step]))
     sdf = field.value(samples, rows.rays.owner, constant=True)
-    before, here, after = sdf.unbind(0)
+    before, here, after = sdf
     curvature, slope = before - 2 * here + after, 0.5 * (after - before)
     # Where the field does not curve upwards the slope tells the side, and no more: the same as of ever less curvature.
     vertex = -slope / curvature.clamp_min(_LEAST_CURVATURE_M)
