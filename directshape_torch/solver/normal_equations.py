@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import torch
@@ -34,14 +35,14 @@ class Segments:
     Attributes:
         object_index: (P,) object of each row, ascending.
         counts: (B,) rows of each object.
+        owner: (M,) object of each block.
         block_rows: (M, 64) row numbers; P stands for an empty place.
-        object_blocks: (B, 2^n) block numbers of each object, in order; M stands for an empty place.
     """
 
     object_index: Tensor
     counts: Tensor
+    owner: Tensor
     block_rows: Tensor
-    object_blocks: Tensor
 
     @classmethod
     def from_sorted_index(cls, object_index: Tensor, num_objects: int) -> Segments:
@@ -52,22 +53,31 @@ class Segments:
             tensor([2, 0, 1])
         """
         counts = torch.bincount(object_index, minlength=num_objects)
-        num_blocks = (counts + _BLOCK - 1) // _BLOCK
+        num_blocks = _num_blocks(counts)
         owner = torch.repeat_interleave(torch.arange(num_objects, device=counts.device), num_blocks)
         first_block = torch.cumsum(num_blocks, 0) - num_blocks
         first_row = torch.cumsum(counts, 0) - counts
         block_in_object = torch.arange(len(owner), device=counts.device) - first_block[owner]
         place = block_in_object[:, None] * _BLOCK + torch.arange(_BLOCK, device=counts.device)
         rows = torch.where(place < counts[owner][:, None], first_row[owner][:, None] + place, len(object_index))
-        # A power of two for the pairwise sums; its shape is known from the longest object.
-        longest = int(num_blocks.max()) if num_objects else 0
-        place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=counts.device)
-        blocks = torch.where(place < num_blocks[:, None], first_block[:, None] + place, len(owner))
-        return cls(object_index, counts, rows, blocks)
+        return cls(object_index, counts, owner, rows)
 
     @property
     def num_objects(self) -> int:
         return len(self.counts)
+
+    @functools.cached_property
+    def object_blocks(self) -> Tensor:
+        """Block numbers (B, 2^n) of each object, in order; M stands for an empty place.
+
+        Of the first sum on: its shape is known from the longest object, for which the host waits.
+        """
+        num_blocks = _num_blocks(self.counts)
+        longest = int(num_blocks.max()) if self.num_objects else 0
+        # A power of two, for the pairwise sums.
+        place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=num_blocks.device)
+        first_block = torch.cumsum(num_blocks, 0) - num_blocks
+        return torch.where(place < num_blocks[:, None], first_block[:, None] + place, len(self.owner))
 
     def _blocks(self, rows: Tensor) -> Tensor:
         padded = torch.cat([rows, rows.new_zeros(1, *rows.shape[1:])])
@@ -89,3 +99,7 @@ class Segments:
         gradient = (self._blocks(gradient_weight)[:, None] @ J)[:, 0]
         hessian = weighted.transpose(1, 2) @ J
         return sum_over_blocks(gradient, self.object_blocks), sum_over_blocks(hessian, self.object_blocks)
+
+
+def _num_blocks(counts: Tensor) -> Tensor:
+    return (counts + _BLOCK - 1) // _BLOCK

@@ -100,13 +100,16 @@ class PackedBlocks(NamedTuple):
             (tensor([0, 2]), tensor([[0, 1, 0],
                     [2, 2, 2]]))
         """
-        segments = Segments.from_sorted_index(object_index, num_objects)
-        filled = segments.block_rows < len(object_index)
+        return cls.of_segments(Segments.from_sorted_index(object_index, num_objects))
+
+    @classmethod
+    def of_segments(cls, segments: Segments) -> PackedBlocks:
+        """The same blocks as those of segments."""
+        filled = segments.block_rows < len(segments.object_index)
         # An empty place must not bring another object's numbers, which may be NaN, nor an index out of range.
         rows = torch.where(filled, segments.block_rows, segments.block_rows[:, :1])
-        owner = object_index[rows[:, 0]]
-        counts = tuple(torch.bincount(owner, minlength=num_objects).tolist())
-        return cls(Blocks.of_owners(owner, counts), rows, filled)
+        counts = tuple(torch.bincount(segments.owner, minlength=segments.num_objects).tolist())
+        return cls(Blocks.of_owners(segments.owner, counts), rows, filled)
 
 
 def weighted_products(
