@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import importlib
 import importlib.metadata
 import os
 import platform
@@ -50,12 +51,13 @@ def start_problem() -> str | None:
 
     Asked once: an import that has failed fails in another way the second time, and hides the reason.
     """
+    problem = _import_problem("torch._inductor.cpp_builder")
+    if problem is not None:
+        return problem
     try:
-        from torch._inductor import cpp_builder  # noqa: F401
-
         _cache_folder()
-    except Exception as error:  # an import can raise anything, and whatever it is there is no compiler
-        return f"PyTorch's compiler does not start ({type(error).__name__}: {first_line_of(error)})"
+    except Exception as error:  # whatever it is, there is no compiler
+        return _does_not_start(error)
     return None
 
 
@@ -97,16 +99,35 @@ def note_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> N
         return
 
 
+def _import_problem(module: str) -> str | None:
+    try:
+        importlib.import_module(module)
+    except Exception as error:  # an import can raise anything, and whatever it is there is no compiler
+        return _does_not_start(error)
+    return None
+
+
+def _does_not_start(error: Exception) -> str:
+    return f"PyTorch's compiler does not start ({type(error).__name__}: {first_line_of(error)})"
+
+
 def _trial_problem(compiler: str, folder: str) -> str | None:
-    command = [compiler, "-x", "c++", "-", "-shared", "-fPIC", "-fopenmp", "-o", os.path.join(folder, "trial.so")]
+    source = Path(folder) / "trial.cpp"
+    source.write_text(_TRIAL, encoding="utf-8")
+    command = [compiler, str(source), "-shared", "-fPIC", "-fopenmp", "-o", os.path.join(folder, "trial.so")]
     command += ["-I", sysconfig.get_paths()["include"]]
     try:
-        trial = subprocess.run(
-            command, input=_TRIAL, capture_output=True, text=True, timeout=_TRIAL_SECONDS, check=False
-        )
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as trial:
+            try:
+                # Needed next: it is read while the compiler tries.
+                problem = _import_problem("torch._inductor.compile_fx")
+                _, errors = trial.communicate(timeout=_TRIAL_SECONDS)
+            except BaseException:
+                trial.kill()
+                raise
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{compiler} does not run ({error})"
-    return None if trial.returncode == 0 else f"{compiler} fails ({_first_line(trial.stderr)})"
+    return problem if trial.returncode == 0 else f"{compiler} fails ({_first_line(errors)})"
 
 
 def _cache_folder() -> Path:

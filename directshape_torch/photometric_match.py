@@ -76,7 +76,7 @@ def matching_costs(term: PhotometricTerm, rows: Tensor, seen: SeenSurface, offse
     """Costs (n, R) of rows (R,) of the pixel set: `PhotometricTerm.pixel_cost`, at offsets (n,) of the disparity."""
     fixed, config = stage_pixels(term), term.config
     weight = fixed.neighbour_weight[rows].mT.contiguous()
-    lost = robust.huber(weight.new_full((), config.lost_grey_levels), config.huber_grey_levels).rho
+    lost = robust.huber_cost(config.lost_grey_levels, config.huber_grey_levels)
     # A few offsets at a time where the pixels are many, so that memory stays that of the other evaluations.
     at_once = max(1, _RESIDUALS_AT_ONCE // max(1, weight.numel()))
     parts = []

@@ -205,18 +205,15 @@ class PhotometricTerm:
     def _weighted_cost(self, rho: Tensor, usable: Tensor) -> Tensor:
         """Cost (..., Q) of each pixel of the set from the norms (..., Q, N) of its neighbourhood."""
         fixed = self.pixel_set
-        rho = torch.where(usable[..., None], rho, self._lost_cost())
+        # A pixel that cannot be compared any more pays what the Huber norm truncated there says.
+        lost = robust.huber_cost(self.config.lost_grey_levels, self.config.huber_grey_levels)
+        rho = torch.where(usable[..., None], rho, lost)
         return (rho * fixed.neighbour_weight).sum(dim=-1) * fixed.gradient_weight
 
     def _norm(self, residual: Tensor) -> robust.RobustValue:
         if self.config.truncated:
             return robust.truncated_huber(residual, self.config.huber_grey_levels, self.config.lost_grey_levels)
         return robust.huber(residual, self.config.huber_grey_levels)
-
-    def _lost_cost(self) -> Tensor:
-        """What a pixel of the set pays that cannot be compared any more: the Huber norm truncated there."""
-        lost = torch.tensor(self.config.lost_grey_levels, dtype=self.pixels.uv.dtype, device=self.pixels.uv.device)
-        return robust.huber(lost, self.config.huber_grey_levels).rho
 
     def _fix(self, pixel_index: Tensor, images: GreyPair) -> PixelSet:
         """The pixels of a set with the left image's side of their residuals."""

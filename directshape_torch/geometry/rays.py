@@ -34,11 +34,13 @@ def ray_box_interval(
     """
     parallel = direction == 0
     inverse = 1 / torch.where(parallel, torch.ones_like(direction), direction)
-    to_lower, to_upper = (bounds[0] - origin) * inverse, (bounds[1] - origin) * inverse
+    lower, upper = bounds
+    to_lower, to_upper = (lower - origin) * inverse, (upper - origin) * inverse
     infinity = torch.full_like(to_lower, torch.inf)
-    inside_slab = (origin >= bounds[0]) & (origin <= bounds[1])
-    entry = torch.where(parallel, torch.where(inside_slab, -infinity, infinity), torch.minimum(to_lower, to_upper))
-    leave = torch.where(parallel, torch.where(inside_slab, infinity, -infinity), torch.maximum(to_lower, to_upper))
+    # As far as a ray beside the slab's faces is inside: for ever, or less than nowhere.
+    reach = torch.where((origin >= lower) & (origin <= upper), infinity, -infinity)
+    entry = torch.where(parallel, -reach, torch.minimum(to_lower, to_upper))
+    leave = torch.where(parallel, reach, torch.maximum(to_lower, to_upper))
     near = entry.amax(dim=-1).clamp_min(minimum)
     far = leave.amin(dim=-1)
     # `near` is finite where it is below something: no `minimum` is minus infinity.

@@ -82,7 +82,7 @@ def sample_grids(
     number = torch.arange(num_samples, dtype=near.dtype, device=near.device)[:, None]
     depths = near + (number + 0.5) * step
     points = torch.addcmul(origin_obj[:, None], depths, direction_obj[:, None])
-    sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index)
+    sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index, constant=True)
     best = sdf.argmin(dim=0, keepdim=True)
     around = [sdf.gather(0, index)[0] for index in neighbours(best, num_samples)]
     offset = vertex_offset(around, best[0], num_samples)
@@ -106,7 +106,7 @@ def probe_grids(
     """
     now = Bracket(*bracket)
     points = torch.addcmul(rays_obj[:3], now.depth, rays_obj[3:])
-    sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index)
+    sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index, constant=True)
     return torch.stack(tuple(now.probed(sdf)))
 
 

@@ -245,7 +245,7 @@ def _norm_and_weight(
 
 def _cost(rows: PhotometricRows, settings: PhotometricSettings, rho: Tensor, usable: Tensor) -> Tensor:
     """Cost (M,) of each block from the norms (M, 64, N): a pixel that cannot be compared pays a constant."""
-    lost = robust.huber(rho.new_full((), settings.lost_grey_levels), settings.huber_grey_levels).rho
+    lost = robust.huber_cost(settings.lost_grey_levels, settings.huber_grey_levels)
     rho = torch.where(usable[..., None], rho, lost)
     per_pixel = (rho * rows.neighbour_weight.movedim(0, -1)).sum(dim=-1) * rows.pixel_weight
     return per_pixel.to(torch.float64).sum(dim=1)

@@ -172,7 +172,7 @@ TARGETS: dict[str, Target] = {
     ),
     "robust": Target(
         "directshape_torch/residuals/robust.py",
-        ("quadratic", "huber", "truncated_huber", "identity"),
+        ("quadratic", "huber", "huber_cost", "truncated_huber", "identity"),
         ("tests/residuals/test_robust.py",),
     ),
     "normal_equations": Target(
@@ -211,7 +211,6 @@ TARGETS: dict[str, Target] = {
                 "_linearisation",
                 "weight",
                 "_weighted_cost",
-                "_lost_cost",
             )
         ),
         ("tests/energy/test_photometric_sums.py", *_ROWS, "tests/energy/test_constant_sets.py"),
