@@ -117,7 +117,8 @@ def _trial_problem(compiler: str, folder: str) -> str | None:
     command = [compiler, str(source), "-shared", "-fPIC", "-fopenmp", "-o", os.path.join(folder, "trial.so")]
     command += ["-I", sysconfig.get_paths()["include"]]
     try:
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as trial:
+        pipe = subprocess.PIPE
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True) as trial:
             try:
                 # Needed next: it is read while the compiler tries.
                 problem = _import_problem("torch._inductor.compile_fx")

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import torch
+import torch._inductor.config
 from torch._dynamo.utils import counters
-from torch._functorch._aot_autograd.autograd_cache import check_cacheable
 
 from directshape_torch.benchmark.workloads import demo_scene, with_cars
 from directshape_torch.compiler_state import compiler_problem
@@ -66,5 +66,8 @@ def test_other_numbers_of_cars_and_pixels_compile_nothing_anew(traced: list[torc
         assert len(result.status) == num_cars
     assert graphs() == len(traced) == len(FUNCTIONS)
     # What the disk cache refuses (such as making a tuple of a type of our own) every process would trace twice.
-    for graph in traced:
-        check_cacheable(graph)
+    from torch._functorch._aot_autograd.autograd_cache import check_cacheable
+
+    with torch._inductor.config.patch(fx_graph_cache=True):
+        for graph in traced:
+            check_cacheable(graph)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,6 +54,25 @@ def test_a_compiler_that_fails_says_why(monkeypatch, tmp_path: Path) -> None:
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     _pretend(monkeypatch, str(script))
     assert compiler_problem() == f"{script} fails (fatal error: Python.h: No such file)"
+
+
+def test_a_compiler_that_does_not_end_is_ended(monkeypatch, tmp_path: Path) -> None:
+    script, ended = tmp_path / "endless", tmp_path / "ended"
+    script.write_text(f"#!/bin/sh\nsleep 1 >/dev/null 2>&1\ntouch {ended}\n")
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    _pretend(monkeypatch, str(script))
+    monkeypatch.setattr(compiler_state, "_TRIAL_SECONDS", 0.05)
+    assert "timed out after 0.05 seconds" in (compiler_problem() or "")
+    assert not ended.exists()
+
+
+def test_modules_that_cannot_be_imported_beside_a_compiler_that_works(monkeypatch, tmp_path: Path) -> None:
+    script = tmp_path / "works"
+    script.write_text("#!/bin/sh\nexit 0\n")
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    _pretend(monkeypatch, str(script))
+    monkeypatch.setitem(sys.modules, "torch._inductor.compile_fx", None)
+    assert (compiler_problem() or "").startswith("PyTorch's compiler does not start (ModuleNotFoundError: ")
 
 
 def test_no_folder_for_the_trial(monkeypatch, tmp_path: Path) -> None:

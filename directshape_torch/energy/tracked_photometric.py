@@ -63,7 +63,7 @@ class TrackedPhotometric:
     def of_term(cls, term: PhotometricTerm, projected: ProjectedState, factor: Tensor | None) -> TrackedPhotometric:
         """From the term of a stage at the state where it begins, and a factor (B,) of its weight."""
         config, fixed = term.config, term.pixel_set
-        packed = PackedBlocks.of_segments(fixed.segments)
+        packed = PackedBlocks.of_rows(fixed.segments)
         settings = PhotometricSettings(
             config.huber_grey_levels,
             config.lost_grey_levels,

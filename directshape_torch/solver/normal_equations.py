@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import torch
@@ -25,12 +24,8 @@ def sum_over_blocks(
 
 
 @dataclass(frozen=True)
-class Segments:
-    """Rows of several objects, sorted by object, cut into blocks of equal size for batched products.
-
-    Blocks are products of matrices of fixed shape, and the blocks of an object are added in a fixed order, hence the
-    sums are the same to the bit from run to run on any device; an atomic `index_add_` on a GPU would not be. No row
-    enters the sum of another object, not even with weight zero: NaN in one object stays there.
+class RowBlocks:
+    """Rows of several objects, sorted by object, cut into blocks of equal size.
 
     Attributes:
         object_index: (P,) object of each row, ascending.
@@ -45,12 +40,12 @@ class Segments:
     block_rows: Tensor
 
     @classmethod
-    def from_sorted_index(cls, object_index: Tensor, num_objects: int) -> Segments:
-        """Plan the sums for rows whose objects (P,) ascend.
+    def of_sorted(cls, object_index: Tensor, num_objects: int) -> RowBlocks:
+        """Blocks of rows whose objects (P,) ascend.
 
         Example:
-            >>> Segments.from_sorted_index(torch.tensor([0, 0, 2]), 3).counts
-            tensor([2, 0, 1])
+            >>> RowBlocks.of_sorted(torch.tensor([0, 0, 2]), 3).owner
+            tensor([0, 2])
         """
         counts = torch.bincount(object_index, minlength=num_objects)
         num_blocks = _num_blocks(counts)
@@ -60,24 +55,43 @@ class Segments:
         block_in_object = torch.arange(len(owner), device=counts.device) - first_block[owner]
         place = block_in_object[:, None] * _BLOCK + torch.arange(_BLOCK, device=counts.device)
         rows = torch.where(place < counts[owner][:, None], first_row[owner][:, None] + place, len(object_index))
-        return cls(object_index, counts, owner, rows)
+        return RowBlocks(object_index, counts, owner, rows)
 
     @property
     def num_objects(self) -> int:
         return len(self.counts)
 
-    @functools.cached_property
-    def object_blocks(self) -> Tensor:
-        """Block numbers (B, 2^n) of each object, in order; M stands for an empty place.
 
-        Of the first sum on: its shape is known from the longest object, for which the host waits.
+@dataclass(frozen=True)
+class Segments(RowBlocks):
+    """Blocks of rows with the order in which those of an object are added.
+
+    Blocks are products of matrices of fixed shape, and the blocks of an object are added in a fixed order, hence the
+    sums are the same to the bit from run to run on any device; an atomic `index_add_` on a GPU would not be. No row
+    enters the sum of another object, not even with weight zero: NaN in one object stays there.
+
+    Attributes:
+        object_blocks: (B, 2^n) block numbers of each object, in order; M stands for an empty place.
+    """
+
+    object_blocks: Tensor
+
+    @classmethod
+    def from_sorted_index(cls, object_index: Tensor, num_objects: int) -> Segments:
+        """Plan the sums for rows whose objects (P,) ascend.
+
+        Example:
+            >>> Segments.from_sorted_index(torch.tensor([0, 0, 2]), 3).counts
+            tensor([2, 0, 1])
         """
-        num_blocks = _num_blocks(self.counts)
-        longest = int(num_blocks.max()) if self.num_objects else 0
-        # A power of two, for the pairwise sums.
-        place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=num_blocks.device)
+        rows = RowBlocks.of_sorted(object_index, num_objects)
+        num_blocks = _num_blocks(rows.counts)
         first_block = torch.cumsum(num_blocks, 0) - num_blocks
-        return torch.where(place < num_blocks[:, None], first_block[:, None] + place, len(self.owner))
+        # A power of two for the pairwise sums; its shape is known from the longest object, for which the host waits.
+        longest = int(num_blocks.max()) if num_objects else 0
+        place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=num_blocks.device)
+        blocks = torch.where(place < num_blocks[:, None], first_block[:, None] + place, len(rows.owner))
+        return cls(rows.object_index, rows.counts, rows.owner, rows.block_rows, blocks)
 
     def _blocks(self, rows: Tensor) -> Tensor:
         padded = torch.cat([rows, rows.new_zeros(1, *rows.shape[1:])])

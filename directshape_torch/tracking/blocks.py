@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.solver.normal_equations import Segments
+from directshape_torch.solver.normal_equations import RowBlocks
 
 
 class ObjectSums(NamedTuple):
@@ -100,16 +100,16 @@ class PackedBlocks(NamedTuple):
             (tensor([0, 2]), tensor([[0, 1, 0],
                     [2, 2, 2]]))
         """
-        return cls.of_segments(Segments.from_sorted_index(object_index, num_objects))
+        return cls.of_rows(RowBlocks.of_sorted(object_index, num_objects))
 
     @classmethod
-    def of_segments(cls, segments: Segments) -> PackedBlocks:
-        """The same blocks as those of segments."""
-        filled = segments.block_rows < len(segments.object_index)
+    def of_rows(cls, cut: RowBlocks) -> PackedBlocks:
+        """Of rows that are cut into blocks already."""
+        filled = cut.block_rows < len(cut.object_index)
         # An empty place must not bring another object's numbers, which may be NaN, nor an index out of range.
-        rows = torch.where(filled, segments.block_rows, segments.block_rows[:, :1])
-        counts = tuple(torch.bincount(segments.owner, minlength=segments.num_objects).tolist())
-        return cls(Blocks.of_owners(segments.owner, counts), rows, filled)
+        rows = torch.where(filled, cut.block_rows, cut.block_rows[:, :1])
+        counts = tuple(torch.bincount(cut.owner, minlength=cut.num_objects).tolist())
+        return cls(Blocks.of_owners(cut.owner, counts), rows, filled)
 
 
 def weighted_products(

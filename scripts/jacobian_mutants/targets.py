@@ -177,7 +177,7 @@ TARGETS: dict[str, Target] = {
     ),
     "normal_equations": Target(
         "directshape_torch/solver/normal_equations.py",
-        ("sum_over_blocks", "Segments.object_blocks", "Segments._blocks", "Segments.sum", "Segments.accumulate"),
+        ("sum_over_blocks", "Segments._blocks", "Segments.sum", "Segments.accumulate"),
         ("tests/solver/test_normal_equations.py",),
     ),
     "silhouette_term": Target(
@@ -222,7 +222,7 @@ TARGETS: dict[str, Target] = {
             "Blocks.of_objects",
             "Blocks.of_owners",
             "Blocks.sums",
-            "PackedBlocks.of_segments",
+            "PackedBlocks.of_rows",
             "weighted_products",
         ),
         ("tests/tracking/test_blocks.py",),
