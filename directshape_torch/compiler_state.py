@@ -51,14 +51,7 @@ def start_problem() -> str | None:
 
     Asked once: an import that has failed fails in another way the second time, and hides the reason.
     """
-    problem = _import_problem("torch._inductor.cpp_builder")
-    if problem is not None:
-        return problem
-    try:
-        _cache_folder()
-    except Exception as error:  # whatever it is, there is no compiler
-        return _does_not_start(error)
-    return None
+    return _problem_with(lambda: importlib.import_module("torch._inductor.cpp_builder")) or _problem_with(_cache_folder)
 
 
 def compiler_failures() -> tuple[type[Exception], ...]:
@@ -99,16 +92,13 @@ def note_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> N
         return
 
 
-def _import_problem(module: str) -> str | None:
+def _problem_with(step: Callable[[], object]) -> str | None:
+    """Why a step of the start fails, or None."""
     try:
-        importlib.import_module(module)
+        step()
     except Exception as error:  # an import can raise anything, and whatever it is there is no compiler
-        return _does_not_start(error)
+        return f"PyTorch's compiler does not start ({type(error).__name__}: {first_line_of(error)})"
     return None
-
-
-def _does_not_start(error: Exception) -> str:
-    return f"PyTorch's compiler does not start ({type(error).__name__}: {first_line_of(error)})"
 
 
 def _trial_problem(compiler: str, folder: str) -> str | None:
@@ -121,7 +111,7 @@ def _trial_problem(compiler: str, folder: str) -> str | None:
         with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, text=True) as trial:
             try:
                 # Needed next: it is read while the compiler tries.
-                problem = _import_problem("torch._inductor.compile_fx")
+                problem = _problem_with(lambda: importlib.import_module("torch._inductor.compile_fx"))
                 _, errors = trial.communicate(timeout=_TRIAL_SECONDS)
             except BaseException:
                 trial.kill()
