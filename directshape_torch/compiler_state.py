@@ -11,6 +11,7 @@ import platform
 import subprocess
 import sysconfig
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,10 @@ def note_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> N
 def _problem_with(step: Callable[[], object]) -> str | None:
     """Why a step of the start fails, or None."""
     try:
-        step()
+        with warnings.catch_warnings():
+            # PyTorch's own deprecations, where its caller has made errors of warnings, are no reason not to compile.
+            warnings.simplefilter("ignore")
+            step()
     except Exception as error:  # an import can raise anything, and whatever it is there is no compiler
         return f"PyTorch's compiler does not start ({type(error).__name__}: {first_line_of(error)})"
     return None

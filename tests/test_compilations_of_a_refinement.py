@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import torch
 import torch._inductor.config
+from helpers.compiled_lookup import needs_compiler
 from torch._dynamo.utils import counters
 
 from directshape_torch.benchmark.workloads import demo_scene, with_cars
-from directshape_torch.compiler_state import compiler_problem
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.compiled_march import probe_grids, sample_grids
@@ -54,7 +54,7 @@ def graphs() -> int:
     return int(counters["stats"]["unique_graphs"])
 
 
-@pytest.mark.skipif(compiler_problem() is not None, reason=f"no C++ compiler: {compiler_problem()}")
+@needs_compiler
 def test_other_numbers_of_cars_and_pixels_compile_nothing_anew(traced: list[torch.fx.GraphModule]) -> None:
     frames = demo_scene().frames
     DirectShapeRefiner(config=load_config(None, FEW_STEPS))(*with_cars(frames, 3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch._inductor.config
 import torch._inductor.cpp_builder
+from helpers.compiled_lookup import needs_compiler
 from torch._inductor.runtime import cache_dir_utils
 
 from directshape_torch import compiler_state
@@ -33,6 +35,16 @@ def _forget() -> None:
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, compiler: str) -> None:
     monkeypatch.setattr(torch._inductor.cpp_builder, "get_cpp_compiler", lambda: compiler)
+
+
+@needs_compiler
+@pytest.mark.parametrize("warnings", ["default", "error"])
+def test_the_compiler_of_this_machine_works(warnings: str) -> None:
+    """In a process that has imported nothing yet: PyTorch's compiler warns of its own parts when it is imported."""
+    code = "from directshape_torch.compiler_state import compiler_problem; print(compiler_problem())"
+    command = [sys.executable, "-W", warnings, "-c", code]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+    assert (done.stdout.strip(), done.returncode) == ("None", 0), done.stderr
 
 
 def test_no_compiler(monkeypatch) -> None:

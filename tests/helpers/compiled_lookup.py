@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import types
 
 import pytest
@@ -11,12 +12,13 @@ from torch._dynamo.utils import counters
 
 from directshape_torch import compilation
 from directshape_torch.compilation import Compilable, compilable
-from directshape_torch.compiler_state import compiler_problem
 
 SIZES = {"points": 0, "grid": 0, "car": 0}
 Nearest = Compilable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
-needs_compiler = pytest.mark.skipif(compiler_problem() is not None, reason=f"no C++ compiler: {compiler_problem()}")
+# Asked of the machine and not of `compiler_problem`: where that is wrong, tests must fail and not be skipped.
+COMPILER = next(filter(None, map(shutil.which, ("g++", "c++", "clang++"))), None)
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler on the PATH")
 
 
 def nearest_values(points: Tensor, grid: Tensor, car: Tensor) -> tuple[Tensor, Tensor]:
