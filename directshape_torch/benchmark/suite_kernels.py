@@ -22,7 +22,8 @@ from directshape_torch.geometry import se3
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.shape.grid_lookup import GridField, Lookup, derivatives_at, value_at
+from directshape_torch.shape.grid_cells import GridField, Lookup
+from directshape_torch.shape.grid_lookup import derivatives_at, value_at
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.normal_equations import Segments

@@ -1,4 +1,4 @@
-"""Reductions along axes of a few entries, in operations that are fast for them.
+"""Operations along axes of a few entries, in the form that is fast for them.
 
 PyTorch's own `norm` and `all` take many times as long where such an axis does not lie innermost in memory.
 """
@@ -31,3 +31,18 @@ def all_along(flags: Tensor, dim: int) -> Tensor:
     if torch.compiler.is_compiling():
         return flags.all(dim)  # one step to trace, and the compiler writes the loop
     return functools.reduce(torch.logical_and, flags.unbind(dim))
+
+
+def cross(left: Tensor, right: Tensor) -> Tensor:
+    """Cross products (*, 3) of vectors (*, 3).
+
+    Example:
+        >>> cross(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+        tensor([0., 0., 1.])
+    """
+    if not torch.compiler.is_compiling():
+        product: Tensor = torch.linalg.cross(left, right)
+        return product
+    # The compiler looks up each component of PyTorch's own by a computed index.
+    (x, y, z), (u, v, w) = ([vectors[..., k] for k in range(3)] for vectors in (left, right))
+    return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u], dim=-1)

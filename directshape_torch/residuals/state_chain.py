@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from directshape_torch.geometry.short_axes import cross
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
 
@@ -23,4 +24,4 @@ def sdf_state_jacobian(
         >>> sdf_state_jacobian(torch.tensor([[1.0, 0.0, 0.0]]), at)
         tensor([[0., 1., 0., 0., 0., 1., 0., 0.]])
     """
-    return torch.cat([at.gradient, torch.linalg.cross(points_obj, at.gradient), at.J_value_code], dim=-1)
+    return torch.cat([at.gradient, cross(points_obj, at.gradient), at.J_value_code], dim=-1)

@@ -13,29 +13,59 @@ from torch import Tensor
 
 from directshape_torch.compilation import compilable
 from directshape_torch.geometry.rays import ray_box_interval
-from directshape_torch.shape.grid_lookup import GridField, value_at
+from directshape_torch.shape.grid_cells import GridField
+from directshape_torch.shape.grid_lookup import value_at
+
+# Rays in a row of those that are compiled: a multiple of what a vector unit takes at once, so that there is no code for
+# what is left over at the end of a row.
+ROW = 16
+
+
+class RayRows(NamedTuple):
+    """P rays in M rows of `ROW`, the places behind the last ray empty: as many rows as there must be, two at least."""
+
+    num_rays: int
+    rays_obj: Tensor  # (6, M, ROW) origin, direction
+    object_index: Tensor  # (M, ROW)
+
+    @classmethod
+    def of(cls, origin_obj: Tensor, direction_obj: Tensor, object_index: Tensor) -> RayRows:
+        """Of origins and directions (P, 3) and objects (P,)."""
+        rays = torch.cat([origin_obj.mT, direction_obj.mT])
+        return cls(len(object_index), in_rows(rays), in_rows(object_index))
+
+    def packed(self, rows: Tensor) -> Tensor:
+        """What rows (..., M, ROW) hold of the rays, (..., P)."""
+        return rows.flatten(-2)[..., : self.num_rays]
+
+
+def in_rows(rays: Tensor) -> Tensor:
+    """Of each ray (..., P) in rows (..., M, ROW), zero in the empty places."""
+    count = rays.shape[-1]
+    rows = max(2, -(-count // ROW))
+    return torch.nn.functional.pad(rays, (0, rows * ROW - count)).view(*rays.shape[:-1], rows, ROW)
 
 
 class SampledRays(NamedTuple):
-    """P rays sampled at S depths inside the bounds, samples first."""
+    """Rays sampled at S depths inside the bounds, samples first."""
 
-    depths: Tensor  # (S, P) metres, ascending
-    sdf: Tensor  # (S, P) metres
-    crosses_bounds: Tensor  # (P,) bool
-    closest_depth: Tensor  # (P,) metres
+    depths: Tensor  # (S, M, ROW) metres, ascending
+    sdf: Tensor  # (S, M, ROW) metres
+    crosses_bounds: Tensor  # (M, ROW) bool
+    closest_depth: Tensor  # (M, ROW) metres
 
 
 class Bracket(NamedTuple):
-    """Depths of Q rays between which each enters a shape, and the signed distances there."""
+    """Depths of rays (...) between which each enters a shape, and the signed distances there."""
 
-    depth: Tensor  # (Q,) to probe next
-    before: Tensor  # (Q,) outside
-    before_sdf: Tensor  # (Q,)
-    behind: Tensor  # (Q,) inside
-    behind_sdf: Tensor  # (Q,)
-    best: Tensor  # (Q,) the depth of the least absolute distance so far
-    best_sdf: Tensor  # (Q,)
-    last_sdf: Tensor  # (Q,) of the latest probe; zero before the first
+    depth: Tensor  # (...) to probe next
+    before: Tensor  # (...) outside
+    before_sdf: Tensor  # (...)
+    behind: Tensor  # (...) inside
+    behind_sdf: Tensor  # (...)
+    best: Tensor  # (...) the depth of the least absolute distance so far
+    best_sdf: Tensor  # (...)
+    last_sdf: Tensor  # (...) of the latest probe; zero before the first
 
     @classmethod
     def between(cls, before: Tensor, before_sdf: Tensor, behind: Tensor, behind_sdf: Tensor) -> Bracket:
@@ -44,7 +74,7 @@ class Bracket(NamedTuple):
         return cls(depth, before, before_sdf, behind, behind_sdf, behind, behind_sdf, torch.zeros_like(behind_sdf))
 
     def probed(self, sdf: Tensor) -> Bracket:
-        """With one end moved to `depth`, of signed distance (Q,): false position in Illinois' form."""
+        """With one end moved to `depth`, of signed distance (...): false position in Illinois' form."""
         inside = sdf < 0
         nearer = sdf.abs() < self.best_sdf.abs()
         # Halving the value of an end that stays a second time makes the convergence superlinear.
@@ -70,16 +100,16 @@ def sample_grids(
     origin: Tensor,
     last_node: Tensor,
     spacing_m: float,
-    rays_obj: Tensor,  # (6, P) origin, direction
-    object_index: Tensor,  # (P,)
+    rays_obj: Tensor,  # (6, M, ROW) origin, direction
+    object_index: Tensor,  # (M, ROW)
     bounds_obj: Tensor,  # (2, 3)
     num_samples: int,
 ) -> SampledRays:
     """Signed distances at the middles of equal parts of each ray's interval with the bounds (`raycast.march`)."""
     origin_obj, direction_obj = rays_obj[:3], rays_obj[3:]
-    near, far, crosses = interval(origin_obj.mT, direction_obj.mT, bounds_obj)
+    near, far, crosses = interval(origin_obj.movedim(0, -1), direction_obj.movedim(0, -1), bounds_obj)
     step = (far - near) / num_samples
-    number = torch.arange(num_samples, dtype=near.dtype, device=near.device)[:, None]
+    number = torch.arange(num_samples, dtype=near.dtype, device=near.device)[:, None, None]
     depths = near + (number + 0.5) * step
     points = torch.addcmul(origin_obj[:, None], depths, direction_obj[:, None])
     sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index, constant=True)
@@ -96,10 +126,10 @@ def probe_grids(
     origin: Tensor,
     last_node: Tensor,
     spacing_m: float,
-    rays_obj: Tensor,  # (6, Q) origin, direction
-    object_index: Tensor,  # (Q,)
-    bracket: Tensor,  # (8, Q)
-) -> Tensor:  # (8, Q)
+    rays_obj: Tensor,  # (6, M, ROW) origin, direction
+    object_index: Tensor,  # (M, ROW)
+    bracket: Tensor,  # (8, M, ROW)
+) -> Tensor:  # (8, M, ROW)
     """Look up the signed distances at the depths to probe: the `Bracket` after that.
 
     Its rows come and go as one tensor: each is a microsecond of a compiled call.
@@ -111,7 +141,7 @@ def probe_grids(
 
 
 def interval(origin_obj: Tensor, direction_obj: Tensor, bounds_obj: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where rays (P, 3) are inside bounds: near and far (P,), any finite depths for those (P,) that miss them."""
+    """Where rays (*, 3) are inside bounds: near and far (*), any finite depths for those (*) that miss them."""
     inside = ray_box_interval(origin_obj, direction_obj, bounds_obj)
     near = torch.where(inside.hit, inside.near, torch.ones_like(inside.near))
     far = torch.where(inside.hit, inside.far, torch.full_like(inside.far, 2.0))

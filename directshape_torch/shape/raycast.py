@@ -14,6 +14,8 @@ from torch import Tensor
 
 from directshape_torch.shape.compiled_march import (
     Bracket,
+    RayRows,
+    in_rows,
     interval,
     neighbours,
     probe_grids,
@@ -66,9 +68,11 @@ class Root(NamedTuple):
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
     if type(shape) is GridShape:
-        sampled = sample_grids.compiled(*shape.field, *_coordinates(rays), bounds_obj, num_samples)
+        rows = RayRows.of(*_fields(rays))
+        sampled = sample_grids.compiled(*shape.field, rows.rays_obj, rows.object_index, bounds_obj, num_samples)
         if sampled is not None:
-            return RayMarch(sampled.depths.mT, sampled.sdf.mT, sampled.crosses_bounds, sampled.closest_depth)
+            depths, sdf, crosses_bounds, closest_depth = (rows.packed(x) for x in sampled)
+            return RayMarch(depths.mT, sdf.mT, crosses_bounds, closest_depth)
     near, far, crosses_bounds = interval(rays.origin_obj, rays.direction_obj, bounds_obj)
     share = (torch.arange(num_samples, dtype=near.dtype, device=near.device) + 0.5) / num_samples
     depths = near[:, None] + (far - near)[:, None] * share
@@ -98,16 +102,12 @@ def _sdf_of_all(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:
 def sdf_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
     """Signed distance (P,) at one depth (P,) of each ray, a constant."""
     if type(shape) is GridShape:
+        rows = RayRows.of(*_fields(rays))
         nothing_else = torch.nn.functional.pad(depth[None], (0, 0, 0, len(Bracket._fields) - 1))
-        probed = probe_grids.compiled(*shape.field, *_coordinates(rays), nothing_else)
+        probed = probe_grids.compiled(*shape.field, rows.rays_obj, rows.object_index, in_rows(nothing_else))
         if probed is not None:
-            return Bracket(*probed.unbind(0)).last_sdf
+            return rows.packed(Bracket(*probed.unbind(0)).last_sdf)
     return shape.value(rays.at(depth), rays.object_index)
-
-
-def _coordinates(rays: ObjectRays) -> tuple[Tensor, Tensor]:
-    """Origins above directions (6, P), and objects (P,)."""
-    return torch.cat([rays.origin_obj.mT, rays.direction_obj.mT]), rays.object_index
 
 
 @torch.no_grad()
@@ -196,11 +196,13 @@ def _first_bracket(
 
 
 def _false_position(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> Tensor:
+    if len(rays.object_index) == 0:
+        return bracket.best
     if type(shape) is GridShape:
-        coordinates, state = _coordinates(rays), torch.stack(bracket)
+        rows, state = RayRows.of(*_fields(rays)), in_rows(torch.stack(bracket))
         for _ in range(num_iterations):
-            state = probe_grids(*shape.field, *coordinates, state)
-        return Bracket(*state.unbind(0)).best
+            state = probe_grids(*shape.field, rows.rays_obj, rows.object_index, state)
+        return rows.packed(Bracket(*state.unbind(0)).best)
     for _ in range(num_iterations):
         bracket = bracket.probed(shape.value(rays.at(bracket.depth), rays.object_index))
     return bracket.best

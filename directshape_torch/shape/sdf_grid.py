@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.shape.grid_lookup import GridField, derivatives_at, value_at
+from directshape_torch.shape.grid_cells import GridField
+from directshape_torch.shape.grid_lookup import derivatives_at, value_at
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
 

@@ -6,7 +6,8 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from directshape_torch.shape.grid_lookup import GridField, Lookup, derivatives_at, value_at
+from directshape_torch.shape.grid_cells import GridField, Lookup
+from directshape_torch.shape.grid_lookup import derivatives_at, value_at
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import BoundShape
 

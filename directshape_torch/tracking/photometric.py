@@ -19,7 +19,7 @@ from directshape_torch.image.interpolate import bilinear_patch
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.photometric import DSO_PATTERN, depth_state_jacobian
 from directshape_torch.residuals.photometric_patch import PatchForm, patch_derivative, patch_residual
-from directshape_torch.shape.grid_lookup import GridField
+from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.shape_prior import SdfDerivatives
 from directshape_torch.tracking.blocks import weighted_products
 from directshape_torch.tracking.field import BlockField, GridBlockField

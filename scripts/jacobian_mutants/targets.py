@@ -77,22 +77,28 @@ TARGETS: dict[str, Target] = {
         (
             "value_at",
             "derivatives_at",
-            "_cells",
-            "_distance",
-            "_corners",
             "_corner_values",
             "_ends",
             "_difference",
             "_interpolated_basis",
             "_summed_basis",
             "_along",
-            "_safe_norm",
         ),
         ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_many_lookups.py"),
     ),
+    "grid_cells": Target(
+        "directshape_torch/shape/grid_cells.py",
+        ("GridField.num_nodes", "GridField.corners", "Cells.distance", "cells_at", "_safe_norm"),
+        ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_traced_lookup.py"),
+    ),
+    "traced_lookup": Target(
+        "directshape_torch/shape/traced_lookup.py",
+        ("traced_value_at", "traced_derivatives_at", "_entries", "_interpolated", "_along", "_moved", "_differences"),
+        ("tests/shape/test_traced_lookup.py",),
+    ),
     "short_axes": Target(
         "directshape_torch/geometry/short_axes.py",
-        ("length", "all_along"),
+        ("length", "all_along", "cross"),
         ("tests/geometry/test_short_axes.py",),
     ),
     "ray_depth": Target(

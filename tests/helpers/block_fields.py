@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry import se3
-from directshape_torch.shape.grid_lookup import Lookup
+from directshape_torch.shape.grid_cells import Lookup
 from directshape_torch.tracking.rays import BlockRays
 
 FLOAT64 = torch.float64

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.compiled_lookup import needs_compiler
 from helpers.ellipsoids import ellipsoid_prior
 from torch import Tensor
 
 from directshape_torch.compilation import compiling
-from directshape_torch.compiler_state import compiler_problem
 from directshape_torch.shape import raycast
-from directshape_torch.shape.compiled_march import probe_grids, sample_grids
+from directshape_torch.shape.compiled_march import ROW, RayRows, in_rows, probe_grids, sample_grids
 from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import SdfDerivatives
@@ -90,12 +90,13 @@ def test_parts_of_the_rays_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_what_is_compiled_samples_as_the_general_path(dtype: torch.dtype, tolerance: float, samples: int) -> None:
     shape, rays, bounds = scene(200, dtype)
     marched = raycast.march(AnyShape(shape), rays, bounds, samples)
-    sampled = sample_grids.plain(*shape.field, *raycast._coordinates(rays), bounds, samples)
+    rows = RayRows.of(*list_of(rays))
+    sampled = sample_grids.plain(*shape.field, rows.rays_obj, rows.object_index, bounds, samples)
     crosses = marched.crosses_bounds
-    assert torch.equal(sampled.crosses_bounds, crosses)
+    assert torch.equal(rows.packed(sampled.crosses_bounds), crosses)
     expected = (marched.depths.mT, marched.sdf.mT, raycast.closest_approach_depth(marched))
     for mine, theirs in zip((sampled.depths, sampled.sdf, sampled.closest_depth), expected, strict=True):
-        torch.testing.assert_close(mine[..., crosses], theirs[..., crosses], rtol=0, atol=tolerance)
+        torch.testing.assert_close(rows.packed(mine)[..., crosses], theirs[..., crosses], rtol=0, atol=tolerance)
 
 
 def test_a_ray_that_is_nowhere_disturbs_no_other() -> None:
@@ -113,7 +114,7 @@ def list_of(rays: ObjectRays) -> list[Tensor]:
     return [rays.origin_obj, rays.direction_obj, rays.object_index]
 
 
-@pytest.mark.skipif(compiler_problem() is not None, reason=f"no C++ compiler: {compiler_problem()}")
+@needs_compiler
 def test_compiled_rays_are_the_plain_ones_for_any_number_of_them() -> None:
     for count in (60, 333, 2000):
         shape, rays, bounds = scene(count, torch.float32)
@@ -121,3 +122,22 @@ def test_compiled_rays_are_the_plain_ones_for_any_number_of_them() -> None:
             compiled = cast(shape, rays, bounds)
         assert_same(compiled, cast(shape, rays, bounds), 1e-4)
     assert sample_grids.num_variants == probe_grids.num_variants == 1
+
+
+@pytest.mark.parametrize(("count", "expected"), [(0, 2), (1, 2), (2 * ROW, 2), (2 * ROW + 1, 3)])
+def test_rays_in_rows_come_back(count: int, expected: int) -> None:
+    rays = ObjectRays(torch.rand(count, 3), torch.rand(count, 3), torch.arange(count))
+    rows = RayRows.of(*list_of(rays))
+    assert rows.rays_obj.shape == (6, expected, ROW)
+    assert rows.object_index.shape == (expected, ROW)
+    assert torch.equal(rows.packed(rows.object_index), rays.object_index)
+    assert torch.equal(rows.packed(rows.rays_obj).mT, torch.cat([rays.origin_obj, rays.direction_obj], dim=1))
+    assert in_rows(rays.object_index).count_nonzero() == max(0, count - 1)
+
+
+def test_without_rays_and_objects_there_is_nothing_to_cast() -> None:
+    shape, rays, bounds = scene(5, torch.float32)
+    nobody = GridShape(shape.values[:0], shape.basis, shape.origin, shape.spacing_m)
+    marched, closest, sdf, root = cast(nobody, ObjectRays(*(x[:0] for x in list_of(rays))), bounds)
+    assert marched.sdf.shape == (0, SAMPLES)
+    assert closest.shape == sdf.shape == root.depth.shape == root.found.shape == (0,)

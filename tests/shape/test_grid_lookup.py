@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.shape.grid_lookup import GridField, derivatives_at, value_at
+from directshape_torch.shape.grid_cells import GridField
+from directshape_torch.shape.grid_lookup import derivatives_at, value_at
 from directshape_torch.shape.sdf_grid import GridShape
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)

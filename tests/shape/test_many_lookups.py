@@ -1,4 +1,4 @@
-"""Lookups of very many points, and those that a compiler traces, go another way: the same numbers."""
+"""Lookups of very many points go another way: the same numbers."""
 
 from __future__ import annotations
 
@@ -28,20 +28,3 @@ def test_many_points_at_once_are_what_they_are_in_parts(constant: bool) -> None:
         torch.testing.assert_close(found.value[part], expected.value, rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(found.gradient[:, part], expected.gradient, rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(found.J_value_code[part], expected.J_value_code, rtol=1e-12, atol=1e-12)
-
-
-def test_the_way_that_a_compiler_traces_gives_the_same(monkeypatch) -> None:
-    """As Python, without a compiler: only the question whether one is at work is answered otherwise."""
-    generator = torch.Generator().manual_seed(5)
-    values = torch.randn(2, 5, 4, 6, generator=generator, dtype=torch.float64)
-    basis = torch.randn(5, 4, 6, 3, generator=generator, dtype=torch.float64)
-    field = GridShape(values, basis, torch.tensor([-1.0, 0.5, 0.0], dtype=torch.float64), 0.4).field
-    points = 2.4 * torch.rand(3, 7, PART, generator=generator, dtype=torch.float64) - 0.6
-    index = torch.arange(PART) % 2
-    expected = derivatives_at(field, points, index)
-    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    for constant in (False, True):
-        found = derivatives_at(field, points, index, constant)
-        for mine, theirs in zip(found, expected, strict=True):
-            torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(value_at(field, points, index), expected.value, rtol=1e-12, atol=1e-12)

@@ -12,7 +12,7 @@ from helpers.block_fields import paraboloid_field, plane_field, random
 from helpers.photometric_blocks import OWNER, SETTINGS, facing, in_objects, of_blocks, rows_of, spread
 from torch import Tensor
 
-from directshape_torch.shape.grid_lookup import Lookup
+from directshape_torch.shape.grid_cells import Lookup
 from directshape_torch.tracking.photometric import Hits, Surface, surface_under
 from directshape_torch.tracking.rays import ObjectBlockRays
 
