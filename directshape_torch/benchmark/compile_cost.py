@@ -57,7 +57,8 @@ def run_probe(preset: str, mode: str, cache: Path, settings: SuiteSettings) -> P
     command += ["--threads", str(torch.get_num_threads()), "--frames", "1" if settings.quick else "3"]
     if settings.data_root is not None:
         command += ["--data", str(settings.data_root)]
-    environment = os.environ | {"TORCHINDUCTOR_CACHE_DIR": str(cache)}
+    # PyTorch keeps some of what it prepares with the temporary files, wherever its cache lies.
+    environment = os.environ | {"TORCHINDUCTOR_CACHE_DIR": str(cache), "TMPDIR": str(cache)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise DirectShapeError(f"the process that compiles failed: {done.stderr.strip()[-500:]}")

@@ -1,6 +1,6 @@
-"""Rays against grids, coordinate first: the form that is compiled, and the leaner one where nothing is.
+"""Rays sampled in grids, coordinate first: the form that is compiled.
 
-`raycast` calls these for grids; any other shape is marched there by its packed points.
+`raycast` asks for it; where nothing is compiled, and for any other shape, it samples packed points.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class RayRows(NamedTuple):
     def of(cls, origin_obj: Tensor, direction_obj: Tensor, object_index: Tensor) -> RayRows:
         """Of origins and directions (P, 3) and objects (P,)."""
         rays = torch.cat([origin_obj.mT, direction_obj.mT])
-        return cls(len(object_index), in_rows(rays), in_rows(object_index))
+        return cls(len(object_index), _in_rows(rays), _in_rows(object_index))
 
     def packed(self, rows: Tensor) -> Tensor:
         """What rows (..., M, ROW) hold of the rays, (..., P)."""
         return rows.flatten(-2)[..., : self.num_rays]
 
 
-def in_rows(rays: Tensor) -> Tensor:
+def _in_rows(rays: Tensor) -> Tensor:
     """Of each ray (..., P) in rows (..., M, ROW), zero in the empty places."""
     count = rays.shape[-1]
     rows = max(2, -(-count // ROW))
@@ -53,44 +53,6 @@ class SampledRays(NamedTuple):
     sdf: Tensor  # (S, M, ROW) metres
     crosses_bounds: Tensor  # (M, ROW) bool
     closest_depth: Tensor  # (M, ROW) metres
-
-
-class Bracket(NamedTuple):
-    """Depths of rays (...) between which each enters a shape, and the signed distances there."""
-
-    depth: Tensor  # (...) to probe next
-    before: Tensor  # (...) outside
-    before_sdf: Tensor  # (...)
-    behind: Tensor  # (...) inside
-    behind_sdf: Tensor  # (...)
-    best: Tensor  # (...) the depth of the least absolute distance so far
-    best_sdf: Tensor  # (...)
-    last_sdf: Tensor  # (...) of the latest probe; zero before the first
-
-    @classmethod
-    def between(cls, before: Tensor, before_sdf: Tensor, behind: Tensor, behind_sdf: Tensor) -> Bracket:
-        """A new one."""
-        depth = _line_zero(before, before_sdf, behind, behind_sdf)
-        return cls(depth, before, before_sdf, behind, behind_sdf, behind, behind_sdf, torch.zeros_like(behind_sdf))
-
-    def probed(self, sdf: Tensor) -> Bracket:
-        """With one end moved to `depth`, of signed distance (...): false position in Illinois' form."""
-        inside = sdf < 0
-        nearer = sdf.abs() < self.best_sdf.abs()
-        # Halving the value of an end that stays a second time makes the convergence superlinear.
-        again = sdf * self.last_sdf > 0
-        before = torch.where(inside, self.before, self.depth)
-        behind = torch.where(inside, self.depth, self.behind)
-        before_sdf = torch.where(inside, torch.where(again, 0.5 * self.before_sdf, self.before_sdf), sdf)
-        behind_sdf = torch.where(inside, sdf, torch.where(again, 0.5 * self.behind_sdf, self.behind_sdf))
-        best, best_sdf = torch.where(nearer, self.depth, self.best), torch.where(nearer, sdf, self.best_sdf)
-        depth = _line_zero(before, before_sdf, behind, behind_sdf)
-        return Bracket(depth, before, before_sdf, behind, behind_sdf, best, best_sdf, sdf)
-
-
-def _line_zero(before: Tensor, before_sdf: Tensor, behind: Tensor, behind_sdf: Tensor) -> Tensor:
-    # The ends differ in sign, so the share is in [0, 1].
-    return torch.lerp(before, behind, before_sdf / (before_sdf - behind_sdf))
 
 
 @compilable(sizes={"values": 0, "rays_obj": 1, "object_index": 0})
@@ -117,27 +79,6 @@ def sample_grids(
     around = [sdf.gather(0, index)[0] for index in neighbours(best, num_samples)]
     offset = vertex_offset(around, best[0], num_samples)
     return SampledRays(depths, sdf, crosses, near + (best[0] + 0.5 + offset) * step)
-
-
-@compilable(sizes={"values": 0, "rays_obj": 1, "object_index": 0, "bracket": 1})
-def probe_grids(
-    values: Tensor,
-    basis: Tensor,
-    origin: Tensor,
-    last_node: Tensor,
-    spacing_m: float,
-    rays_obj: Tensor,  # (6, M, ROW) origin, direction
-    object_index: Tensor,  # (M, ROW)
-    bracket: Tensor,  # (8, M, ROW)
-) -> Tensor:  # (8, M, ROW)
-    """Look up the signed distances at the depths to probe: the `Bracket` after that.
-
-    Its rows come and go as one tensor: each is a microsecond of a compiled call.
-    """
-    now = Bracket(*bracket)
-    points = torch.addcmul(rays_obj[:3], now.depth, rays_obj[3:])
-    sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index, constant=True)
-    return torch.stack(tuple(now.probed(sdf)))
 
 
 def interval(origin_obj: Tensor, direction_obj: Tensor, bounds_obj: Tensor) -> tuple[Tensor, Tensor, Tensor]:

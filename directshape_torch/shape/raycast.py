@@ -12,16 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.shape.compiled_march import (
-    Bracket,
-    RayRows,
-    in_rows,
-    interval,
-    neighbours,
-    probe_grids,
-    sample_grids,
-    vertex_offset,
-)
+from directshape_torch.shape.bracket import Bracket
+from directshape_torch.shape.compiled_march import RayRows, interval, neighbours, sample_grids, vertex_offset
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import BoundShape
 
@@ -101,12 +93,6 @@ def _sdf_of_all(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:
 @torch.no_grad()
 def sdf_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
     """Signed distance (P,) at one depth (P,) of each ray, a constant."""
-    if type(shape) is GridShape:
-        rows = RayRows.of(*_fields(rays))
-        nothing_else = torch.nn.functional.pad(depth[None], (0, 0, 0, len(Bracket._fields) - 1))
-        probed = probe_grids.compiled(*shape.field, rows.rays_obj, rows.object_index, in_rows(nothing_else))
-        if probed is not None:
-            return rows.packed(Bracket(*probed.unbind(0)).last_sdf)
     return shape.value(rays.at(depth), rays.object_index)
 
 
@@ -196,13 +182,6 @@ def _first_bracket(
 
 
 def _false_position(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> Tensor:
-    if len(rays.object_index) == 0:
-        return bracket.best
-    if type(shape) is GridShape:
-        rows, state = RayRows.of(*_fields(rays)), in_rows(torch.stack(bracket))
-        for _ in range(num_iterations):
-            state = probe_grids(*shape.field, rows.rays_obj, rows.object_index, state)
-        return rows.packed(Bracket(*state.unbind(0)).best)
     for _ in range(num_iterations):
         bracket = bracket.probed(shape.value(rays.at(bracket.depth), rays.object_index))
     return bracket.best

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from directshape_torch.compilation import compiling
 from directshape_torch.shape import raycast
-from directshape_torch.shape.compiled_march import ROW, RayRows, in_rows, probe_grids, sample_grids
+from directshape_torch.shape.compiled_march import ROW, RayRows, sample_grids
 from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import SdfDerivatives
@@ -121,7 +121,7 @@ def test_compiled_rays_are_the_plain_ones_for_any_number_of_them() -> None:
         with compiling("on", 3):
             compiled = cast(shape, rays, bounds)
         assert_same(compiled, cast(shape, rays, bounds), 1e-4)
-    assert sample_grids.num_variants == probe_grids.num_variants == 1
+    assert sample_grids.num_variants == 1
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, 2), (1, 2), (2 * ROW, 2), (2 * ROW + 1, 3)])
@@ -132,7 +132,7 @@ def test_rays_in_rows_come_back(count: int, expected: int) -> None:
     assert rows.object_index.shape == (expected, ROW)
     assert torch.equal(rows.packed(rows.object_index), rays.object_index)
     assert torch.equal(rows.packed(rows.rays_obj).mT, torch.cat([rays.origin_obj, rays.direction_obj], dim=1))
-    assert in_rows(rays.object_index).count_nonzero() == max(0, count - 1)
+    assert rows.object_index.count_nonzero() == max(0, count - 1)
 
 
 def test_without_rays_and_objects_there_is_nothing_to_cast() -> None:
