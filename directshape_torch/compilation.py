@@ -54,8 +54,8 @@ CARS_WORTH_LOADING = round(_WARM_SECONDS / _SAVED_SECONDS_PER_CAR)
 # Indices are right by construction (NaN included); sizes are checked before a call. Both checks cost a multiple of the
 # arithmetic. Code that asks for the number of threads serves every setting of the user with one entry on disk. What the
 # processor says of its vector units is believed: trying each of them with the compiler takes seconds of the first start
-# and one of later ones, and a compiler that reads PyTorch's headers at all (C++20) knows them. Headers are read with
-# each function: made ready for all of them they cost a first start as much as they save it, and every later one more.
+# and one of later ones, and a compiler that reads PyTorch's headers at all (C++20) knows them. Precompiled
+# headers would cost a first start what they save it, and later ones a quarter of a second to see that they still fit.
 _OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
     "assert_indirect_indexing": False,
     "size_asserts": False,

@@ -57,7 +57,7 @@ def run_probe(preset: str, mode: str, cache: Path, settings: SuiteSettings) -> P
     command += ["--threads", str(torch.get_num_threads()), "--frames", "1" if settings.quick else "3"]
     if settings.data_root is not None:
         command += ["--data", str(settings.data_root)]
-    # PyTorch keeps some of what it prepares with the temporary files, wherever its cache lies.
+    # Headers that PyTorch precompiles, should it do so, lie with the temporary files, wherever its cache is.
     environment = os.environ | {"TORCHINDUCTOR_CACHE_DIR": str(cache), "TMPDIR": str(cache)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:

@@ -11,7 +11,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.method import method_stages
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
 from directshape_torch.energy.stage_unknowns import moving_unknowns, step_limits, without_held
 from directshape_torch.energy.term import Term, TermLinearisation, scaled, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
@@ -90,7 +90,7 @@ class CarProblem:
         state: CarState,
         *,
         frozen: ProjectedState | None = None,
-        root_iterations: int | None = None,
+        root_iterations: int = ROOT_ITERATIONS,
         moving_depths: bool = False,
     ) -> ProjectedState:
         """Everything that the terms share at a state; the options are those of `ProjectedState`.
@@ -98,7 +98,7 @@ class CarProblem:
         Without options the same state (the very tensors, unchanged) gives the same projection, with all that it has
         computed.
         """
-        plain = frozen is None and root_iterations is None and not moving_depths
+        plain = frozen is None and root_iterations == ROOT_ITERATIONS and not moving_depths
         of_prior = [tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters())]
         versions = _versions(*state, *of_prior)
         if not plain or torch.is_grad_enabled() or versions is None:
@@ -106,12 +106,12 @@ class CarProblem:
         for then, known in self._projections:
             if then == versions and all(mine is theirs for mine, theirs in zip(known.state, state, strict=True)):
                 return known
-        projected = self._new_projection(state, None, None, False)
+        projected = self._new_projection(state, None, ROOT_ITERATIONS, False)
         self._projections = [(versions, projected), *self._projections[: _REMEMBERED - 1]]
         return projected
 
     def _new_projection(
-        self, state: CarState, frozen: ProjectedState | None, root_iterations: int | None, moving_depths: bool
+        self, state: CarState, frozen: ProjectedState | None, root_iterations: int, moving_depths: bool
     ) -> ProjectedState:
         return ProjectedState(
             self.prior,

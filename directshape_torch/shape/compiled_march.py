@@ -16,8 +16,8 @@ from directshape_torch.geometry.rays import ray_box_interval
 from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.grid_lookup import value_at
 
-# Rays in a row of those that are compiled: a multiple of what a vector unit takes at once, so that there is no code for
-# what is left over at the end of a row.
+# Rays in a row of those that are compiled: as many float32 as the widest vector unit takes at once, so that there is no
+# code for what is left over at the end of a row.
 ROW = 16
 
 

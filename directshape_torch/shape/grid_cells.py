@@ -60,7 +60,7 @@ def cells_at(field: GridField, points_obj: Tensor) -> Cells:
     position = (points_obj - field.origin.view(column)) * (1 / field.spacing_m)
     if torch.compiler.is_compiling():
         # A comparison with NaN is false; the compiler writes `fmin` as five operations.
-        clamped = torch.minimum(torch.where(position > 0, position, 0.0), last_node)
+        clamped = torch.minimum(torch.where(position >= 0, position, 0.0), last_node)
         lower = torch.minimum(clamped.detach().floor(), last_node - 1)
     else:
         clamped = torch.minimum(position.clamp_min(0), last_node)

@@ -89,7 +89,12 @@ TARGETS: dict[str, Target] = {
     "grid_cells": Target(
         "directshape_torch/shape/grid_cells.py",
         ("GridField.num_nodes", "GridField.corners", "Cells.distance", "cells_at", "_safe_norm"),
-        ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_traced_lookup.py"),
+        (
+            "tests/shape/test_grid_lookup.py",
+            "tests/shape/test_sdf_grid.py",
+            "tests/shape/test_many_lookups.py",
+            "tests/shape/test_traced_lookup.py",
+        ),
     ),
     "traced_lookup": Target(
         "directshape_torch/shape/traced_lookup.py",

@@ -1,4 +1,4 @@
-"""Rays against grids in the coordinate-first form, plain and compiled, against the general path."""
+"""Rays sampled in grids in rows, plain and compiled, against the general path."""
 
 from __future__ import annotations
 
@@ -73,7 +73,11 @@ def assert_same(
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
 @pytest.mark.parametrize("samples", [7, SAMPLES])
-def test_grids_are_cast_as_any_other_shape(dtype: torch.dtype, tolerance: float, samples: int) -> None:
+def test_grids_are_cast_as_any_other_shape(
+    monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, tolerance: float, samples: int
+) -> None:
+    """In rows, as where they are compiled, but plainly."""
+    monkeypatch.setattr(sample_grids, "compiled", sample_grids.plain)
     shape, rays, bounds = scene(400, dtype)
     assert_same(cast(shape, rays, bounds, samples), cast(AnyShape(shape), rays, bounds, samples), tolerance)
 
@@ -99,11 +103,15 @@ def test_what_is_compiled_samples_as_the_general_path(dtype: torch.dtype, tolera
         torch.testing.assert_close(rows.packed(mine)[..., crosses], theirs[..., crosses], rtol=0, atol=tolerance)
 
 
-def test_a_ray_that_is_nowhere_disturbs_no_other() -> None:
+@pytest.mark.parametrize("compiling_them", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_a_ray_that_is_nowhere_disturbs_no_other(bad: float, compiling_them: bool) -> None:
+    """Compiled code would read anywhere in memory, for indices are not checked there."""
     shape, rays, bounds = scene(50, torch.float32)
     origin = rays.origin_obj.clone()
-    origin[3] = torch.nan
-    whole, damaged = (cast(shape, ObjectRays(o, *list_of(rays)[1:]), bounds) for o in (rays.origin_obj, origin))
+    origin[3] = bad
+    with compiling("on" if compiling_them else "off", 3):
+        whole, damaged = (cast(shape, ObjectRays(o, *list_of(rays)[1:]), bounds) for o in (rays.origin_obj, origin))
     others = torch.arange(50) != 3
     assert torch.equal(damaged[3].found[others], whole[3].found[others])
     assert torch.equal(damaged[3].depth[others], whole[3].depth[others])
