@@ -119,10 +119,6 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         _ROW_IN_PAIRS,
     ),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
-    *(
-        Equivalent("_corner_values", "(nx, ny, nz, _)", after, "only the product of the three is used")
-        for after in ("(nx, nz, ny, _)", "(ny, nx, nz, _)")
-    ),
     Equivalent(
         "_quaternion",
         "row / row.norm(dim=-1, keepdim=True)",
