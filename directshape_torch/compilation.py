@@ -12,7 +12,6 @@ import inspect
 import logging
 import os
 import threading
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -21,6 +20,10 @@ from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
 
+from directshape_torch.compile_helpers import compiled_by_helpers, num_helpers
+from directshape_torch.compile_request import CompileRequest
+from directshape_torch.compiled_form import CompiledForm
+from directshape_torch.compiled_store import load
 from directshape_torch.compiler_inputs import (
     is_normal,
     is_unusual_call,
@@ -28,16 +31,8 @@ from directshape_torch.compiler_inputs import (
     outside_inference_mode,
     variant_of,
     varying_dimensions,
-    with_varying_sizes,
 )
-from directshape_torch.compiler_state import (
-    compiler_failures,
-    compiler_problem,
-    first_line_of,
-    is_on_disk,
-    note_on_disk,
-    start_problem,
-)
+from directshape_torch.compiler_state import compiler_problem, first_line_of, start_problem
 from directshape_torch.errors import CompilationError
 
 CompileMode = Literal["auto", "on", "off"]
@@ -50,20 +45,6 @@ CompileMode = Literal["auto", "on", "off"]
 _COLD_SECONDS, _WARM_SECONDS, _SAVED_SECONDS_PER_CAR = 44.0, 5.4, 0.0144
 CARS_WORTH_COMPILING = round(_COLD_SECONDS / _SAVED_SECONDS_PER_CAR)
 CARS_WORTH_LOADING = round(_WARM_SECONDS / _SAVED_SECONDS_PER_CAR)
-
-# Indices are right by construction (NaN included); sizes are checked before a call. Both checks cost a multiple of the
-# arithmetic. Code that asks for the number of threads serves every setting of the user with one entry on disk. What the
-# processor says of its vector units is believed: trying each of them with the compiler takes seconds of the first start
-# and one of later ones, and a compiler that reads PyTorch's headers at all (C++20) knows them. Precompiled
-# headers would cost a first start what they save it, and later ones a quarter of a second to see that they still fit.
-_OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
-    "assert_indirect_indexing": False,
-    "size_asserts": False,
-    "cpp.dynamic_threads": True,
-    "cpp.vec_isa_ok": True,
-    "cpp_cache_precompile_headers": False,
-}
-_MAX_VARIANTS = 64
 
 _logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
@@ -82,6 +63,8 @@ class _Region:
     mode: CompileMode
     cars: int  # that speak for compiling: those ahead where that is known, else those so far
     compiling_helps: bool = False  # a call has come that has a compiled form
+    # What is to be compiled once all of it is known (`compiled_together`); None: each function when it is called.
+    wanted: dict[tuple[Compilable[..., Any], tuple[object, ...]], CompileRequest] | None = None
 
 
 @dataclass
@@ -90,6 +73,7 @@ class _Process:
 
     lock: threading.RLock
     cars: int = 0  # whose refinement has a compiled form, used or not
+    forms: int = 0
     given_up: bool = False
     forked: bool = False
 
@@ -125,7 +109,7 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
         num_cars: of this call.
 
     Raises:
-        CompilationError: mode "on" and no working C++ compiler, or no folder for its files.
+        CompilationError: in mode "on", at the call of a function that must be compiled and cannot be.
 
     Example:
         >>> @compilable(sizes={"x": 0})
@@ -137,8 +121,6 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
         >>> doubled.num_variants
         0
     """
-    if mode == "on":
-        _require_compiler()
     job = _job.get()
     region = _Region(mode, _process.cars + num_cars if job is None else max(job.cars_ahead, num_cars))
     token = _region.set(region)
@@ -168,6 +150,41 @@ def cars_ahead(num_cars: int) -> Iterator[None]:
         _job.reset(token)
 
 
+def compiled_together(work: Callable[[], _R]) -> _R:
+    """Work inside a `compiling` region, all functions of which are compiled before it, side by side.
+
+    Work that finds functions that are yet to be compiled runs plain to its end, so that all of them are known, and then
+    again, compiled: it must be repeatable.
+
+    Example:
+        >>> with compiling("off", num_cars=1):
+        ...     compiled_together(lambda: 3)
+        3
+    """
+    region = _region.get()
+    if region is None or region.wanted is not None:
+        return work()
+    while True:
+        region.wanted = {}
+        try:
+            result = work()
+        finally:
+            wanted, region.wanted = region.wanted, None
+        if not wanted:
+            return result
+        _compile_all(wanted, region)
+
+
+def num_forms() -> int:
+    """How many forms of functions this process has compiled, or loaded from the disk.
+
+    Example:
+        >>> num_forms()
+        0
+    """
+    return _process.forms
+
+
 class Compilable(Generic[_P, _R]):
     """A pure function of tensors in two forms, plain and compiled; see `compilable`."""
 
@@ -175,14 +192,14 @@ class Compilable(Generic[_P, _R]):
         self.plain = function
         self._signature = inspect.signature(function)
         self._varying = varying_dimensions(function, sizes)
-        self._compiled: Callable[..., Any] | None = None
-        self._variants: set[tuple[object, ...]] = set()
+        # By variant. What is compiled may assume more of the sizes than we ask for; then there are several.
+        self._forms: dict[tuple[object, ...], list[CompiledForm]] = {}
         functools.update_wrapper(self, function)
 
     @property
     def num_variants(self) -> int:
-        """How many combinations of dtypes, devices and fixed sizes were compiled."""
-        return len(self._variants)
+        """How many combinations of dtypes, devices and fixed sizes were compiled, or loaded."""
+        return len(self._forms)
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         compiled = self.compiled(*args, **kwargs)
@@ -201,64 +218,107 @@ class Compilable(Generic[_P, _R]):
         if variant is None:
             return None
         region.compiling_helps = True
-        known = variant in self._variants
-        if not (known or self._may_compile(variant, region)):
+        if variant not in self._forms and not _may_start(region):
             return None
         # Always the same kind of tensor: memory layout, parameters and gradients that are off make no further variants.
         values = tuple(value if is_normal(value) else normal(value) for value in values)
         with torch.no_grad():
-            try:
-                if known and self._compiled is not None:
-                    result: _R = self._compiled(*values)
-                    return result
-                return self._first_call(variant, values)
-            # A later call may compile too, if something changed that is no part of the variant.
-            except compiler_failures() as error:
-                self._fail(variant, region, error)
-                return None
+            form = self._fitting(variant, values) or self._new_form(variant, values, region)
+            return None if form is None else form(values)
 
-    def _may_compile(self, variant: tuple[object, ...], region: _Region) -> bool:
-        if region.mode == "on":
-            return True
-        if _process.given_up or region.cars < CARS_WORTH_LOADING:
-            return False
-        problem = start_problem()
-        if problem is None and region.cars < CARS_WORTH_COMPILING and not is_on_disk(self.plain, variant[1:]):
-            return False
-        problem = problem or compiler_problem()
-        if problem is not None:
-            _give_up(problem)
-        return problem is None
+    def _fitting(self, variant: tuple[object, ...], values: tuple[object, ...]) -> CompiledForm | None:
+        return next((form for form in self._forms.get(variant, ()) if form.fits(values)), None)
 
-    def _first_call(self, variant: tuple[object, ...], values: tuple[Any, ...]) -> _R:
-        """Compile for a variant; other threads that need it wait."""
+    def _new_form(
+        self, variant: tuple[object, ...], values: tuple[object, ...], region: _Region
+    ) -> CompiledForm | None:
+        """From the disk or the compiler, if it is worth it for the cars of the region; other threads wait."""
+        if not _may_start(region):
+            return None
         with _process.lock:
-            result = self._compile(values)
-            self._variants.add(variant)
-        note_on_disk(self.plain, variant[1:])
-        return result
+            form = self._fitting(variant, values)
+            while form is None and self.load(variant, len(self._forms.get(variant, ()))):
+                form = self._fitting(variant, values)
+            if form is not None or not _may_compile(region):
+                return form
+            number = len(self._forms.get(variant, ()))
+            request = CompileRequest.of(self.plain, variant[1:], number, values, self._varying)
+            if region.wanted is not None:
+                region.wanted[self, variant] = request
+                return None
+            self.compile(variant, request, region.mode)
+            return self._fitting(variant, values)
 
-    def _fail(self, variant: tuple[object, ...], region: _Region, error: Exception) -> None:
-        self._variants.discard(variant)
-        problem = f"{self.plain.__qualname__} could not be compiled: {first_line_of(error)}"
-        if region.mode == "on":
-            raise CompilationError(problem) from error
-        _give_up(problem)
+    def load(self, variant: tuple[object, ...], number: int) -> bool:
+        """Whether there is a stored form of the variant with this number; now it is known."""
+        if number < len(self._forms.get(variant, ())):
+            return True
+        form = load(self.plain, variant[1:], number)
+        if form is not None:
+            self._add(variant, form)
+        return form is not None
 
-    def _compile(self, values: tuple[Any, ...]) -> _R:
-        import torch._dynamo
+    def compile(self, variant: tuple[object, ...], request: CompileRequest, mode: CompileMode) -> None:
+        """One more form of a variant; where that fails `auto` goes on without.
 
-        if self._compiled is None:
-            self._compiled = torch.compile(self.plain, fullgraph=True, options=_OPTIONS)
+        Raises:
+            CompilationError: it fails in the mode "on".
+        """
         _logger.info("compiling %s", self.plain.__qualname__)
-        with (
-            warnings.catch_warnings(),
-            # Shapes that depend on sizes are not worth remembering: asking costs more than finding them again.
-            torch._dynamo.config.patch(recompile_limit=_MAX_VARIANTS, fake_tensor_cache_enabled=False),
-        ):
-            warnings.simplefilter("ignore")
-            result: _R = self._compiled(*with_varying_sizes(values, self._varying))
-        return result
+        try:
+            form = request.compile(self.plain)
+        except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no form
+            problem = f"{self.plain.__qualname__} could not be compiled: {first_line_of(error)}"
+            if mode == "on":
+                raise CompilationError(problem) from error
+            _give_up(problem)
+            return
+        self._add(variant, form)
+
+    def _add(self, variant: tuple[object, ...], form: CompiledForm) -> None:
+        self._forms[variant] = [*self._forms.get(variant, ()), form]
+        _process.forms += 1
+
+
+def _may_start(region: _Region) -> bool:
+    """Whether a form that is on disk would be loaded."""
+    if region.mode == "on":
+        _require(start_problem())
+        return True
+    if _process.given_up or region.cars < CARS_WORTH_LOADING:
+        return False
+    return _is_possible(start_problem())
+
+
+def _may_compile(region: _Region) -> bool:
+    """Whether a form that is not on disk would be made."""
+    if region.mode == "on":
+        _require(compiler_problem())
+        return True
+    return region.cars >= CARS_WORTH_COMPILING and _is_possible(compiler_problem())
+
+
+def _compile_all(
+    wanted: Mapping[tuple[Compilable[..., Any], tuple[object, ...]], CompileRequest], region: _Region
+) -> None:
+    """Each of the last ones by a helper, as far as there are cores, for what is called late is the largest."""
+    by_helpers = [asked for asked, request in wanted.items() if request.is_for_any_process()]
+    by_helpers = by_helpers[max(len(by_helpers) - num_helpers(len(wanted)), 0) :]
+    with _process.lock:
+        with compiled_by_helpers([wanted[asked] for asked in by_helpers]):
+            for asked, request in wanted.items():
+                if asked not in by_helpers:
+                    _compile_one(asked, request, region)
+        for asked in by_helpers:
+            _compile_one(asked, wanted[asked], region)
+
+
+def _compile_one(
+    asked: tuple[Compilable[..., Any], tuple[object, ...]], request: CompileRequest, region: _Region
+) -> None:
+    function, variant = asked
+    if not (region.mode == "auto" and _process.given_up) and not function.load(variant, request.number):
+        function.compile(variant, request, region.mode)
 
 
 def compilable(
@@ -289,10 +349,15 @@ def compilable(
     return mark
 
 
-def _require_compiler() -> None:
-    problem = compiler_problem()
+def _require(problem: str | None) -> None:
     if problem is not None:
         raise CompilationError(f"compile: on needs a working C++ compiler, but {problem}; set compile to auto or off")
+
+
+def _is_possible(problem: str | None) -> bool:
+    if problem is not None:
+        _give_up(problem)
+    return problem is None
 
 
 def _give_up(reason: str) -> None:

@@ -1,22 +1,16 @@
-"""What the machine has for compiling: a working compiler, and code that an earlier process left on disk."""
+"""What the machine has for compiling: a working compiler, and a folder for its files."""
 
 from __future__ import annotations
 
 import functools
-import hashlib
 import importlib
-import importlib.metadata
 import os
-import platform
 import subprocess
 import sysconfig
 import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
-
-import torch
 
 _TRIAL = "#include <Python.h>\n#include <omp.h>\nint threads() { return omp_get_max_threads(); }\n"
 _TRIAL_SECONDS = 60
@@ -33,12 +27,7 @@ def compiler_problem() -> str | None:
     """
     if start_problem() is not None:
         return start_problem()
-    from torch._inductor.cpp_builder import get_cpp_compiler
-
-    try:
-        compiler = get_cpp_compiler()
-    except (RuntimeError, OSError) as error:
-        return f"none was found ({first_line_of(error)})"
+    compiler = _compiler()
     try:
         with tempfile.TemporaryDirectory() as folder:
             return _trial_problem(compiler, folder)
@@ -48,18 +37,18 @@ def compiler_problem() -> str | None:
 
 @functools.cache
 def start_problem() -> str | None:
-    """Why PyTorch's compiler cannot be imported or has no folder for its files, or None if all is well.
+    """Why not even code that is on disk can be loaded, or None if all is well.
 
-    Asked once: an import that has failed fails in another way the second time, and hides the reason.
+    PyTorch's compiler cannot be imported, has no folder for its files, or finds no C++ compiler, by whose command it
+    knows its files again. Asked once: an import that has failed fails in another way the second time, and hides the
+    reason.
     """
-    return _problem_with(lambda: importlib.import_module("torch._inductor.cpp_builder")) or _problem_with(_cache_folder)
-
-
-def compiler_failures() -> tuple[type[Exception], ...]:
-    """What a call of a compiled function raises if compiling fails."""
-    from torch._dynamo.exc import FailOnRecompileLimitHit, TorchDynamoException
-
-    return TorchDynamoException, FailOnRecompileLimitHit, OSError, ImportError
+    for step in (lambda: importlib.import_module("torch._inductor.cpp_builder"), cache_folder):
+        problem = _problem_with(step)
+        if problem is not None:
+            return f"PyTorch's compiler does not start ({problem})"
+    problem = _problem_with(_compiler)
+    return None if problem is None else f"none was found ({problem})"
 
 
 def first_line_of(error: BaseException) -> str:
@@ -67,30 +56,17 @@ def first_line_of(error: BaseException) -> str:
     return _first_line(str(error)) or type(error).__name__
 
 
-def is_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> bool:
-    """Whether an earlier process compiled the function, with this very source, for the variant on such a machine."""
-    try:
-        return _marker(function, variant).is_file()
-    except (OSError, ImportError):
-        return False
+def cache_folder() -> Path:
+    """PyTorch's own for what it compiles."""
+    from torch._inductor.runtime.cache_dir_utils import cache_dir
+
+    return Path(cache_dir())
 
 
-def note_on_disk(function: Callable[..., Any], variant: tuple[object, ...]) -> None:
-    """Remember for later processes that the compiler's disk cache holds the function.
+def _compiler() -> str:
+    from torch._inductor.cpp_builder import get_cpp_compiler
 
-    The note lies in the cache's own folder: who empties the cache takes the note with it.
-    """
-    try:
-        from torch._inductor import config
-
-        if config.force_disable_caches or not config.fx_graph_cache:
-            return
-        marker = _marker(function, variant)
-        marker.parent.mkdir(parents=True, exist_ok=True)
-        marker.touch()
-    except (OSError, ImportError):
-        # A cache that cannot be written has nothing to remember either.
-        return
+    return str(get_cpp_compiler())
 
 
 def _problem_with(step: Callable[[], object]) -> str | None:
@@ -101,7 +77,7 @@ def _problem_with(step: Callable[[], object]) -> str | None:
             warnings.simplefilter("ignore")
             step()
     except Exception as error:  # an import can raise anything, and whatever it is there is no compiler
-        return f"PyTorch's compiler does not start ({type(error).__name__}: {first_line_of(error)})"
+        return f"{type(error).__name__}: {first_line_of(error)}"
     return None
 
 
@@ -122,46 +98,9 @@ def _trial_problem(compiler: str, folder: str) -> str | None:
                 raise
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"{compiler} does not run ({error})"
-    return problem if trial.returncode == 0 else f"{compiler} fails ({_first_line(errors)})"
-
-
-def _cache_folder() -> Path:
-    from torch._inductor.runtime.cache_dir_utils import cache_dir
-
-    return Path(cache_dir())
-
-
-def _marker(function: Callable[..., Any], variant: tuple[object, ...]) -> Path:
-    name = f"{function.__module__}.{function.__qualname__}"
-    number = hashlib.sha256(repr(variant).encode()).hexdigest()[:16]
-    return _cache_folder() / "directshape_torch" / _fingerprint() / f"{name}-{number}"
-
-
-@functools.cache
-def _fingerprint() -> str:
-    """Changes whenever code in the disk cache no longer fits: versions, sources, processor."""
-    digest = hashlib.sha256()
-    machine = (platform.machine(), _processor(), torch.backends.cpu.get_cpu_capability(), platform.python_version())
-    for part in (torch.__version__, _package_version(), *machine):
-        digest.update(f"{part}\n".encode())
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:32]
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line for line in lines if line.startswith("model name")), platform.processor())
-
-
-def _package_version() -> str:
-    try:
-        return importlib.metadata.version("directshape_torch")
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+    if trial.returncode != 0:
+        return f"{compiler} fails ({_first_line(errors)})"
+    return None if problem is None else f"PyTorch's compiler does not start ({problem})"
 
 
 def _first_line(text: str) -> str:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.compiled_lookup import nearest_inputs, without_disk
-from torch import Tensor
+from helpers.compiled_lookup import compile_nothing, nearest_inputs, without_disk
 
 from directshape_torch import compilation
-from directshape_torch.compilation import CARS_WORTH_COMPILING, CARS_WORTH_LOADING, Compilable, cars_ahead, compiling
+from directshape_torch.compilation import CARS_WORTH_COMPILING, CARS_WORTH_LOADING, cars_ahead, compiling
 
 
 class TestAuto:
@@ -16,14 +15,7 @@ class TestAuto:
 
     @pytest.fixture(autouse=True)
     def _count(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        without_disk(monkeypatch)
-        monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
-
-        def compile_nothing(self: Compilable, values: tuple[Tensor, ...]) -> object:
-            self._compiled = self.plain
-            return self.plain(*values)
-
-        monkeypatch.setattr(Compilable, "_compile", compile_nothing)
+        compile_nothing(monkeypatch)
 
     def test_where_nobody_knows_it_waits_until_the_cars_so_far_would_have_paid(self, nearest) -> None:
         for i in range(CARS_WORTH_COMPILING // 10 + 2):
@@ -64,7 +56,7 @@ class TestAuto:
         assert nearest.num_variants == 0
 
     def test_code_on_disk_is_loaded_for_far_fewer_cars(self, nearest, monkeypatch) -> None:
-        without_disk(monkeypatch, on_disk=True)
+        without_disk(monkeypatch, stored=True)
         with compiling("auto", CARS_WORTH_LOADING - 1):
             nearest(*nearest_inputs(20, 10))
         assert nearest.num_variants == 0
@@ -77,7 +69,8 @@ class TestAuto:
         with compiling("on", 3):
             nearest(*nearest_inputs(20, 3))
         calls = []
-        nearest._compiled = lambda *values: calls.append(values)
+        (form,) = next(iter(nearest._forms.values()))
+        form.function = lambda *values: calls.append(values)
         with compiling("auto", 1):
             nearest(*nearest_inputs(20, 3))
         assert len(calls) == 1

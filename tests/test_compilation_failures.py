@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.compiled_lookup import nearest_inputs, nearest_values, without_disk
+from helpers.compiled_lookup import PlainForm, nearest_inputs, nearest_values, new_nearest, without_disk
 from torch import Tensor
 
 from directshape_torch import compilation
@@ -20,9 +20,10 @@ from directshape_torch.compilation import (
     Compilable,
     cars_ahead,
     compilable,
+    compiled_together,
     compiling,
 )
-from directshape_torch.compiler_inputs import variant_of
+from directshape_torch.compiled_form import CompiledForm
 from directshape_torch.errors import CompilationError
 
 
@@ -46,9 +47,16 @@ class TestWithoutCompiler:
             nearest(*nearest_inputs(20, 3))
         assert not caplog.records
 
-    def test_on_raises(self) -> None:
-        with pytest.raises(CompilationError, match=r"needs a working C\+\+ compiler, but none was found; set compile"):
-            compiling("on", 3).__enter__()
+    def test_on_raises_where_something_must_be_compiled(self, nearest) -> None:
+        needed = r"needs a working C\+\+ compiler, but none was found; set compile"
+        with compiling("on", 3), pytest.raises(CompilationError, match=needed):
+            nearest(*nearest_inputs(20, 3))
+
+    def test_what_is_stored_is_loaded_all_the_same(self, nearest, monkeypatch) -> None:
+        without_disk(monkeypatch, stored=True)
+        with compiling("on", 3):
+            nearest(*nearest_inputs(20, 3))
+        assert nearest.num_variants == 1
 
 
 class TestFailure:
@@ -80,32 +88,34 @@ class TestFailure:
         def no_space(*_: object) -> object:
             raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr(Compilable, "_compile", no_space)
+        monkeypatch.setattr(CompiledForm, "of", no_space)
         with cars_ahead(CARS_WORTH_COMPILING), compiling("auto", 1):
             assert torch.equal(function(torch.ones(3)), torch.full((3,), 2.0))
         assert "could not be compiled: [Errno 28] No space left on device" in caplog.text
         with compiling("on", 1), pytest.raises(CompilationError, match="No space left on device"):
             function(torch.ones(3))
-
-    def test_a_later_call_that_is_compiled_anew_and_fails_is_such_a_failure_too(self, function, caplog) -> None:
-        def anew(*_: object) -> Tensor:
-            raise torch._dynamo.exc.FailOnRecompileLimitHit("hit its limit")
-
-        x, calls = torch.ones(3), []
-        function._compiled = anew
-        function._variants.add(variant_of((x,), ((0,),)))
-        with (
-            compiling("on", 1),
-            pytest.raises(CompilationError, match="branching could not be compiled: hit its limit"),
-        ):
-            function(x)
-        function._variants.add(variant_of((x,), ((0,),)))
-        for _ in range(2):
-            with compiling("auto", 1):
-                calls.append(function(x))
-        assert all(torch.equal(call, torch.full((3,), 2.0)) for call in calls)
-        assert caplog.text.count("hit its limit") == 1
         assert function.num_variants == 0
+
+    def test_a_failure_among_functions_that_are_compiled_together_leaves_the_others(
+        self, function, monkeypatch
+    ) -> None:
+        other = new_nearest()
+        compile_branching = CompiledForm.of
+        monkeypatch.setattr(
+            CompiledForm,
+            "of",
+            lambda plain, *rest: compile_branching(plain, *rest) if plain is function.plain else PlainForm(plain),
+        )
+
+        def work() -> Tensor:
+            other(*nearest_inputs(20, 3))
+            return function(torch.ones(3))
+
+        with cars_ahead(CARS_WORTH_COMPILING), compiling("auto", 1):
+            assert torch.equal(compiled_together(work), torch.full((3,), 2.0))
+        assert (other.num_variants, function.num_variants) == (1, 0)
+        with compiling("on", 1), pytest.raises(CompilationError, match="branching could not be compiled"):
+            compiled_together(work)
 
 
 NO_FOLDER = """
@@ -120,7 +130,8 @@ for _ in range(2):
         assert doubled(torch.ones(3)).tolist() == [2, 2, 2]
 for _ in range(2):
     try:
-        compilation.compiling("on", 1).__enter__()
+        with compilation.compiling("on", 1):
+            doubled(torch.ones(3))
     except CompilationError as error:
         print(error)
 """

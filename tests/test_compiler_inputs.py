@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import torch
-from helpers.compiled_lookup import nearest_inputs, nearest_values, without_disk
+from helpers.compiled_lookup import nearest_inputs, nearest_values, trace_only
 from torch._dynamo.utils import counters
 
-from directshape_torch import compilation
 from directshape_torch.compilation import compilable, compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
@@ -50,10 +49,7 @@ SETTINGS = {
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_global_setting_that_compiled_code_is_bound_to_makes_a_variant_of_its_own(nearest, name, monkeypatch) -> None:
     # Traced and run as it is: the tracer alone decides about a new compilation.
-    compile_with = torch.compile
-    monkeypatch.setattr(torch, "compile", lambda f, **_: compile_with(f, fullgraph=True, backend="aot_eager"))
-    without_disk(monkeypatch)
-    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    trace_only(monkeypatch, "aot_eager")
     inputs = nearest_inputs(40, 3)
     with compiling("on", 3):
         nearest(*inputs)

@@ -1,4 +1,4 @@
-"""Is there a compiler that works, and what did an earlier process leave on disk?"""
+"""Is there a compiler that works, and a folder for its files?"""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from helpers.compiled_lookup import needs_compiler
 from torch._inductor.runtime import cache_dir_utils
 
 from directshape_torch import compiler_state
-from directshape_torch.compiler_state import compiler_problem, is_on_disk, note_on_disk, start_problem
-
-VARIANT = ("float32", (-1, 3))
+from directshape_torch.compiler_state import compiler_problem, start_problem
 
 
 @pytest.fixture(autouse=True)
@@ -101,45 +99,3 @@ def test_a_cache_folder_that_cannot_be_made(monkeypatch) -> None:
     monkeypatch.setattr(cache_dir_utils, "cache_dir", _no_cache)
     problem = "PyTorch's compiler does not start (FileNotFoundError: [Errno 2] No such file or directory: '/no/such')"
     assert start_problem() == compiler_problem() == problem
-    assert not is_on_disk(_function, VARIANT)
-    note_on_disk(_function, VARIANT)
-
-
-def _function() -> None: ...
-
-
-@pytest.fixture
-def _cache_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(cache_dir_utils, "cache_dir", lambda: str(tmp_path))
-
-
-@pytest.mark.usefixtures("_cache_folder")
-def test_a_note_is_found_for_the_same_variant_only() -> None:
-    assert not is_on_disk(_function, VARIANT)
-    note_on_disk(_function, VARIANT)
-    assert is_on_disk(_function, VARIANT)
-    assert not is_on_disk(_function, (*VARIANT, "else"))
-
-
-@pytest.mark.usefixtures("_cache_folder")
-def test_other_versions_and_sources_do_not_find_it(monkeypatch) -> None:
-    note_on_disk(_function, VARIANT)
-    compiler_state._fingerprint.cache_clear()
-    monkeypatch.setattr(compiler_state, "_package_version", lambda: "another")
-    assert not is_on_disk(_function, VARIANT)
-    compiler_state._fingerprint.cache_clear()
-
-
-@pytest.mark.usefixtures("_cache_folder")
-def test_nothing_is_noted_where_there_is_no_cache() -> None:
-    with torch._inductor.config.patch(force_disable_caches=True):
-        note_on_disk(_function, VARIANT)
-    assert not is_on_disk(_function, VARIANT)
-
-
-def test_a_folder_that_cannot_be_written_is_no_error(monkeypatch, tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.touch()
-    monkeypatch.setattr(cache_dir_utils, "cache_dir", lambda: str(file))
-    note_on_disk(_function, VARIANT)
-    assert not is_on_disk(_function, VARIANT)

@@ -20,6 +20,7 @@ import torch
 from directshape_torch.batch.timing import peak_memory_mb
 from directshape_torch.benchmark.presets import make_refiner
 from directshape_torch.benchmark.workloads import first_scene, with_cars
+from directshape_torch.compilation import num_forms
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
@@ -32,7 +33,7 @@ class ProbeResult:
     Attributes:
         first_s: of the first call of every frame together, compilation included.
         again_s: of the second call of each.
-        graphs: that were compiled in the first pass; 0 when nothing is compiled.
+        graphs: that were compiled, or loaded, in the first pass; 0 when nothing is compiled.
         graphs_again: in the second pass and for another number of cars, which should need none.
         peak_memory_mb: of the whole process, libraries included; None where the system does not tell.
     """
@@ -50,12 +51,12 @@ class ProbeResult:
 
 def probe(refiner: DirectShapeRefiner, frames: Sequence[LoadedFrame]) -> ProbeResult:
     """Refine every frame, then every frame again and as many cars as there were not before."""
-    before = _compiled_graphs()
+    before = num_forms()
     first_s = _refine_all(refiner, frames)
-    graphs = _compiled_graphs()
+    graphs = num_forms()
     again_s = _refine_all(refiner, frames)
     refiner(*with_cars(frames, len(frames[0].detections) + 2))
-    return ProbeResult(first_s, again_s, graphs - before, _compiled_graphs() - graphs, peak_memory_mb())
+    return ProbeResult(first_s, again_s, graphs - before, num_forms() - graphs, peak_memory_mb())
 
 
 def _refine_all(refiner: DirectShapeRefiner, frames: Sequence[LoadedFrame]) -> float:
@@ -63,13 +64,6 @@ def _refine_all(refiner: DirectShapeRefiner, frames: Sequence[LoadedFrame]) -> f
     for loaded in frames:
         refiner(*collate([loaded]))
     return time.perf_counter() - start
-
-
-def _compiled_graphs() -> int:
-    """Graphs that PyTorch's compiler has made in this process."""
-    from torch._dynamo.utils import counters
-
-    return int(counters["stats"].get("unique_graphs", 0))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -6,14 +6,19 @@ import os
 import shutil
 import sys
 import types
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 from torch._dynamo.utils import counters
 
-from directshape_torch import compilation
+from directshape_torch import compilation, compile_request
 from directshape_torch.compilation import Compilable, compilable
+from directshape_torch.compile_request import CompileRequest
+from directshape_torch.compiled_form import CompiledForm
+from directshape_torch.compiler_inputs import with_varying_sizes
 
 SIZES = {"points": 0, "grid": 0, "car": 0}
 Nearest = Compilable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -43,10 +48,47 @@ def new_nearest() -> Nearest:
     return compilable(sizes=SIZES)(types.FunctionType(code, nearest_values.__globals__, "nearest_values"))
 
 
-def without_disk(monkeypatch: pytest.MonkeyPatch, on_disk: bool = False) -> None:
-    """Nothing is looked up in the compiler's folder, nor noted there."""
-    monkeypatch.setattr(compilation, "is_on_disk", lambda *_: on_disk)
-    monkeypatch.setattr(compilation, "note_on_disk", lambda *_: None)
+def without_disk(monkeypatch: pytest.MonkeyPatch, stored: bool = False) -> None:
+    """Nothing is looked up in the compiler's folder, nor kept there; or everything is there, in its plain form."""
+    monkeypatch.setattr(compilation, "load", lambda function, *_: PlainForm(function) if stored else None)
+    monkeypatch.setattr(compile_request, "store", lambda *_: None)
+
+
+class PlainForm:
+    """In place of a `CompiledForm`: the function itself."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+
+    def fits(self, values: Sequence[object]) -> bool:
+        return True
+
+    def __call__(self, values: Sequence[object]) -> Any:
+        return self.function(*values)
+
+
+def compile_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What would be compiled stays plain, and no disk is asked; the compiler itself is not needed."""
+    without_disk(monkeypatch)
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(CompileRequest, "compile", lambda _, function: PlainForm(function))
+
+
+def trace_only(monkeypatch: pytest.MonkeyPatch, backend: Callable[..., Any] | str) -> None:
+    """What would be compiled is traced and then run by `backend`, anew where what was traced does not fit."""
+
+    class TracedForm(PlainForm):
+        def __init__(self, function: Callable[..., Any], _: object, varying: Sequence[tuple[int, ...]]) -> None:
+            super().__init__(torch.compile(function, fullgraph=True, backend=backend))
+            self.varying: Sequence[tuple[int, ...]] = varying
+
+        def __call__(self, values: Sequence[object]) -> Any:
+            values, self.varying = with_varying_sizes(values, self.varying), ()
+            return super().__call__(values)
+
+    without_disk(monkeypatch)
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(CompiledForm, "of", TracedForm)
 
 
 @pytest.fixture

@@ -1,0 +1,198 @@
+"""Functions compiled side by side in other processes, and what happens when such a process cannot do it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.compiled_lookup import (
+    SIZES,
+    PlainForm,
+    compile_nothing,
+    nearest_inputs,
+    nearest_values,
+    needs_compiler,
+    new_nearest,
+)
+from torch._inductor.runtime import cache_dir_utils
+
+from directshape_torch import compilation, compile_helpers
+from directshape_torch.compilation import compiled_together, compiling
+from directshape_torch.compile_helpers import compiled_by_helpers, num_helpers
+from directshape_torch.compile_request import CompileRequest
+from directshape_torch.compiled_form import CompiledForm
+from directshape_torch.compiled_store import is_stored, load
+from directshape_torch.compiler_inputs import global_settings, varying_dimensions
+from directshape_torch.shape.compiled_march import RayRows, sample_grids
+from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+def march_arguments(num_rays: int = 40, num_samples: int = 4) -> tuple[object, ...]:
+    prior = PCAShapePrior.load_bundled()
+    centre = torch.tensor([[0.0, -0.7, -9.0]]).expand(num_rays, 3)
+    direction = torch.randn(num_rays, 3) * 0.05 + torch.tensor([0.0, 0.0, 1.0])
+    rays = RayRows.of(centre, direction, torch.zeros(num_rays).long())
+    return (
+        *prior.bind(prior.initial_code(2)).field,
+        rays.rays_obj,
+        rays.object_index,
+        prior.bounds_obj,
+        num_samples,
+    )
+
+
+def march_request(num_samples: int = 4) -> CompileRequest:
+    variant = (*global_settings()[1:], f"{num_samples} samples")
+    return CompileRequest.of(
+        sample_grids.plain, variant, 0, march_arguments(num_samples=num_samples), sample_grids._varying
+    )
+
+
+@pytest.fixture
+def _folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(cache_dir_utils, "cache_dir", lambda: str(tmp_path))
+
+
+def test_a_request_is_for_other_processes_if_they_find_the_function_and_need_no_card() -> None:
+    request = march_request()
+    assert request.is_for_any_process()
+    assert not replace(request, module="__main__").is_for_any_process()
+    assert not replace(request, module="no.such.module").is_for_any_process()
+    assert not replace(request, name="sample_grid").is_for_any_process()
+    on_card = replace(request.arguments[0], device=torch.device("cuda"))
+    assert not replace(request, arguments=(on_card,)).is_for_any_process()
+    varying = varying_dimensions(nearest_values, SIZES)
+    assert not CompileRequest.of(nearest_values, (), 0, nearest_inputs(5, 3), varying).is_for_any_process()
+
+
+def test_other_settings_than_those_of_the_caller_are_no_setting_to_compile_with() -> None:
+    with pytest.raises(RuntimeError, match="sample_grids cannot be compiled in this process: other code, or other"):
+        replace(march_request(), variant=(torch.float64,)).compile_elsewhere()
+
+
+def test_helpers_are_as_many_as_there_are_other_functions_and_other_cores(monkeypatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(4), raising=False)
+    assert [num_helpers(functions) for functions in (0, 1, 2, 3, 9)] == [0, 0, 1, 2, 3]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(1), raising=False)
+    assert num_helpers(3) == 0
+
+
+def test_a_process_that_is_one_of_several_workers_starts_no_helpers(monkeypatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(4), raising=False)
+    monkeypatch.setattr(compile_helpers.multiprocessing, "parent_process", object)
+    assert num_helpers(3) == 0
+
+
+@needs_compiler
+@pytest.mark.usefixtures("_folder")
+def test_what_a_helper_compiles_is_what_is_compiled_here() -> None:
+    request = march_request()
+    with compiled_by_helpers([request]):
+        assert not is_stored(sample_grids.plain, request.variant)
+        here = CompiledForm.of(sample_grids.plain, march_arguments(), sample_grids._varying)
+    theirs = load(sample_grids.plain, request.variant)
+    assert theirs is not None
+    arguments = march_arguments(100)
+    assert theirs.fits(arguments)
+    for mine, other in zip(here(arguments), theirs(arguments), strict=True):
+        assert torch.equal(mine, other)
+
+
+@pytest.mark.usefixtures("_folder")
+@pytest.mark.parametrize("command", ["false", "missing"])
+def test_a_helper_that_fails_says_why_and_stops_nothing(command, monkeypatch, caplog, tmp_path: Path) -> None:
+    script = tmp_path / "python"
+    script.write_text("#!/bin/sh\necho 'no module here' >&2\nexit 1\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script if command == "false" else tmp_path / "missing"))
+    with caplog.at_level(logging.INFO), compiled_by_helpers([march_request()]):
+        pass
+    assert "compiled here instead" in caplog.text
+    assert ("no module here" in caplog.text) == (command == "false")
+    assert not is_stored(sample_grids.plain, march_request().variant)
+
+
+@pytest.mark.usefixtures("_folder")
+def test_a_helper_that_hangs_is_ended(monkeypatch, caplog, tmp_path: Path) -> None:
+    script, ended = tmp_path / "python", tmp_path / "ended"
+    script.write_text(f"#!/bin/sh\nsleep 2 >/dev/null 2>&1\ntouch {ended}\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    monkeypatch.setattr(compile_helpers, "_SECONDS", 0.05)
+    with compiled_by_helpers([march_request()]):
+        pass
+    assert "has not ended" in caplog.text
+    assert not ended.exists()
+
+
+@pytest.mark.usefixtures("_folder")
+def test_an_error_here_ends_the_helpers(monkeypatch, tmp_path: Path) -> None:
+    script, ended = tmp_path / "python", tmp_path / "ended"
+    script.write_text(f"#!/bin/sh\nsleep 2 >/dev/null 2>&1\ntouch {ended}\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    with pytest.raises(KeyboardInterrupt), compiled_by_helpers([march_request()]):
+        raise KeyboardInterrupt
+    assert not ended.exists()
+
+
+class TestTogether:
+    """Work of two functions, with one core beside that of this process."""
+
+    @pytest.fixture(autouse=True)
+    def _one_core(self, monkeypatch) -> None:
+        compile_nothing(monkeypatch)
+        monkeypatch.setattr(compilation, "num_helpers", lambda functions: min(functions - 1, 1))
+
+    def test_work_runs_plain_once_and_then_compiled(self) -> None:
+        first, second, runs = new_nearest(), new_nearest(), []
+
+        def work() -> torch.Tensor:
+            runs.append((first.num_variants, second.num_variants))
+            first(*nearest_inputs(20, 3))
+            return second(*nearest_inputs(9, 2))[0]
+
+        with compiling("on", 3):
+            assert torch.equal(compiled_together(work), nearest_values(*nearest_inputs(9, 2))[0])
+            compiled_together(work)
+        assert runs == [(0, 0), (1, 1), (1, 1)]
+
+    def test_nothing_is_run_twice_where_nothing_is_compiled(self) -> None:
+        nearest, runs = new_nearest(), []
+        for mode in ("off", "auto"):
+            with compiling(mode, 3):
+                compiled_together(lambda: runs.append(nearest(*nearest_inputs(20, 3))))
+        compiled_together(lambda: runs.append(1))
+        assert len(runs) == 3
+
+    @pytest.mark.parametrize("helper_works", [True, False])
+    def test_the_last_function_is_left_to_the_helper_and_made_here_if_it_fails(self, helper_works, monkeypatch) -> None:
+        first, last, asked, made = new_nearest(), new_nearest(), [], []
+
+        class Helpers:
+            def __init__(self, requests: list[CompileRequest]) -> None:
+                asked.extend(requests)
+
+            def __enter__(self) -> None: ...
+
+            def __exit__(self, *_: object) -> None:
+                if helper_works:
+                    monkeypatch.setattr(compilation, "load", lambda function, *_: PlainForm(function))
+
+        def compile_here(_: CompileRequest, function: object) -> PlainForm:
+            made.append(function)
+            return PlainForm(function)
+
+        monkeypatch.setattr(compilation, "compiled_by_helpers", Helpers)
+        monkeypatch.setattr(CompileRequest, "is_for_any_process", lambda _: True)
+        monkeypatch.setattr(CompileRequest, "compile", compile_here)
+        with compiling("on", 3):
+            compiled_together(lambda: (first(*nearest_inputs(20, 3)), last(*nearest_inputs(9, 2))))
+        assert len(asked) == 1
+        assert made == ([first.plain] if helper_works else [first.plain, last.plain])
+        assert last.num_variants == 1
