@@ -201,6 +201,13 @@ class Compilable(Generic[_P, _R]):
         """How many combinations of dtypes, devices and fixed sizes were compiled, or loaded."""
         return len(self._forms)
 
+    def may_be_compiled(self) -> bool:
+        """Whether a call could be: where it cannot, nobody need prepare the arguments of the compiled form."""
+        region = _region.get()
+        if region is None or region.mode == "off" or torch.compiler.is_compiling():
+            return False
+        return bool(self._forms) or region.mode == "on" or region.cars >= CARS_WORTH_LOADING
+
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         compiled = self.compiled(*args, **kwargs)
         return self.plain(*args, **kwargs) if compiled is None else compiled

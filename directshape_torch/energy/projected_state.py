@@ -73,6 +73,10 @@ class ProjectedView:
     @cached_property
     def closest_sdf(self) -> Tensor:
         """Signed distance (P,) at the closest approach, a constant."""
+        at_closest = self.march.closest_sdf
+        # Of a frozen march it is that of another state, and depths that move are found anew.
+        if at_closest is not None and self._frozen is None and not self._moving_depths:
+            return at_closest
         return sdf_on_rays(self._shape, self.rays, self.closest_depth.detach()).detach()
 
     @cached_property

@@ -53,6 +53,7 @@ class SampledRays(NamedTuple):
     sdf: Tensor  # (S, M, ROW) metres
     crosses_bounds: Tensor  # (M, ROW) bool
     closest_depth: Tensor  # (M, ROW) metres
+    closest_sdf: Tensor  # (M, ROW) metres, there
 
 
 @compilable(sizes={"values": 0, "rays_obj": 1, "object_index": 0})
@@ -74,11 +75,14 @@ def sample_grids(
     number = torch.arange(num_samples, dtype=near.dtype, device=near.device)[:, None, None]
     depths = near + (number + 0.5) * step
     points = torch.addcmul(origin_obj[:, None], depths, direction_obj[:, None])
-    sdf = value_at(GridField(values, basis, origin, last_node, spacing_m), points, object_index, constant=True)
+    field = GridField(values, basis, origin, last_node, spacing_m)
+    sdf = value_at(field, points, object_index, constant=True)
     best = sdf.argmin(dim=0, keepdim=True)
     around = [sdf.gather(0, index)[0] for index in neighbours(best, num_samples)]
     offset = vertex_offset(around, best[0], num_samples)
-    return SampledRays(depths, sdf, crosses, near + (best[0] + 0.5 + offset) * step)
+    closest_depth = near + (best[0] + 0.5 + offset) * step
+    closest = torch.addcmul(origin_obj, closest_depth, direction_obj)
+    return SampledRays(depths, sdf, crosses, closest_depth, value_at(field, closest, object_index, constant=True))
 
 
 def interval(origin_obj: Tensor, direction_obj: Tensor, bounds_obj: Tensor) -> tuple[Tensor, Tensor, Tensor]:

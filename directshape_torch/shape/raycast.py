@@ -46,7 +46,9 @@ class RayMarch(NamedTuple):
     depths: Tensor  # (P, S) metres, ascending
     sdf: Tensor  # (P, S) metres
     crosses_bounds: Tensor  # (P,) bool; where false the depths are meaningless
-    closest_depth: Tensor | None = None  # (P,) `closest_approach_depth`, where it came with the samples
+    # Where they came with the samples:
+    closest_depth: Tensor | None = None  # (P,) `closest_approach_depth`
+    closest_sdf: Tensor | None = None  # (P,) metres, there
 
 
 class Root(NamedTuple):
@@ -59,12 +61,12 @@ class Root(NamedTuple):
 @torch.no_grad()
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
-    if type(shape) is GridShape:
+    if type(shape) is GridShape and sample_grids.may_be_compiled():
         rows = RayRows.of(*_fields(rays))
         sampled = sample_grids.compiled(*shape.field, rows.rays_obj, rows.object_index, bounds_obj, num_samples)
         if sampled is not None:
-            depths, sdf, crosses_bounds, closest_depth = (rows.packed(x) for x in sampled)
-            return RayMarch(depths.mT, sdf.mT, crosses_bounds, closest_depth)
+            depths, sdf, *of_rays = (rows.packed(x) for x in sampled)
+            return RayMarch(depths.mT, sdf.mT, *of_rays)
     near, far, crosses_bounds = interval(rays.origin_obj, rays.direction_obj, bounds_obj)
     share = (torch.arange(num_samples, dtype=near.dtype, device=near.device) + 0.5) / num_samples
     depths = near[:, None] + (far - near)[:, None] * share

@@ -77,6 +77,7 @@ def test_grids_are_cast_as_any_other_shape(
     monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, tolerance: float, samples: int
 ) -> None:
     """In rows, as where they are compiled, but plainly."""
+    monkeypatch.setattr(sample_grids, "may_be_compiled", lambda: True)
     monkeypatch.setattr(sample_grids, "compiled", sample_grids.plain)
     shape, rays, bounds = scene(400, dtype)
     assert_same(cast(shape, rays, bounds, samples), cast(AnyShape(shape), rays, bounds, samples), tolerance)
@@ -98,8 +99,10 @@ def test_what_is_compiled_samples_as_the_general_path(dtype: torch.dtype, tolera
     sampled = sample_grids.plain(*shape.field, rows.rays_obj, rows.object_index, bounds, samples)
     crosses = marched.crosses_bounds
     assert torch.equal(rows.packed(sampled.crosses_bounds), crosses)
-    expected = (marched.depths.mT, marched.sdf.mT, raycast.closest_approach_depth(marched))
-    for mine, theirs in zip((sampled.depths, sampled.sdf, sampled.closest_depth), expected, strict=True):
+    closest = raycast.closest_approach_depth(marched)
+    expected = (marched.depths.mT, marched.sdf.mT, closest, raycast.sdf_on_rays(shape, rays, closest))
+    found = (sampled.depths, sampled.sdf, sampled.closest_depth, sampled.closest_sdf)
+    for mine, theirs in zip(found, expected, strict=True):
         torch.testing.assert_close(rows.packed(mine)[..., crosses], theirs[..., crosses], rtol=0, atol=tolerance)
 
 
