@@ -19,12 +19,14 @@ from dataclasses import dataclass
 from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor
 
 from directshape_torch.compile_helpers import compiled_by_helpers, num_helpers
 from directshape_torch.compile_request import CompileRequest
 from directshape_torch.compiled_form import CompiledForm
-from directshape_torch.compiled_store import load
+from directshape_torch.compiled_store import can_keep, load, store
 from directshape_torch.compiler_inputs import (
+    distinct,
     is_normal,
     is_unusual_call,
     normal,
@@ -45,6 +47,9 @@ CompileMode = Literal["auto", "on", "off"]
 _COLD_SECONDS, _WARM_SECONDS, _SAVED_SECONDS_PER_CAR = 44.0, 5.4, 0.0144
 CARS_WORTH_COMPILING = round(_COLD_SECONDS / _SAVED_SECONDS_PER_CAR)
 CARS_WORTH_LOADING = round(_WARM_SECONDS / _SAVED_SECONDS_PER_CAR)
+
+# Of one variant: more would be a sign of arguments that are never the same.
+_MAX_FORMS = 8
 
 _logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
@@ -172,6 +177,7 @@ def compiled_together(work: Callable[[], _R]) -> _R:
             wanted, region.wanted = region.wanted, None
         if not wanted:
             return result
+        del result  # with all the memory that it holds
         _compile_all(wanted, region)
 
 
@@ -194,6 +200,7 @@ class Compilable(Generic[_P, _R]):
         self._varying = varying_dimensions(function, sizes)
         # By variant. What is compiled may assume more of the sizes than we ask for; then there are several.
         self._forms: dict[tuple[object, ...], list[CompiledForm]] = {}
+        self._not_stored: set[tuple[tuple[object, ...], int]] = set()
         functools.update_wrapper(self, function)
 
     @property
@@ -201,12 +208,13 @@ class Compilable(Generic[_P, _R]):
         """How many combinations of dtypes, devices and fixed sizes were compiled, or loaded."""
         return len(self._forms)
 
-    def may_be_compiled(self) -> bool:
-        """Whether a call could be: where it cannot, nobody need prepare the arguments of the compiled form."""
-        region = _region.get()
-        if region is None or region.mode == "off" or torch.compiler.is_compiling():
+    def may_be_compiled(self, like: Tensor) -> bool:
+        """Whether a call with tensors like this could be; if not, nobody need prepare the compiled form's arguments."""
+        region = _region_of_call()
+        if region is None or variant_of((like,), ((),)) is None:
             return False
-        return bool(self._forms) or region.mode == "on" or region.cars >= CARS_WORTH_LOADING
+        region.compiling_helps = True
+        return bool(self._forms) or _may_start(region)
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
         compiled = self.compiled(*args, **kwargs)
@@ -214,11 +222,8 @@ class Compilable(Generic[_P, _R]):
 
     def compiled(self, *args: _P.args, **kwargs: _P.kwargs) -> _R | None:
         """The compiled form's result, or None where the plain form is called for: a caller may have a better one."""
-        # First of all: the user's own compilation traces the plain form.
-        if torch.compiler.is_compiling():
-            return None
-        region = _region.get()
-        if region is None or region.mode == "off" or _process.forked or is_unusual_call():
+        region = _region_of_call()
+        if region is None:
             return None
         values = self._signature.bind(*args, **kwargs).args if kwargs else args
         variant = variant_of(values, self._varying)
@@ -242,28 +247,41 @@ class Compilable(Generic[_P, _R]):
         """From the disk or the compiler, if it is worth it for the cars of the region; other threads wait."""
         if not _may_start(region):
             return None
+        # One tensor that is two arguments is taken for two, as no function writes to any.
+        values = distinct(values)
         with _process.lock:
             form = self._fitting(variant, values)
-            while form is None and self.load(variant, len(self._forms.get(variant, ()))):
+            while form is None and self.load(variant):
                 form = self._fitting(variant, values)
             if form is not None or not _may_compile(region):
                 return form
-            number = len(self._forms.get(variant, ()))
-            request = CompileRequest.of(self.plain, variant[1:], number, values, self._varying)
+            request = CompileRequest.of(self.plain, variant[1:], self.count(variant), values, self._varying)
             if region.wanted is not None:
                 region.wanted[self, variant] = request
                 return None
             self.compile(variant, request, region.mode)
             return self._fitting(variant, values)
 
-    def load(self, variant: tuple[object, ...], number: int) -> bool:
-        """Whether there is a stored form of the variant with this number; now it is known."""
-        if number < len(self._forms.get(variant, ())):
-            return True
-        form = load(self.plain, variant[1:], number)
-        if form is not None:
-            self._add(variant, form)
-        return form is not None
+    def count(self, variant: tuple[object, ...]) -> int:
+        """How many forms of a variant are known."""
+        return len(self._forms.get(variant, ()))
+
+    def load(self, variant: tuple[object, ...]) -> bool:
+        """Whether there is one more stored form of the variant; now it is known."""
+        if (variant, self.count(variant)) in self._not_stored:
+            return False
+        form = load(self.plain, variant[1:], self.count(variant))
+        if form is None:
+            # Asked once: a call that goes on plainly should not look at the disk.
+            self._not_stored.add((variant, self.count(variant)))
+            return False
+        self._add(variant, form)
+        return True
+
+    def load_again(self, variant: tuple[object, ...]) -> bool:
+        """`load` of what a helper may have stored since it was asked for."""
+        self._not_stored.discard((variant, self.count(variant)))
+        return self.load(variant)
 
     def compile(self, variant: tuple[object, ...], request: CompileRequest, mode: CompileMode) -> None:
         """One more form of a variant; where that fails `auto` goes on without.
@@ -273,6 +291,8 @@ class Compilable(Generic[_P, _R]):
         """
         _logger.info("compiling %s", self.plain.__qualname__)
         try:
+            if request.number >= _MAX_FORMS:
+                raise RuntimeError(f"{_MAX_FORMS} forms were compiled for arguments that hardly differ")
             form = request.compile(self.plain)
         except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no form
             problem = f"{self.plain.__qualname__} could not be compiled: {first_line_of(error)}"
@@ -281,10 +301,22 @@ class Compilable(Generic[_P, _R]):
             _give_up(problem)
             return
         self._add(variant, form)
+        store(form, self.plain, request.variant, request.number)
 
     def _add(self, variant: tuple[object, ...], form: CompiledForm) -> None:
         self._forms[variant] = [*self._forms.get(variant, ()), form]
         _process.forms += 1
+
+
+def _region_of_call() -> _Region | None:
+    """The region, if this is a call that has a compiled form, whatever its arguments."""
+    # First of all: the user's own compilation traces the plain form.
+    if torch.compiler.is_compiling():
+        return None
+    region = _region.get()
+    if region is None or region.mode == "off" or _process.forked or is_unusual_call():
+        return None
+    return region
 
 
 def _may_start(region: _Region) -> bool:
@@ -309,22 +341,31 @@ def _compile_all(
     wanted: Mapping[tuple[Compilable[..., Any], tuple[object, ...]], CompileRequest], region: _Region
 ) -> None:
     """Each of the last ones by a helper, as far as there are cores, for what is called late is the largest."""
-    by_helpers = [asked for asked, request in wanted.items() if request.is_for_any_process()]
-    by_helpers = by_helpers[max(len(by_helpers) - num_helpers(len(wanted)), 0) :]
     with _process.lock:
-        with compiled_by_helpers([wanted[asked] for asked in by_helpers]):
-            for asked, request in wanted.items():
+        # Another thread may have compiled some of them by now.
+        rest = {asked: request for asked, request in wanted.items() if not _is_known(asked, request)}
+        by_helpers = [asked for asked, request in rest.items() if can_keep(asked[0].plain) and request.is_for_helpers()]
+        by_helpers = by_helpers[max(len(by_helpers) - num_helpers(len(rest)), 0) :]
+        with compiled_by_helpers([rest[asked] for asked in by_helpers]):
+            for asked, request in rest.items():
                 if asked not in by_helpers:
                     _compile_one(asked, request, region)
         for asked in by_helpers:
-            _compile_one(asked, wanted[asked], region)
+            function, variant = asked
+            if not function.load_again(variant):
+                _compile_one(asked, rest[asked], region)
+
+
+def _is_known(asked: tuple[Compilable[..., Any], tuple[object, ...]], request: CompileRequest) -> bool:
+    function, variant = asked
+    return function.count(variant) > request.number
 
 
 def _compile_one(
     asked: tuple[Compilable[..., Any], tuple[object, ...]], request: CompileRequest, region: _Region
 ) -> None:
     function, variant = asked
-    if not (region.mode == "auto" and _process.given_up) and not function.load(variant, request.number):
+    if region.mode == "on" or not _process.given_up:
         function.compile(variant, request, region.mode)
 
 

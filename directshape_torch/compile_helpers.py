@@ -10,9 +10,11 @@ import logging
 import multiprocessing
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import IO
@@ -23,7 +25,9 @@ from directshape_torch.compiler_state import cache_folder
 _logger = logging.getLogger(__name__)
 
 # A multiple of what everything takes on a slow machine: a helper that hangs must not hang the user's program.
-_SECONDS = 600
+_SECONDS = 300
+# Set in the environment of a helper.
+_IS_HELPER = "DIRECTSHAPE_COMPILE_HELPER"
 
 
 def num_helpers(num_functions: int) -> int:
@@ -33,11 +37,16 @@ def num_helpers(num_functions: int) -> int:
         >>> num_helpers(1)
         0
     """
-    # Processes that share the work of one program have each a core of their own, and none to spare.
-    if not sys.executable or multiprocessing.parent_process() is not None:
+    if _shares_its_machine() or not sys.executable or hasattr(sys, "frozen"):
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(min(num_functions, cores) - 1, 0)
+
+
+def _shares_its_machine() -> bool:
+    """Whether this is one of several processes that do the same: each has a core of its own, and none to spare."""
+    of_a_launcher = any(name in os.environ for name in ("LOCAL_RANK", "RANK", _IS_HELPER))
+    return of_a_launcher or "ray" in sys.modules or multiprocessing.parent_process() is not None
 
 
 @contextmanager
@@ -48,11 +57,12 @@ def compiled_by_helpers(requests: Sequence[CompileRequest]) -> Iterator[None]:
         for request in requests:
             try:
                 helpers.append(started.enter_context(_helper(request)))
-            except OSError as error:
+            except Exception as error:  # what cannot be started or sent is compiled here
                 _logger.info("no process that compiles can be started (%s): compiled here instead", error)
+        end = time.monotonic() + _SECONDS
         yield
         for process, errors in helpers:
-            _await(process, errors)
+            _await(process, errors, end)
 
 
 @contextmanager
@@ -61,17 +71,21 @@ def _helper(request: CompileRequest) -> Iterator[tuple[subprocess.Popen[bytes], 
     # The same code as here, from wherever it was imported.
     path = os.pathsep.join(os.path.abspath(folder) for folder in sys.path)
     environment = {**os.environ, "PYTHONPATH": path, "TORCHINDUCTOR_CACHE_DIR": str(cache_folder())}
+    environment[_IS_HELPER] = "1"
     command = [sys.executable, "-P", "-m", "directshape_torch.compile_helper"]
     pipe, nothing = subprocess.PIPE, subprocess.DEVNULL
     with (
         tempfile.TemporaryFile() as errors,
-        subprocess.Popen(command, stdin=pipe, stdout=nothing, stderr=errors, env=environment) as process,
+        # A session of its own, to be ended with the C++ compiler that it may have started.
+        subprocess.Popen(
+            command, stdin=pipe, stdout=nothing, stderr=errors, env=environment, start_new_session=True
+        ) as process,
     ):
         try:
             _send(process, request)
             yield process, errors
         finally:
-            process.kill()
+            _end(process)
 
 
 def _send(process: subprocess.Popen[bytes], request: CompileRequest) -> None:
@@ -84,9 +98,18 @@ def _send(process: subprocess.Popen[bytes], request: CompileRequest) -> None:
         return
 
 
-def _await(process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is not None:
+        return
+    if hasattr(os, "killpg"):
+        os.killpg(process.pid, signal.SIGKILL)
+    else:
+        process.kill()
+
+
+def _await(process: subprocess.Popen[bytes], errors: IO[bytes], end: float) -> None:
     try:
-        code = process.wait(timeout=_SECONDS)
+        code = process.wait(timeout=max(end - time.monotonic(), 0))
     except subprocess.TimeoutExpired:
         _logger.warning("a process that compiles has not ended in %d s: compiled here instead", _SECONDS)
         return

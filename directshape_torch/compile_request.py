@@ -19,11 +19,12 @@ from directshape_torch.compiler_inputs import global_settings
 @dataclass(frozen=True)
 class _TensorLike:
     shape: tuple[int, ...]
+    stride: tuple[int, ...]
     dtype: torch.dtype
     device: torch.device
 
     def tensor(self) -> Tensor:
-        return torch.empty(self.shape, dtype=self.dtype, device=self.device)
+        return torch.empty_strided(self.shape, self.stride, dtype=self.dtype, device=self.device)
 
 
 @dataclass(frozen=True)
@@ -59,30 +60,30 @@ class CompileRequest:
         Example:
             >>> from directshape_torch.table_lookup import take
             >>> request = CompileRequest.of(take, (), 0, (torch.ones(5), torch.arange(2)), ((0,), (0,)))
-            >>> request.name, request.is_for_any_process()
+            >>> request.name, request.is_for_helpers()
             ('take', False)
         """
-        arguments = (_TensorLike(tuple(v.shape), v.dtype, v.device) if isinstance(v, Tensor) else v for v in values)
-        return cls(function.__module__, function.__qualname__, variant, number, tuple(arguments), tuple(varying))
+        arguments = tuple(
+            _TensorLike(tuple(v.shape), v.stride(), v.dtype, v.device) if isinstance(v, Tensor) else v for v in values
+        )
+        return cls(function.__module__, function.__qualname__, variant, number, arguments, tuple(varying))
 
-    def is_for_any_process(self) -> bool:
+    def is_for_helpers(self) -> bool:
         """Whether another process would find the function, and needs no graphics card for it."""
         on_processor = all(a.device.type == "cpu" for a in self.arguments if isinstance(a, _TensorLike))
         return on_processor and self.module != "__main__" and self._found() is not None
 
     def compile(self, function: Callable[..., Any]) -> CompiledForm:
-        """The form of the plain function, which is stored as well.
+        """The form of the plain function.
 
         Raises:
             Exception: of any kind that PyTorch's compiler raises.
         """
         values = [a.tensor() if isinstance(a, _TensorLike) else a for a in self.arguments]
-        form = CompiledForm.of(function, values, self.varying)
-        store(form, function, self.variant, self.number)
-        return form
+        return CompiledForm.of(function, values, self.varying)
 
     def compile_elsewhere(self) -> None:
-        """`compile` in a process that was started for it.
+        """`compile` in a process that was started for it, into the store.
 
         Raises:
             RuntimeError: the function is not here, or settings of PyTorch differ from those it was asked with.
@@ -91,7 +92,7 @@ class CompileRequest:
         function, settings = self._found(), global_settings()[1:]
         if function is None or self.variant[: len(settings)] != settings:
             raise RuntimeError(f"{self.name} cannot be compiled in this process: other code, or other settings")
-        self.compile(function)
+        store(self.compile(function), function, self.variant, self.number)
 
     def _found(self) -> Callable[..., Any] | None:
         """The plain function, if it is where its name says."""

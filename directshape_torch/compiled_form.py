@@ -46,9 +46,9 @@ class CompiledForm:
         Raises:
             Exception: of any kind that PyTorch's compiler raises.
         """
-        import torch._dynamo
-        import torch._inductor.config
-
+        with _quiet():
+            import torch._dynamo
+            import torch._inductor.config
         with (
             _quiet(),
             torch.no_grad(),
@@ -68,12 +68,13 @@ class CompiledForm:
         Raises:
             Exception: of any kind, where the bytes are damaged or of other versions.
         """
-        import torch._inductor.config
-        from torch._dynamo.aot_compile import AOTCompiledFunction
+        with _quiet():
+            import torch._inductor.config
+            from torch._dynamo.aot_compile import AOTCompiledFunction
 
-        # The libraries that belong to it are looked up by the very command that compiled them.
-        with _quiet(), torch._inductor.config.patch(_OPTIONS):
-            return cls(AOTCompiledFunction.deserialize(data))
+            # The libraries that belong to it are looked up by the very command that compiled them.
+            with torch._inductor.config.patch(_OPTIONS):
+                return cls(AOTCompiledFunction.deserialize(data))
 
     def to_bytes(self) -> bytes:
         """For a file: generated code, and what was traced. It is unpickled, so only for a folder of one's own."""
@@ -90,13 +91,26 @@ class CompiledForm:
 def _of_arguments(guards: Sequence[GuardFilterEntry]) -> list[bool]:
     """Which of the things that tracing has assumed are to be checked: what concerns arguments, and can be stored.
 
-    Settings of PyTorch make variants of their own (`global_settings`), and the number of threads is no matter.
+    Settings of PyTorch make variants of their own (`global_settings`), and the number of threads is no matter. Names of
+    modules are taken for constants.
     """
     from torch._dynamo.guards import CheckFunctionManager
 
     not_stored = CheckFunctionManager.UNSUPPORTED_SERIALIZATION_GUARD_TYPES
     of_arguments = (not g.is_global and (g.name != "" or g.guard_type == "SHAPE_ENV") for g in guards)
     return [mine and g.guard_type not in not_stored for mine, g in zip(of_arguments, guards, strict=True)]
+
+
+def code_settings() -> str:
+    """What decides which code a function becomes, beside its arguments: versions, processor, PyTorch's settings."""
+    with _quiet():
+        import torch._inductor.config
+        from torch._dynamo.package import SystemInfo
+        from torch._inductor.cpu_vec_isa import pick_vec_isa
+
+        with torch._inductor.config.patch(_OPTIONS):
+            of_compiler = sorted(torch._inductor.config.save_config_portable().items(), key=str)
+            return repr((SystemInfo.current(), str(pick_vec_isa()), of_compiler))
 
 
 @contextmanager

@@ -8,64 +8,87 @@ import importlib.metadata
 import logging
 import os
 import platform
+import stat
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from directshape_torch.compiled_form import CompiledForm
+from directshape_torch.compiled_form import CompiledForm, code_settings
 from directshape_torch.compiler_state import cache_folder, first_line_of
 
 _logger = logging.getLogger(__name__)
+
+# Sources that are younger than this are not those that run.
+_IMPORTED = time.time()
+# Files that could not be used: tried once in a process.
+_unusable: set[Path] = set()
+
+
+def can_keep(function: Callable[..., Any]) -> bool:
+    """Whether forms of a plain function are kept on disk.
+
+    Those of this package are, whose sources are known, unless they have changed since they were imported, or PyTorch's
+    caches are switched off.
+    """
+    if function.__module__.split(".")[0] != __name__.split(".")[0]:
+        return False
+    from torch._inductor import config
+
+    return config.fx_graph_cache and not config.force_disable_caches and _fingerprint() is not None
 
 
 def is_stored(function: Callable[..., Any], variant: tuple[object, ...], number: int = 0) -> bool:
     """Whether an earlier process compiled the function, with these very sources, for the variant on such a machine.
 
     Args:
-        function: plain; only of this package, whose sources are known, anything is stored.
+        function: plain.
         variant: what its arguments have in common, see `variant_of`.
         number: of the form, where the variant has several.
     """
     try:
-        return _is_ours(function) and _path(function, variant, number).is_file()
+        if not can_keep(function):
+            return False
+        path = _path(function, variant, number)
+        return path not in _unusable and path.is_file() and _is_trusted(path)
     except (OSError, ImportError):
         return False
 
 
 def load(function: Callable[..., Any], variant: tuple[object, ...], number: int = 0) -> CompiledForm | None:
-    """The stored form, or None where there is none. A file that cannot be used is removed, and the log says so."""
+    """The stored form, or None where there is none; of a file that cannot be used the log says why."""
     if not is_stored(function, variant, number):
         return None
     path = _path(function, variant, number)
     try:
         return CompiledForm.from_bytes(path.read_bytes())
     except Exception as error:  # of what other programs left in the folder anything can be wrong
-        _logger.warning("%s cannot be used and is removed (%s)", path, first_line_of(error))
-        path.unlink(missing_ok=True)
+        _logger.warning("%s cannot be used: %s", path, first_line_of(error))
+        _unusable.add(path)
         return None
 
 
 def store(form: CompiledForm, function: Callable[..., Any], variant: tuple[object, ...], number: int = 0) -> None:
-    """Keep a form for later processes, unless PyTorch's caches are switched off. The file appears atomically."""
-    if not _is_ours(function):
-        return
+    """Keep a form for later processes, if it can be kept. The file appears atomically."""
     try:
-        from torch._inductor import config
-
-        if config.force_disable_caches or not config.fx_graph_cache:
-            return
-        path = _path(function, variant, number)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _write(path, form.to_bytes())
+        if can_keep(function):
+            path = _path(function, variant, number)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write(path, form.to_bytes())
+            _unusable.discard(path)
     except Exception as error:  # the form works all the same; what cannot be kept is made anew by the next process
         _logger.info("%s is not kept on disk: %s", function.__qualname__, first_line_of(error))
 
 
-def _is_ours(function: Callable[..., Any]) -> bool:
-    return function.__module__.split(".")[0] == __name__.split(".")[0]
+def _is_trusted(path: Path) -> bool:
+    """Whether a file is this user's or the administrator's, and nobody else's to write: it will be unpickled."""
+    if not hasattr(os, "getuid"):
+        return True
+    status = path.stat()
+    return status.st_uid in (0, os.getuid()) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -81,19 +104,20 @@ def _write(path: Path, data: bytes) -> None:
 
 def _path(function: Callable[..., Any], variant: tuple[object, ...], number: int) -> Path:
     name = f"{function.__module__}.{function.__qualname__}"
-    key = hashlib.sha256(repr((variant, number)).encode()).hexdigest()[:16]
-    return cache_folder() / "directshape_torch" / _fingerprint() / f"{name}-{key}"
+    key = hashlib.sha256(repr((variant, number, code_settings())).encode()).hexdigest()[:16]
+    return cache_folder() / "directshape_torch" / (_fingerprint() or "") / f"{name}-{key}"
 
 
 @functools.cache
-def _fingerprint() -> str:
-    """Changes whenever a stored form no longer fits: versions, sources, processor."""
+def _fingerprint() -> str | None:
+    """Changes with the sources, the versions and the processor; None where other sources than these run."""
     digest = hashlib.sha256()
-    machine = (platform.machine(), _processor(), torch.backends.cpu.get_cpu_capability(), platform.python_version())
-    for part in (torch.__version__, _package_version(), *machine):
+    for part in (torch.__version__, _package_version(), platform.machine(), _processor()):
         digest.update(f"{part}\n".encode())
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
+        if path.stat().st_mtime > _IMPORTED:
+            return None
     return digest.hexdigest()[:32]
 
 

@@ -33,6 +33,23 @@ def normal(value: object) -> object:
     return detached.contiguous()
 
 
+def distinct(values: Iterable[object]) -> tuple[object, ...]:
+    """The arguments with another object in place of a tensor that is among them already.
+
+    Example:
+        >>> x = torch.ones(2)
+        >>> first, second = distinct((x, x))
+        >>> first is second
+        False
+    """
+    seen: set[int] = set()
+    found = []
+    for value in values:
+        found.append(value.detach() if isinstance(value, Tensor) and id(value) in seen else value)
+        seen.add(id(value))
+    return tuple(found)
+
+
 def is_unusual_call() -> bool:
     """Inside jacfwd, vmap, ..., a region of forward-mode differentiation, autocast, or a mode that sees every step."""
     forward_mode = torch.autograd.forward_ad._current_level >= 0

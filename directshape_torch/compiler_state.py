@@ -39,14 +39,16 @@ def compiler_problem() -> str | None:
 def start_problem() -> str | None:
     """Why not even code that is on disk can be loaded, or None if all is well.
 
-    PyTorch's compiler cannot be imported, has no folder for its files, or finds no C++ compiler, by whose command it
-    knows its files again. Asked once: an import that has failed fails in another way the second time, and hides the
-    reason.
+    PyTorch's compiler cannot be imported, has no folder for its files, is switched off, or finds no C++ compiler, by
+    whose command it knows its files again. Asked once: an import that has failed fails in another way the second time,
+    and hides the reason.
     """
     for step in (lambda: importlib.import_module("torch._inductor.cpp_builder"), cache_folder):
         problem = _problem_with(step)
         if problem is not None:
             return f"PyTorch's compiler does not start ({problem})"
+    if _is_switched_off():
+        return "PyTorch's compiler is switched off (TORCH_COMPILE_DISABLE, TORCHDYNAMO_DISABLE)"
     problem = _problem_with(_compiler)
     return None if problem is None else f"none was found ({problem})"
 
@@ -61,6 +63,12 @@ def cache_folder() -> Path:
     from torch._inductor.runtime.cache_dir_utils import cache_dir
 
     return Path(cache_dir())
+
+
+def _is_switched_off() -> bool:
+    import torch._dynamo.config
+
+    return torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1"
 
 
 def _compiler() -> str:

@@ -60,14 +60,14 @@ def _folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 def test_a_request_is_for_other_processes_if_they_find_the_function_and_need_no_card() -> None:
     request = march_request()
-    assert request.is_for_any_process()
-    assert not replace(request, module="__main__").is_for_any_process()
-    assert not replace(request, module="no.such.module").is_for_any_process()
-    assert not replace(request, name="sample_grid").is_for_any_process()
+    assert request.is_for_helpers()
+    assert not replace(request, module="__main__").is_for_helpers()
+    assert not replace(request, module="no.such.module").is_for_helpers()
+    assert not replace(request, name="sample_grid").is_for_helpers()
     on_card = replace(request.arguments[0], device=torch.device("cuda"))
-    assert not replace(request, arguments=(on_card,)).is_for_any_process()
+    assert not replace(request, arguments=(on_card,)).is_for_helpers()
     varying = varying_dimensions(nearest_values, SIZES)
-    assert not CompileRequest.of(nearest_values, (), 0, nearest_inputs(5, 3), varying).is_for_any_process()
+    assert not CompileRequest.of(nearest_values, (), 0, nearest_inputs(5, 3), varying).is_for_helpers()
 
 
 def test_other_settings_than_those_of_the_caller_are_no_setting_to_compile_with() -> None:
@@ -189,7 +189,8 @@ class TestTogether:
             return PlainForm(function)
 
         monkeypatch.setattr(compilation, "compiled_by_helpers", Helpers)
-        monkeypatch.setattr(CompileRequest, "is_for_any_process", lambda _: True)
+        monkeypatch.setattr(compilation, "can_keep", lambda _: True)
+        monkeypatch.setattr(CompileRequest, "is_for_helpers", lambda _: True)
         monkeypatch.setattr(CompileRequest, "compile", compile_here)
         with compiling("on", 3):
             compiled_together(lambda: (first(*nearest_inputs(20, 3)), last(*nearest_inputs(9, 2))))

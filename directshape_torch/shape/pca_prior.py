@@ -137,8 +137,10 @@ class PCAShapePrior(nn.Module):
         With a memory, whose last values end, nothing can be differentiated.
         """
         check_shape("code", code, ("B", self.num_codes))
-        room = None if memory is None else memory.room(code, self.mean.numel())
-        flat = torch.addmm(self.mean.reshape(1, -1), code, self.basis.reshape(-1, self.num_codes).T, out=room)
+        if memory is None:
+            flat = torch.addmm(self.mean.reshape(1, -1), code, self.basis.reshape(-1, self.num_codes).T)
+        else:
+            flat = memory.values(self.mean, self.basis, code)
         return flat.reshape(-1, *self.mean.shape)
 
     def bind(self, code: Tensor, memory: GridMemory | None = None) -> GridShape:

@@ -61,7 +61,7 @@ class Root(NamedTuple):
 @torch.no_grad()
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
-    if type(shape) is GridShape and sample_grids.may_be_compiled():
+    if type(shape) is GridShape and sample_grids.may_be_compiled(rays.origin_obj):
         rows = RayRows.of(*_fields(rays))
         sampled = sample_grids.compiled(*shape.field, rows.rays_obj, rows.object_index, bounds_obj, num_samples)
         if sampled is not None:

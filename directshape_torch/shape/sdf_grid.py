@@ -11,9 +11,10 @@ from directshape_torch.shape.shape_prior import SdfDerivatives
 
 
 class GridMemory:
-    """Room for the grids of shapes of which each ends when the next begins.
+    """Room for the grids of shapes of which each ends when the next begins, and the table that they are made from.
 
-    Grids are megabytes: memory that the system must first hand out costs more than what is computed into it.
+    Grids are megabytes: memory that the system must first hand out costs more than what is computed into it. It serves
+    one family of shapes at a time, whose tensors stay as they are.
 
     Example:
         >>> memory = GridMemory()
@@ -23,6 +24,7 @@ class GridMemory:
 
     def __init__(self) -> None:
         self._numbers: Tensor | None = None
+        self._table: tuple[Tensor, Tensor, Tensor] | None = None  # with what it was made from
 
     def room(self, code: Tensor, num_nodes: int) -> Tensor:
         """Memory (B, num_nodes) with any contents for the grids of codes (B, K); the room given before ends."""
@@ -30,6 +32,17 @@ class GridMemory:
         if self._numbers is None or not _can_hold(self._numbers, count, code):
             self._numbers = code.new_empty(count)
         return self._numbers[:count].view(len(code), num_nodes)
+
+    def values(self, mean: Tensor, basis: Tensor, code: Tensor) -> Tensor:
+        """`mean + basis code` (B, V) at V nodes, in that room, of a mean (...), a basis (..., K) and codes (B, K).
+
+        One product with a table of whole rows, which takes a third to two thirds of the time of a product and a sum.
+        """
+        if self._table is None or self._table[0] is not mean or self._table[1] is not basis:
+            num_codes = basis.shape[-1]
+            self._table = mean, basis, torch.cat([basis.reshape(-1, num_codes).T, mean.reshape(1, -1)])
+        with_mean = torch.nn.functional.pad(code, (0, 1), value=1.0)
+        return torch.mm(with_mean, self._table[2], out=self.room(code, mean.numel()))
 
 
 def _can_hold(numbers: Tensor, count: int, code: Tensor) -> bool:

@@ -77,7 +77,7 @@ def test_grids_are_cast_as_any_other_shape(
     monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, tolerance: float, samples: int
 ) -> None:
     """In rows, as where they are compiled, but plainly."""
-    monkeypatch.setattr(sample_grids, "may_be_compiled", lambda: True)
+    monkeypatch.setattr(sample_grids, "may_be_compiled", lambda _: True)
     monkeypatch.setattr(sample_grids, "compiled", sample_grids.plain)
     shape, rays, bounds = scene(400, dtype)
     assert_same(cast(shape, rays, bounds, samples), cast(AnyShape(shape), rays, bounds, samples), tolerance)

@@ -6,6 +6,7 @@ import torch
 from helpers.host_traffic import host_traffic
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance
@@ -139,19 +140,22 @@ def test_bind_agrees_with_the_sum_over_components(prior):
 
 def test_shapes_bound_one_after_the_other_with_one_memory(prior):
     memory, codes = GridMemory(), torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    first = prior.bind(codes, memory)
-    assert torch.equal(first.values, prior.values(codes))
-    second = prior.bind(codes[1:], memory)
-    assert torch.equal(second.values, prior.values(codes[1:]))
-    assert second.values.data_ptr() == first.values.data_ptr()
-    # A memory that is too small, or of other numbers, is replaced.
-    more = prior.bind(codes.repeat(2, 1), memory)
-    assert torch.equal(more.values, prior.values(codes.repeat(2, 1)))
-    single = copy.deepcopy(prior).float().bind(codes.float(), memory)
-    assert single.values.dtype == torch.float32
+
+    def assert_bound(prior: PCAShapePrior, codes: Tensor) -> Tensor:
+        values = prior.bind(codes, memory).values
+        torch.testing.assert_close(values, prior.values(codes))
+        return values
+
+    first = assert_bound(prior, codes)
+    second = assert_bound(prior, codes[1:])
+    assert second.data_ptr() == first.data_ptr()
+    # A memory that is too small, or of other numbers, or of another prior, is replaced.
+    assert_bound(prior, codes.repeat(2, 1))
+    assert_bound(copy.deepcopy(prior).float(), codes.float())
+    assert_bound(prior.with_num_codes(2), codes[:, :2])
     with torch.inference_mode():
         prior.bind(codes.repeat(3, 1), memory)
-    assert torch.equal(prior.bind(codes, memory).values, prior.values(codes))
+    assert_bound(prior, codes)
 
 
 def test_fewer_codes(prior):
