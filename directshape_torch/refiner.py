@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from directshape_torch.admission import check_fit, refusals, without_empty_masks
 from directshape_torch.backward import attached_state
-from directshape_torch.compilation import compiled_together, compiling
+from directshape_torch.compilation.regions import compiled_together, compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem

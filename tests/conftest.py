@@ -8,7 +8,7 @@ import hypothesis
 import pytest
 import torch
 
-from directshape_torch import compilation
+from directshape_torch.compilation import regions
 
 # Fixtures that several files share.
 pytest_plugins = ("helpers.compiled_lookup", "helpers.run_fixtures")
@@ -28,4 +28,4 @@ def _seed() -> None:
 @pytest.fixture(autouse=True)
 def _fresh_count_of_cars(monkeypatch: pytest.MonkeyPatch) -> None:
     """The setting `compile: auto` counts the cars of a process: without this a test would change form in the middle."""
-    monkeypatch.setattr(compilation, "_process", compilation._Process(threading.RLock()))
+    monkeypatch.setattr(regions, "_process", regions._Process(threading.RLock()))

@@ -12,7 +12,7 @@ from directshape_torch.benchmark.rows import Goal, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import Scene, load_scenes
-from directshape_torch.compiler_state import compiler_problem
+from directshape_torch.compilation.machine import compiler_problem
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner

@@ -14,7 +14,6 @@ from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine
 
-from directshape_torch import compilation
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import expected_cars, refine_dataset
 from directshape_torch.config_files import load_config
@@ -136,7 +135,7 @@ def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
 
     class Watched(DirectShapeRefiner):
         def forward(self, *args: Any, **kwargs: Any) -> RefinementResult:
-            job = compilation._job.get()
+            job = regions._job.get()
             counts.append(None if job is None else job.cars_ahead)
             return super().forward(*args, **kwargs)
 
@@ -146,7 +145,7 @@ def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
     refine_dataset(dataset(kitti_copy), watched, tmp_path)
     # The same for every call: neither the calls before nor an interruption change what is compiled.
     assert counts == [5000, 5000]
-    assert compilation._job.get() is None
+    assert regions._job.get() is None
 
 
 def test_options_are_checked() -> None:

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch._dynamo.utils import counters
 
-from directshape_torch import compilation, compile_request
-from directshape_torch.compilation import Compilable, compilable
-from directshape_torch.compile_request import CompileRequest
-from directshape_torch.compiled_form import CompiledForm
-from directshape_torch.compiler_inputs import with_varying_sizes
+from directshape_torch.compilation import regions, request
+from directshape_torch.compilation.form import CompiledForm
+from directshape_torch.compilation.inputs import with_varying_sizes
+from directshape_torch.compilation.regions import Compilable, compilable
+from directshape_torch.compilation.request import CompileRequest
 
 SIZES = {"points": 0, "grid": 0, "car": 0}
 Nearest = Compilable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
@@ -50,8 +50,8 @@ def new_nearest() -> Nearest:
 
 def without_disk(monkeypatch: pytest.MonkeyPatch, stored: bool = False) -> None:
     """Nothing is looked up in the compiler's folder, nor kept there; or everything is there, in its plain form."""
-    monkeypatch.setattr(compilation, "load", lambda function, *_: PlainForm(function) if stored else None)
-    monkeypatch.setattr(compile_request, "store", lambda *_: None)
+    monkeypatch.setattr(regions, "load", lambda function, *_: PlainForm(function) if stored else None)
+    monkeypatch.setattr(request, "store", lambda *_: None)
 
 
 class PlainForm:
@@ -70,7 +70,7 @@ class PlainForm:
 def compile_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would be compiled stays plain, and no disk is asked; the compiler itself is not needed."""
     without_disk(monkeypatch)
-    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(regions, "compiler_problem", lambda: None)
     monkeypatch.setattr(CompileRequest, "compile", lambda _, function: PlainForm(function))
 
 
@@ -87,7 +87,7 @@ def trace_only(monkeypatch: pytest.MonkeyPatch, backend: Callable[..., Any] | st
             return super().__call__(values)
 
     without_disk(monkeypatch)
-    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(regions, "compiler_problem", lambda: None)
     monkeypatch.setattr(CompiledForm, "of", TracedForm)
 
 

@@ -8,7 +8,7 @@ from helpers.compiled_lookup import needs_compiler
 from helpers.ellipsoids import ellipsoid_prior
 from torch import Tensor
 
-from directshape_torch.compilation import compiling
+from directshape_torch.compilation.regions import compiling
 from directshape_torch.shape import raycast
 from directshape_torch.shape.compiled_march import ROW, RayRows, sample_grids
 from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root

@@ -9,8 +9,8 @@ import torch
 from helpers.compiled_lookup import PlainForm, compile_nothing, needs_compiler
 from torch import Tensor
 
-from directshape_torch import compilation
-from directshape_torch.compilation import (
+from directshape_torch.compilation import regions
+from directshape_torch.compilation.regions import (
     CARS_WORTH_COMPILING,
     CARS_WORTH_LOADING,
     Compilable,
@@ -19,7 +19,7 @@ from directshape_torch.compilation import (
     compiled_together,
     compiling,
 )
-from directshape_torch.compile_request import CompileRequest
+from directshape_torch.compilation.request import CompileRequest
 from directshape_torch.errors import CompilationError
 
 
@@ -66,7 +66,7 @@ class TestForms:
             asked.append(number)
             return EvenForm(plain, number) if number < 2 else None
 
-        monkeypatch.setattr(compilation, "load", load)
+        monkeypatch.setattr(regions, "load", load)
         with cars_ahead(CARS_WORTH_LOADING), compiling("auto", 1):
             for length in (3, 2, 5):
                 function(torch.ones(length), torch.ones(length))
@@ -74,7 +74,7 @@ class TestForms:
 
     def test_the_disk_is_asked_once_where_nothing_is_compiled(self, function, monkeypatch) -> None:
         asked = []
-        monkeypatch.setattr(compilation, "load", lambda *arguments: asked.append(arguments))
+        monkeypatch.setattr(regions, "load", lambda *arguments: asked.append(arguments))
         with cars_ahead(CARS_WORTH_COMPILING - 1), compiling("auto", 1):
             for _ in range(3):
                 function(torch.ones(2), torch.ones(2))
@@ -118,8 +118,8 @@ def test_a_side_of_length_one_may_have_any_stride_in_what_counts_as_contiguous()
 def test_rays_that_might_be_compiled_count_even_where_they_are_not(function) -> None:
     with compiling("auto", 7):
         assert not function.may_be_compiled(torch.ones(3, dtype=torch.float64))
-    assert compilation._process.cars == 0
+    assert regions._process.cars == 0
     with compiling("auto", 7):
         assert not function.may_be_compiled(torch.ones(3))
-    assert compilation._process.cars == 7
+    assert regions._process.cars == 7
     assert not function.may_be_compiled(torch.ones(3))

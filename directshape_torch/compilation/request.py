@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from directshape_torch.compiled_form import CompiledForm
-from directshape_torch.compiled_store import store
-from directshape_torch.compiler_inputs import global_settings
+from directshape_torch.compilation.form import CompiledForm
+from directshape_torch.compilation.inputs import global_settings
+from directshape_torch.compilation.store import store
 
 
 @dataclass(frozen=True)

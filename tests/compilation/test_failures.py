@@ -13,8 +13,9 @@ import torch
 from helpers.compiled_lookup import PlainForm, nearest_inputs, nearest_values, new_nearest, without_disk
 from torch import Tensor
 
-from directshape_torch import compilation
-from directshape_torch.compilation import (
+from directshape_torch.compilation import regions
+from directshape_torch.compilation.form import CompiledForm
+from directshape_torch.compilation.regions import (
     CARS_WORTH_COMPILING,
     CARS_WORTH_LOADING,
     Compilable,
@@ -23,7 +24,6 @@ from directshape_torch.compilation import (
     compiled_together,
     compiling,
 )
-from directshape_torch.compiled_form import CompiledForm
 from directshape_torch.errors import CompilationError
 
 
@@ -31,7 +31,7 @@ class TestWithoutCompiler:
     @pytest.fixture(autouse=True)
     def _no_compiler(self, monkeypatch: pytest.MonkeyPatch) -> None:
         without_disk(monkeypatch)
-        monkeypatch.setattr(compilation, "compiler_problem", lambda: "none was found")
+        monkeypatch.setattr(regions, "compiler_problem", lambda: "none was found")
 
     def test_auto_says_so_once_and_stays_plain(self, nearest, caplog) -> None:
         with caplog.at_level(logging.INFO):
@@ -69,14 +69,14 @@ class TestFailure:
     @pytest.fixture
     def function(self, monkeypatch: pytest.MonkeyPatch) -> Compilable[[Tensor], Tensor]:
         without_disk(monkeypatch)
-        monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+        monkeypatch.setattr(regions, "compiler_problem", lambda: None)
         return compilable(sizes={"x": 0})(self.branching)
 
     def test_auto_goes_on_and_says_so_once(self, function, caplog) -> None:
         for _ in range(2):
             with cars_ahead(CARS_WORTH_COMPILING), compiling("auto", 1):
                 assert torch.equal(function(torch.ones(3)), torch.full((3,), 2.0))
-        messages = [r.getMessage() for r in caplog.records if r.name == compilation.__name__]
+        messages = [r.getMessage() for r in caplog.records if r.name == regions.__name__]
         assert len(messages) == 1
         assert "branching could not be compiled" in messages[0]
 
@@ -120,17 +120,17 @@ class TestFailure:
 
 NO_FOLDER = """
 import logging, torch
-from directshape_torch import compilation
+from directshape_torch.compilation import regions
 from directshape_torch.errors import CompilationError
 logging.basicConfig()
-compilation._process.cars = {cars}
-doubled = compilation.compilable(sizes={{"x": 0}})(lambda x: 2 * x)
+regions._process.cars = {cars}
+doubled = regions.compilable(sizes={{"x": 0}})(lambda x: 2 * x)
 for _ in range(2):
-    with compilation.compiling("auto", 1):
+    with regions.compiling("auto", 1):
         assert doubled(torch.ones(3)).tolist() == [2, 2, 2]
 for _ in range(2):
     try:
-        with compilation.compiling("on", 1):
+        with regions.compiling("on", 1):
             doubled(torch.ones(3))
     except CompilationError as error:
         print(error)
@@ -164,7 +164,7 @@ def test_a_forked_process_stays_plain(nearest, tmp_path: Path) -> None:
     if child == 0:
         with compiling("auto", 2 * CARS_WORTH_COMPILING):
             nearest(*nearest_inputs(20, 10))
-        answer.write_text(f"{compilation._process.forked} {nearest.num_variants}")
+        answer.write_text(f"{regions._process.forked} {nearest.num_variants}")
         os._exit(0)
     os.waitpid(child, 0)
     assert answer.read_text() == "True 0"

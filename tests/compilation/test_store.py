@@ -13,10 +13,10 @@ import torch._inductor.config
 from helpers.compiled_lookup import SIZES, nearest_inputs, nearest_values, needs_compiler
 from torch._inductor.runtime import cache_dir_utils
 
-from directshape_torch import compiled_store
-from directshape_torch.compiled_form import CompiledForm
-from directshape_torch.compiled_store import is_stored, load, store
-from directshape_torch.compiler_inputs import varying_dimensions
+from directshape_torch.compilation import store as stored
+from directshape_torch.compilation.form import CompiledForm
+from directshape_torch.compilation.inputs import varying_dimensions
+from directshape_torch.compilation.store import is_stored, load, store
 from directshape_torch.shape.compiled_march import sample_grids
 
 VARIANT = ("float32", (-1, 3))
@@ -52,10 +52,10 @@ class TestFiles:
 
     def test_other_versions_and_sources_do_not_find_it(self, monkeypatch) -> None:
         store(Stored(), FUNCTION, VARIANT)
-        compiled_store._fingerprint.cache_clear()
-        monkeypatch.setattr(compiled_store, "_package_version", lambda: "another")
+        stored._fingerprint.cache_clear()
+        monkeypatch.setattr(stored, "_package_version", lambda: "another")
         assert not is_stored(FUNCTION, VARIANT)
-        compiled_store._fingerprint.cache_clear()
+        stored._fingerprint.cache_clear()
 
     @pytest.mark.parametrize("setting", [{"force_disable_caches": True}, {"fx_graph_cache": False}])
     def test_nothing_is_kept_where_the_caches_are_off(self, setting) -> None:
@@ -85,10 +85,10 @@ class TestFiles:
         assert not is_stored(FUNCTION, VARIANT)
 
     def test_sources_that_changed_since_they_were_imported_keep_nothing(self, monkeypatch) -> None:
-        monkeypatch.setattr(compiled_store, "_IMPORTED", 0.0)
-        compiled_store._fingerprint.cache_clear()
+        monkeypatch.setattr(stored, "_IMPORTED", 0.0)
+        stored._fingerprint.cache_clear()
         store(Stored(), FUNCTION, VARIANT)
-        compiled_store._fingerprint.cache_clear()
+        stored._fingerprint.cache_clear()
         monkeypatch.undo()
         assert not is_stored(FUNCTION, VARIANT)
 
@@ -151,7 +151,7 @@ def test_caches_that_are_off_do_not_keep_it_from_being_compiled(tmp_path: Path) 
 PROCESS = """
 import json, sys, torch
 from torch._dynamo.utils import counters
-from directshape_torch.compilation import compiling
+from directshape_torch.compilation.regions import compiling
 from directshape_torch.shape.compiled_march import RayRows, sample_grids
 from directshape_torch.shape.pca_prior import PCAShapePrior
 prior = PCAShapePrior.load_bundled()

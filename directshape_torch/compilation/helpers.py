@@ -19,8 +19,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import IO
 
-from directshape_torch.compile_request import CompileRequest
-from directshape_torch.compiler_state import cache_folder
+from directshape_torch.compilation.machine import cache_folder
+from directshape_torch.compilation.request import CompileRequest
 
 _logger = logging.getLogger(__name__)
 
@@ -72,7 +72,7 @@ def _helper(request: CompileRequest) -> Iterator[tuple[subprocess.Popen[bytes], 
     path = os.pathsep.join(os.path.abspath(folder) for folder in sys.path)
     environment = {**os.environ, "PYTHONPATH": path, "TORCHINDUCTOR_CACHE_DIR": str(cache_folder())}
     environment[_IS_HELPER] = "1"
-    command = [sys.executable, "-P", "-m", "directshape_torch.compile_helper"]
+    command = [sys.executable, "-P", "-m", "directshape_torch.compilation.helper_process"]
     pipe, nothing = subprocess.PIPE, subprocess.DEVNULL
     with (
         tempfile.TemporaryFile() as errors,

@@ -6,8 +6,8 @@ import pytest
 import torch
 from helpers.compiled_lookup import compile_nothing, nearest_inputs, without_disk
 
-from directshape_torch import compilation
-from directshape_torch.compilation import CARS_WORTH_COMPILING, CARS_WORTH_LOADING, cars_ahead, compiling
+from directshape_torch.compilation import regions
+from directshape_torch.compilation.regions import CARS_WORTH_COMPILING, CARS_WORTH_LOADING, cars_ahead, compiling
 
 
 class TestAuto:
@@ -33,14 +33,14 @@ class TestAuto:
         points, grid, car = nearest_inputs(20, 10)
         with compiling(mode, 10 * CARS_WORTH_COMPILING):
             nearest(points.to(dtype), grid.to(dtype), car)
-        assert compilation._process.cars == 0
+        assert regions._process.cars == 0
         with compiling("auto", 10):
             nearest(points, grid, car)
         assert nearest.num_variants == 0
-        assert compilation._process.cars == 10
+        assert regions._process.cars == 10
 
     def test_a_job_that_is_known_to_be_short_never_compiles_whatever_came_before(self, nearest, monkeypatch) -> None:
-        monkeypatch.setattr(compilation._process, "cars", 10 * CARS_WORTH_COMPILING)
+        monkeypatch.setattr(regions._process, "cars", 10 * CARS_WORTH_COMPILING)
         with cars_ahead(50):
             for _ in range(5):
                 with compiling("auto", 10):

@@ -21,13 +21,13 @@ from helpers.compiled_lookup import (
 )
 from torch._inductor.runtime import cache_dir_utils
 
-from directshape_torch import compilation, compile_helpers
-from directshape_torch.compilation import compiled_together, compiling
-from directshape_torch.compile_helpers import compiled_by_helpers, num_helpers
-from directshape_torch.compile_request import CompileRequest
-from directshape_torch.compiled_form import CompiledForm
-from directshape_torch.compiled_store import is_stored, load
-from directshape_torch.compiler_inputs import global_settings, varying_dimensions
+from directshape_torch.compilation import helpers, regions
+from directshape_torch.compilation.form import CompiledForm
+from directshape_torch.compilation.helpers import compiled_by_helpers, num_helpers
+from directshape_torch.compilation.inputs import global_settings, varying_dimensions
+from directshape_torch.compilation.regions import compiled_together, compiling
+from directshape_torch.compilation.request import CompileRequest
+from directshape_torch.compilation.store import is_stored, load
 from directshape_torch.shape.compiled_march import RayRows, sample_grids
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -84,7 +84,7 @@ def test_helpers_are_as_many_as_there_are_other_functions_and_other_cores(monkey
 
 def test_a_process_that_is_one_of_several_workers_starts_no_helpers(monkeypatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(4), raising=False)
-    monkeypatch.setattr(compile_helpers.multiprocessing, "parent_process", object)
+    monkeypatch.setattr(helpers.multiprocessing, "parent_process", object)
     assert num_helpers(3) == 0
 
 
@@ -123,7 +123,7 @@ def test_a_helper_that_hangs_is_ended(monkeypatch, caplog, tmp_path: Path) -> No
     script.write_text(f"#!/bin/sh\nsleep 2 >/dev/null 2>&1\ntouch {ended}\n")
     script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
-    monkeypatch.setattr(compile_helpers, "_SECONDS", 0.05)
+    monkeypatch.setattr(helpers, "_SECONDS", 0.05)
     with compiled_by_helpers([march_request()]):
         pass
     assert "has not ended" in caplog.text
@@ -147,7 +147,7 @@ class TestTogether:
     @pytest.fixture(autouse=True)
     def _one_core(self, monkeypatch) -> None:
         compile_nothing(monkeypatch)
-        monkeypatch.setattr(compilation, "num_helpers", lambda functions: min(functions - 1, 1))
+        monkeypatch.setattr(regions, "num_helpers", lambda functions: min(functions - 1, 1))
 
     def test_work_runs_plain_once_and_then_compiled(self) -> None:
         first, second, runs = new_nearest(), new_nearest(), []
@@ -182,14 +182,14 @@ class TestTogether:
 
             def __exit__(self, *_: object) -> None:
                 if helper_works:
-                    monkeypatch.setattr(compilation, "load", lambda function, *_: PlainForm(function))
+                    monkeypatch.setattr(regions, "load", lambda function, *_: PlainForm(function))
 
         def compile_here(_: CompileRequest, function: object) -> PlainForm:
             made.append(function)
             return PlainForm(function)
 
-        monkeypatch.setattr(compilation, "compiled_by_helpers", Helpers)
-        monkeypatch.setattr(compilation, "can_keep", lambda _: True)
+        monkeypatch.setattr(regions, "compiled_by_helpers", Helpers)
+        monkeypatch.setattr(regions, "can_keep", lambda _: True)
         monkeypatch.setattr(CompileRequest, "is_for_helpers", lambda _: True)
         monkeypatch.setattr(CompileRequest, "compile", compile_here)
         with compiling("on", 3):

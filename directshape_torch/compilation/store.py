@@ -17,8 +17,8 @@ from typing import Any
 
 import torch
 
-from directshape_torch.compiled_form import CompiledForm, code_settings
-from directshape_torch.compiler_state import cache_folder, first_line_of
+from directshape_torch.compilation.form import CompiledForm, code_settings
+from directshape_torch.compilation.machine import cache_folder, first_line_of
 
 _logger = logging.getLogger(__name__)
 
@@ -114,7 +114,7 @@ def _fingerprint() -> str | None:
     digest = hashlib.sha256()
     for part in (torch.__version__, _package_version(), platform.machine(), _processor()):
         digest.update(f"{part}\n".encode())
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.read_bytes())
         if path.stat().st_mtime > _IMPORTED:
             return None

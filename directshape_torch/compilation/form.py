@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from directshape_torch.compiler_inputs import with_varying_sizes
+from directshape_torch.compilation.inputs import with_varying_sizes
 
 if TYPE_CHECKING:
     from torch._dynamo.aot_compile import AOTCompiledFunction

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch._dynamo.utils import counters
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from directshape_torch.compilation import compiling
-from directshape_torch.compiler_state import compiler_problem
+from directshape_torch.compilation.machine import compiler_problem
+from directshape_torch.compilation.regions import compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 

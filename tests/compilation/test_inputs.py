@@ -11,7 +11,7 @@ import torch
 from helpers.compiled_lookup import nearest_inputs, nearest_values, trace_only
 from torch._dynamo.utils import counters
 
-from directshape_torch.compilation import compilable, compiling
+from directshape_torch.compilation.regions import compilable, compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 

@@ -21,11 +21,9 @@ from typing import Any, Generic, Literal, ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from directshape_torch.compile_helpers import compiled_by_helpers, num_helpers
-from directshape_torch.compile_request import CompileRequest
-from directshape_torch.compiled_form import CompiledForm
-from directshape_torch.compiled_store import can_keep, load, store
-from directshape_torch.compiler_inputs import (
+from directshape_torch.compilation.form import CompiledForm
+from directshape_torch.compilation.helpers import compiled_by_helpers, num_helpers
+from directshape_torch.compilation.inputs import (
     distinct,
     is_normal,
     is_unusual_call,
@@ -34,7 +32,9 @@ from directshape_torch.compiler_inputs import (
     variant_of,
     varying_dimensions,
 )
-from directshape_torch.compiler_state import compiler_problem, first_line_of, start_problem
+from directshape_torch.compilation.machine import compiler_problem, first_line_of, start_problem
+from directshape_torch.compilation.request import CompileRequest
+from directshape_torch.compilation.store import can_keep, load, store
 from directshape_torch.errors import CompilationError
 
 CompileMode = Literal["auto", "on", "off"]

@@ -15,8 +15,8 @@ import torch._inductor.cpp_builder
 from helpers.compiled_lookup import needs_compiler
 from torch._inductor.runtime import cache_dir_utils
 
-from directshape_torch import compiler_state
-from directshape_torch.compiler_state import compiler_problem, start_problem
+from directshape_torch.compilation import machine
+from directshape_torch.compilation.machine import compiler_problem, start_problem
 
 
 @pytest.fixture(autouse=True)
@@ -39,7 +39,7 @@ def _pretend(monkeypatch: pytest.MonkeyPatch, compiler: str) -> None:
 @pytest.mark.parametrize("warnings", ["default", "error"])
 def test_the_compiler_of_this_machine_works(warnings: str) -> None:
     """In a process that has imported nothing yet: PyTorch's compiler warns of its own parts when it is imported."""
-    code = "from directshape_torch.compiler_state import compiler_problem; print(compiler_problem())"
+    code = "from directshape_torch.compilation.machine import compiler_problem; print(compiler_problem())"
     command = [sys.executable, "-W", warnings, "-c", code]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     assert (done.stdout.strip(), done.returncode) == ("None", 0), done.stderr
@@ -71,7 +71,7 @@ def test_a_compiler_that_does_not_end_is_ended(monkeypatch, tmp_path: Path) -> N
     script.write_text(f"#!/bin/sh\nsleep 1 >/dev/null 2>&1\ntouch {ended}\n")
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
     _pretend(monkeypatch, str(script))
-    monkeypatch.setattr(compiler_state, "_TRIAL_SECONDS", 0.05)
+    monkeypatch.setattr(machine, "_TRIAL_SECONDS", 0.05)
     assert "timed out after 0.05 seconds" in (compiler_problem() or "")
     assert not ended.exists()
 

@@ -1,11 +1,11 @@
-"""The process that `compile_helpers` starts: compiles the function that its parent asks for on standard input."""
+"""The process that `helpers` starts: compiles the function that its parent asks for on standard input."""
 
 from __future__ import annotations
 
 import pickle
 import sys
 
-from directshape_torch.compile_request import CompileRequest
+from directshape_torch.compilation.request import CompileRequest
 
 
 def main() -> None:
