@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from directshape_torch.admission import check_fit, refusals, without_empty_masks
 from directshape_torch.backward import attached_state
-from directshape_torch.compilation.regions import compiled_together, compiling
+from directshape_torch.compilation.regions import compiling
+from directshape_torch.compilation.together import compiled_together
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
@@ -80,7 +81,7 @@ class DirectShapeRefiner(nn.Module):
         Raises:
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
                 wanted of a prior that has none.
-            CompilationError: `compile: on` where no compiler works.
+            CompilationError: `compile: on` where something must be compiled and cannot be.
         """
         if torch.compiler.is_compiling():
             # One break in the graph of a compiled model around it: the loop decides by values all the time.

@@ -16,13 +16,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, ParamSpec, TypeVar
+from typing import Any, Generic, Literal, ParamSpec, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
 from directshape_torch.compilation.form import CompiledForm
-from directshape_torch.compilation.helpers import compiled_by_helpers, num_helpers
 from directshape_torch.compilation.inputs import (
     distinct,
     is_normal,
@@ -34,7 +33,7 @@ from directshape_torch.compilation.inputs import (
 )
 from directshape_torch.compilation.machine import compiler_problem, first_line_of, start_problem
 from directshape_torch.compilation.request import CompileRequest
-from directshape_torch.compilation.store import can_keep, load, store
+from directshape_torch.compilation.store import load, store
 from directshape_torch.errors import CompilationError
 
 CompileMode = Literal["auto", "on", "off"]
@@ -56,6 +55,10 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 
+# A function with the variant of its arguments that it is to be compiled for.
+Asked: TypeAlias = "tuple[Compilable[..., Any], tuple[object, ...]]"
+
+
 @dataclass
 class _Job:
     """Work whose amount is known beforehand."""
@@ -64,12 +67,14 @@ class _Job:
 
 
 @dataclass
-class _Region:
+class Region:
+    """What the calls inside a `compiling` region have in common."""
+
     mode: CompileMode
     cars: int  # that speak for compiling: those ahead where that is known, else those so far
     compiling_helps: bool = False  # a call has come that has a compiled form
-    # What is to be compiled once all of it is known (`compiled_together`); None: each function when it is called.
-    wanted: dict[tuple[Compilable[..., Any], tuple[object, ...]], CompileRequest] | None = None
+    # What is to be compiled once all of it is known (`together`); None: each function when it is called.
+    wanted: dict[Asked, CompileRequest] | None = None
 
 
 @dataclass
@@ -85,7 +90,7 @@ class _Process:
 
 _process = _Process(threading.RLock())
 _job: ContextVar[_Job | None] = ContextVar("directshape_torch_job", default=None)
-_region: ContextVar[_Region | None] = ContextVar("directshape_torch_compiling", default=None)
+_region: ContextVar[Region | None] = ContextVar("directshape_torch_compiling", default=None)
 
 
 def _in_child() -> None:
@@ -127,7 +132,7 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
         0
     """
     job = _job.get()
-    region = _Region(mode, _process.cars + num_cars if job is None else max(job.cars_ahead, num_cars))
+    region = Region(mode, _process.cars + num_cars if job is None else max(job.cars_ahead, num_cars))
     token = _region.set(region)
     try:
         with outside_inference_mode():
@@ -155,30 +160,19 @@ def cars_ahead(num_cars: int) -> Iterator[None]:
         _job.reset(token)
 
 
-def compiled_together(work: Callable[[], _R]) -> _R:
-    """Work inside a `compiling` region, all functions of which are compiled before it, side by side.
+def current_region() -> Region | None:
+    """The innermost one."""
+    return _region.get()
 
-    Work that finds functions that are yet to be compiled runs plain to its end, so that all of them are known, and then
-    again, compiled: it must be repeatable.
 
-    Example:
-        >>> with compiling("off", num_cars=1):
-        ...     compiled_together(lambda: 3)
-        3
-    """
-    region = _region.get()
-    if region is None or region.wanted is not None:
-        return work()
-    while True:
-        region.wanted = {}
-        try:
-            result = work()
-        finally:
-            wanted, region.wanted = region.wanted, None
-        if not wanted:
-            return result
-        del result  # with all the memory that it holds
-        _compile_all(wanted, region)
+def process_lock() -> threading.RLock:
+    """Who holds it compiles or loads; all others of the process wait."""
+    return _process.lock
+
+
+def has_given_up() -> bool:
+    """Whether "auto" compiles nothing any more in this process."""
+    return _process.given_up
 
 
 def num_forms() -> int:
@@ -241,9 +235,7 @@ class Compilable(Generic[_P, _R]):
     def _fitting(self, variant: tuple[object, ...], values: tuple[object, ...]) -> CompiledForm | None:
         return next((form for form in self._forms.get(variant, ()) if form.fits(values)), None)
 
-    def _new_form(
-        self, variant: tuple[object, ...], values: tuple[object, ...], region: _Region
-    ) -> CompiledForm | None:
+    def _new_form(self, variant: tuple[object, ...], values: tuple[object, ...], region: Region) -> CompiledForm | None:
         """From the disk or the compiler, if it is worth it for the cars of the region; other threads wait."""
         if not _may_start(region):
             return None
@@ -308,7 +300,7 @@ class Compilable(Generic[_P, _R]):
         _process.forms += 1
 
 
-def _region_of_call() -> _Region | None:
+def _region_of_call() -> Region | None:
     """The region, if this is a call that has a compiled form, whatever its arguments."""
     # First of all: the user's own compilation traces the plain form.
     if torch.compiler.is_compiling():
@@ -319,7 +311,7 @@ def _region_of_call() -> _Region | None:
     return region
 
 
-def _may_start(region: _Region) -> bool:
+def _may_start(region: Region) -> bool:
     """Whether a form that is on disk would be loaded."""
     if region.mode == "on":
         _require(start_problem())
@@ -329,44 +321,12 @@ def _may_start(region: _Region) -> bool:
     return _is_possible(start_problem())
 
 
-def _may_compile(region: _Region) -> bool:
+def _may_compile(region: Region) -> bool:
     """Whether a form that is not on disk would be made."""
     if region.mode == "on":
         _require(compiler_problem())
         return True
     return region.cars >= CARS_WORTH_COMPILING and _is_possible(compiler_problem())
-
-
-def _compile_all(
-    wanted: Mapping[tuple[Compilable[..., Any], tuple[object, ...]], CompileRequest], region: _Region
-) -> None:
-    """Each of the last ones by a helper, as far as there are cores, for what is called late is the largest."""
-    with _process.lock:
-        # Another thread may have compiled some of them by now.
-        rest = {asked: request for asked, request in wanted.items() if not _is_known(asked, request)}
-        by_helpers = [asked for asked, request in rest.items() if can_keep(asked[0].plain) and request.is_for_helpers()]
-        by_helpers = by_helpers[max(len(by_helpers) - num_helpers(len(rest)), 0) :]
-        with compiled_by_helpers([rest[asked] for asked in by_helpers]):
-            for asked, request in rest.items():
-                if asked not in by_helpers:
-                    _compile_one(asked, request, region)
-        for asked in by_helpers:
-            function, variant = asked
-            if not function.load_again(variant):
-                _compile_one(asked, rest[asked], region)
-
-
-def _is_known(asked: tuple[Compilable[..., Any], tuple[object, ...]], request: CompileRequest) -> bool:
-    function, variant = asked
-    return function.count(variant) > request.number
-
-
-def _compile_one(
-    asked: tuple[Compilable[..., Any], tuple[object, ...]], request: CompileRequest, region: _Region
-) -> None:
-    function, variant = asked
-    if region.mode == "on" or not _process.given_up:
-        function.compile(variant, request, region.mode)
 
 
 def compilable(

@@ -110,14 +110,17 @@ def _path(function: Callable[..., Any], variant: tuple[object, ...], number: int
 
 @functools.cache
 def _fingerprint() -> str | None:
-    """Changes with the sources, the versions and the processor; None where other sources than these run."""
+    """Changes with the sources, the versions and the processor; None where other sources run than can be read."""
     digest = hashlib.sha256()
     for part in (torch.__version__, _package_version(), platform.machine(), _processor()):
         digest.update(f"{part}\n".encode())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
-        digest.update(path.read_bytes())
-        if path.stat().st_mtime > _IMPORTED:
-            return None
+    try:
+        for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+            digest.update(path.read_bytes())
+            if path.stat().st_mtime > _IMPORTED:
+                return None
+    except OSError:
+        return None
     return digest.hexdigest()[:32]
 
 

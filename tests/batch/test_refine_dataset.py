@@ -16,6 +16,7 @@ from helpers.quick_runs import dataset, refine
 
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import expected_cars, refine_dataset
+from directshape_torch.compilation import regions
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_labels import read_objects

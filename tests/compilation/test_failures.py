@@ -21,9 +21,9 @@ from directshape_torch.compilation.regions import (
     Compilable,
     cars_ahead,
     compilable,
-    compiled_together,
     compiling,
 )
+from directshape_torch.compilation.together import compiled_together
 from directshape_torch.errors import CompilationError
 
 

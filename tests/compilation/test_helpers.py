@@ -21,13 +21,14 @@ from helpers.compiled_lookup import (
 )
 from torch._inductor.runtime import cache_dir_utils
 
-from directshape_torch.compilation import helpers, regions
+from directshape_torch.compilation import helpers, regions, together
 from directshape_torch.compilation.form import CompiledForm
 from directshape_torch.compilation.helpers import compiled_by_helpers, num_helpers
 from directshape_torch.compilation.inputs import global_settings, varying_dimensions
-from directshape_torch.compilation.regions import compiled_together, compiling
+from directshape_torch.compilation.regions import compiling
 from directshape_torch.compilation.request import CompileRequest
 from directshape_torch.compilation.store import is_stored, load
+from directshape_torch.compilation.together import compiled_together
 from directshape_torch.shape.compiled_march import RayRows, sample_grids
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -147,7 +148,7 @@ class TestTogether:
     @pytest.fixture(autouse=True)
     def _one_core(self, monkeypatch) -> None:
         compile_nothing(monkeypatch)
-        monkeypatch.setattr(regions, "num_helpers", lambda functions: min(functions - 1, 1))
+        monkeypatch.setattr(together, "num_helpers", lambda functions: min(functions - 1, 1))
 
     def test_work_runs_plain_once_and_then_compiled(self) -> None:
         first, second, runs = new_nearest(), new_nearest(), []
@@ -188,8 +189,8 @@ class TestTogether:
             made.append(function)
             return PlainForm(function)
 
-        monkeypatch.setattr(regions, "compiled_by_helpers", Helpers)
-        monkeypatch.setattr(regions, "can_keep", lambda _: True)
+        monkeypatch.setattr(together, "compiled_by_helpers", Helpers)
+        monkeypatch.setattr(together, "can_keep", lambda _: True)
         monkeypatch.setattr(CompileRequest, "is_for_helpers", lambda _: True)
         monkeypatch.setattr(CompileRequest, "compile", compile_here)
         with compiling("on", 3):
