@@ -76,6 +76,15 @@ def test_other_settings_than_those_of_the_caller_are_no_setting_to_compile_with(
         replace(march_request(), variant=(torch.float64,)).compile_elsewhere()
 
 
+@pytest.fixture
+def _alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever other tests of this process have imported, and whoever has started it."""
+    monkeypatch.delitem(sys.modules, "ray", raising=False)
+    for name in ("RANK", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.mark.usefixtures("_alone")
 def test_helpers_are_as_many_as_there_are_other_functions_and_other_cores(monkeypatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(4), raising=False)
     assert [num_helpers(functions) for functions in (0, 1, 2, 3, 9)] == [0, 0, 1, 2, 3]
@@ -83,9 +92,16 @@ def test_helpers_are_as_many_as_there_are_other_functions_and_other_cores(monkey
     assert num_helpers(3) == 0
 
 
-def test_a_process_that_is_one_of_several_workers_starts_no_helpers(monkeypatch) -> None:
+@pytest.mark.usefixtures("_alone")
+@pytest.mark.parametrize("kind", ["child", "rank", "ray", "helper"])
+def test_a_process_that_is_one_of_several_workers_starts_no_helpers(kind, monkeypatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(4), raising=False)
-    monkeypatch.setattr(helpers.multiprocessing, "parent_process", object)
+    if kind == "child":
+        monkeypatch.setattr(helpers.multiprocessing, "parent_process", object)
+    elif kind == "ray":
+        monkeypatch.setitem(sys.modules, "ray", object())
+    else:
+        monkeypatch.setenv({"rank": "RANK", "helper": helpers._IS_HELPER}[kind], "1")
     assert num_helpers(3) == 0
 
 

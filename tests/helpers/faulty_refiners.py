@@ -77,5 +77,5 @@ class SlowRefiner(QuickRefiner):
     """Takes its time, so that there is some to be killed in."""
 
     def forward(self, *args: Any) -> RefinementResult:
-        time.sleep(1.0)
+        time.sleep(0.5)
         return super().forward(*args)
