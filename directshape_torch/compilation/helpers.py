@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import IO
 
 from directshape_torch.compilation.machine import cache_folder
@@ -89,22 +89,21 @@ def _helper(request: CompileRequest) -> Iterator[tuple[subprocess.Popen[bytes], 
 
 
 def _send(process: subprocess.Popen[bytes], request: CompileRequest) -> None:
+    """The request; the pipe stays open, for at its end the helper ends."""
     assert process.stdin is not None
-    try:
-        with process.stdin as to:
-            to.write(pickle.dumps(request))
-    except BrokenPipeError:
-        # It has ended already, and its errors say why.
-        return
+    process.stdin.write(pickle.dumps(request))
+    process.stdin.flush()
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is not None:
         return
-    if hasattr(os, "killpg"):
-        os.killpg(process.pid, signal.SIGKILL)
-    else:
-        process.kill()
+    # It may end by itself at this very moment.
+    with suppress(OSError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
 
 
 def _await(process: subprocess.Popen[bytes], errors: IO[bytes], end: float) -> None:

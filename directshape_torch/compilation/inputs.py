@@ -103,6 +103,9 @@ def variant_of(values: Iterable[object], varying: Iterable[tuple[int, ...]]) -> 
             continue
         if value.dtype == torch.float64 or (grad and value.requires_grad):
             return None
+        # Subclasses have operations of their own.
+        if type(value) is not Tensor and type(value) is not torch.nn.Parameter:
+            return None
         shape = list(value.shape)
         for dim in dims:
             if shape[dim] < _LEAST_SIZE:

@@ -47,8 +47,9 @@ def start_problem() -> str | None:
         problem = _problem_with(step)
         if problem is not None:
             return f"PyTorch's compiler does not start ({problem})"
-    if _is_switched_off():
-        return "PyTorch's compiler is switched off (TORCH_COMPILE_DISABLE, TORCHDYNAMO_DISABLE)"
+    switch = _is_switched_off()
+    if switch is not None:
+        return f"PyTorch's compiler is switched off ({switch})"
     problem = _problem_with(_compiler)
     return None if problem is None else f"none was found ({problem})"
 
@@ -65,10 +66,18 @@ def cache_folder() -> Path:
     return Path(cache_dir())
 
 
-def _is_switched_off() -> bool:
+def _is_switched_off() -> str | None:
+    """By which variables of the environment."""
     import torch._dynamo.config
+    import torch._inductor.config
 
-    return torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1"
+    if torch._dynamo.config.disable or os.environ.get("TORCHDYNAMO_DISABLE") == "1":
+        return "TORCH_COMPILE_DISABLE, TORCHDYNAMO_DISABLE"
+    # What is compiled ahead of its first call is put together from PyTorch's cache. Switched off in the program it is
+    # used for that alone; the environment has the last word.
+    with torch._inductor.config.patch(force_disable_caches=False):
+        is_off = torch._inductor.config.force_disable_caches
+    return "TORCHINDUCTOR_FORCE_DISABLE_CACHES, TORCH_COMPILE_FORCE_DISABLE_CACHES" if is_off else None
 
 
 def _compiler() -> str:

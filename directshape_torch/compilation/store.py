@@ -24,8 +24,8 @@ _logger = logging.getLogger(__name__)
 
 # Sources that are younger than this are not those that run.
 _IMPORTED = time.time()
-# Files that could not be used: tried once in a process.
-_unusable: set[Path] = set()
+# Files that could not be used, by path, inode and time: each is tried once in a process.
+_unusable: set[tuple[Path, int, int]] = set()
 
 
 def can_keep(function: Callable[..., Any]) -> bool:
@@ -49,25 +49,23 @@ def is_stored(function: Callable[..., Any], variant: tuple[object, ...], number:
         variant: what its arguments have in common, see `variant_of`.
         number: of the form, where the variant has several.
     """
-    try:
-        if not can_keep(function):
-            return False
-        path = _path(function, variant, number)
-        return path not in _unusable and path.is_file() and _is_trusted(path)
-    except (OSError, ImportError):
-        return False
+    return _known_file(function, variant, number) is not None
 
 
 def load(function: Callable[..., Any], variant: tuple[object, ...], number: int = 0) -> CompiledForm | None:
-    """The stored form, or None where there is none; of a file that cannot be used the log says why."""
-    if not is_stored(function, variant, number):
+    """The stored form, or None where there is none that can be used; of such a file the log says why."""
+    path = _known_file(function, variant, number)
+    if path is None:
         return None
-    path = _path(function, variant, number)
     try:
-        return CompiledForm.from_bytes(path.read_bytes())
+        identity = _identity(path)
+        try:
+            return CompiledForm.from_bytes(path.read_bytes())
+        except BaseException:
+            _unusable.add(identity)
+            raise
     except Exception as error:  # of what other programs left in the folder anything can be wrong
         _logger.warning("%s cannot be used: %s", path, first_line_of(error))
-        _unusable.add(path)
         return None
 
 
@@ -78,9 +76,25 @@ def store(form: CompiledForm, function: Callable[..., Any], variant: tuple[objec
             path = _path(function, variant, number)
             path.parent.mkdir(parents=True, exist_ok=True)
             _write(path, form.to_bytes())
-            _unusable.discard(path)
     except Exception as error:  # the form works all the same; what cannot be kept is made anew by the next process
         _logger.info("%s is not kept on disk: %s", function.__qualname__, first_line_of(error))
+
+
+def _known_file(function: Callable[..., Any], variant: tuple[object, ...], number: int) -> Path | None:
+    """The file of a form, if there is one that may be read and that was not tried in vain."""
+    try:
+        if not can_keep(function):
+            return None
+        path = _path(function, variant, number)
+        return path if path.is_file() and _is_trusted(path) and _identity(path) not in _unusable else None
+    except Exception as error:  # what cannot be asked is not there
+        _logger.info("what is stored of %s cannot be seen: %s", function.__qualname__, first_line_of(error))
+        return None
+
+
+def _identity(path: Path) -> tuple[Path, int, int]:
+    status = path.stat()
+    return path, status.st_ino, status.st_mtime_ns
 
 
 def _is_trusted(path: Path) -> bool:
@@ -110,16 +124,20 @@ def _path(function: Callable[..., Any], variant: tuple[object, ...], number: int
 
 @functools.cache
 def _fingerprint() -> str | None:
-    """Changes with the sources, the versions and the processor; None where other sources run than can be read."""
+    """Changes with the sources, the versions and the processor; None where those that run cannot be read."""
     digest = hashlib.sha256()
     for part in (torch.__version__, _package_version(), platform.machine(), _processor()):
         digest.update(f"{part}\n".encode())
     try:
-        for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        sources = sorted(Path(__file__).parents[1].rglob("*.py"))
+        # The time of a change counts too, for a copy may keep the time of its original.
+        changed = max(max(status.st_mtime, status.st_ctime) for status in (path.stat() for path in sources))
+        for path in sources:
             digest.update(path.read_bytes())
-            if path.stat().st_mtime > _IMPORTED:
-                return None
-    except OSError:
+    except (OSError, ValueError):
+        return None
+    if changed > _IMPORTED:
+        _logger.info("nothing compiled is kept on disk: sources have changed since they were imported")
         return None
     return digest.hexdigest()[:32]
 

@@ -18,7 +18,7 @@ def compiled_together(work: Callable[[], _R]) -> _R:
     """Work inside a `compiling` region, all functions of which are compiled before it, side by side.
 
     Work that finds functions that are yet to be compiled runs plain to its end, so that all of them are known, and then
-    again, compiled: it must be repeatable.
+    again, until all are compiled, which is once as a rule: it must be repeatable.
 
     Example:
         >>> with compiling("off", num_cars=1):
@@ -43,9 +43,9 @@ def compiled_together(work: Callable[[], _R]) -> _R:
 def _compile_all(wanted: Mapping[Asked, CompileRequest], region: Region) -> None:
     """Each of the last ones by a helper, as far as there are cores, for what is called late is the largest."""
     with regions.process_lock():
-        # Another thread may have compiled some of them by now.
-        rest = {asked: request for asked, request in wanted.items() if not _is_known(asked, request)}
-        by_helpers = [asked for asked, request in rest.items() if can_keep(asked[0].plain) and request.is_for_helpers()]
+        # Another thread or process may have compiled some of them by now.
+        rest = {asked: request for asked, request in wanted.items() if not _is_there(asked, request)}
+        by_helpers = [asked for asked, request in rest.items() if _is_for_helpers(asked, request)]
         by_helpers = by_helpers[max(len(by_helpers) - num_helpers(len(rest)), 0) :]
         with compiled_by_helpers([rest[asked] for asked in by_helpers]):
             for asked, request in rest.items():
@@ -57,9 +57,13 @@ def _compile_all(wanted: Mapping[Asked, CompileRequest], region: Region) -> None
                 _compile_one(asked, rest[asked], region)
 
 
-def _is_known(asked: Asked, request: CompileRequest) -> bool:
+def _is_there(asked: Asked, request: CompileRequest) -> bool:
     function, variant = asked
-    return function.count(variant) > request.number
+    return function.count(variant) > request.number or function.load_again(variant)
+
+
+def _is_for_helpers(asked: Asked, request: CompileRequest) -> bool:
+    return request.number < regions.MAX_FORMS and can_keep(asked[0].plain) and request.is_for_helpers()
 
 
 def _compile_one(asked: Asked, request: CompileRequest, region: Region) -> None:

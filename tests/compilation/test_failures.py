@@ -48,7 +48,7 @@ class TestWithoutCompiler:
         assert not caplog.records
 
     def test_on_raises_where_something_must_be_compiled(self, nearest) -> None:
-        needed = r"needs a working C\+\+ compiler, but none was found; set compile"
+        needed = r"needs a compiler that works, but none was found; set compile"
         with compiling("on", 3), pytest.raises(CompilationError, match=needed):
             nearest(*nearest_inputs(20, 3))
 

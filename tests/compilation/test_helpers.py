@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import pickle
+import signal
+import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -134,28 +138,43 @@ def test_a_helper_that_fails_says_why_and_stops_nothing(command, monkeypatch, ca
     assert not is_stored(sample_grids.plain, march_request().variant)
 
 
-@pytest.mark.usefixtures("_folder")
-def test_a_helper_that_hangs_is_ended(monkeypatch, caplog, tmp_path: Path) -> None:
-    script, ended = tmp_path / "python", tmp_path / "ended"
-    script.write_text(f"#!/bin/sh\nsleep 2 >/dev/null 2>&1\ntouch {ended}\n")
+def endless_helper(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Path:
+    """A helper that waits for a child, as for a C++ compiler; the file that the child makes if it is not ended."""
+    script, ended = folder / "python", folder / "ended"
+    script.write_text(f"#!/bin/sh\n(sleep 1; touch {ended}) >/dev/null 2>&1 &\nwait\n")
     script.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(script))
+    return ended
+
+
+@pytest.mark.usefixtures("_folder")
+def test_a_helper_that_hangs_is_ended_with_all_that_it_started(monkeypatch, caplog, tmp_path: Path) -> None:
+    ended = endless_helper(monkeypatch, tmp_path)
     monkeypatch.setattr(helpers, "_SECONDS", 0.05)
     with compiled_by_helpers([march_request()]):
         pass
     assert "has not ended" in caplog.text
+    time.sleep(1.5)
     assert not ended.exists()
 
 
 @pytest.mark.usefixtures("_folder")
 def test_an_error_here_ends_the_helpers(monkeypatch, tmp_path: Path) -> None:
-    script, ended = tmp_path / "python", tmp_path / "ended"
-    script.write_text(f"#!/bin/sh\nsleep 2 >/dev/null 2>&1\ntouch {ended}\n")
-    script.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(script))
+    ended = endless_helper(monkeypatch, tmp_path)
     with pytest.raises(KeyboardInterrupt), compiled_by_helpers([march_request()]):
         raise KeyboardInterrupt
+    time.sleep(1.5)
     assert not ended.exists()
+
+
+def test_a_helper_ends_when_the_pipe_from_its_parent_does() -> None:
+    """Before it has compiled anything: the process that asked is gone."""
+    command = [sys.executable, "-P", "-m", "directshape_torch.compilation.helper_process"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True) as helper:
+        assert helper.stdin is not None
+        helper.stdin.write(pickle.dumps(march_request(num_samples=96)))
+        helper.stdin.close()
+        assert helper.wait(timeout=120) in (-signal.SIGKILL, 1)
 
 
 class TestTogether:

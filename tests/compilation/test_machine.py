@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 import subprocess
 import sys
@@ -43,6 +44,17 @@ def test_the_compiler_of_this_machine_works(warnings: str) -> None:
     command = [sys.executable, "-W", warnings, "-c", code]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
     assert (done.stdout.strip(), done.returncode) == ("None", 0), done.stderr
+
+
+@pytest.mark.parametrize("name", ["TORCH_COMPILE_DISABLE", "TORCHDYNAMO_DISABLE", "TORCHINDUCTOR_FORCE_DISABLE_CACHES"])
+def test_a_compiler_that_is_switched_off_does_not_work(name: str) -> None:
+    code = "from directshape_torch.compilation.machine import start_problem; print(start_problem())"
+    environment = {**os.environ, name: "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, check=False, capture_output=True, text=True, timeout=300
+    )
+    assert done.stdout.startswith("PyTorch's compiler is switched off ("), done.stderr
+    assert name in done.stdout
 
 
 def test_no_compiler(monkeypatch) -> None:
