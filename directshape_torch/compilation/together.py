@@ -21,7 +21,7 @@ def compiled_together(work: Callable[[], _R]) -> _R:
     again, until all are compiled, which is once as a rule: it must be repeatable.
 
     Example:
-        >>> with compiling("off", num_cars=1):
+        >>> with regions.compiling("off", num_cars=1):
         ...     compiled_together(lambda: 3)
         3
     """
