@@ -69,8 +69,9 @@ TARGETS: dict[str, Target] = {
             "GridShape.__init__",
             "GridShape.value",
             "GridShape.value_and_derivatives",
+            "GridMemory.values",
         ),
-        ("tests/shape/test_sdf_grid.py",),
+        ("tests/shape/test_sdf_grid.py", "tests/shape/test_pca_prior.py"),
     ),
     "grid_lookup": Target(
         "directshape_torch/shape/grid_lookup.py",

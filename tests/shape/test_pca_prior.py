@@ -147,8 +147,10 @@ def test_shapes_bound_one_after_the_other_with_one_memory(prior):
         return values
 
     first = assert_bound(prior, codes)
+    table = memory._table
     second = assert_bound(prior, codes[1:])
     assert second.data_ptr() == first.data_ptr()
+    assert memory._table is table
     # A memory that is too small, or of other numbers, or of another prior, is replaced.
     assert_bound(prior, codes.repeat(2, 1))
     assert_bound(copy.deepcopy(prior).float(), codes.float())
