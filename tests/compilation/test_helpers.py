@@ -8,6 +8,7 @@ import pickle
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -205,6 +206,27 @@ class TestTogether:
                 compiled_together(lambda: runs.append(nearest(*nearest_inputs(20, 3))))
         compiled_together(lambda: runs.append(1))
         assert len(runs) == 3
+
+    def test_threads_share_what_is_compiled(self, monkeypatch) -> None:
+        nearest, made, results = new_nearest(), [], []
+
+        def compile_slowly(_: CompileRequest, function: object) -> PlainForm:
+            made.append(function)
+            time.sleep(0.2)
+            return PlainForm(function)
+
+        def call() -> None:
+            with compiling("on", 3):
+                results.append(compiled_together(lambda: nearest(*nearest_inputs(20, 3))[0]))
+
+        monkeypatch.setattr(CompileRequest, "compile", compile_slowly)
+        threads = [threading.Thread(target=call) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert made == [nearest.plain]
+        assert len(results) == 3
 
     @pytest.mark.parametrize("helper_works", [True, False])
     def test_the_last_function_is_left_to_the_helper_and_made_here_if_it_fails(self, helper_works, monkeypatch) -> None:

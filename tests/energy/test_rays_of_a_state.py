@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import pytest
 import torch
 from helpers.problems import begun_problem
 from helpers.synthetic_scene import cached_street, disturbed
 
+from directshape_torch.energy import projected_state
+from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
+from directshape_torch.shape import raycast
 
 
 def test_points_of_rays_are_transformed_points() -> None:
@@ -20,3 +26,22 @@ def test_points_of_rays_are_transformed_points() -> None:
         torch.testing.assert_close(view.rays.at(depth), expected)
         assert torch.equal(view.rays.object_index, pixels.object_index)
     assert problem.right.origin_cam.abs().max() > 0.5
+
+
+def test_the_distance_that_comes_with_a_march_is_that_of_its_own_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiled marches bring it; of a frozen march, or where depths move, the present shape is asked."""
+    prior, scene = cached_street()
+    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections))
+    at_closest = problem.project(state, moving_depths=True).left.closest_sdf
+    march = raycast.march
+
+    def with_distance(*arguments: Any) -> raycast.RayMarch:
+        marched = march(*arguments)
+        return marched._replace(closest_sdf=torch.full_like(marched.depths[:, 0], 7.0))
+
+    monkeypatch.setattr(projected_state, "march", with_distance)
+    there = CarState(state.T_obj_cam, state.code + 0.1)
+    brought = problem.project(there)
+    assert bool((brought.left.closest_sdf == 7.0).all())
+    torch.testing.assert_close(problem.project(state, moving_depths=True).left.closest_sdf, at_closest)
+    torch.testing.assert_close(problem.project(state, frozen=problem.project(state)).left.closest_sdf, at_closest)
