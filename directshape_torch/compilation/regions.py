@@ -243,14 +243,10 @@ class Compilable(Generic[_P, _R]):
         # One tensor that is two arguments is taken for two, as no function writes to any.
         values = distinct(values)
         with _process.lock:
-            form = self._fitting(variant, values)
-            while form is None and self.load(variant):
-                form = self._fitting(variant, values)
+            form = self._fitting(variant, values) or self._stored(variant, values, self.load)
             if form is not None or not _may_compile(region):
                 return form
-            # Since it was last asked for another process may have made it.
-            while form is None and self.load_again(variant):
-                form = self._fitting(variant, values)
+            form = self._stored(variant, values, self.load_again)
             if form is not None:
                 return form
             request = CompileRequest.of(self.plain, variant[1:], self.count(variant), values, self._varying)
@@ -259,6 +255,15 @@ class Compilable(Generic[_P, _R]):
                 return None
             self.compile(variant, request, region.mode)
             return self._fitting(variant, values)
+
+    def _stored(
+        self, variant: tuple[object, ...], values: tuple[object, ...], load_one: Callable[[tuple[object, ...]], bool]
+    ) -> CompiledForm | None:
+        """The first of the stored forms, beside those that are known, that fits."""
+        form = None
+        while form is None and load_one(variant):
+            form = self._fitting(variant, values)
+        return form
 
     def count(self, variant: tuple[object, ...]) -> int:
         """How many forms of a variant are known."""
@@ -277,7 +282,7 @@ class Compilable(Generic[_P, _R]):
         return True
 
     def load_again(self, variant: tuple[object, ...]) -> bool:
-        """`load` of what a helper may have stored since it was asked for."""
+        """`load` of what another process may have stored since it was last asked for."""
         self._not_stored.discard((variant, self.count(variant)))
         return self.load(variant)
 
@@ -343,8 +348,8 @@ def compilable(
     Inside a `compiling` region it is compiled once for all values of the named sizes; each combination of the other
     sizes, dtypes, devices and values of arguments that are not tensors is a compilation of its own. Calls with
     gradients, in float64, inside a functorch transform, a forward-mode region, autocast, a `TorchDispatchMode`, a
-    `TorchFunctionMode` that is not a default device, or the user's own `torch.compile`, or with a named size below 2
-    take the plain form.
+    `TorchFunctionMode` that is not a default device, or the user's own `torch.compile`, with subclasses of tensors, or
+    with a named size below 2 take the plain form.
 
     Args:
         sizes: dimensions of the arguments, by name, whose sizes vary from call to call.

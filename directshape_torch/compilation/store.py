@@ -41,20 +41,29 @@ def can_keep(function: Callable[..., Any]) -> bool:
     return config.fx_graph_cache and not config.force_disable_caches and _fingerprint() is not None
 
 
-def is_stored(function: Callable[..., Any], variant: tuple[object, ...], number: int = 0) -> bool:
-    """Whether an earlier process compiled the function, with these very sources, for the variant on such a machine.
+def stored_file(function: Callable[..., Any], variant: tuple[object, ...], number: int = 0) -> Path | None:
+    """The file of a form that a process with these very sources compiled, on such a machine, if it may be read.
+
+    None too where it was tried in vain.
 
     Args:
-        function: plain.
+        function: plain; only of this package, whose sources are known, anything is stored.
         variant: what its arguments have in common, see `variant_of`.
         number: of the form, where the variant has several.
     """
-    return _known_file(function, variant, number) is not None
+    try:
+        if not can_keep(function):
+            return None
+        path = _path(function, variant, number)
+        return path if path.is_file() and _is_trusted(path) and _identity(path) not in _unusable else None
+    except Exception as error:  # what cannot be asked is not there
+        _logger.info("what is stored of %s cannot be seen: %s", function.__qualname__, first_line_of(error))
+        return None
 
 
 def load(function: Callable[..., Any], variant: tuple[object, ...], number: int = 0) -> CompiledForm | None:
     """The stored form, or None where there is none that can be used; of such a file the log says why."""
-    path = _known_file(function, variant, number)
+    path = stored_file(function, variant, number)
     if path is None:
         return None
     try:
@@ -78,18 +87,6 @@ def store(form: CompiledForm, function: Callable[..., Any], variant: tuple[objec
             _write(path, form.to_bytes())
     except Exception as error:  # the form works all the same; what cannot be kept is made anew by the next process
         _logger.info("%s is not kept on disk: %s", function.__qualname__, first_line_of(error))
-
-
-def _known_file(function: Callable[..., Any], variant: tuple[object, ...], number: int) -> Path | None:
-    """The file of a form, if there is one that may be read and that was not tried in vain."""
-    try:
-        if not can_keep(function):
-            return None
-        path = _path(function, variant, number)
-        return path if path.is_file() and _is_trusted(path) and _identity(path) not in _unusable else None
-    except Exception as error:  # what cannot be asked is not there
-        _logger.info("what is stored of %s cannot be seen: %s", function.__qualname__, first_line_of(error))
-        return None
 
 
 def _identity(path: Path) -> tuple[Path, int, int]:

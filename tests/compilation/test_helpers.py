@@ -32,7 +32,7 @@ from directshape_torch.compilation.helpers import compiled_by_helpers, num_helpe
 from directshape_torch.compilation.inputs import global_settings, varying_dimensions
 from directshape_torch.compilation.regions import compiling
 from directshape_torch.compilation.request import CompileRequest
-from directshape_torch.compilation.store import is_stored, load
+from directshape_torch.compilation.store import load, stored_file
 from directshape_torch.compilation.together import compiled_together
 from directshape_torch.shape.compiled_march import RayRows, sample_grids
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -115,7 +115,7 @@ def test_a_process_that_is_one_of_several_workers_starts_no_helpers(kind, monkey
 def test_what_a_helper_compiles_is_what_is_compiled_here() -> None:
     request = march_request()
     with compiled_by_helpers([request]):
-        assert not is_stored(sample_grids.plain, request.variant)
+        assert stored_file(sample_grids.plain, request.variant) is None
         here = CompiledForm.of(sample_grids.plain, march_arguments(), sample_grids._varying)
     theirs = load(sample_grids.plain, request.variant)
     assert theirs is not None
@@ -136,7 +136,7 @@ def test_a_helper_that_fails_says_why_and_stops_nothing(command, monkeypatch, ca
         pass
     assert "compiled here instead" in caplog.text
     assert ("no module here" in caplog.text) == (command == "false")
-    assert not is_stored(sample_grids.plain, march_request().variant)
+    assert stored_file(sample_grids.plain, march_request().variant) is None
 
 
 def endless_helper(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Path:

@@ -11,6 +11,7 @@ import torch
 from helpers.compiled_lookup import nearest_inputs, nearest_values, trace_only
 from torch._dynamo.utils import counters
 
+from directshape_torch.compilation.inputs import variant_of
 from directshape_torch.compilation.regions import compilable, compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
@@ -74,3 +75,12 @@ def test_every_setting_that_the_tracer_looks_at_is_known_here() -> None:
 def test_a_misspelt_size_is_found_at_once() -> None:
     with pytest.raises(ValueError, match="nearest_values has no argument 'point': points, grid, car"):
         compilable(sizes={"point": 0})(nearest_values)
+
+
+def test_a_subclass_of_tensors_is_no_argument_of_compiled_code() -> None:
+    class Own(torch.Tensor):
+        pass
+
+    x = torch.ones(5, 3)
+    assert variant_of((x,), ((0,),)) == variant_of((torch.nn.Parameter(x, requires_grad=False),), ((0,),)) is not None
+    assert variant_of((x.as_subclass(Own),), ((0,),)) is None

@@ -16,7 +16,7 @@ from torch._inductor.runtime import cache_dir_utils
 from directshape_torch.compilation import store as stored
 from directshape_torch.compilation.form import CompiledForm
 from directshape_torch.compilation.inputs import varying_dimensions
-from directshape_torch.compilation.store import is_stored, load, store
+from directshape_torch.compilation.store import load, store, stored_file
 from directshape_torch.shape.compiled_march import sample_grids
 
 VARIANT = ("float32", (-1, 3))
@@ -39,32 +39,32 @@ def _folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_folder")
 class TestFiles:
     def test_a_form_is_found_for_the_same_variant_and_number_only(self) -> None:
-        assert not is_stored(FUNCTION, VARIANT)
+        assert stored_file(FUNCTION, VARIANT) is None
         store(Stored(), FUNCTION, VARIANT)
-        assert is_stored(FUNCTION, VARIANT)
-        assert not is_stored(FUNCTION, (*VARIANT, "else"))
-        assert not is_stored(FUNCTION, VARIANT, 1)
+        assert stored_file(FUNCTION, VARIANT) is not None
+        assert stored_file(FUNCTION, (*VARIANT, "else")) is None
+        assert stored_file(FUNCTION, VARIANT, 1) is None
 
     def test_of_a_function_whose_sources_are_not_known_nothing_is_kept(self, tmp_path: Path) -> None:
         store(Stored(), nearest_values, VARIANT)
-        assert not is_stored(nearest_values, VARIANT)
+        assert stored_file(nearest_values, VARIANT) is None
         assert list(tmp_path.iterdir()) == []
 
     def test_other_versions_and_sources_do_not_find_it(self, monkeypatch) -> None:
         store(Stored(), FUNCTION, VARIANT)
         stored._fingerprint.cache_clear()
         monkeypatch.setattr(stored, "_package_version", lambda: "another")
-        assert not is_stored(FUNCTION, VARIANT)
+        assert stored_file(FUNCTION, VARIANT) is None
         stored._fingerprint.cache_clear()
 
     @pytest.mark.parametrize("setting", [{"force_disable_caches": True}, {"fx_graph_cache": False}])
     def test_nothing_is_kept_where_the_caches_are_off(self, setting) -> None:
         with torch._inductor.config.patch(setting):
             store(Stored(), FUNCTION, VARIANT)
-        assert not is_stored(FUNCTION, VARIANT)
+        assert stored_file(FUNCTION, VARIANT) is None
         store(Stored(), FUNCTION, VARIANT)
         with torch._inductor.config.patch(setting):
-            assert not is_stored(FUNCTION, VARIANT)
+            assert stored_file(FUNCTION, VARIANT) is None
 
     def test_a_damaged_file_is_as_good_as_none_and_the_log_names_it(self, caplog, tmp_path: Path) -> None:
         store(Stored(), FUNCTION, VARIANT)
@@ -75,14 +75,14 @@ class TestFiles:
         assert load(FUNCTION, VARIANT) is None
         assert caplog.text.count("cannot be used") == 1
         store(Stored(), FUNCTION, VARIANT)
-        assert is_stored(FUNCTION, VARIANT)
+        assert stored_file(FUNCTION, VARIANT) is not None
 
     @pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners of files on this system")
     def test_a_file_that_others_may_write_is_not_read(self, tmp_path: Path) -> None:
         store(Stored(), FUNCTION, VARIANT)
         (path,) = (path for path in tmp_path.rglob("*") if path.is_file())
         path.chmod(0o666)
-        assert not is_stored(FUNCTION, VARIANT)
+        assert stored_file(FUNCTION, VARIANT) is None
 
     def test_sources_that_changed_since_they_were_imported_keep_nothing(self, monkeypatch) -> None:
         monkeypatch.setattr(stored, "_IMPORTED", 0.0)
@@ -90,14 +90,14 @@ class TestFiles:
         store(Stored(), FUNCTION, VARIANT)
         stored._fingerprint.cache_clear()
         monkeypatch.undo()
-        assert not is_stored(FUNCTION, VARIANT)
+        assert stored_file(FUNCTION, VARIANT) is None
 
     def test_other_settings_of_the_compiler_do_not_find_it(self) -> None:
         store(Stored(), FUNCTION, VARIANT)
         for setting in ({"cpp.simdlen": 256}, {"max_fusion_size": 3}):
             with torch._inductor.config.patch(setting):
-                assert not is_stored(FUNCTION, VARIANT)
-        assert is_stored(FUNCTION, VARIANT)
+                assert stored_file(FUNCTION, VARIANT) is None
+        assert stored_file(FUNCTION, VARIANT) is not None
 
     def test_a_form_that_cannot_be_written_leaves_no_file(self, tmp_path: Path) -> None:
         class Unwritable(Stored):
@@ -113,7 +113,7 @@ def test_a_folder_that_cannot_be_written_is_no_error(monkeypatch, tmp_path: Path
     file.touch()
     monkeypatch.setattr(cache_dir_utils, "cache_dir", lambda: str(file))
     store(Stored(), FUNCTION, VARIANT)
-    assert not is_stored(FUNCTION, VARIANT)
+    assert stored_file(FUNCTION, VARIANT) is None
 
 
 def test_a_cache_folder_that_cannot_be_made_is_no_error(monkeypatch) -> None:
@@ -122,7 +122,7 @@ def test_a_cache_folder_that_cannot_be_made_is_no_error(monkeypatch) -> None:
 
     monkeypatch.setattr(cache_dir_utils, "cache_dir", none)
     store(Stored(), FUNCTION, VARIANT)
-    assert not is_stored(FUNCTION, VARIANT)
+    assert stored_file(FUNCTION, VARIANT) is None
 
 
 @needs_compiler
