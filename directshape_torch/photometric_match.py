@@ -53,8 +53,7 @@ def seen_surface(term: PhotometricTerm, projected: ProjectedState, rows: Tensor 
     """The surface of a state under some rows (R,) of the term's pixel set."""
     pixels = stage_pixels(term).pixel_index[rows]
     rays, root = projected.left.surface(pixels)
-    # The cost of the state has looked these derivatives up already.
-    gradient = projected.left.at_surface(pixels, rays, root.depth).gradient
+    gradient = projected.left.surface_gradient(pixels, rays, root.depth)
     _, grazing = surface_slope(gradient, rays.direction_obj, term.config.min_ray_cosine)
     return SeenSurface(root.depth, root.found & ~grazing)
 

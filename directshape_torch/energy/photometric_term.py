@@ -152,7 +152,7 @@ class PhotometricTerm:
         """Depth with its hand-derived Jacobian, residuals there, and which pixels (Q,) of the set are usable."""
         rays, root = projected.left.surface(self.pixel_set.pixel_index)
         points = rays.at(root.depth)
-        at = projected.left.at_surface(self.pixel_set.pixel_index, rays, root.depth)
+        at = projected.shape.value_and_derivatives(points, rays.object_index)
         depth = depth_state_jacobian(points, at, rays.direction_obj, self.config.min_ray_cosine)
         residual = self._residual(root.depth)
         return depth, residual, self._is_usable(root.found & ~depth.grazing, residual.inside, residual.uv_right)
@@ -287,6 +287,6 @@ class PhotometricTerm:
         """Depth (Q,) of the surface under packed pixels `rows`, and where (Q,) there is one that is not grazing."""
         rays, root = projected.left.surface(rows)
         depth = root.depth.detach()
-        at = projected.left.at_surface(rows, rays, depth)
-        _, grazing = surface_slope(at.gradient.detach(), rays.direction_obj.detach(), self.config.min_ray_cosine)
+        gradient = projected.left.surface_gradient(rows, rays, depth)
+        _, grazing = surface_slope(gradient, rays.direction_obj.detach(), self.config.min_ray_cosine)
         return depth, root.found & ~grazing

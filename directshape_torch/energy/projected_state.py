@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import cached_property
 
-import torch
 from torch import Tensor
 
 from directshape_torch.energy.car_state import CarState
@@ -17,11 +16,12 @@ from directshape_torch.shape.raycast import (
     attached_depth,
     closest_approach_depth,
     first_crossing,
+    gradient_on_rays,
     march,
     polished_depth,
     sdf_on_rays,
 )
-from directshape_torch.shape.shape_prior import BoundShape, SdfDerivatives, ShapePrior
+from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
 
 # Superlinear from a bracket of one sample distance: 8 reach float32's and nearly float64's precision.
 ROOT_ITERATIONS = 8
@@ -86,13 +86,11 @@ class ProjectedView:
         return first_crossing(self._shape, self.rays, self.march, closest, self._root_iterations, self.closest_sdf)
 
     @cached_property
-    def _at_entry(self) -> SdfDerivatives:
-        """The field where the rays enter, a constant; zero for those that do not."""
+    def _gradient_at_entry(self) -> Tensor:
+        """Gradient (P, 3) of the field where the rays enter, a constant; zero for those that do not."""
         entering = self._entry.found.nonzero()[:, 0]
-        rays = self.rays.select(entering)
-        at = self._shape.value_and_derivatives(rays.at(self._entry.depth[entering]), rays.object_index)
-        count = len(self._entry.found)
-        return SdfDerivatives(*(x.new_zeros(count, *x.shape[1:]).index_copy(0, entering, x).detach() for x in at))
+        gradient = gradient_on_rays(self._shape, self.rays.select(entering), self._entry.depth[entering])
+        return gradient.new_zeros(len(self._entry.found), 3).index_copy(0, entering, gradient).detach()
 
     def surface(self, rows: Tensor) -> tuple[ObjectRays, Root]:
         """Where some of the rays (Q,) enter the shape."""
@@ -105,11 +103,11 @@ class ProjectedView:
             root = root._replace(depth=attached_depth(self._shape, rays, root.depth, root.found))
         return rays, root
 
-    def at_surface(self, rows: Tensor, rays: ObjectRays, depth: Tensor) -> SdfDerivatives:
-        """The field at the points of `surface`: looked up once for all terms where nothing is differentiated."""
-        if self._frozen is None and not self._moving_depths and not torch.is_grad_enabled():
-            return SdfDerivatives(*(x.index_select(0, rows) for x in self._at_entry))
-        return self._shape.value_and_derivatives(rays.at(depth), rays.object_index)
+    def surface_gradient(self, rows: Tensor, rays: ObjectRays, depth: Tensor) -> Tensor:
+        """Gradient (Q, 3) of the field at the points of `surface`, a constant: looked up once for all who ask."""
+        if self._frozen is None and not self._moving_depths:
+            return self._gradient_at_entry.index_select(0, rows)
+        return gradient_on_rays(self._shape, rays, depth.detach()).detach()
 
 
 class ProjectedState:

@@ -47,6 +47,17 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     if torch.compiler.is_compiling():
         return traced_derivatives_at(field, points_obj, object_index, constant)
     cells = cells_at(field, points_obj)
+    value, gradient = _value_and_gradient(field, cells, object_index, constant)
+    basis = _summed_basis(field, cells) if constant else _interpolated_basis(field, cells)
+    return Lookup(value, gradient, basis)
+
+
+def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
+    """The gradient (3, ...) of `derivatives_at` by itself, a constant."""
+    return _value_and_gradient(field, cells_at(field, points_obj), object_index, constant=True)[1]
+
+
+def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor, constant: bool) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
     lower, upper = _ends(_corner_values(field, cells, object_index))
     (d_z,) = _along(fx, *_ends(_along(fy, *_ends(_difference(lower, upper)))))
@@ -57,9 +68,7 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     direction = cells.outward / torch.where(distance > 0, distance, torch.ones_like(distance))
     inside = torch.stack([upper - lower, d_y, d_z]) * (1 / field.spacing_m)
     gradient = torch.where(cells.outward == 0, inside, direction)
-    value = torch.lerp(lower, upper, fx) + field.spacing_m * distance
-    basis = _summed_basis(field, cells) if constant else _interpolated_basis(field, cells)
-    return Lookup(value, gradient, basis)
+    return torch.lerp(lower, upper, fx) + field.spacing_m * distance, gradient
 
 
 def _corner_values(field: GridField, cells: Cells, object_index: Tensor) -> _Corners:

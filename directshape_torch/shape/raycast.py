@@ -99,6 +99,15 @@ def sdf_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
 
 
 @torch.no_grad()
+def gradient_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
+    """Gradient (P, 3) of the signed distance at one depth (P,) of each ray, a constant."""
+    # Not `isinstance`: a shape that looks up in its own way must be asked. Derivatives by the code cost the most.
+    if type(shape) is GridShape:
+        return shape.gradient(rays.at(depth), rays.object_index)
+    return shape.value_and_derivatives(rays.at(depth), rays.object_index).gradient
+
+
+@torch.no_grad()
 def closest_approach_depth(marched: RayMarch) -> Tensor:
     """Depth (P,) at which each ray comes closest to the surface from outside, or is deepest inside.
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.shape.grid_cells import GridField
-from directshape_torch.shape.grid_lookup import derivatives_at, value_at
+from directshape_torch.shape.grid_lookup import derivatives_at, gradient_at, value_at
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
 
@@ -91,12 +91,22 @@ class GridShape:
 
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
-        return value_at(self.field, points_obj.mT.contiguous(), object_index)
+        return value_at(self.field, points_obj.mT.contiguous(), object_index, _is_constant())
 
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
 
         The gradient is the exact derivative of the trilinear lookup and of its continuation.
         """
-        at = derivatives_at(self.field, points_obj.mT.contiguous(), object_index)
+        at = derivatives_at(self.field, points_obj.mT.contiguous(), object_index, _is_constant())
         return SdfDerivatives(at.value, at.gradient.mT.contiguous(), at.J_value_code)
+
+    def gradient(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
+        """That gradient (P, 3) by itself, a constant."""
+        return gradient_at(self.field, points_obj.mT.contiguous(), object_index).mT.contiguous()
+
+
+def _is_constant() -> bool:
+    """Whether nothing that is computed now can be differentiated, backward or forward."""
+    forward = torch.autograd.forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
+    return not (torch.is_grad_enabled() or forward)

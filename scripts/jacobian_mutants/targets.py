@@ -69,6 +69,8 @@ TARGETS: dict[str, Target] = {
             "GridShape.__init__",
             "GridShape.value",
             "GridShape.value_and_derivatives",
+            "GridShape.gradient",
+            "_is_constant",
             "GridMemory.values",
         ),
         ("tests/shape/test_sdf_grid.py", "tests/shape/test_pca_prior.py"),
@@ -78,6 +80,8 @@ TARGETS: dict[str, Target] = {
         (
             "value_at",
             "derivatives_at",
+            "gradient_at",
+            "_value_and_gradient",
             "_corner_values",
             "_ends",
             "_difference",

@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 import torch
+import torch.autograd.forward_ad as fwAD
 from torch import Tensor
 
 from directshape_torch.shape.sdf_grid import GridShape
@@ -166,13 +167,46 @@ def test_no_points_and_no_objects() -> None:
         assert (at.value.shape, at.gradient.shape, at.J_value_code.shape) == ((0,), (0, 3), (0, 3))
 
 
-def test_points_that_are_not_finite_disturb_no_others() -> None:
+@pytest.mark.parametrize("where", ["inside", "outside"])
+def test_lookups_that_nobody_differentiates_are_the_same(where: str) -> None:
+    shape, points = random_shape(), points_inside(40) if where == "inside" else points_outside(40)
+    index = torch.arange(40) % 2
+    expected = shape.value_and_derivatives(points, index)
+    with torch.no_grad():
+        found = shape.value_and_derivatives(points, index)
+        torch.testing.assert_close(shape.value(points, index), expected.value, rtol=1e-14, atol=1e-14)
+    for mine, theirs in zip(found, expected, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
+    assert torch.equal(shape.gradient(points, index), found.gradient)
+
+
+@pytest.mark.parametrize("by", ["function transform", "dual numbers"])
+def test_forward_differentiation_needs_no_gradient_mode(by: str) -> None:
+    """Where there is no distance from the grid, a derivative that takes it for a constant is NaN."""
+    shape, points = random_shape(), points_inside(20)
+    index, along = torch.arange(20) % 2, torch.ones(20, 3, dtype=torch.float64)
+    expected = (shape.value_and_derivatives(points, index).gradient * along).sum(1)
+    with torch.no_grad():
+        if by == "dual numbers":
+            with fwAD.dual_level():
+                tangent = fwAD.unpack_dual(shape.value(fwAD.make_dual(points, along), index)).tangent
+        else:
+            _, tangent = torch.func.jvp(lambda x: shape.value(x, index), (points,), (along,))
+    torch.testing.assert_close(tangent, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("differentiable", [True, False])
+def test_points_that_are_not_finite_disturb_no_others(differentiable: bool) -> None:
     points = points_inside(4)
     index = torch.zeros(4, dtype=torch.long)
     expected = random_shape(1).value(points, index)
     broken = points.clone()
     broken[1, 0], broken[2, 2] = torch.nan, torch.inf
-    value = random_shape(1).value(broken, index)
+    with torch.set_grad_enabled(differentiable):
+        at = random_shape(1).value_and_derivatives(broken, index)
+        value = random_shape(1).value(broken, index)
     assert value[1].isnan()
     assert value[2].isinf()
     assert (value[[0, 3]] == expected[[0, 3]]).all()
+    for mine, theirs in zip(at, random_shape(1).value_and_derivatives(points, index), strict=True):
+        torch.testing.assert_close(mine[[0, 3]], theirs[[0, 3]], rtol=1e-12, atol=1e-12)
