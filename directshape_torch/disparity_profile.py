@@ -17,9 +17,9 @@ from directshape_torch.car_rows import kept, placed
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.projected_state import ProjectedState, SeenSurface
 from directshape_torch.errors import InputError
-from directshape_torch.photometric_match import SeenSurface, matching_costs, seen_surface, stage_pixels
+from directshape_torch.photometric_match import matching_costs, seen_surface, stage_pixels
 
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""

@@ -13,22 +13,15 @@ from torch import Tensor
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.energy.photometric_pixels import PixelSet
 from directshape_torch.energy.photometric_term import PhotometricTerm
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.projected_state import ProjectedState, SeenSurface
 from directshape_torch.residuals import robust
-from directshape_torch.residuals.photometric import DSO_PATTERN, surface_slope
+from directshape_torch.residuals.photometric import DSO_PATTERN
 from directshape_torch.residuals.photometric_patch import patch_residual
 from directshape_torch.residuals.photometric_profile import DisparityResiduals, residuals_on_lines
 
 _CENTRE = DSO_PATTERN.index((0, 0))
 # Of many offsets at once: 4 MB in single precision, for what does not stay in the caches takes longer.
 _RESIDUALS_AT_ONCE = 1_000_000
-
-
-class SeenSurface(NamedTuple):
-    """The surface under R pixels."""
-
-    depth: Tensor  # (R,) metres
-    on_surface: Tensor  # (R,) bool: there is one, and it is not grazing
 
 
 class Match(NamedTuple):
@@ -51,11 +44,7 @@ def stage_pixels(term: PhotometricTerm) -> PixelSet:
 
 def seen_surface(term: PhotometricTerm, projected: ProjectedState, rows: Tensor | slice) -> SeenSurface:
     """The surface of a state under some rows (R,) of the term's pixel set."""
-    pixels = stage_pixels(term).pixel_index[rows]
-    rays, root = projected.left.surface(pixels)
-    gradient = projected.left.surface_gradient(pixels, rays, root.depth)
-    _, grazing = surface_slope(gradient, rays.direction_obj, term.config.min_ray_cosine)
-    return SeenSurface(root.depth, root.found & ~grazing)
+    return projected.left.seen_surface(stage_pixels(term).pixel_index[rows], term.config.min_ray_cosine)
 
 
 def match(term: PhotometricTerm, rows: Tensor | slice, seen: SeenSurface, offsets_px: Tensor) -> Match:

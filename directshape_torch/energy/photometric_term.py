@@ -16,7 +16,7 @@ from directshape_torch.config import PhotometricConfig
 from directshape_torch.energy.brightness import matched_brightness
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.photometric_pixels import GreyPair, PixelSet, neighbours_on_car
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.energy.projected_state import ProjectedState, SeenSurface
 from directshape_torch.energy.term import ResidualRows, TermLinearisation
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.image.interpolate import bilinear_with_gradient
@@ -29,7 +29,6 @@ from directshape_torch.residuals.photometric import (
     SurfaceDepth,
     depth_state_jacobian,
     photometric_residual,
-    surface_slope,
 )
 from directshape_torch.residuals.photometric_patch import PatchForm, patch_derivative, patch_residual
 from directshape_torch.residuals.photometric_profile import residuals_on_lines, warp_lines
@@ -76,7 +75,7 @@ class PhotometricTerm:
     def at_stage(self, stage: Stage, projected: ProjectedState) -> PhotometricTerm:
         images = self.pyramid[stage.image_level]
         rows = torch.arange(len(self.pixels), device=self.pixels.uv.device)
-        candidates = self._surface(projected, rows)[1]
+        candidates = self._surface(projected, rows).on_surface
         if self.config.pixel_set == "hit_and_mask":
             candidates = candidates & (self.pixels.foreground > 0.5)
         trial = replace(self, fixed=self._fix(candidates.nonzero()[:, 0], images))
@@ -283,10 +282,6 @@ class PhotometricTerm:
         residual = self._residual(depth)
         return self._is_usable(on_surface, residual.inside, residual.uv_right), residual
 
-    def _surface(self, projected: ProjectedState, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def _surface(self, projected: ProjectedState, rows: Tensor) -> SeenSurface:
         """Depth (Q,) of the surface under packed pixels `rows`, and where (Q,) there is one that is not grazing."""
-        rays, root = projected.left.surface(rows)
-        depth = root.depth.detach()
-        gradient = projected.left.surface_gradient(rows, rays, depth)
-        _, grazing = surface_slope(gradient, rays.direction_obj.detach(), self.config.min_ray_cosine)
-        return depth, root.found & ~grazing
+        return projected.left.seen_surface(rows, self.config.min_ray_cosine)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import NamedTuple
 
 from torch import Tensor
 
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.residuals.photometric import surface_slope
 from directshape_torch.shape.raycast import (
     ObjectRays,
     RayMarch,
@@ -25,6 +27,13 @@ from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
 
 # Superlinear from a bracket of one sample distance: 8 reach float32's and nearly float64's precision.
 ROOT_ITERATIONS = 8
+
+
+class SeenSurface(NamedTuple):
+    """The surface under R pixels."""
+
+    depth: Tensor  # (R,) metres
+    on_surface: Tensor  # (R,) bool: there is one, and it is not grazing
 
 
 class ProjectedView:
@@ -55,6 +64,7 @@ class ProjectedView:
         origin = (R @ pixels.origin_cam[..., None])[..., 0] + t
         direction = (R @ pixels.ray_cam[..., None])[..., 0]
         self.rays = ObjectRays(origin, direction, pixels.object_index)
+        self._seen: dict[float, Tensor] = {}  # by the least cosine: which rays (P,) see a surface
 
     @cached_property
     def march(self) -> RayMarch:
@@ -103,11 +113,35 @@ class ProjectedView:
             root = root._replace(depth=attached_depth(self._shape, rays, root.depth, root.found))
         return rays, root
 
-    def surface_gradient(self, rows: Tensor, rays: ObjectRays, depth: Tensor) -> Tensor:
-        """Gradient (Q, 3) of the field at the points of `surface`, a constant: looked up once for all who ask."""
-        if self._frozen is None and not self._moving_depths:
+    def surface_gradient(self, rows: Tensor, root: Root) -> Tensor:
+        """Gradient (Q, 3) of the field where some of the rays enter, as `surface` says, a constant.
+
+        It is looked up once for all who ask; where no ray enters it means nothing.
+        """
+        if self._is_plain:
             return self._gradient_at_entry.index_select(0, rows)
-        return gradient_on_rays(self._shape, rays, depth.detach()).detach()
+        return gradient_on_rays(self._shape, self.rays.select(rows), root.depth.detach()).detach()
+
+    def seen_surface(self, rows: Tensor, min_cosine: float) -> SeenSurface:
+        """The surface under some of the rays (Q,), constants."""
+        if self._is_plain:
+            if min_cosine not in self._seen:
+                self._seen[min_cosine] = self._not_grazing(self.rays, self._entry, self._gradient_at_entry, min_cosine)
+            of_all = self._entry.depth.detach(), self._seen[min_cosine]
+            return SeenSurface(*(x.index_select(0, rows) for x in of_all))
+        rays, root = self.surface(rows)
+        gradient = self.surface_gradient(rows, root)
+        return SeenSurface(root.depth.detach(), self._not_grazing(rays, root, gradient, min_cosine))
+
+    @property
+    def _is_plain(self) -> bool:
+        """Whether entries are those of this state, and constants."""
+        return self._frozen is None and not self._moving_depths
+
+    @staticmethod
+    def _not_grazing(rays: ObjectRays, root: Root, gradient: Tensor, min_cosine: float) -> Tensor:
+        """Of rays that enter with these gradients, (Q,) bool."""
+        return root.found & ~surface_slope(gradient, rays.direction_obj.detach(), min_cosine)[1]
 
 
 class ProjectedState:

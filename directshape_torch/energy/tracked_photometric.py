@@ -170,5 +170,5 @@ def _hidden(term: PhotometricTerm, owner: Tensor) -> tuple[Tensor, Tensor, Tenso
 def _hits(term: PhotometricTerm, projected: ProjectedState, packed: PackedBlocks) -> Hits:
     rays, root = projected.left.surface(term.pixel_set.pixel_index)
     points = rays.at(root.depth)
-    normal = projected.left.surface_gradient(term.pixel_set.pixel_index, rays, root.depth)
+    normal = projected.left.surface_gradient(term.pixel_set.pixel_index, root)
     return Hits(*(x[packed.rows].movedim(-1, 0).contiguous() for x in (points, normal)))

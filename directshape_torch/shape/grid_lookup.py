@@ -53,7 +53,9 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
 
 
 def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
-    """The gradient (3, ...) of `derivatives_at` by itself, a constant."""
+    """The gradient (3, ...) of `derivatives_at` by itself, for what is not differentiated again."""
+    if torch.compiler.is_compiling():
+        return traced_derivatives_at(field, points_obj, object_index, constant=True).gradient
     return _value_and_gradient(field, cells_at(field, points_obj), object_index, constant=True)[1]
 
 

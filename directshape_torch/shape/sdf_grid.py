@@ -102,11 +102,10 @@ class GridShape:
         return SdfDerivatives(at.value, at.gradient.mT.contiguous(), at.J_value_code)
 
     def gradient(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
-        """That gradient (P, 3) by itself, a constant."""
+        """That gradient (P, 3) by itself, for what is not differentiated again."""
         return gradient_at(self.field, points_obj.mT.contiguous(), object_index).mT.contiguous()
 
 
 def _is_constant() -> bool:
-    """Whether nothing that is computed now can be differentiated, backward or forward."""
-    forward = torch.autograd.forward_ad._current_level >= 0 or torch._C._are_functorch_transforms_active()
-    return not (torch.is_grad_enabled() or forward)
+    """Whether nothing that is computed now can be differentiated; `torch.func` opens a level or enables gradients."""
+    return not (torch.is_grad_enabled() or torch.autograd.forward_ad._current_level >= 0)

@@ -420,7 +420,14 @@ TARGETS: dict[str, Target] = {
     ),
     "rays_of_a_state": Target(
         "directshape_torch/energy/projected_state.py",
-        ("ProjectedView.__init__",),
+        (
+            "ProjectedView.__init__",
+            "ProjectedView._gradient_at_entry",
+            "ProjectedView.surface_gradient",
+            "ProjectedView.seen_surface",
+            "ProjectedView._is_plain",
+            "ProjectedView._not_grazing",
+        ),
         ("tests/energy/test_rays_of_a_state.py", f"{_COST}::test_g_is_the_gradient_of_the_reported_cost"),
     ),
     "covariance": Target(

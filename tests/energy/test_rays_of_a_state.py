@@ -45,3 +45,23 @@ def test_the_distance_that_comes_with_a_march_is_that_of_its_own_state(monkeypat
     assert bool((brought.left.closest_sdf == 7.0).all())
     torch.testing.assert_close(problem.project(state, moving_depths=True).left.closest_sdf, at_closest)
     torch.testing.assert_close(problem.project(state, frozen=problem.project(state)).left.closest_sdf, at_closest)
+
+
+@pytest.mark.parametrize("kind", ["plain", "frozen", "moving"])
+def test_a_surface_is_seen_where_rays_enter_and_do_not_graze(kind: str) -> None:
+    prior, scene = cached_street()
+    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections))
+    frozen = problem.project(state) if kind == "frozen" else None
+    view = problem.project(state, frozen=frozen, moving_depths=kind == "moving").left
+    rows = torch.arange(1, len(problem.left), 2)
+    rays, root = view.surface(rows)
+    gradient = prior.bind(state.code).value_and_derivatives(rays.at(root.depth), rays.object_index).gradient
+    cosine = (gradient * rays.direction_obj).sum(1).abs() / gradient.norm(dim=1) / rays.direction_obj.norm(dim=1)
+    numbers = []
+    for min_cosine in (0.1, 0.6, 0.1):
+        seen = view.seen_surface(rows, min_cosine)
+        assert torch.equal(seen.on_surface, root.found & (cosine > min_cosine))
+        torch.testing.assert_close(seen.depth[root.found], root.depth[root.found])
+        assert not seen.depth.requires_grad
+        numbers.append(int(seen.on_surface.sum()))
+    assert 0 < numbers[1] < numbers[0] == numbers[2] < len(rows)

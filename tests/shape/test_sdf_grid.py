@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
 import torch.autograd.forward_ad as fwAD
 from torch import Tensor
 
+from directshape_torch.shape import sdf_grid
 from directshape_torch.shape.sdf_grid import GridShape
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
@@ -180,8 +183,8 @@ def test_lookups_that_nobody_differentiates_are_the_same(where: str) -> None:
     assert torch.equal(shape.gradient(points, index), found.gradient)
 
 
-@pytest.mark.parametrize("by", ["function transform", "dual numbers"])
-def test_forward_differentiation_needs_no_gradient_mode(by: str) -> None:
+@pytest.mark.parametrize("by", ["forward transform", "reverse transform", "dual numbers"])
+def test_differentiation_needs_no_gradient_mode(by: str) -> None:
     """Where there is no distance from the grid, a derivative that takes it for a constant is NaN."""
     shape, points = random_shape(), points_inside(20)
     index, along = torch.arange(20) % 2, torch.ones(20, 3, dtype=torch.float64)
@@ -190,9 +193,40 @@ def test_forward_differentiation_needs_no_gradient_mode(by: str) -> None:
         if by == "dual numbers":
             with fwAD.dual_level():
                 tangent = fwAD.unpack_dual(shape.value(fwAD.make_dual(points, along), index)).tangent
+        elif by == "reverse transform":
+            (gradient,) = torch.func.vjp(lambda x: shape.value(x, index), points)[1](torch.ones(20).double())
+            tangent = (gradient * along).sum(1)
         else:
             _, tangent = torch.func.jvp(lambda x: shape.value(x, index), (points,), (along,))
     torch.testing.assert_close(tangent, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("differentiable", [True, False])
+def test_the_shorter_form_is_for_what_nobody_differentiates(
+    differentiable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def of(lookup: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(field: object, points_obj: Tensor, index: Tensor, constant: bool) -> Any:
+            asked.append(constant)
+            return lookup(field, points_obj, index, constant)
+
+        return noted
+
+    monkeypatch.setattr(sdf_grid, "value_at", of(sdf_grid.value_at))
+    monkeypatch.setattr(sdf_grid, "derivatives_at", of(sdf_grid.derivatives_at))
+    shape, index = random_shape(), torch.zeros(3, dtype=torch.long)
+    with torch.set_grad_enabled(differentiable):
+        shape.value(points_inside(3), index)
+        shape.value_and_derivatives(points_inside(3), index)
+    assert asked == [not differentiable] * 2
+
+
+def test_the_gradient_can_be_traced() -> None:
+    shape, points, index = random_shape(), points_inside(20), torch.arange(20) % 2
+    traced = torch.compile(shape.gradient, backend="eager", fullgraph=True)
+    torch.testing.assert_close(traced(points, index), shape.gradient(points, index), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("differentiable", [True, False])
