@@ -95,10 +95,9 @@ class SilhouetteTerm:
 
     def accumulate(self, rows: ResidualRows, J: Tensor, with_fisher: bool = False) -> TermLinearisation:
         norm = robust.identity(rows.value, self.config.residual_floor)
-        gradient, hessian = self.segments.accumulate(J, norm.gradient_weight, norm.hessian_weight)
-        fisher = torch.zeros_like(hessian)
-        if with_fisher:
-            fisher = self.segments.accumulate(J, norm.gradient_weight, torch.ones_like(rows.value))[1]
+        weights = [norm.hessian_weight, torch.ones_like(rows.value)] if with_fisher else [norm.hessian_weight]
+        gradient, *matrices = self.segments.accumulate(J, norm.gradient_weight, *weights)
+        hessian, fisher = matrices if with_fisher else (matrices[0], torch.zeros_like(matrices[0]))
         weight = self.weight()
         cost = self.segments.sum(norm.rho) * weight
         return TermLinearisation(cost, weight[:, None] * gradient, weight[:, None, None] * hessian, fisher)
@@ -138,12 +137,22 @@ class SilhouetteTerm:
 
     def _rows_closest_approach(self, shape: BoundShape, view: ProjectedView) -> tuple[Tensor, Tensor]:
         """By the envelope theorem the Jacobian of the least distance is that of the one point where it is taken."""
-        points = view.rays.at(view.closest_depth)
-        at = shape.value_and_derivatives(points, view.rays.object_index)
-        residual, J_residual_sdf = residual_derivative_closest_approach(
-            at.value, self.zeta, self.config.saturation, self.foreground
-        )
-        return residual, J_residual_sdf[:, None] * sdf_state_jacobian(points, at)
+        if torch.is_grad_enabled():
+            points = view.rays.at(view.closest_depth)
+            at = shape.value_and_derivatives(points, view.rays.object_index)
+            residual, J_residual_sdf = self._by_sdf(at.value)
+            return residual, J_residual_sdf[:, None] * sdf_state_jacobian(points, at)
+        residual, J_residual_sdf = self._by_sdf(view.closest_sdf)
+        # The projection of most rays is certain, and what does not depend on the state needs no lookup.
+        rows = (view.march.crosses_bounds & (J_residual_sdf != 0)).nonzero()[:, 0]
+        rays = view.rays.select(rows)
+        points = rays.at(view.closest_depth.index_select(0, rows))
+        at = shape.value_and_derivatives(points, rays.object_index)
+        J = J_residual_sdf.index_select(0, rows)[:, None] * sdf_state_jacobian(points, at)
+        return residual, J.new_zeros(len(residual), J.shape[1]).index_copy(0, rows, J)
+
+    def _by_sdf(self, closest_sdf: Tensor) -> tuple[Tensor, Tensor]:
+        return residual_derivative_closest_approach(closest_sdf, self.zeta, self.config.saturation, self.foreground)
 
     def _rows_product(self, shape: BoundShape, view: ProjectedView) -> tuple[Tensor, Tensor]:
         """Sums over the samples of each ray one sample at a time: a Jacobian per sample is never kept."""

@@ -105,14 +105,14 @@ class Segments(RowBlocks):
         self,
         rows: Tensor,  # (P, D) Jacobians
         gradient_weight: Tensor,  # (P,) c rho'(r) for each row
-        hessian_weight: Tensor,  # (P,) c rho'(r) / r for each row
-    ) -> tuple[Tensor, Tensor]:
-        """`g = sum w_g J` (B, D) and `H = sum w_H J^T J` (B, D, D), float64."""
+        *hessian_weights: Tensor,  # (P,) c rho'(r) / r for each row
+    ) -> tuple[Tensor, ...]:
+        """`g = sum w_g J` (B, D), and for each of the weights `H = sum w_H J^T J` (B, D, D), float64."""
         J = self._blocks(rows)
-        weighted = J * self._blocks(hessian_weight)[..., None]
         gradient = (self._blocks(gradient_weight)[:, None] @ J)[:, 0]
-        hessian = weighted.transpose(1, 2) @ J
-        return sum_over_blocks(gradient, self.object_blocks), sum_over_blocks(hessian, self.object_blocks)
+        weighted = (J * self._blocks(weight)[..., None] for weight in hessian_weights)
+        products = (gradient, *(w.transpose(1, 2) @ J for w in weighted))
+        return tuple(sum_over_blocks(product, self.object_blocks) for product in products)
 
 
 def _num_blocks(counts: Tensor) -> Tensor:

@@ -206,6 +206,7 @@ TARGETS: dict[str, Target] = {
                 "residual_at",
                 "_rows",
                 "_rows_closest_approach",
+                "_by_sdf",
                 "_rows_product",
                 "accumulate",
                 "weight",

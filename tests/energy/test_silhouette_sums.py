@@ -6,13 +6,16 @@ import pytest
 import torch
 from helpers.problems import CONFIGS, begun_problem
 from helpers.synthetic_scene import cached_street, disturbed
+from torch import Tensor
 
 from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
+from directshape_torch.shape.shape_prior import SdfDerivatives
 
 
+@pytest.mark.parametrize("differentiable", [True, False])
 @pytest.mark.parametrize("config", ["default", "paper"])
-def test_sums_over_the_pixels(config: str) -> None:
+def test_sums_over_the_pixels(config: str, differentiable: bool) -> None:
     """c = lambda / number of pixels; g = c sum J, H = c sum J^T J / r, Fisher = sum J^T J."""
     prior, scene = cached_street()
     problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections), CONFIGS[config])
@@ -22,7 +25,8 @@ def test_sums_over_the_pixels(config: str) -> None:
         if not isinstance(term, SilhouetteTerm):
             continue
         seen += 1
-        part = term.linearise(projected, with_fisher=True)
+        with torch.set_grad_enabled(differentiable):
+            part = term.linearise(projected, with_fisher=True)
         torch.testing.assert_close(part.cost, term.cost(projected), rtol=1e-12, atol=0)
         assert torch.equal(term._rows(projected)[0].object_index, term.pixels.object_index)
         for car in range(len(state.code)):
@@ -39,3 +43,22 @@ def test_sums_over_the_pixels(config: str) -> None:
             ):
                 torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-9 * float(expected.abs().max()))
     assert seen == 2
+
+
+@torch.no_grad()
+def test_rays_whose_projection_is_certain_are_not_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    prior, scene = cached_street()
+    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections))
+    (term, *_), projected = (t for t in problem.terms if isinstance(t, SilhouetteTerm)), problem.project(state)
+    J = term.jacobian(projected)
+    asked, shape = [], projected.shape
+    lookup = shape.value_and_derivatives
+
+    def noted(points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
+        asked.append(len(points_obj))
+        return lookup(points_obj, object_index)
+
+    monkeypatch.setattr(shape, "value_and_derivatives", noted)
+    assert torch.equal(term.jacobian(projected), J)
+    assert asked == [int((J != 0).any(dim=1).sum())]
+    assert 0 < asked[0] < len(J)

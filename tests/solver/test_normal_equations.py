@@ -17,7 +17,7 @@ def test_against_a_loop(counts: list[int]) -> None:
     segments = Segments.from_sorted_index(index, len(counts))
     J = torch.randn(len(index), 4, dtype=torch.float64)
     first, second = torch.randn(2, len(index), dtype=torch.float64)
-    gradient, hessian = segments.accumulate(J, first, second)
+    gradient, hessian, further = segments.accumulate(J, first, second, first)
     assert segments.counts.tolist() == counts
     assert gradient.shape == (len(counts), 4)
     for i in range(len(counts)):
@@ -26,6 +26,7 @@ def test_against_a_loop(counts: list[int]) -> None:
         torch.testing.assert_close(gradient[i], (first[own, None] * J[own]).sum(0), rtol=1e-11, atol=1e-11)
         expected = (J[own] * second[own, None]).T @ J[own]
         torch.testing.assert_close(hessian[i], expected, rtol=1e-11, atol=1e-11)
+        torch.testing.assert_close(further[i], (J[own] * first[own, None]).T @ J[own], rtol=1e-11, atol=1e-11)
 
 
 def test_objects_without_rows_sum_to_zero() -> None:
