@@ -96,8 +96,8 @@ class SilhouetteTerm:
     def accumulate(self, rows: ResidualRows, J: Tensor, with_fisher: bool = False) -> TermLinearisation:
         norm = robust.identity(rows.value, self.config.residual_floor)
         weights = [norm.hessian_weight, torch.ones_like(rows.value)] if with_fisher else [norm.hessian_weight]
-        gradient, *matrices = self.segments.accumulate(J, norm.gradient_weight, *weights)
-        hessian, fisher = matrices if with_fisher else (matrices[0], torch.zeros_like(matrices[0]))
+        gradient, hessian, *further = self.segments.accumulate(J, norm.gradient_weight, *weights)
+        fisher = further[0] if further else torch.zeros_like(hessian)
         weight = self.weight()
         cost = self.segments.sum(norm.rho) * weight
         return TermLinearisation(cost, weight[:, None] * gradient, weight[:, None, None] * hessian, fisher)

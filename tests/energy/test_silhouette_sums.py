@@ -27,8 +27,11 @@ def test_sums_over_the_pixels(config: str, differentiable: bool) -> None:
         seen += 1
         with torch.set_grad_enabled(differentiable):
             part = term.linearise(projected, with_fisher=True)
+            without = term.linearise(projected)
         torch.testing.assert_close(part.cost, term.cost(projected), rtol=1e-12, atol=0)
         assert torch.equal(term._rows(projected)[0].object_index, term.pixels.object_index)
+        for plain, expected in zip(without, (*part[:3], torch.zeros_like(part.fisher)), strict=True):
+            assert torch.equal(plain, expected)
         for car in range(len(state.code)):
             own = rows.object_index == car
             c = term.config.weight / int(own.sum())
