@@ -116,7 +116,7 @@ class ProjectedView:
     def surface_gradient(self, rows: Tensor, root: Root) -> Tensor:
         """Gradient (Q, 3) of the field where some of the rays enter, as `surface` says, a constant.
 
-        It is looked up once for all who ask; where no ray enters it means nothing.
+        In a plain projection it is looked up once for all who ask. Where no ray enters it means nothing.
         """
         if self._is_plain:
             return self._gradient_at_entry.index_select(0, rows)

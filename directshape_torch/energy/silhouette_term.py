@@ -12,6 +12,7 @@ from directshape_torch.config import SilhouetteConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
 from directshape_torch.energy.term import ResidualRows, TermLinearisation
+from directshape_torch.gradient_mode import nothing_is_differentiated
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.silhouette import (
@@ -53,7 +54,7 @@ class SilhouetteTerm:
         return replace(self, zeta=zeta[self.pixels.object_index])
 
     def cost(self, projected: ProjectedState) -> Tensor:
-        if self.config.form == "closest_approach" and not torch.is_grad_enabled():
+        if self.config.form == "closest_approach" and nothing_is_differentiated():
             return self.segments.sum(self.residual_at(self.view(projected))) * self.weight()
         return self.segments.sum(self.pixel_residual(projected)) * self.weight()
 
@@ -137,14 +138,15 @@ class SilhouetteTerm:
 
     def _rows_closest_approach(self, shape: BoundShape, view: ProjectedView) -> tuple[Tensor, Tensor]:
         """By the envelope theorem the Jacobian of the least distance is that of the one point where it is taken."""
-        if torch.is_grad_enabled():
+        if not nothing_is_differentiated():
             points = view.rays.at(view.closest_depth)
             at = shape.value_and_derivatives(points, view.rays.object_index)
             residual, J_residual_sdf = self._by_sdf(at.value)
             return residual, J_residual_sdf[:, None] * sdf_state_jacobian(points, at)
         residual, J_residual_sdf = self._by_sdf(view.closest_sdf)
         # The projection of most rays is certain, and what does not depend on the state needs no lookup.
-        rows = (view.march.crosses_bounds & (J_residual_sdf != 0)).nonzero()[:, 0]
+        unclear = (J_residual_sdf != 0) | residual.isnan()
+        rows = (view.march.crosses_bounds & unclear).nonzero()[:, 0]
         rays = view.rays.select(rows)
         points = rays.at(view.closest_depth.index_select(0, rows))
         at = shape.value_and_derivatives(points, rays.object_index)

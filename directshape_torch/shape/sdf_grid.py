@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from directshape_torch.gradient_mode import nothing_is_differentiated
 from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.grid_lookup import derivatives_at, gradient_at, value_at
 from directshape_torch.shape.shape_prior import SdfDerivatives
@@ -91,21 +92,16 @@ class GridShape:
 
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
-        return value_at(self.field, points_obj.mT.contiguous(), object_index, _is_constant())
+        return value_at(self.field, points_obj.mT.contiguous(), object_index, nothing_is_differentiated())
 
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
 
         The gradient is the exact derivative of the trilinear lookup and of its continuation.
         """
-        at = derivatives_at(self.field, points_obj.mT.contiguous(), object_index, _is_constant())
+        at = derivatives_at(self.field, points_obj.mT.contiguous(), object_index, nothing_is_differentiated())
         return SdfDerivatives(at.value, at.gradient.mT.contiguous(), at.J_value_code)
 
     def gradient(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """That gradient (P, 3) by itself, for what is not differentiated again."""
         return gradient_at(self.field, points_obj.mT.contiguous(), object_index).mT.contiguous()
-
-
-def _is_constant() -> bool:
-    """Whether nothing that is computed now can be differentiated; `torch.func` opens a level or enables gradients."""
-    return not (torch.is_grad_enabled() or torch.autograd.forward_ad._current_level >= 0)

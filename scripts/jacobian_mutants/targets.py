@@ -70,7 +70,6 @@ TARGETS: dict[str, Target] = {
             "GridShape.value",
             "GridShape.value_and_derivatives",
             "GridShape.gradient",
-            "_is_constant",
             "GridMemory.values",
         ),
         ("tests/shape/test_sdf_grid.py", "tests/shape/test_pca_prior.py"),

@@ -51,6 +51,7 @@ def test_the_distance_that_comes_with_a_march_is_that_of_its_own_state(monkeypat
 def test_a_surface_is_seen_where_rays_enter_and_do_not_graze(kind: str) -> None:
     prior, scene = cached_street()
     problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections))
+    state = CarState(*(x.clone().requires_grad_() for x in state))
     frozen = problem.project(state) if kind == "frozen" else None
     view = problem.project(state, frozen=frozen, moving_depths=kind == "moving").left
     rows = torch.arange(1, len(problem.left), 2)

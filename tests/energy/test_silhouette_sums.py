@@ -65,3 +65,38 @@ def test_rays_whose_projection_is_certain_are_not_looked_up(monkeypatch: pytest.
     assert torch.equal(term.jacobian(projected), J)
     assert asked == [int((J != 0).any(dim=1).sum())]
     assert 0 < asked[0] < len(J)
+
+
+@pytest.mark.parametrize("kind", ["plain", "frozen", "moving"])
+def test_tangents_need_no_gradient_mode(kind: str) -> None:
+    """Of cost and gradient by the code, forward with gradients off, as they are with gradients on."""
+    prior, scene = cached_street()
+    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections))
+    (term, *_) = (t for t in problem.terms if isinstance(t, SilhouetteTerm))
+
+    def of_code(code: Tensor) -> Tensor:
+        frozen = problem.project(state) if kind == "frozen" else None
+        projected = problem.project(state._replace(code=code), frozen=frozen, moving_depths=kind == "moving")
+        part = term.linearise(projected)
+        return torch.stack([part.cost.sum(), part.gradient.sum(), term.cost(projected).sum()])
+
+    along = torch.ones_like(state.code)
+    _, expected = torch.func.jvp(of_code, (state.code,), (along,))
+    with torch.no_grad():
+        _, found = torch.func.jvp(of_code, (state.code,), (along,))
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    assert expected[0] != 0
+
+
+def test_a_broken_car_has_no_finite_derivatives() -> None:
+    prior, scene = cached_street()
+    problem, state = begun_problem(prior, scene.frames, disturbed(scene.detections))
+    (term, *_) = (t for t in problem.terms if isinstance(t, SilhouetteTerm))
+    clean = term.linearise(problem.project(state), with_fisher=True)
+    broken = state._replace(code=state.code.index_fill(0, torch.tensor([0]), torch.nan))
+    for differentiable in (True, False):
+        with torch.set_grad_enabled(differentiable):
+            part = term.linearise(problem.project(broken), with_fisher=True)
+        for x, expected in zip(part, clean, strict=True):
+            assert x[0].isnan().any()
+            torch.testing.assert_close(x[1], expected[1], rtol=1e-9, atol=1e-9)
