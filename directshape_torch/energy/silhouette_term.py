@@ -144,7 +144,7 @@ class SilhouetteTerm:
             residual, J_residual_sdf = self._by_sdf(at.value)
             return residual, J_residual_sdf[:, None] * sdf_state_jacobian(points, at)
         residual, J_residual_sdf = self._by_sdf(view.closest_sdf)
-        # The projection of most rays is certain, and what does not depend on the state needs no lookup.
+        # The projection of half of the rays is certain, and what does not depend on the state needs no lookup.
         unclear = (J_residual_sdf != 0) | residual.isnan()
         rows = (view.march.crosses_bounds & unclear).nonzero()[:, 0]
         rays = view.rays.select(rows)
