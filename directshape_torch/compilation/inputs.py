@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.utils._device import DeviceContext
 
+from directshape_torch.gradient_mode import is_forward_mode
+
 # Sizes below are special to the compiler: each would be one more compilation.
 _LEAST_SIZE = 2
 
@@ -52,8 +54,7 @@ def distinct(values: Iterable[object]) -> tuple[object, ...]:
 
 def is_unusual_call() -> bool:
     """Inside jacfwd, vmap, ..., a region of forward-mode differentiation, autocast, or a mode that sees every step."""
-    forward_mode = torch.autograd.forward_ad._current_level >= 0
-    if torch._C._are_functorch_transforms_active() or forward_mode or torch._C._is_any_autocast_enabled():
+    if torch._C._are_functorch_transforms_active() or is_forward_mode() or torch._C._is_any_autocast_enabled():
         return True
     if not torch._C._is_torch_function_enabled() or torch._C._len_torch_dispatch_stack() > 0:
         return True
