@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+_T = TypeVar("_T")
 
 
 def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
@@ -23,3 +27,27 @@ def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.devic
     # Usable in and out of inference mode, wherever it was made.
     with torch.inference_mode(mode=False):
         return torch.tensor(values, dtype=dtype, device=device)
+
+
+def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tensor], _T]:
+    """For a function that makes constants of a dtype on a device: one that gives those like a tensor.
+
+    Example:
+        >>> @made_once
+        ... def ramp(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        ...     return torch.arange(3, dtype=dtype, device=device)
+        >>> ramp(torch.zeros(1)), ramp(torch.zeros(1)) is ramp(torch.ones(1))
+        (tensor([0., 1., 2.]), True)
+    """
+
+    @lru_cache(maxsize=32)
+    def made(dtype: torch.dtype, device: torch.device) -> _T:
+        # Usable in and out of inference mode, wherever they were made.
+        with torch.inference_mode(mode=False):
+            return make(dtype, device)
+
+    @wraps(make)
+    def like(tensor: Tensor) -> _T:
+        return made(tensor.dtype, tensor.device)
+
+    return like

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, Self
@@ -67,7 +68,8 @@ class TrackedProblem:
         self.energy.follow(accepted)
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
-        return retract(state, step, self.config.max_code)
+        # Steps end at the trust region, in which no component of the rotation is larger than its limit.
+        return retract(state, step, self.config.max_code, math.sqrt(3) * self.config.max_step_rotation_rad)
 
     def step_limits(self) -> Tensor:
         return step_limits(self.config, self.prior.num_codes, self.prior.origin.device)

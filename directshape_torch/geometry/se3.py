@@ -7,12 +7,18 @@ at the identity and near a rotation by pi.
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-# Below this squared angle the trigonometric ratios are replaced by Taylor series; the fourth-order series are then
-# exact to float64 rounding and, unlike the ratios, have finite derivatives of every order at zero.
-_SMALL_ANGLE_SQUARED = 1e-3
+from directshape_torch.device_constants import made_once
+
+# Below these squared angles trigonometric ratios are replaced by Taylor series, whose first terms left out are then
+# below float64's rounding. Unlike the ratios they have finite derivatives of every order at zero.
+_SMALL_ANGLE_SQUARED = 1e-3  # of the logarithm
+_SERIES_ANGLE_SQUARED = 0.35  # of the exponential
 
 
 def hat(vector: Tensor) -> Tensor:
@@ -51,32 +57,49 @@ def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | 
     return basis
 
 
+class _ExpConstants(NamedTuple):
+    """What `exp` is made of."""
+
+    generators: Tensor  # (6, 16)
+    identity: Tensor  # (4, 4)
+    # Coefficients (2,) of powers of -a^2, the highest first, of (1 - cos a)/a^2 and (a - sin a)/a^3.
+    series: tuple[Tensor, ...]
+
+
+@made_once
+def _exp_constants(dtype: torch.dtype, device: torch.device) -> _ExpConstants:
+    pairs = [(1 / math.factorial(2 * n + 2), 1 / math.factorial(2 * n + 3)) for n in range(6, -1, -1)]
+    series = torch.tensor(pairs, dtype=dtype, device=device).unbind(0)
+    return _ExpConstants(generators(dtype, device).view(6, 16), torch.eye(4, dtype=dtype, device=device), series)
+
+
 def _exp_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """`sin(a)/a`, `(1 - cos a)/a^2` and `(a - sin a)/a^3` as smooth functions of `a^2`."""
-    b, c = _higher_exp_coefficients(angle_squared)
+    b, c = _higher_exp_coefficients(angle_squared[..., None], math.inf).unbind(-1)
     return 1 - angle_squared * c, b, c
 
 
-def _higher_exp_coefficients(angle_squared: Tensor) -> tuple[Tensor, Tensor]:
-    """The last two of `_exp_coefficients`."""
-    t = angle_squared
-    small = t < _SMALL_ANGLE_SQUARED
-    safe = t.clamp_min(_SMALL_ANGLE_SQUARED)
+def _higher_exp_coefficients(angle_squared: Tensor, max_angle: float) -> Tensor:
+    """The last two of `_exp_coefficients`, (*, 2) from (*, 1)."""
+    minus_t = -angle_squared
+    series, *lower = _exp_constants(minus_t).series
+    for coefficients in lower:
+        series = torch.addcmul(coefficients, series, minus_t)
+    if max_angle**2 <= _SERIES_ANGLE_SQUARED:
+        return series
+    safe = angle_squared.clamp_min(_SERIES_ANGLE_SQUARED)
     angle = safe.sqrt()
     half = torch.sin(0.5 * angle)
-    s = -t
-    b_series = (((s / 3628800 + 1 / 40320) * s + 1 / 720) * s + 1 / 24) * s + 1 / 2
-    c_series = (((s / 39916800 + 1 / 362880) * s + 1 / 5040) * s + 1 / 120) * s + 1 / 6
-    b = torch.where(small, b_series, 2 * half * half / safe)
-    c = torch.where(small, c_series, (angle - torch.sin(angle)) / (safe * angle))
-    return b, c
+    ratios = torch.cat([2 * half * half, 1 - torch.sin(angle) / angle], dim=-1) / safe
+    return torch.where(angle_squared < _SERIES_ANGLE_SQUARED, series, ratios)
 
 
-def exp(twist: Tensor) -> Tensor:
+def exp(twist: Tensor, max_angle: float = math.inf) -> Tensor:
     """Exponential map of SE(3).
 
     Args:
         twist: :math:`(*, 6)`, `(v, omega)` in metres and radians.
+        max_angle: no rotation is larger, radians. Where it is known to be small the same comes in fewer steps.
 
     Returns:
         Rigid transforms :math:`(*, 4, 4)`.
@@ -85,15 +108,14 @@ def exp(twist: Tensor) -> Tensor:
         >>> exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3]
         tensor([1., 2., 3.])
     """
-    v_x, v_y, v_z, x, y, z = twist.reshape(-1, 6).unbind(-1)
-    b, c = _higher_exp_coefficients(x * x + y * y + z * z)
-    zero = torch.zeros_like(x)
-    rows = (zero, -z, y, v_x, z, zero, -x, v_y, -y, x, zero, v_z, zero, zero, zero, zero)
-    X = torch.stack(rows, dim=-1).view(-1, 4, 4)
+    twists, constants = twist.reshape(-1, 6), _exp_constants(twist)
+    omega = twists[:, 3:]
+    coefficients = _higher_exp_coefficients((omega * omega).sum(dim=1, keepdim=True), max_angle)
+    b, c = torch.split_with_sizes(coefficients[:, None], [1, 1], dim=2)
+    X = torch.mm(twists, constants.generators).view(-1, 4, 4)
     X2 = torch.bmm(X, X)
     # X^4 = -angle^2 X^2, hence the power series of the 4 x 4 matrix ends with its third power.
-    identity = torch.eye(4, dtype=twist.dtype, device=twist.device)
-    T = torch.addcmul(identity + X, b.view(-1, 1, 1), X2).addcmul(c.view(-1, 1, 1), torch.bmm(X2, X))
+    T = torch.addcmul(constants.identity + X, b, X2).addcmul(c, torch.bmm(X2, X))
     return T.view(*twist.shape[:-1], 4, 4)
 
 

@@ -56,7 +56,7 @@ class StageProblem(Protocol[StateT]):
         ...
 
     def retract(self, state: StateT, step: Tensor) -> StateT:
-        """The state moved by tangent vectors (B, D): the only place where a state changes."""
+        """The state moved by tangent vectors (B, D) within the step limits: the only place where a state changes."""
         ...
 
     def step_limits(self) -> Tensor:

@@ -41,6 +41,7 @@ TARGETS: dict[str, Target] = {
             "hat",
             "generators",
             "_exp_coefficients",
+            "_exp_constants",
             "_higher_exp_coefficients",
             "exp",
             "from_rotation_translation",

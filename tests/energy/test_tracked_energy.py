@@ -424,7 +424,7 @@ def test_what_was_followed_is_no_matter_of_the_problem() -> None:
     for found, expected in zip(problem.linearise(there), before, strict=True):
         assert torch.equal(found, expected)
     assert torch.equal(stage.step_limits(), problem.step_limits())
-    step = step_of(5, 1.0, 9.0)
+    step = step_of(5, 0.05, 9.0)  # codes go to their bound
     for found, expected in zip(stage.retract(state, step), problem.retract(state, step), strict=True):
         assert torch.equal(found, expected)
 

@@ -7,6 +7,9 @@ term that they leave out.
 
 from __future__ import annotations
 
+import math
+from decimal import Decimal, localcontext
+
 import pytest
 import torch
 
@@ -16,14 +19,31 @@ AXIS = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
 
 
 def test_coefficients_of_exp(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(se3, "_SMALL_ANGLE_SQUARED", 1.0)
-    t = torch.tensor([0.9, 0.5], dtype=torch.float64)
+    monkeypatch.setattr(se3, "_SERIES_ANGLE_SQUARED", 10.0)
+    t = torch.tensor([9.0, 5.0], dtype=torch.float64)
     angle = t.sqrt()
     a, b, c = se3._exp_coefficients(t)
-    # First terms left out: t^5 / 11!, t^5 / 12!, t^5 / 13!.
-    torch.testing.assert_close(a, angle.sin() / angle, atol=1.6e-8, rtol=0)
-    torch.testing.assert_close(b, (1 - angle.cos()) / t, atol=1.3e-9, rtol=0)
-    torch.testing.assert_close(c, (angle - angle.sin()) / (t * angle), atol=1.0e-10, rtol=0)
+    # First terms left out: t^8 / 17!, t^7 / 16!, t^7 / 17!.
+    torch.testing.assert_close(a, angle.sin() / angle, atol=1.3e-7, rtol=0)
+    torch.testing.assert_close(b, (1 - angle.cos()) / t, atol=2.3e-7, rtol=0)
+    torch.testing.assert_close(c, (angle - angle.sin()) / (t * angle), atol=1.4e-8, rtol=0)
+
+
+def test_series_of_exp_is_exact_where_it_is_used() -> None:
+    """Against the closed forms, with more digits than float64 has."""
+    t = se3._SERIES_ANGLE_SQUARED
+    with localcontext(prec=60):
+        terms = [Decimal(-t) ** n / math.factorial(2 * n + 2) for n in range(30)]
+        b, c = sum(terms), sum(term / (2 * n + 3) for n, term in enumerate(terms))
+    found = se3._exp_coefficients(torch.tensor(t * (1 - 1e-16), dtype=torch.float64))
+    torch.testing.assert_close(torch.stack(found[1:]), torch.tensor([b, c], dtype=torch.float64), atol=0, rtol=3e-16)
+
+
+@pytest.mark.parametrize("max_angle", [0.59, 0.6])
+def test_a_known_largest_angle_changes_no_result(max_angle: float) -> None:
+    """Below the threshold of the series, and above it, where it says nothing."""
+    twist = torch.cat([torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), 0.59 * AXIS])
+    torch.testing.assert_close(se3.exp(twist, max_angle), se3.exp(twist), atol=0, rtol=0)
 
 
 def test_rotation_series_of_log(monkeypatch: pytest.MonkeyPatch) -> None:
