@@ -211,7 +211,7 @@ def _sum_and_solve_rows(frames: FrameBatch, detections: Detections, settings: Su
     num_cars, unknowns = len(detections), 6 + state.code.shape[1]
     generator = torch.Generator().manual_seed(0)
     rays = torch.cat([problem.left.object_index, problem.right.object_index]).sort().values
-    segments = Segments.from_sorted_index(rays, num_cars)
+    segments = Segments.of_sorted(rays, num_cars)
     J = torch.randn(len(rays), unknowns, generator=generator)
     weight = torch.rand(len(rays), generator=generator)
     gradient, hessian = segments.accumulate(J, weight, weight)

@@ -32,7 +32,7 @@ def matched_brightness(
 
     Example:
         >>> left, weight = torch.tensor([[90.0, 110.0], [100.0, 100.0]]), torch.ones(2, 2)
-        >>> segments = Segments.from_sorted_index(torch.tensor([0, 0]), 1)
+        >>> segments = Segments.of_sorted(torch.tensor([0, 0]), 1)
         >>> matched_brightness("gain", left, 1.1 * left, weight, segments)
         tensor([[ 99., 121.],
                 [110., 110.]])

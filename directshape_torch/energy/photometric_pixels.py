@@ -59,7 +59,7 @@ class PixelSet(NamedTuple):
             self.gradient_weight[chosen],
             self.neighbour_weight[chosen],
             self.images,
-            Segments.from_sorted_index(object_index, num_objects),
+            Segments.of_sorted(object_index, num_objects),
         )
 
 

@@ -225,7 +225,7 @@ class PhotometricTerm:
         rays = rays_from_pixels(uv_full, self.cars.K_left[chosen.object_index][:, None])
         c2 = self.config.gradient_constant_grey_levels**2
         weight = c2 / (c2 + chosen.gradient_magnitude**2)
-        segments = Segments.from_sorted_index(chosen.object_index, len(self.cars.frame_index))
+        segments = Segments.of_sorted(chosen.object_index, len(self.cars.frame_index))
         neighbours = torch.ones_like(intensity)
         if self.config.pixel_set != "hit":  # the paper's keeps those that are not on the car
             sizes = self.pyramid[0].sizes

@@ -88,4 +88,4 @@ def point_cloud_term(config: PointCloudConfig, points: PointSamples) -> PointClo
 
 
 def _segments(points: PointSamples) -> Segments:
-    return Segments.from_sorted_index(points.object_index, len(points.counts))
+    return Segments.of_sorted(points.object_index, len(points.counts))

@@ -120,7 +120,7 @@ class SilhouetteTerm:
             self,
             cars=self.cars.of_objects(keep),
             pixels=pixels,
-            segments=Segments.from_sorted_index(pixels.object_index, int(keep.sum())),
+            segments=Segments.of_sorted(pixels.object_index, int(keep.sum())),
             foreground=self.foreground[rows],
             zeta=self.zeta[rows],
         )
@@ -185,7 +185,7 @@ def silhouette_term(
         config=config,
         cars=cars,
         pixels=pixels,
-        segments=Segments.from_sorted_index(pixels.object_index, len(cars.frame_index)),
+        segments=Segments.of_sorted(pixels.object_index, len(cars.frame_index)),
         foreground=clamp_foreground(pixels.foreground, config.probability_floor),
         zeta=torch.ones_like(pixels.foreground),
     )

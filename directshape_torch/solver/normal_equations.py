@@ -3,103 +3,99 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import torch
 from torch import Tensor
 
+from directshape_torch.gradient_mode import nothing_is_differentiated
+
 _BLOCK = 64
-
-
-def sum_over_blocks(
-    per_block: Tensor,  # (M, ...)
-    object_blocks: Tensor,  # (B, 2^n) block numbers of each object; M stands for an empty place
-) -> Tensor:
-    """Sums (B, ...) over the blocks of each object, pairwise: empty places change no bit."""
-    padded = torch.cat([per_block, per_block.new_zeros(1, *per_block.shape[1:])])
-    # In less time than `padded[object_blocks]`.
-    part = padded.index_select(0, object_blocks.reshape(-1)).view(*object_blocks.shape, *per_block.shape[1:])
-    while part.shape[1] > 1:
-        part = part[:, 0::2] + part[:, 1::2]
-    return part[:, 0]
 
 
 @dataclass(frozen=True)
 class RowBlocks:
-    """Rows of several objects, sorted by object, cut into blocks of equal size.
+    """Rows of several objects, sorted by object, cut into blocks of equal size where somebody asks for them.
 
     Attributes:
         object_index: (P,) object of each row, ascending.
         counts: (B,) rows of each object.
-        owner: (M,) object of each block.
-        block_rows: (M, 64) row numbers; P stands for an empty place.
     """
 
     object_index: Tensor
     counts: Tensor
-    owner: Tensor
-    block_rows: Tensor
 
     @classmethod
-    def of_sorted(cls, object_index: Tensor, num_objects: int) -> RowBlocks:
-        """Blocks of rows whose objects (P,) ascend.
+    def of_sorted(cls, object_index: Tensor, num_objects: int) -> Self:
+        """For rows whose objects (P,) ascend.
 
         Example:
             >>> RowBlocks.of_sorted(torch.tensor([0, 0, 2]), 3).owner
             tensor([0, 2])
         """
-        counts = torch.bincount(object_index, minlength=num_objects)
-        num_blocks = _num_blocks(counts)
-        owner = torch.repeat_interleave(torch.arange(num_objects, device=counts.device), num_blocks)
-        first_block = torch.cumsum(num_blocks, 0) - num_blocks
-        first_row = torch.cumsum(counts, 0) - counts
-        block_in_object = torch.arange(len(owner), device=counts.device) - first_block[owner]
-        place = block_in_object[:, None] * _BLOCK + torch.arange(_BLOCK, device=counts.device)
-        rows = torch.where(place < counts[owner][:, None], first_row[owner][:, None] + place, len(object_index))
-        return RowBlocks(object_index, counts, owner, rows)
+        return cls(object_index, torch.bincount(object_index, minlength=num_objects))
 
     @property
     def num_objects(self) -> int:
         return len(self.counts)
 
+    @cached_property
+    def num_blocks(self) -> Tensor:
+        """Blocks (B,) of each object."""
+        with _for_every_mode():
+            return (self.counts + _BLOCK - 1) // _BLOCK
 
-@dataclass(frozen=True)
+    @cached_property
+    def owner(self) -> Tensor:
+        """Object (M,) of each block."""
+        with _for_every_mode():
+            objects = torch.arange(self.num_objects, device=self.counts.device)
+            return torch.repeat_interleave(objects, self.num_blocks)
+
+    @cached_property
+    def block_rows(self) -> Tensor:
+        """Row numbers (M, 64); P stands for an empty place."""
+        with _for_every_mode():
+            owner, counts = self.owner, self.counts
+            first_row = torch.cumsum(counts, 0) - counts
+            block_in_object = torch.arange(len(owner), device=counts.device) - self._first_block[owner]
+            place = block_in_object[:, None] * _BLOCK + torch.arange(_BLOCK, device=counts.device)
+            rows = first_row[owner][:, None] + place
+            return torch.where(place < counts[owner][:, None], rows, len(self.object_index))
+
+    @cached_property
+    def _first_block(self) -> Tensor:
+        with _for_every_mode():
+            return torch.cumsum(self.num_blocks, 0) - self.num_blocks
+
+
 class Segments(RowBlocks):
-    """Blocks of rows with the order in which those of an object are added.
+    """Rows of objects with the order in which those of an object are added.
 
-    Blocks are products of matrices of fixed shape, and the blocks of an object are added in a fixed order, hence the
-    sums are the same to the bit from run to run on any device; an atomic `index_add_` on a GPU would not be. No row
-    enters the sum of another object, not even with weight zero: NaN in one object stays there.
+    It is the rows' own, one after the other or block by block, hence the sums are the same to the bit from run to run
+    on any device; those of an atomic `index_add_` on a GPU would not be. No row enters the sum of another object, not
+    even with weight zero: NaN in one object stays there.
 
-    Attributes:
-        object_blocks: (B, 2^n) block numbers of each object, in order; M stands for an empty place.
+    Where something is differentiated the sums are made of operations that can be differentiated in both modes and
+    again; else of a single one.
     """
 
-    object_blocks: Tensor
-
-    @classmethod
-    def from_sorted_index(cls, object_index: Tensor, num_objects: int) -> Segments:
-        """Plan the sums for rows whose objects (P,) ascend.
-
-        Example:
-            >>> Segments.from_sorted_index(torch.tensor([0, 0, 2]), 3).counts
-            tensor([2, 0, 1])
-        """
-        rows = RowBlocks.of_sorted(object_index, num_objects)
-        num_blocks = _num_blocks(rows.counts)
-        first_block = torch.cumsum(num_blocks, 0) - num_blocks
-        # A power of two for the pairwise sums; its shape is known from the longest object, for which the host waits.
-        longest = int(num_blocks.max()) if num_objects else 0
-        place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=num_blocks.device)
-        blocks = torch.where(place < num_blocks[:, None], first_block[:, None] + place, len(rows.owner))
-        return cls(rows.object_index, rows.counts, rows.owner, rows.block_rows, blocks)
-
-    def _blocks(self, rows: Tensor) -> Tensor:
-        padded = torch.cat([rows, rows.new_zeros(1, *rows.shape[1:])])
-        return padded[self.block_rows].to(torch.float64)
+    @cached_property
+    def object_blocks(self) -> Tensor:
+        """Block numbers (B, 2^n) of each object, in order; M stands for an empty place."""
+        with _for_every_mode():
+            # A power of two for the pairwise sums; its shape is known from the longest object: the host waits for it.
+            longest = int(self.num_blocks.max()) if self.num_objects else 0
+            place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=self.counts.device)
+            blocks = self._first_block[:, None] + place
+            return torch.where(place < self.num_blocks[:, None], blocks, len(self.owner))
 
     def sum(self, values: Tensor) -> Tensor:
-        """Sum (B,) of values (P,) over the rows of each object, float64; differentiable."""
-        return sum_over_blocks(self._blocks(values).sum(dim=1), self.object_blocks)
+        """Sum (B, ...) of values (P, ...) over the rows of each object, float64; differentiable."""
+        if nothing_is_differentiated():
+            return _sum_of_runs(values.to(torch.float64), self.counts)
+        return self._sum_over_blocks(self._blocks(values).sum(dim=1))
 
     def accumulate(
         self,
@@ -112,8 +108,31 @@ class Segments(RowBlocks):
         gradient = (self._blocks(gradient_weight)[:, None] @ J)[:, 0]
         weighted = (J * self._blocks(weight)[..., None] for weight in hessian_weights)
         products = (gradient, *(w.transpose(1, 2) @ J for w in weighted))
-        return tuple(sum_over_blocks(product, self.object_blocks) for product in products)
+        return tuple(self._sum_over_blocks(product) for product in products)
+
+    def _blocks(self, rows: Tensor) -> Tensor:
+        padded = torch.cat([rows, rows.new_zeros(1, *rows.shape[1:])])
+        return padded[self.block_rows].to(torch.float64)
+
+    def _sum_over_blocks(self, per_block: Tensor) -> Tensor:
+        """Sums (B, ...) of (M, ...) over the blocks of each object."""
+        if nothing_is_differentiated():
+            return _sum_of_runs(per_block, self.num_blocks)
+        padded = torch.cat([per_block, per_block.new_zeros(1, *per_block.shape[1:])])
+        of_object = self.object_blocks
+        # In less time than `padded[of_object]`.
+        part = padded.index_select(0, of_object.reshape(-1)).view(*of_object.shape, *per_block.shape[1:])
+        # Pairwise, so that empty places change no bit.
+        while part.shape[1] > 1:
+            part = part[:, 0::2] + part[:, 1::2]
+        return part[:, 0]
 
 
-def _num_blocks(counts: Tensor) -> Tensor:
-    return (counts + _BLOCK - 1) // _BLOCK
+def _sum_of_runs(values: Tensor, lengths: Tensor) -> Tensor:
+    """Sums (B, ...) of (P, ...) over so many rows (B,) one after the other; none of them is 0."""
+    return torch.segment_reduce(values.contiguous(), "sum", lengths=lengths, unsafe=True)
+
+
+def _for_every_mode() -> torch.inference_mode:
+    """What is made in here and kept can be used in and out of inference mode."""
+    return torch.inference_mode(mode=False)

@@ -108,8 +108,7 @@ class PackedBlocks(NamedTuple):
         filled = cut.block_rows < len(cut.object_index)
         # An empty place must not bring another object's numbers, which may be NaN, nor an index out of range.
         rows = torch.where(filled, cut.block_rows, cut.block_rows[:, :1])
-        counts = tuple(torch.bincount(cut.owner, minlength=cut.num_objects).tolist())
-        return cls(Blocks.of_owners(cut.owner, counts), rows, filled)
+        return cls(Blocks.of_owners(cut.owner, tuple(cut.num_blocks.tolist())), rows, filled)
 
 
 def weighted_products(

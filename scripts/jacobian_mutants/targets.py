@@ -193,7 +193,18 @@ TARGETS: dict[str, Target] = {
     ),
     "normal_equations": Target(
         "directshape_torch/solver/normal_equations.py",
-        ("sum_over_blocks", "Segments._blocks", "Segments.sum", "Segments.accumulate"),
+        (
+            "RowBlocks.of_sorted",
+            "RowBlocks.num_blocks",
+            "RowBlocks.block_rows",
+            "RowBlocks._first_block",
+            "Segments.object_blocks",
+            "Segments._blocks",
+            "Segments._sum_over_blocks",
+            "Segments.sum",
+            "Segments.accumulate",
+            "_sum_of_runs",
+        ),
         ("tests/solver/test_normal_equations.py",),
     ),
     "silhouette_term": Target(

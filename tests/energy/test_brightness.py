@@ -10,7 +10,7 @@ from directshape_torch.energy.brightness import Brightness, matched_brightness
 from directshape_torch.solver.normal_equations import Segments
 
 CAR = torch.tensor([0] * 30 + [1] * 20)
-SEGMENTS = Segments.from_sorted_index(CAR, 3)  # the third car has no pixels
+SEGMENTS = Segments.of_sorted(CAR, 3)  # the third car has no pixels
 
 
 def _left() -> tuple[Tensor, Tensor]:
