@@ -9,38 +9,38 @@ from torch import Tensor
 
 
 class Bracket(NamedTuple):
-    """Depths of rays (...) between which each enters a shape, and the signed distances there."""
+    """Depths of rays (...) between which each enters a shape, one end outside and one inside."""
 
     depth: Tensor  # (...) to probe next
-    before: Tensor  # (...) outside
-    before_sdf: Tensor  # (...)
-    behind: Tensor  # (...) inside
-    behind_sdf: Tensor  # (...)
+    latest: Tensor  # (...) the end that was probed last
+    latest_sdf: Tensor  # (...) signed distance there
+    latest_inside: Tensor  # (...) bool
+    other: Tensor  # (...) the other end
+    other_sdf: Tensor  # (...) signed distance there, less where it has stayed
     best: Tensor  # (...) the depth of the least absolute distance so far
-    best_sdf: Tensor  # (...)
-    last_sdf: Tensor  # (...) of the latest probe; zero before the first
+    best_distance: Tensor  # (...)
 
     @classmethod
     def between(cls, before: Tensor, before_sdf: Tensor, behind: Tensor, behind_sdf: Tensor) -> Bracket:
-        """A new one."""
+        """A new one, of depths outside and inside."""
+        inside = torch.ones_like(behind_sdf, dtype=torch.bool)
         depth = _line_zero(before, before_sdf, behind, behind_sdf)
-        return cls(depth, before, before_sdf, behind, behind_sdf, behind, behind_sdf, torch.zeros_like(behind_sdf))
+        return cls(depth, behind, behind_sdf, inside, before, before_sdf, behind, behind_sdf.abs())
 
     def probed(self, sdf: Tensor) -> Bracket:
         """With one end moved to `depth`, of signed distance (...): false position in Illinois' form."""
         inside = sdf < 0
-        nearer = sdf.abs() < self.best_sdf.abs()
-        # Halving the value of an end that stays a second time makes the convergence superlinear.
-        again = sdf * self.last_sdf > 0
-        before = torch.where(inside, self.before, self.depth)
-        behind = torch.where(inside, self.depth, self.behind)
-        before_sdf = torch.where(inside, torch.where(again, 0.5 * self.before_sdf, self.before_sdf), sdf)
-        behind_sdf = torch.where(inside, sdf, torch.where(again, 0.5 * self.behind_sdf, self.behind_sdf))
-        best, best_sdf = torch.where(nearer, self.depth, self.best), torch.where(nearer, sdf, self.best_sdf)
-        depth = _line_zero(before, before_sdf, behind, behind_sdf)
-        return Bracket(depth, before, before_sdf, behind, behind_sdf, best, best_sdf, sdf)
+        crossed = inside ^ self.latest_inside
+        other = torch.where(crossed, self.latest, self.other)
+        # Halving the value of an end that stays makes the convergence superlinear.
+        other_sdf = torch.where(crossed, self.latest_sdf, 0.5 * self.other_sdf)
+        distance = sdf.abs()
+        best = torch.where(distance < self.best_distance, self.depth, self.best)
+        best_distance = torch.fmin(distance, self.best_distance)
+        depth = _line_zero(other, other_sdf, self.depth, sdf)
+        return Bracket(depth, self.depth, sdf, inside, other, other_sdf, best, best_distance)
 
 
-def _line_zero(before: Tensor, before_sdf: Tensor, behind: Tensor, behind_sdf: Tensor) -> Tensor:
-    # The ends differ in sign, so the share is in [0, 1].
-    return torch.lerp(before, behind, before_sdf / (before_sdf - behind_sdf))
+def _line_zero(depth: Tensor, sdf: Tensor, other: Tensor, other_sdf: Tensor) -> Tensor:
+    # One of them is not negative and the other is, so the share is in [0, 1].
+    return torch.lerp(depth, other, sdf / (sdf - other_sdf))

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.device_constants import constant_like
 from directshape_torch.geometry.short_axes import length
 
 
@@ -62,12 +63,13 @@ def cells_at(field: GridField, points_obj: Tensor) -> Cells:
         # A comparison with NaN is false; the compiler writes `fmin` as five operations.
         clamped = torch.minimum(torch.where(position >= 0, position, 0.0), last_node)
         lower = torch.minimum(clamped.detach().floor(), last_node - 1)
+        flat = lower[0] * (ny * nz) + (lower[1] * nz + lower[2])
     else:
         clamped = torch.minimum(position.clamp_min(0), last_node)
         # `fmin` and not `minimum`: of NaN and a number it is the number.
         lower = torch.fmin(clamped.detach().floor(), last_node - 1)
-    flat = (lower[0] * (ny * nz) + (lower[1] * nz + lower[2])).long()
-    return Cells(flat, clamped - lower, position - clamped)
+        flat = (lower * constant_like((ny * nz, nz, 1), lower).view(column)).sum(0)
+    return Cells(flat.long(), clamped - lower, position - clamped)
 
 
 def _safe_norm(vector: Tensor) -> Tensor:

@@ -6,14 +6,17 @@ linearisation; only the signed distances along the ray carry derivatives.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from directshape_torch.gradient_mode import nothing_is_differentiated
 from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.compiled_march import RayRows, interval, neighbours, sample_grids, vertex_offset
+from directshape_torch.shape.grid_lookup import value_at
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import BoundShape
 
@@ -193,9 +196,20 @@ def _first_bracket(
 
 
 def _false_position(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> Tensor:
+    sdf_at = _sdf_along(shape, rays)
     for _ in range(num_iterations):
-        bracket = bracket.probed(shape.value(rays.at(bracket.depth), rays.object_index))
+        bracket = bracket.probed(sdf_at(bracket.depth))
     return bracket.best
+
+
+def _sdf_along(shape: BoundShape, rays: ObjectRays) -> Callable[[Tensor], Tensor]:
+    """Signed distances (P,) at depths (P,) of the same rays, to be asked for again and again."""
+    if type(shape) is not GridShape:
+        return lambda depth: shape.value(rays.at(depth), rays.object_index)
+    # Coordinates first, as lookups in grids want them, once for all depths.
+    origin, direction = rays.origin_obj.mT.contiguous(), rays.direction_obj.mT.contiguous()
+    constant = nothing_is_differentiated()
+    return lambda depth: value_at(shape.field, torch.addcmul(origin, depth, direction), rays.object_index, constant)
 
 
 @torch.no_grad()

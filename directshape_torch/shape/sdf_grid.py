@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from directshape_torch.device_constants import constant_like
 from directshape_torch.gradient_mode import nothing_is_differentiated
 from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.grid_lookup import derivatives_at, gradient_at, value_at
@@ -71,8 +72,7 @@ class GridShape:
 
     def __init__(self, values: Tensor, basis: Tensor, origin: Tensor, spacing_m: float) -> None:
         self.values = values
-        # Filled on the device: a list would be copied there, and the host would wait.
-        last_node = torch.cat([origin.new_full((1,), count - 1) for count in values.shape[1:]])
+        last_node = constant_like(tuple(count - 1 for count in values.shape[1:]), origin)
         self.field = GridField(values.reshape(-1), basis, origin, last_node, spacing_m)
 
     @property
