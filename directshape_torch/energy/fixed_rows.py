@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from directshape_torch.solver.problem import Linearisation
+from directshape_torch.tracking.blocks import BlockParts
 from directshape_torch.tracking.field import BlockField
 
 
@@ -16,5 +16,5 @@ class FixedRows(NamedTuple):
 
     residuals: Callable[[BlockField, Tensor], Tensor]
     """Residuals (M, 64, ...) of a field at poses (B, 4, 4), differentiable."""
-    accumulate: Callable[[Tensor, Tensor], Linearisation]
-    """The linearisation from residuals and any Jacobian (M, 64, ..., D) of them."""
+    accumulate: Callable[[Tensor, Tensor], BlockParts]
+    """What blocks add to the linearisation, from residuals and any Jacobian (M, 64, ..., D) of them."""

@@ -1,7 +1,7 @@
 """All prior terms of a batch of cars at once: the sums of the terms by themselves, in a few small operations.
 
-The rows of height, tilt and pose come from one product with constants (`pose_rows`); what is quadratic in the code has
-a constant matrix. With five cars the terms one by one are hundreds of operations on a handful of numbers each.
+The rows of all of them come from one product with constants (`prior_rows`). With five cars the terms one by one are
+hundreds of operations on a handful of numbers each.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ from torch import Tensor
 
 from directshape_torch.device_constants import constant_like
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.pose_rows import (
-    NUM_COLUMNS,
-    RESIDUAL,
+from directshape_torch.energy.prior_rows import (
     cosine_rows,
     heading_constants,
     heading_rows,
     level_rows,
-    pose_features,
     position_rows,
+    state_features,
+    state_rows,
     without_heading,
 )
 from directshape_torch.energy.prior_terms import (
@@ -41,6 +40,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.residuals.priors import viewing_axes
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.tracking.blocks import BlockParts
 
 _TWIST = 6
 
@@ -75,20 +75,15 @@ class StackedPriors:
     """The sum of several `PriorTerm`s, in float64 throughout but for the dimensions that a shape prior computes itself.
 
     Attributes:
-        pose_rows: (B, R * 7, F) from the features of a pose to the rows (R, 7) of its priors.
+        rows: (B, R (D + 1), F) from the features of a state to the rows `[J r]` of its priors.
         heading: (B, 4, 2) of `heading_constants`; None where no prior asks for the heading.
-        code_form: (B, K + 1, K + 1) the cost of the priors that are quadratic in the code is half this form of
-            `[code, 1]`.
-        hessian: (B, D, D) its part by the code, zero elsewhere.
-        one: (B, 1, 1).
+        ones: (B,) the weights are in the rows.
         dimensions: priors of dimensions that are not linear in the code.
     """
 
-    pose_rows: Tensor
+    rows: Tensor
     heading: Tensor | None
-    code_form: Tensor
-    hessian: Tensor
-    one: Tensor
+    ones: Tensor
     dimensions: tuple[_Dimensions, ...]
 
     @staticmethod
@@ -116,57 +111,43 @@ class StackedPriors:
         scaled = list(zip(terms, _roots_of_weights(terms, factors), strict=True))
         pose_rows = torch.cat([_pose_rows(term, root) for term, root in scaled], dim=1)
         code_rows = torch.cat([_code_rows(term, root, num_codes) for term, root in scaled], dim=1)
-        code_form = code_rows.mT @ code_rows
         sees_heading = any(isinstance(term.residual_of, PoseResidual) for term in terms)
         dimensions = (_dimensions(term, root) for term, root in scaled)
         return cls(
-            pose_rows=(pose_rows if sees_heading else without_heading(pose_rows)).flatten(1, 2),
+            rows=state_rows(pose_rows if sees_heading else without_heading(pose_rows), code_rows).flatten(1, 2),
             heading=heading_constants(terms[0].cars.detector_T_cam_obj.to(torch.float64)) if sees_heading else None,
-            code_form=code_form,
-            hessian=torch.nn.functional.pad(code_form[:, :-1, :-1], (_TWIST, 0, _TWIST, 0)),
-            one=code_form.new_ones(len(code_form), 1, 1),
+            ones=torch.ones_like(scaled[0][1]),
             dimensions=tuple(d for d in dimensions if d is not None and not d.are_linear),
         )
 
-    @property
-    def num_pose_rows(self) -> int:
-        """R."""
-        return self.pose_rows.shape[1] // NUM_COLUMNS
-
     def cost(self, state: CarState) -> Tensor:
         """Cost (B,) of a state."""
-        return self.linearise(state).cost
+        return self.parts(state).cost
 
     def linearise(self, state: CarState) -> TermLinearisation:
         """Cost, gradient and Gauss-Newton matrix, which is the Fisher matrix too; differentiable by autograd."""
-        features = pose_features(state.T_obj_cam.to(torch.float64), self.heading)
-        rows = torch.bmm(self.pose_rows, features).view(len(features), self.num_pose_rows, NUM_COLUMNS)
+        cost, products = self.parts(state)
+        return TermLinearisation(cost, products[:, -1], products[:, :-1], products[:, :-1])
+
+    def parts(self, state: CarState) -> BlockParts:
+        """Cost (B,), and Gauss-Newton matrix with the gradient as one more row, (B, D + 1, D)."""
+        columns = _TWIST + state.code.shape[1] + 1
+        features = state_features(state.T_obj_cam.to(torch.float64), state.code.to(torch.float64), self.heading)
+        rows = torch.bmm(self.rows, features).view(len(features), self.rows.shape[1] // columns, columns)
         squares = torch.bmm(rows.mT, rows)
-        by_twist = squares[:, :RESIDUAL]
-        code = torch.cat([state.code.to(torch.float64).unsqueeze(2), self.one], dim=1)
-        slopes = torch.bmm(self.code_form, code)
-        cost = 0.5 * (squares[:, RESIDUAL, RESIDUAL] + (slopes * code).sum(dim=(1, 2)))
-        gradient = torch.cat([by_twist[:, :, RESIDUAL], slopes[:, :-1, 0]], dim=1)
-        hessian = self.hessian.clone()
-        hessian[:, :_TWIST, :_TWIST] = by_twist[:, :, :RESIDUAL]
         for dimensions in self.dimensions:
             curved = dimensions.rows(state.code)
-            more = torch.bmm(curved.mT, curved)
-            hessian[:, _TWIST:, _TWIST:] += more[:, :-1, :-1]
-            gradient[:, _TWIST:] += more[:, :-1, -1]
-            cost = cost + 0.5 * more[:, -1, -1]
-        return TermLinearisation(cost, gradient, hessian, hessian)
+            squares[:, _TWIST:, _TWIST:] += torch.bmm(curved.mT, curved)
+        return BlockParts(0.5 * squares[:, -1, -1], squares[:, :, :-1])
 
     def of_objects(self, keep: Tensor, count: int | None = None) -> StackedPriors:
         """Those of the cars where `keep` (B,) bool holds; so many (`count`), or the host asks for their number."""
         kept = keep.nonzero() if count is None else torch.nonzero_static(keep, size=count)
         index = kept[:, 0]
         return StackedPriors(
-            self.pose_rows.index_select(0, index),
+            self.rows.index_select(0, index),
             None if self.heading is None else self.heading.index_select(0, index),
-            self.code_form.index_select(0, index),
-            self.hessian.index_select(0, index),
-            self.one.index_select(0, index),
+            self.ones.index_select(0, index),
             tuple(dimensions.of_objects(index) for dimensions in self.dimensions),
         )
 

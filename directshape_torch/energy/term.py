@@ -85,6 +85,8 @@ def scaled(part: TermLinearisation, factor: Tensor | None) -> TermLinearisation:
 
 def total_of(parts: Sequence[Linearisation | TermLinearisation]) -> Linearisation:
     """What the solver sees of the terms of an energy."""
+    if len(parts) == 1:
+        return Linearisation(*parts[0][:3])
     return Linearisation(
         sum_of([p.cost for p in parts]), sum_of([p.gradient for p in parts]), sum_of([p.hessian for p in parts])
     )

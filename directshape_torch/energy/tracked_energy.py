@@ -18,16 +18,23 @@ from directshape_torch.energy.tracked_photometric import TrackedPhotometric
 from directshape_torch.energy.tracked_silhouettes import TrackedSilhouettes
 from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
 from directshape_torch.solver.problem import Linearisation
+from directshape_torch.tracking.blocks import BlockParts, Blocks, WeightedBlocks
 from directshape_torch.tracking.field import block_field
 
 
 @dataclass
 class TrackedEnergy:
-    """The terms of a stage whose rays are followed, and the priors, each with the factors (B,) of single cars."""
+    """The terms of a stage whose rays are followed, and the priors: one sum over blocks of all of them.
+
+    Attributes:
+        silhouettes, photometric, priors: those that there are.
+        blocks: theirs in this order, with the weights of terms and cars; of priors one for each car.
+    """
 
     silhouettes: TrackedSilhouettes | None
     photometric: TrackedPhotometric | None
     priors: StackedPriors | None
+    blocks: WeightedBlocks | None
 
     @classmethod
     def of_terms(
@@ -43,25 +50,40 @@ class TrackedEnergy:
         photometric = [(t, w) for t, w in pairs if isinstance(t, PhotometricTerm)]
         priors = [(t, w) for t, w in pairs if StackedPriors.takes(t)]
         of_sides = [t for t, _ in sides], projected, [w for _, w in sides]
-        return cls(
+        return cls._of_parts(
             TrackedSilhouettes.of_terms(*of_sides, after_wider) if sides else None,
             TrackedPhotometric.of_term(photometric[0][0], projected, photometric[0][1]) if photometric else None,
             _stacked(priors, projected.state.code.shape[1]),
         )
+
+    @classmethod
+    def _of_parts(
+        cls,
+        silhouettes: TrackedSilhouettes | None,
+        photometric: TrackedPhotometric | None,
+        priors: StackedPriors | None,
+    ) -> TrackedEnergy:
+        parts = [(t.blocks, t.weight) for t in (silhouettes, photometric) if t is not None]
+        if priors is not None:
+            parts.append((Blocks.one_each(len(priors.rows), priors.rows.device), priors.ones))
+        if not parts:
+            return cls(None, None, None, None)
+        blocks, weights = zip(*parts, strict=True)
+        return cls(silhouettes, photometric, priors, WeightedBlocks.of(Blocks.join(blocks), torch.cat(weights)))
 
     @property
     def _tracked(self) -> list[TrackedSilhouettes | TrackedPhotometric]:
         return [t for t in (self.silhouettes, self.photometric) if t is not None]
 
     def linearise(self, shape: BoundShape, state: CarState) -> list[Linearisation | TermLinearisation]:
-        """All parts at a state with these shapes, with hand-derived Jacobians."""
+        """The sum of all at a state with these shapes, with hand-derived Jacobians; nothing where there are none."""
         field = block_field(shape)
-        return self._with_priors([tracked.linearise(field, state.T_obj_cam) for tracked in self._tracked], state)
+        return self._summed([tracked.linearise(field, state.T_obj_cam) for tracked in self._tracked], state)
 
     def linearise_by_autograd(self, prior: ShapePrior, state: CarState) -> list[Linearisation | TermLinearisation]:
         """The same with the rays' Jacobians by forward-mode differentiation: D tangents at once, over all cars."""
         if not self._tracked:
-            return self._with_priors([], state)
+            return self._summed([], state)
         field = block_field(prior.bind(state.code))
         fixed = [tracked.fixed_rows(field, state.T_obj_cam) for tracked in self._tracked]
 
@@ -74,10 +96,17 @@ class TrackedEnergy:
         zero = torch.zeros(6 + state.code.shape[1], dtype=state.code.dtype, device=state.code.device)
         J, residuals = torch.func.jacfwd(values, has_aux=True)(zero)
         parts = [rows.accumulate(r, J_r) for rows, r, J_r in zip(fixed, residuals, J, strict=True)]
-        return self._with_priors(parts, state)
+        return self._summed(parts, state)
 
-    def _with_priors(self, parts: list[Linearisation], state: CarState) -> list[Linearisation | TermLinearisation]:
-        return [*parts] if self.priors is None else [*parts, self.priors.linearise(state)]
+    def _summed(self, parts: list[BlockParts], state: CarState) -> list[Linearisation | TermLinearisation]:
+        if self.blocks is None:
+            return []
+        if self.priors is not None:
+            parts = [*parts, self.priors.parts(state)]
+        cost, gradient, hessian = self.blocks.sums(parts)
+        if self.silhouettes is not None:
+            cost = cost + self.silhouettes.constant
+        return [Linearisation(cost, gradient, hessian)]
 
     def follow(self, accepted: Tensor) -> None:
         """The objects (B,) that are now at the state of the latest evaluation."""
@@ -86,7 +115,7 @@ class TrackedEnergy:
 
     def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> TrackedEnergy:
         """Those of the objects where `keep` (B,) holds: `numbers` of them, as the host knows them."""
-        return TrackedEnergy(
+        return TrackedEnergy._of_parts(
             None if self.silhouettes is None else self.silhouettes.of_objects(keep, numbers),
             None if self.photometric is None else self.photometric.of_objects(keep, numbers),
             None if self.priors is None else self.priors.of_objects(keep, len(numbers)),

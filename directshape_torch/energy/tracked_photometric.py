@@ -12,8 +12,7 @@ from torch import Tensor
 from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
-from directshape_torch.solver.problem import Linearisation
-from directshape_torch.tracking.blocks import Blocks, PackedBlocks
+from directshape_torch.tracking.blocks import BlockParts, Blocks, PackedBlocks
 from directshape_torch.tracking.field import BlockField
 from directshape_torch.tracking.photometric import (
     Hits,
@@ -76,8 +75,8 @@ class TrackedPhotometric:
         rows, hits = _rows(term, packed), _hits(term, projected, packed)
         return cls(packed.blocks, rows, settings, weight[packed.blocks.owner], hits)
 
-    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> Linearisation:
-        """Cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
+    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> BlockParts:
+        """What blocks add to cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
         return self._noted(
             linearise_photometric(field, self.rows, self.settings, self._of_blocks(T_obj_cam), self.hits)
         )
@@ -91,8 +90,8 @@ class TrackedPhotometric:
         """Residuals (M, 64, N), differentiable."""
         return self._residual(depth_of_state(field, self.rows, self._of_blocks(T_obj_cam), fixed.surface)).value
 
-    def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: FixedSurface) -> Linearisation:
-        """The linearisation with any Jacobian (M, 64, N, D) of the residuals."""
+    def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: FixedSurface) -> BlockParts:
+        """The same with any Jacobian (M, 64, N, D) of the residuals."""
         hits = fixed.surface.hits
         return self._noted(accumulate_photometric(self.rows, self.settings, residual, J, fixed.usable, hits))
 
@@ -122,9 +121,9 @@ class TrackedPhotometric:
     def _residual(self, depth: Tensor) -> Residual:
         return photometric_residuals(self.rows, self.settings, depth)
 
-    def _noted(self, sums: PhotometricSums) -> Linearisation:
+    def _noted(self, sums: PhotometricSums) -> BlockParts:
         self.latest = Hits(sums.points_obj, sums.normal_obj)
-        return Linearisation(*self.blocks.sums(self.weight, sums.cost, sums.products))
+        return BlockParts(sums.cost, sums.products)
 
 
 def _rows(term: PhotometricTerm, packed: PackedBlocks) -> PhotometricRows:

@@ -12,8 +12,7 @@ from torch import Tensor
 from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
-from directshape_torch.solver.problem import Linearisation
-from directshape_torch.tracking.blocks import Blocks, PackedBlocks
+from directshape_torch.tracking.blocks import BlockParts, Blocks, PackedBlocks
 from directshape_torch.tracking.field import BlockField
 from directshape_torch.tracking.rays import BlockRays
 from directshape_torch.tracking.silhouette import (
@@ -90,8 +89,8 @@ class TrackedSilhouettes:
             anchor_obj=torch.cat([side.anchor_obj for side in sides], dim=1),
         )
 
-    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> Linearisation:
-        """Cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
+    def linearise(self, field: BlockField, T_obj_cam: Tensor) -> BlockParts:
+        """What blocks add to cost, gradient and Gauss-Newton matrix at poses (B, 4, 4), with hand-derived Jacobians."""
         return self._noted(linearise_silhouettes(field, self.rows, self._of_blocks(T_obj_cam), self.anchor_obj))
 
     def fixed_depths(self, field: BlockField, T_obj_cam: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,8 +101,8 @@ class TrackedSilhouettes:
         """Residuals (M, 64) at fixed depths, differentiable."""
         return silhouette_residuals(field, self.rows, self._of_blocks(T_obj_cam), *fixed)
 
-    def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: tuple[Tensor, Tensor]) -> Linearisation:
-        """The linearisation with any Jacobian (M, 64, D) of the residuals."""
+    def accumulate(self, residual: Tensor, J: Tensor, T_obj_cam: Tensor, fixed: tuple[Tensor, Tensor]) -> BlockParts:
+        """The same with any Jacobian (M, 64, D) of the residuals."""
         depth, crosses = fixed
         points = self.rows.rays.in_objects(self._of_blocks(T_obj_cam)).at(depth)
         J = torch.where(crosses[..., None], J, torch.zeros_like(J))
@@ -132,10 +131,9 @@ class TrackedSilhouettes:
     def _of_blocks(self, T_obj_cam: Tensor) -> Tensor:
         return self.rows.rays.of_blocks(T_obj_cam)
 
-    def _noted(self, sums: SilhouetteSums) -> Linearisation:
+    def _noted(self, sums: SilhouetteSums) -> BlockParts:
         self.latest = sums.points_obj
-        cost, gradient, hessian = self.blocks.sums(self.weight, sums.cost, sums.products)
-        return Linearisation(cost + self.constant, gradient, hessian)
+        return BlockParts(sums.cost, sums.products)
 
 
 class _Side(NamedTuple):

@@ -23,6 +23,13 @@ class ObjectSums(NamedTuple):
     hessian: Tensor  # (B, D, D)
 
 
+class BlockParts(NamedTuple):
+    """What each of M blocks adds to the sums of its object, float64."""
+
+    cost: Tensor  # (M,)
+    products: Tensor  # (M, D + 1, D) of `weighted_products`
+
+
 class Blocks(NamedTuple):
     """M blocks of B objects, an object's not necessarily side by side.
 
@@ -30,28 +37,18 @@ class Blocks(NamedTuple):
     """
 
     owner: Tensor  # (M,) object of each block
-    by_object: Tensor  # (M,) blocks of the first object in order, then of the second, ...
-    first: Tensor  # (B,) where those of each object begin
     counts: tuple[int, ...]  # (B,) of each object
 
     @classmethod
-    def of_owners(cls, owner: Tensor, counts: tuple[int, ...]) -> Blocks:
-        """Blocks of objects (M,), and how many each object has.
-
-        Example:
-            >>> blocks = Blocks.of_owners(torch.tensor([0, 2, 0]), (2, 0, 1))
-            >>> blocks.by_object, blocks.first
-            (tensor([0, 2, 1]), tensor([0, 2, 2]))
-        """
-        ascending, by_object = owner.sort(stable=True)
-        objects = torch.arange(len(counts), device=owner.device)
-        return cls(owner, by_object, torch.searchsorted(ascending, objects), counts)
+    def one_each(cls, num_objects: int, device: torch.device) -> Blocks:
+        """One block of every object."""
+        return cls(torch.arange(num_objects, device=device), (1,) * num_objects)
 
     @classmethod
-    def join(cls, parts: list[Blocks]) -> Blocks:
+    def join(cls, parts: Sequence[Blocks]) -> Blocks:
         """Blocks of the same objects, those of the parts one after the other."""
         counts = tuple(map(sum, zip(*(part.counts for part in parts), strict=True)))
-        return cls.of_owners(torch.cat([part.owner for part in parts]), counts)
+        return cls(torch.cat([part.owner for part in parts]), counts)
 
     def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> tuple[Blocks, Tensor]:
         """The blocks of the objects where `keep` (B,) holds, renumbered, and which (R,) of the blocks they are.
@@ -63,21 +60,41 @@ class Blocks(NamedTuple):
         counts = tuple(self.counts[number] for number in numbers)
         kept = torch.nonzero_static(keep[self.owner], size=sum(counts))[:, 0]
         new_object = torch.cumsum(keep.long(), 0) - 1
-        return Blocks.of_owners(new_object[self.owner[kept]], counts), kept
+        return Blocks(new_object[self.owner[kept]], counts), kept
 
-    def sums(self, weight: Tensor, cost: Tensor, products: Tensor) -> ObjectSums:
+
+class WeightedBlocks(NamedTuple):
+    """Blocks in the order in which they are added, with the weights of their parts."""
+
+    by_object: Tensor  # (M,) blocks of the first object in order, then of the second, ...
+    first: Tensor  # (B,) where those of each object begin
+    weight: Tensor  # (M,) float64, in that order
+
+    @classmethod
+    def of(cls, blocks: Blocks, weight: Tensor) -> WeightedBlocks:
+        """Blocks with a weight (M,) for each, float64.
+
+        Example:
+            >>> blocks = WeightedBlocks.of(Blocks(torch.tensor([0, 2, 0]), (2, 0, 1)), torch.tensor([0.1, 0.2, 0.3]))
+            >>> blocks.by_object, blocks.first, blocks.weight
+            (tensor([0, 2, 1]), tensor([0, 2, 2]), tensor([0.1000, 0.3000, 0.2000]))
+        """
+        ascending, by_object = blocks.owner.sort(stable=True)
+        objects = torch.arange(len(blocks.counts), device=blocks.owner.device)
+        return cls(by_object, torch.searchsorted(ascending, objects), weight[by_object])
+
+    def sums(self, parts: Sequence[BlockParts]) -> ObjectSums:
         """Weighted sums over the blocks of each object, block after block: whatever the other objects have.
 
         Args:
-            weight: (M,) of each block, float64.
-            cost: (M,), float64.
-            products: (M, D + 1, D) of `weighted_products`.
+            parts: of the blocks, those of one kind of rows after the other's.
         """
+        cost, products = (torch.cat(of_kinds) for of_kinds in zip(*parts, strict=True))
         _, rows, unknowns = products.shape
-        both = torch.cat([products.flatten(1), cost[:, None]], dim=1)
+        both = torch.cat([products.flatten(1), cost.unsqueeze(1)], dim=1)
         # A lookup in a table of rows, which are added as they are read: nothing but the sums is written.
         total = torch.nn.functional.embedding_bag(
-            self.by_object, both, self.first, mode="sum", per_sample_weights=weight[self.by_object]
+            self.by_object, both, self.first, mode="sum", per_sample_weights=self.weight
         )
         of_object = total[:, :-1].reshape(-1, rows, unknowns)
         return ObjectSums(total[:, -1], of_object[:, -1], of_object[:, :-1])
@@ -108,7 +125,7 @@ class PackedBlocks(NamedTuple):
         filled = cut.block_rows < len(cut.object_index)
         # An empty place must not bring another object's numbers, which may be NaN, nor an index out of range.
         rows = torch.where(filled, cut.block_rows, cut.block_rows[:, :1])
-        return cls(Blocks.of_owners(cut.owner, tuple(cut.num_blocks.tolist())), rows, filled)
+        return cls(Blocks(cut.owner, tuple(cut.num_blocks.tolist())), rows, filled)
 
 
 def weighted_products(

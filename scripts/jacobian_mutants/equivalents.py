@@ -54,23 +54,16 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("_hidden", "nowhere[:, :1]", "nowhere[:, 1:2]", "another column of the same zeros"),
     Equivalent("are_tracked", "(*sides, *photometric)", "(*photometric, *sides)", "only membership is asked"),
     Equivalent(
-        "TrackedEnergy._with_priors",
-        "[*parts, self.priors.linearise(state)]",
-        "[self.priors.linearise(state), *parts]",
-        "the order of the parts, which are added",
-    ),
-    Equivalent(
         "_Dimensions.rows",
         "torch.cat([at.J_hwl_code.to(torch.float64), residual], dim=2) * self.scale",
         "(-(torch.cat([at.J_hwl_code.to(torch.float64), residual], dim=2) * self.scale))",
         _ROW_IN_PAIRS,
     ),
     Equivalent("StackedPriors.from_terms", "terms[0]", "terms[1]", "all priors of a batch know the same cars"),
-    Equivalent("StackedPriors.linearise", "(1, 2)", "(2, 1)", "a sum over both axes, in either order"),
     Equivalent(
         "StackedPriors.of_objects",
-        "self.pose_rows.index_select(0, index)",
-        "(-self.pose_rows.index_select(0, index))",
+        "self.rows.index_select(0, index)",
+        "(-self.rows.index_select(0, index))",
         _ROW_IN_PAIRS,
     ),
     Equivalent(

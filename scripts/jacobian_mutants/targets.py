@@ -248,8 +248,8 @@ TARGETS: dict[str, Target] = {
         (
             "Blocks.join",
             "Blocks.of_objects",
-            "Blocks.of_owners",
-            "Blocks.sums",
+            "WeightedBlocks.of",
+            "WeightedBlocks.sums",
             "PackedBlocks.of_rows",
             "weighted_products",
         ),
@@ -367,7 +367,8 @@ TARGETS: dict[str, Target] = {
             "TrackedEnergy.of_terms",
             "TrackedEnergy.linearise",
             "TrackedEnergy.linearise_by_autograd",
-            "TrackedEnergy._with_priors",
+            "TrackedEnergy._of_parts",
+            "TrackedEnergy._summed",
             "TrackedEnergy.follow",
             "TrackedEnergy.of_objects",
             "are_tracked",
@@ -386,10 +387,11 @@ TARGETS: dict[str, Target] = {
         ("scaled", "total_of", "sum_of"),
         (f"{_TRACKED}::test_factors_of_single_cars",),
     ),
-    "pose_rows": Target(
-        "directshape_torch/energy/pose_rows.py",
+    "prior_rows": Target(
+        "directshape_torch/energy/prior_rows.py",
         (
-            "pose_features",
+            "state_features",
+            "state_rows",
             "heading_constants",
             "position_rows",
             "level_rows",
@@ -407,6 +409,7 @@ TARGETS: dict[str, Target] = {
             "_Dimensions.of_objects",
             "StackedPriors.from_terms",
             "StackedPriors.linearise",
+            "StackedPriors.parts",
             "StackedPriors.of_objects",
             "_roots_of_weights",
             "_pose_rows",

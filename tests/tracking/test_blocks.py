@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.tracking.blocks import Blocks, PackedBlocks, weighted_products
+from directshape_torch.tracking.blocks import BlockParts, Blocks, PackedBlocks, WeightedBlocks, weighted_products
 
 COUNTS = [[0], [3], [64], [65, 0, 1], [130, 64, 0, 200], [0, 0, 5], []]
 UNKNOWNS = 4
@@ -31,7 +31,8 @@ def sums_of(packed: PackedBlocks, rows: tuple[Tensor, ...], weight: Tensor) -> t
     J, first, second, cost = (x[packed.rows] for x in rows)
     first, second, cost = (torch.where(packed.filled, x, torch.zeros_like(x)) for x in (first, second, cost))
     owner = packed.blocks.owner
-    return packed.blocks.sums(weight[owner], cost.sum(dim=1), weighted_products(J, first, second))
+    parts = BlockParts(cost.sum(dim=1), weighted_products(J, first, second))
+    return WeightedBlocks.of(packed.blocks, weight[owner]).sums([parts])
 
 
 def looped(index: Tensor, rows: tuple[Tensor, ...], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -49,9 +50,10 @@ def looped(index: Tensor, rows: tuple[Tensor, ...], weight: Tensor) -> tuple[Ten
 
 def blocks_of_each(blocks: Blocks) -> list[list[int]]:
     """By their places in order: object by object."""
-    places = [*blocks.first.tolist(), len(blocks.owner)]
+    order = WeightedBlocks.of(blocks, torch.ones(len(blocks.owner), dtype=torch.float64))
+    places = [*order.first.tolist(), len(blocks.owner)]
     assert [end - begin for begin, end in itertools.pairwise(places)] == list(blocks.counts)
-    return [blocks.by_object[begin:end].tolist() for begin, end in itertools.pairwise(places)]
+    return [order.by_object[begin:end].tolist() for begin, end in itertools.pairwise(places)]
 
 
 def weights(num_objects: int) -> Tensor:
@@ -90,13 +92,12 @@ def _joined() -> tuple[Blocks, list[PackedBlocks]]:
 
 
 def _of_both(blocks: Blocks, parts: list[PackedBlocks], weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    costs, products = [], []
+    of_each = []
     for number, (packed, counts) in enumerate(zip(parts, (LEFT, RIGHT), strict=True)):
         J, first, second, cost = (x[packed.rows] for x in rows_of(counts, number))
         first, second, cost = (torch.where(packed.filled, x, torch.zeros_like(x)) for x in (first, second, cost))
-        costs.append(cost.sum(dim=1))
-        products.append(weighted_products(J, first, second))
-    return blocks.sums(weight[blocks.owner], torch.cat(costs), torch.cat(products))
+        of_each.append(BlockParts(cost.sum(dim=1), weighted_products(J, first, second)))
+    return WeightedBlocks.of(blocks, weight[blocks.owner]).sums(of_each)
 
 
 def test_joined_blocks_add_what_their_parts_give() -> None:
@@ -106,6 +107,25 @@ def test_joined_blocks_add_what_their_parts_give() -> None:
     assert_same(_of_both(blocks, parts, weight), tuple(a + b for a, b in zip(*each, strict=True)))
     assert blocks.owner.tolist() == [0, 0, 0, 2, 3, 0, 1, 1, 3, 3, 3, 3, 3]
     assert blocks_of_each(blocks) == [[0, 1, 2, 5], [6, 7], [3], [4, 8, 9, 10, 11, 12]]
+
+
+def test_one_block_of_every_object() -> None:
+    """As priors have it: its sum is itself, beside those of other rows and alone."""
+    blocks, parts = _joined()
+    every = Blocks.one_each(4, torch.device("cpu"))
+    own = BlockParts(weights(4), torch.randn(4, UNKNOWNS + 1, UNKNOWNS, dtype=torch.float64))
+    ones = torch.ones(4, dtype=torch.float64)
+    cost, gradient, hessian = WeightedBlocks.of(every, ones).sums([own])
+    assert torch.equal(cost, own.cost)
+    assert torch.equal(torch.cat([hessian, gradient[:, None]], dim=1), own.products)
+    others = BlockParts(torch.ones(len(blocks.owner), dtype=torch.float64), own.products[blocks.owner])
+    joined = Blocks.join([blocks, every])
+    assert joined.counts == tuple(1 + count for count in blocks.counts)
+    together = WeightedBlocks.of(joined, torch.ones(len(joined.owner), dtype=torch.float64)).sums([others, own])
+    expected = own.cost + torch.tensor(blocks.counts)
+    torch.testing.assert_close(together.cost, expected)
+    torch.testing.assert_close(together.gradient, gradient * (1 + torch.tensor(blocks.counts))[:, None].double())
+    assert len(parts) == 2
 
 
 def test_one_part_joined_is_itself() -> None:
@@ -131,8 +151,9 @@ def test_objects_that_leave_take_their_blocks_along(keep: list[int]) -> None:
     count = len(blocks.owner)
     cost = torch.randn(count, generator=generator, dtype=torch.float64)
     products = torch.randn(count, UNKNOWNS + 1, UNKNOWNS, generator=generator, dtype=torch.float64)
-    all_of_them = blocks.sums(weight[blocks.owner], cost, products)
-    some = fewer.sums(weight[kept][fewer.owner], cost[chosen], products[chosen])
+    all_of_them = WeightedBlocks.of(blocks, weight[blocks.owner]).sums([BlockParts(cost, products)])
+    of_kept = BlockParts(cost[chosen], products[chosen])
+    some = WeightedBlocks.of(fewer, weight[kept][fewer.owner]).sums([of_kept])
     for x, y in zip(some, all_of_them, strict=True):
         assert torch.equal(x, y[kept])
     assert len(parts) == 2
@@ -151,7 +172,9 @@ def test_an_objects_sums_do_not_depend_on_how_many_blocks_the_others_have() -> N
     wide_cost = torch.full((many,), torch.nan, dtype=torch.float64).index_copy(0, own, cost)
     wide = torch.full((many, *products.shape[1:]), torch.nan, dtype=torch.float64).index_copy(0, own, products)
     weight = torch.ones(many, dtype=torch.float64)
-    for x, y in zip(alone.sums(ones, cost, products), beside.sums(weight, wide_cost, wide), strict=True):
+    sums = WeightedBlocks.of(alone, ones).sums([BlockParts(cost, products)])
+    beside_sums = WeightedBlocks.of(beside, weight).sums([BlockParts(wide_cost, wide)])
+    for x, y in zip(sums, beside_sums, strict=True):
         assert torch.equal(x[0], y[0])
         assert not torch.isfinite(y[1]).any()
 
