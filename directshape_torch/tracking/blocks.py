@@ -90,14 +90,15 @@ class WeightedBlocks(NamedTuple):
             parts: of the blocks, those of one kind of rows after the other's.
         """
         cost, products = (torch.cat(of_kinds) for of_kinds in zip(*parts, strict=True))
-        _, rows, unknowns = products.shape
-        both = torch.cat([products.flatten(1), cost.unsqueeze(1)], dim=1)
+        gradient_and_hessian = self._sum(products.flatten(1)).view(-1, *products.shape[1:])
+        return ObjectSums(self._sum(cost.unsqueeze(1))[:, 0], gradient_and_hessian[:, -1], gradient_and_hessian[:, :-1])
+
+    def _sum(self, table: Tensor) -> Tensor:
+        """Sums (B, n) of the rows (M, n) of each object."""
         # A lookup in a table of rows, which are added as they are read: nothing but the sums is written.
-        total = torch.nn.functional.embedding_bag(
-            self.by_object, both, self.first, mode="sum", per_sample_weights=self.weight
+        return torch.nn.functional.embedding_bag(
+            self.by_object, table, self.first, mode="sum", per_sample_weights=self.weight
         )
-        of_object = total[:, :-1].reshape(-1, rows, unknowns)
-        return ObjectSums(total[:, -1], of_object[:, -1], of_object[:, :-1])
 
 
 class PackedBlocks(NamedTuple):

@@ -250,6 +250,7 @@ TARGETS: dict[str, Target] = {
             "Blocks.of_objects",
             "WeightedBlocks.of",
             "WeightedBlocks.sums",
+            "WeightedBlocks._sum",
             "PackedBlocks.of_rows",
             "weighted_products",
         ),
