@@ -68,7 +68,7 @@ def position_rows(
     offset: Tensor,  # (B, R)
 ) -> Tensor:  # (B, R, 7, F)
     """`r = axis . origin_cam + offset`, whose Jacobian is `-axis R_cam_obj` by v."""
-    rows = _no_rows(axes_cam, axes_cam.shape[1])
+    rows = no_rows(axes_cam, axes_cam.shape[1])
     for i in range(3):
         rows[:, :, i, 4 * i : 4 * i + 3] = -axes_cam
     rows[:, :, RESIDUAL, _MINUS_ORIGIN : _MINUS_ORIGIN + 3] = -axes_cam
@@ -78,7 +78,7 @@ def position_rows(
 
 def level_rows(normal_cam: Tensor) -> Tensor:
     """`r = (n_obj.x, n_obj.z)` of `tilt_prior_normal` for normals (B, 3), scaled as they are; (B, 2, 7, F)."""
-    rows = _no_rows(normal_cam, 2)
+    rows = no_rows(normal_cam, 2)
     _put_normal(rows[:, 0], normal_cam, residual=0, J_omega={1: (2, 1), 2: (1, -1)})
     _put_normal(rows[:, 1], normal_cam, residual=2, J_omega={0: (1, 1), 1: (0, -1)})
     return rows
@@ -86,7 +86,7 @@ def level_rows(normal_cam: Tensor) -> Tensor:
 
 def cosine_rows(normal_cam: Tensor, scale: Tensor) -> Tensor:
     """`r = scale + n_obj.y` of `tilt_prior_cosine` for normals (B, 3) of length `scale` (B,); (B, 1, 7, F)."""
-    rows = _no_rows(normal_cam, 1)
+    rows = no_rows(normal_cam, 1)
     _put_normal(rows[:, 0], normal_cam, residual=1, J_omega={0: (2, -1), 2: (0, 1)})
     rows[:, 0, RESIDUAL, _ONE] = scale
     return rows
@@ -94,7 +94,7 @@ def cosine_rows(normal_cam: Tensor, scale: Tensor) -> Tensor:
 
 def heading_rows(scale: Tensor) -> Tensor:
     """`r = scale * angle from the detector's heading`, (B, 1, 7, F) for scales (B,)."""
-    rows = _no_rows(scale[:, None], 1)
+    rows = no_rows(scale[:, None], 1)
     rows[:, 0, RESIDUAL, _ANGLE] = scale
     rows[:, 0, _OMEGA + 1, _J_Y] = scale
     rows[:, 0, _OMEGA + 2, _J_MINUS_Z] = -scale
@@ -106,7 +106,8 @@ def without_heading(rows: Tensor) -> Tensor:
     return rows[..., :_ANGLE]
 
 
-def _no_rows(like: Tensor, count: int) -> Tensor:
+def no_rows(like: Tensor, count: int = 0) -> Tensor:
+    """Rows (B, count, 7, F) of zeros for B cars."""
     return like.new_zeros(len(like), count, NUM_COLUMNS, _NUM_FEATURES)
 
 

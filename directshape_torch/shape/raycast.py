@@ -31,7 +31,7 @@ class ObjectRays:
 
     def at(self, depth: Tensor) -> Tensor:
         """Points (P, 3) at depths (P,)."""
-        return self.origin_obj + depth[:, None] * self.direction_obj
+        return torch.addcmul(self.origin_obj, depth[:, None], self.direction_obj)
 
     def select(self, index: Tensor) -> ObjectRays:
         return ObjectRays(*(x.index_select(0, index) for x in (self.origin_obj, self.direction_obj, self.object_index)))

@@ -35,7 +35,6 @@ _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEI
 
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
-    Equivalent("exp", "zero", "(-zero)", _OF_ZERO),
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("viewing_axes", "zero", "(-zero)", _OF_ZERO),
@@ -102,9 +101,7 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         _ROW_IN_PAIRS,
     ),
     Equivalent("_pose_rows", "heading_rows(scale[:, 3])", "(-heading_rows(scale[:, 3]))", _ROW_IN_PAIRS),
-    Equivalent("_pose_rows", "level_rows(normal)[:, :0]", "level_rows(normal)[:, 0:0]", "an empty slice either way"),
     Equivalent("_code_rows", "root[:, None, None] * identity", "(-(root[:, None, None] * identity))", _ROW_IN_PAIRS),
-    Equivalent("_code_rows", "rows[:, :0]", "rows[:, 0:0]", "an empty slice either way"),
     Equivalent(
         "_dimensions",
         "root[:, None] / constant_like(sigma_hwl_m, root)",
