@@ -101,7 +101,12 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         _ROW_IN_PAIRS,
     ),
     Equivalent("_pose_rows", "heading_rows(scale[:, 3])", "(-heading_rows(scale[:, 3]))", _ROW_IN_PAIRS),
-    Equivalent("_code_rows", "root[:, None, None] * identity", "(-(root[:, None, None] * identity))", _ROW_IN_PAIRS),
+    Equivalent(
+        "_code_rows",
+        "root[:, None, None] * torch.eye(num_codes, num_codes + 1, dtype=root.dtype, device=root.device)",
+        "(-(root[:, None, None] * torch.eye(num_codes, num_codes + 1, dtype=root.dtype, device=root.device)))",
+        _ROW_IN_PAIRS,
+    ),
     Equivalent(
         "_dimensions",
         "root[:, None] / constant_like(sigma_hwl_m, root)",
