@@ -127,7 +127,7 @@ def project_boxes(
     K_left, K_right, T_right_cam = (x[0].double() for x in (camera.K_left, camera.K_right, camera.T_right_cam))
     uv_left = project(points_cam, K_left)
     field = camera.disparity_field
-    offset = () if field is None else (field.bias(uv_left), field.vertical(uv_left))
+    offset = () if field is None else field.offsets(uv_left)
     right = warp_to_right(rays_from_pixels(uv_left, K_left), points_cam[..., 2], K_right, T_right_cam, *offset)
     return (
         _enclosing_box(uv_left, in_front, size_hw),

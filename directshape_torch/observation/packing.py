@@ -144,7 +144,7 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
     if field is None:
         zero = torch.zeros_like(uv_left[..., 0])
         return zero, zero
-    return field.bias(uv_left), field.vertical(uv_left)
+    return field.offsets(uv_left)
 
 
 def sampling_settings(config: SamplingConfig) -> SamplingSettings:
