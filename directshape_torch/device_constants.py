@@ -1,13 +1,18 @@
-"""Constants as tensors: made once for each device, for making one from a list lets the host wait for the device."""
+"""Constants as tensors: made once for each device, for making one from a list lets the host wait for the device.
+
+And what objects make of their tensors once, when it is asked for. All of it can be used in and out of inference mode,
+wherever it was made, and nothing is kept that a transform or a tracer of PyTorch made for itself.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, wraps
-from typing import TypeVar
+from typing import Any, Generic, TypeVar, overload
 
 import torch
 from torch import Tensor
+
+from directshape_torch.gradient_mode import is_plain
 
 _T = TypeVar("_T")
 
@@ -19,14 +24,7 @@ def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
         >>> constant_like((0.5, 2.0), torch.zeros(1))
         tensor([0.5000, 2.0000])
     """
-    return _constant(values, like.dtype, like.device)
-
-
-@lru_cache(maxsize=256)
-def _constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    # Usable in and out of inference mode, wherever it was made.
-    with torch.inference_mode(mode=False):
-        return torch.tensor(values, dtype=dtype, device=device)
+    return _kept(_CONSTANTS, values, like, lambda dtype, device: torch.tensor(values, dtype=dtype, device=device))
 
 
 def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tensor], _T]:
@@ -39,15 +37,73 @@ def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tens
         >>> ramp(torch.zeros(1)), ramp(torch.zeros(1)) is ramp(torch.ones(1))
         (tensor([0., 1., 2.]), True)
     """
+    constants: dict[_Key, Any] = {}
 
-    @lru_cache(maxsize=32)
-    def made(dtype: torch.dtype, device: torch.device) -> _T:
-        # Usable in and out of inference mode, wherever they were made.
-        with torch.inference_mode(mode=False):
-            return make(dtype, device)
-
-    @wraps(make)
     def like(tensor: Tensor) -> _T:
-        return made(tensor.dtype, tensor.device)
+        return _kept(constants, (), tensor, make)
 
     return like
+
+
+_Key = tuple[tuple[float, ...], torch.dtype, torch.device]
+_CONSTANTS: dict[_Key, Any] = {}
+_MOST_KEPT = 256
+
+
+def _kept(
+    constants: dict[_Key, Any],
+    values: tuple[float, ...],
+    like: Tensor,
+    make: Callable[[torch.dtype, torch.device], _T],
+) -> _T:
+    key = (values, like.dtype, like.device)
+    if not torch.compiler.is_compiling() and key in constants:
+        known: _T = constants[key]
+        return known
+    with torch.inference_mode(False):
+        made = make(like.dtype, like.device)
+        if not torch.compiler.is_compiling() and is_plain(torch.empty(0, device=like.device)):
+            if len(constants) >= _MOST_KEPT:
+                constants.clear()
+            constants[key] = made
+    return made
+
+
+class kept_property(Generic[_T]):  # noqa: N801  used as `functools.cached_property` is
+    """A `functools.cached_property` for a tensor that an object makes of its own.
+
+    Example:
+        >>> class Row:
+        ...     def __init__(self, length: int) -> None:
+        ...         self.length = length
+        ...
+        ...     @kept_property
+        ...     def places(self) -> torch.Tensor:
+        ...         return torch.arange(self.length)
+        >>> row = Row(2)
+        >>> row.places, row.places is row.places
+        (tensor([0, 1]), True)
+    """
+
+    def __init__(self, make: Callable[[Any], _T]) -> None:
+        self._make = make
+        self.__doc__ = make.__doc__
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> kept_property[_T]: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> _T: ...
+
+    def __get__(self, instance: object | None, owner: type) -> kept_property[_T] | _T:
+        if instance is None:
+            return self
+        with torch.inference_mode(False):
+            made = self._make(instance)
+        # Found there before this is asked again.
+        if isinstance(made, Tensor) and not torch.compiler.is_compiling() and is_plain(made):
+            instance.__dict__[self._name] = made
+        return made

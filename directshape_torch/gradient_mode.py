@@ -1,8 +1,9 @@
-"""Whether what is computed now can be differentiated."""
+"""Whether what is computed now can be differentiated, and whether it may be kept."""
 
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 
 def nothing_is_differentiated() -> bool:
@@ -28,3 +29,15 @@ def is_forward_mode() -> bool:
         True
     """
     return torch.autograd.forward_ad._current_level >= 0
+
+
+def is_plain(tensor: Tensor) -> bool:
+    """Whether a tensor is one of numbers alone: not a wrapper of `torch.func`, nor a tracer's without any numbers.
+
+    Only such ones may be kept for later: the others mean nothing outside of the call that made them.
+
+    Example:
+        >>> is_plain(torch.ones(1)), torch.func.grad(lambda x: x * is_plain(x))(torch.tensor(2.0)).item()
+        (True, 0.0)
+    """
+    return type(tensor) in (Tensor, torch.nn.Parameter) and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)

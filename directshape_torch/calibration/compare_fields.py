@@ -64,8 +64,8 @@ def compare_fields(
     if not bool(common.any()):
         raise InputError("fields", "hulls with a common part", "none", "fit the fields to more of the image")
     inside = uv[common]
-    difference = first.bias(inside) - second.bias(inside)
-    of_rows = first.vertical(inside) - second.vertical(inside)
+    of_both = zip(first.offsets(inside), second.offsets(inside), strict=True)
+    difference, of_rows = (one - other for one, other in of_both)
     return FieldDifference(
         float(common.double().mean()),
         float(difference.mean()),

@@ -24,7 +24,7 @@ def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_ang
         state: B cars.
         delta: (B, 6 + K), `(v, omega, dcode)` in metres, radians and standard deviations.
         max_code: largest magnitude of a code component.
-        max_angle: no rotation is larger, radians, as far as is known (`se3.exp`).
+        max_angle: no rotation is larger, radians (see `se3.exp`).
 
     Example:
         >>> state = CarState(torch.eye(4)[None], torch.zeros(1, 2))

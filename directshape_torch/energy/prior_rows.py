@@ -1,9 +1,8 @@
-"""Rows of the priors of a state as linear functions of a vector of features of it.
+"""Rows of the priors of a pose as linear functions of a vector of features of it.
 
 Residuals of height, tilt and pose and their Jacobians by the twist are linear in the entries of `T_obj_cam`, in the
-object's origin in the camera frame, and in the heading with its two derivatives; those of the shape and of its
-dimensions are linear in the code. The coefficients are constants of a refinement, so one product gives all rows.
-`residuals.priors` has the same residuals one by one, readable.
+object's origin in the camera frame, and in the heading with its two derivatives. The coefficients are constants of a
+refinement, so one product gives all rows. `residuals.priors` has the same residuals one by one, readable.
 """
 
 from __future__ import annotations
@@ -12,19 +11,17 @@ import torch
 from torch import Tensor
 
 # The features: the sixteen entries of T_obj_cam, row by row, the last of which is 1; R_cam_obj t, which is minus the
-# origin in the camera frame; the angle from the detector's heading, and its derivatives by -omega_z and omega_y. Behind
-# them those of a code, which are itself.
+# origin in the camera frame; the angle from the detector's heading, and its derivatives by -omega_z and omega_y.
 _ONE, _MINUS_ORIGIN, _ANGLE, _J_MINUS_Z, _J_Y, _NUM_FEATURES = 15, 16, 19, 20, 21, 22
 # The columns of a row: its Jacobian by the twist (v, omega), then the residual.
 _OMEGA, RESIDUAL, NUM_COLUMNS = 3, 6, 7
 
 
-def state_features(
+def pose_features(
     T_obj_cam: Tensor,  # (B, 4, 4)
-    code: Tensor,  # (B, K)
     heading: Tensor | None,  # (B, 4, 2) of `heading_constants`
 ) -> Tensor:  # (B, F, 1)
-    """What the rows are linear in; F is 22 + K, or 19 + K without a prior of the heading."""
+    """What the rows are linear in; F is 22, or 19 without a prior of the heading."""
     R_obj_cam, t = torch.split_with_sizes(T_obj_cam[:, :3], [3, 1], dim=2)
     parts = [T_obj_cam.reshape(-1, 16, 1), torch.bmm(R_obj_cam.mT, t)]
     if heading is not None:
@@ -34,23 +31,16 @@ def state_features(
         # atan2(-h_z, h_x) moves by (h_z dh_x - h_x dh_z) / |h|^2.
         slopes = torch.bmm(horizontal[:, 1:], turned) / (turned * turned).sum(dim=1, keepdim=True)
         parts += [torch.atan2(sine, cosine), slopes]
-    return torch.cat([*parts, code.unsqueeze(2)], dim=1)
+    return torch.cat(parts, dim=1)
 
 
-def state_rows(
-    pose_rows: Tensor,  # (B, R, 7, F) of priors of the pose
-    code_rows: Tensor,  # (B, Q, K + 1) rows [J r] at the code 0 of priors that are linear in the code
-) -> Tensor:  # (B, R + Q, 6 + K + 1, F + K)
-    """Both as functions of the features of a state."""
-    cars, num_pose_rows, _, num_pose_features = pose_rows.shape
-    of_code, num_codes = code_rows.shape[1], code_rows.shape[2] - 1
-    rows = pose_rows.new_zeros(cars, num_pose_rows + of_code, NUM_COLUMNS + num_codes, num_pose_features + num_codes)
-    of_pose, of_shape = rows[:, :num_pose_rows, :, :num_pose_features], rows[:, num_pose_rows:]
-    of_pose[:, :, :RESIDUAL] = pose_rows[:, :, :RESIDUAL]
-    of_pose[:, :, -1] = pose_rows[:, :, RESIDUAL]
-    of_shape[:, :, RESIDUAL:, _ONE] = code_rows
-    of_shape[:, :, -1, num_pose_features:] = code_rows[:, :, :-1]
-    return rows
+def beside_codes(
+    rows: Tensor,  # (B, R, 7, F) of priors of the pose
+    num_codes: int,
+) -> Tensor:  # (B, R, 6 + K + 1, F)
+    """Among the columns of a state, (v, omega, code) and the residual."""
+    twist, residual = torch.split_with_sizes(rows, [RESIDUAL, 1], dim=2)
+    return torch.cat([twist, rows.new_zeros(*rows.shape[:2], num_codes, rows.shape[3]), residual], dim=2)
 
 
 def heading_constants(detector_T_cam_obj: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """All prior terms of a batch of cars at once: the sums of the terms by themselves, in a few small operations.
 
-The rows of all of them come from one product with constants (`prior_rows`). With five cars the terms one by one are
-hundreds of operations on a handful of numbers each.
+The rows of height, tilt and pose come from one product with constants (`prior_rows`), what is linear in the code has
+constant slopes, and one square of them all is the whole matrix. With five cars the terms one by one are hundreds of
+operations on a handful of numbers each.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from torch import Tensor
 from directshape_torch.device_constants import constant_like
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.prior_rows import (
+    beside_codes,
     cosine_rows,
     heading_constants,
     heading_rows,
     level_rows,
     no_rows,
+    pose_features,
     position_rows,
-    state_features,
-    state_rows,
     without_heading,
 )
 from directshape_torch.energy.prior_terms import (
@@ -36,7 +37,7 @@ from directshape_torch.energy.prior_terms import (
     TiltResidual,
     detector_pose_sigma,
 )
-from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.energy.term import Term
 from directshape_torch.errors import InputError
 from directshape_torch.residuals.priors import viewing_axes
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -75,16 +76,20 @@ class _Dimensions:
 class StackedPriors:
     """The sum of several `PriorTerm`s, in float64 throughout but for the dimensions that a shape prior computes itself.
 
+    Of each row `[J r]` as they enter squares, times the roots of the weights.
+
     Attributes:
-        rows: (B, R (D + 1), F) from the features of a state to the rows `[J r]` of its priors.
+        pose_rows: (B, R (D + 1), F) from the features of a pose to the rows of its priors.
         heading: (B, 4, 2) of `heading_constants`; None where no prior asks for the heading.
-        ones: (B,) the weights are in the rows.
+        code_slopes: (B, Q, D) of priors that are linear in the code.
+        code_rest: (B, Q, 1) their residuals at the code 0.
         dimensions: priors of dimensions that are not linear in the code.
     """
 
-    rows: Tensor
+    pose_rows: Tensor
     heading: Tensor | None
-    ones: Tensor
+    code_slopes: Tensor
+    code_rest: Tensor
     dimensions: tuple[_Dimensions, ...]
 
     @staticmethod
@@ -114,28 +119,27 @@ class StackedPriors:
         code_rows = torch.cat([_code_rows(term, root, num_codes) for term, root in scaled], dim=1)
         sees_heading = any(isinstance(term.residual_of, PoseResidual) for term in terms)
         dimensions = (_dimensions(term, root) for term, root in scaled)
+        pose_rows = beside_codes(pose_rows if sees_heading else without_heading(pose_rows), num_codes)
+        slopes, rest = torch.split_with_sizes(code_rows, [num_codes, 1], dim=2)
         return cls(
-            rows=state_rows(pose_rows if sees_heading else without_heading(pose_rows), code_rows).flatten(1, 2),
+            pose_rows=pose_rows.flatten(1, 2),
             heading=heading_constants(terms[0].cars.detector_T_cam_obj.to(torch.float64)) if sees_heading else None,
-            ones=torch.ones_like(scaled[0][1]),
+            code_slopes=torch.nn.functional.pad(slopes, (_TWIST, 0)),
+            code_rest=rest,
             dimensions=tuple(d for d in dimensions if d is not None and not d.are_linear),
         )
 
-    def cost(self, state: CarState) -> Tensor:
-        """Cost (B,) of a state."""
-        return self.parts(state).cost
-
-    def linearise(self, state: CarState) -> TermLinearisation:
-        """Cost, gradient and Gauss-Newton matrix, which is the Fisher matrix too; differentiable by autograd."""
-        cost, products = self.parts(state)
-        return TermLinearisation(cost, products[:, -1], products[:, :-1], products[:, :-1])
-
     def parts(self, state: CarState) -> BlockParts:
-        """Cost (B,), and Gauss-Newton matrix with the gradient as one more row, (B, D + 1, D)."""
-        columns = _TWIST + state.code.shape[1] + 1
-        features = state_features(state.T_obj_cam.to(torch.float64), state.code.to(torch.float64), self.heading)
-        # In less time than a product of matrices, with so many small ones.
-        rows = (self.rows * features.mT).sum(dim=2).view(len(features), self.rows.shape[1] // columns, columns)
+        """Cost (B,), and Gauss-Newton matrix with the gradient as one more row, (B, D + 1, D).
+
+        The matrix is the Fisher matrix too. Differentiable by autograd, forward and again.
+        """
+        code = state.code.to(torch.float64).unsqueeze(2)
+        columns = _TWIST + code.shape[1] + 1
+        of_pose = torch.bmm(self.pose_rows, pose_features(state.T_obj_cam.to(torch.float64), self.heading))
+        residual = torch.baddbmm(self.code_rest, self.code_slopes[:, :, _TWIST:], code)
+        of_code = torch.cat([self.code_slopes, residual], dim=2)
+        rows = torch.cat([of_pose.view(len(code), of_pose.shape[1] // columns, columns), of_code], dim=1)
         squares = torch.bmm(rows.mT, rows)
         for dimensions in self.dimensions:
             curved = dimensions.rows(state.code)
@@ -147,9 +151,10 @@ class StackedPriors:
         kept = keep.nonzero() if count is None else torch.nonzero_static(keep, size=count)
         index = kept[:, 0]
         return StackedPriors(
-            self.rows.index_select(0, index),
+            self.pose_rows.index_select(0, index),
             None if self.heading is None else self.heading.index_select(0, index),
-            self.ones.index_select(0, index),
+            self.code_slopes.index_select(0, index),
+            self.code_rest.index_select(0, index),
             tuple(dimensions.of_objects(index) for dimensions in self.dimensions),
         )
 

@@ -13,7 +13,7 @@ from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.energy.stacked_priors import StackedPriors
-from directshape_torch.energy.term import Term, TermLinearisation
+from directshape_torch.energy.term import Term
 from directshape_torch.energy.tracked_photometric import TrackedPhotometric
 from directshape_torch.energy.tracked_silhouettes import TrackedSilhouettes
 from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
@@ -25,6 +25,8 @@ from directshape_torch.tracking.field import block_field
 @dataclass
 class TrackedEnergy:
     """The terms of a stage whose rays are followed, and the priors: one sum over blocks of all of them.
+
+    For iterations: sums over blocks cannot be differentiated (`CarProblem.linearise_differentiably` can).
 
     Attributes:
         silhouettes, photometric, priors: those that there are.
@@ -65,7 +67,9 @@ class TrackedEnergy:
     ) -> TrackedEnergy:
         parts = [(t.blocks, t.weight) for t in (silhouettes, photometric) if t is not None]
         if priors is not None:
-            parts.append((Blocks.one_each(len(priors.rows), priors.rows.device), priors.ones))
+            # Their weights are in their rows.
+            ones = priors.code_rest.new_ones(len(priors.code_rest))
+            parts.append((Blocks.one_each(len(ones), ones.device), ones))
         if not parts:
             return cls(None, None, None, None)
         blocks, weights = zip(*parts, strict=True)
@@ -75,12 +79,12 @@ class TrackedEnergy:
     def _tracked(self) -> list[TrackedSilhouettes | TrackedPhotometric]:
         return [t for t in (self.silhouettes, self.photometric) if t is not None]
 
-    def linearise(self, shape: BoundShape, state: CarState) -> list[Linearisation | TermLinearisation]:
+    def linearise(self, shape: BoundShape, state: CarState) -> list[Linearisation]:
         """The sum of all at a state with these shapes, with hand-derived Jacobians; nothing where there are none."""
         field = block_field(shape)
         return self._summed([tracked.linearise(field, state.T_obj_cam) for tracked in self._tracked], state)
 
-    def linearise_by_autograd(self, prior: ShapePrior, state: CarState) -> list[Linearisation | TermLinearisation]:
+    def linearise_by_autograd(self, prior: ShapePrior, state: CarState) -> list[Linearisation]:
         """The same with the rays' Jacobians by forward-mode differentiation: D tangents at once, over all cars."""
         if not self._tracked:
             return self._summed([], state)
@@ -98,7 +102,7 @@ class TrackedEnergy:
         parts = [rows.accumulate(r, J_r) for rows, r, J_r in zip(fixed, residuals, J, strict=True)]
         return self._summed(parts, state)
 
-    def _summed(self, parts: list[BlockParts], state: CarState) -> list[Linearisation | TermLinearisation]:
+    def _summed(self, parts: list[BlockParts], state: CarState) -> list[Linearisation]:
         if self.blocks is None:
             return []
         if self.priors is not None:

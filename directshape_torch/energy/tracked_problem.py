@@ -51,12 +51,11 @@ class TrackedProblem:
 
     def linearise(self, state: CarState) -> Linearisation:
         if self.config.jacobian == "autograd":
-            parts = self.energy.linearise_by_autograd(self.prior, state)
+            tracked = self.energy.linearise_by_autograd(self.prior, state)
         else:
-            parts = self.energy.linearise(self._bound(state.code), state)
-        if self.others is not None:
-            parts += self.others.linearise_terms(state)
-        return without_held(total_of(parts), self.unknowns)
+            tracked = self.energy.linearise(self._bound(state.code), state)
+        others = [] if self.others is None else self.others.linearise_terms(state)
+        return without_held(total_of([*tracked, *others]), self.unknowns)
 
     def _bound(self, code: Tensor) -> BoundShape:
         # Not by `isinstance`: a prior made from this one may bind in its own way.

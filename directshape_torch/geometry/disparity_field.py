@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.gradient_mode import is_plain
 
 SCHEMA = "directshape disparity field"
 SCHEMA_VERSION = 1
@@ -66,9 +67,16 @@ def nearest_in_convex_polygon(
         tensor([[1., 2.],
                 [4., 2.]])
     """
-    flat = points.reshape(-1, 2)
-    outside = (~_is_inside(flat, polygon)).nonzero()[:, 0]
-    return flat.index_copy(0, outside, _nearest_on_border(flat[outside], polygon)).view(points.shape)
+    dtype = torch.promote_types(points.dtype, polygon.dtype)
+    flat, polygon = points.reshape(-1, 2).to(dtype), polygon.to(dtype)
+    inside = _is_inside(flat, polygon)
+    if points.device.type == "cpu" and is_plain(points):
+        # Few are outside; elsewhere asking which ones would let the host wait.
+        outside = (~inside).nonzero()[:, 0]
+        moved = flat.index_copy(0, outside, _nearest_on_border(flat[outside], polygon))
+    else:
+        moved = torch.where(inside[:, None], flat, _nearest_on_border(flat, polygon))
+    return moved.view(points.shape)
 
 
 def _is_inside(points: Tensor, polygon: Tensor) -> Tensor:
@@ -197,7 +205,8 @@ class DisparityField:
             (tensor([0.2500]), tensor([0.]))
         """
         inside = nearest_in_convex_polygon(uv_left, self.hull_uv.to(uv_left))
-        coefficients = torch.stack([self.coefficients, self.vertical_coefficients], dim=1).to(uv_left)
+        both = (self.coefficients, self.vertical_coefficients)
+        coefficients = torch.stack([x.to(uv_left) for x in both], dim=1)
         bias, vertical = (polynomial_basis(inside, self.size_wh) @ coefficients).unbind(dim=-1)
         return bias, vertical
 

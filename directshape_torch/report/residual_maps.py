@@ -137,7 +137,7 @@ def _photometric(
     camera = pair.camera
     assert pair.right is not None, "asked for only where there is a right image"
     rig = camera.disparity_field
-    bias, vertical = (None, None) if rig is None else (rig.bias(uv).to(uv), rig.vertical(uv).to(uv))
+    bias, vertical = (None, None) if rig is None else rig.offsets(uv)
     warped = warp_to_right(ray_cam, depth, camera.K_right[0], camera.T_right_cam[0], bias, vertical)
     frame = torch.zeros(len(uv), dtype=torch.int64)
     right, _, inside = bilinear_with_gradient(pair.right, frame, warped.uv_right)

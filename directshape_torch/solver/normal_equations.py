@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Self
 
 import torch
 from torch import Tensor
 
+from directshape_torch.device_constants import kept_property
 from directshape_torch.gradient_mode import nothing_is_differentiated
 
 _BLOCK = 64
@@ -40,34 +40,30 @@ class RowBlocks:
     def num_objects(self) -> int:
         return len(self.counts)
 
-    @cached_property
+    @kept_property
     def num_blocks(self) -> Tensor:
         """Blocks (B,) of each object."""
-        with _for_every_mode():
-            return (self.counts + _BLOCK - 1) // _BLOCK
+        return (self.counts + _BLOCK - 1) // _BLOCK
 
-    @cached_property
+    @kept_property
     def owner(self) -> Tensor:
         """Object (M,) of each block."""
-        with _for_every_mode():
-            objects = torch.arange(self.num_objects, device=self.counts.device)
-            return torch.repeat_interleave(objects, self.num_blocks)
+        objects = torch.arange(self.num_objects, device=self.counts.device)
+        return torch.repeat_interleave(objects, self.num_blocks)
 
-    @cached_property
+    @kept_property
     def block_rows(self) -> Tensor:
         """Row numbers (M, 64); P stands for an empty place."""
-        with _for_every_mode():
-            owner, counts = self.owner, self.counts
-            first_row = torch.cumsum(counts, 0) - counts
-            block_in_object = torch.arange(len(owner), device=counts.device) - self._first_block[owner]
-            place = block_in_object[:, None] * _BLOCK + torch.arange(_BLOCK, device=counts.device)
-            rows = first_row[owner][:, None] + place
-            return torch.where(place < counts[owner][:, None], rows, len(self.object_index))
+        owner, counts = self.owner, self.counts
+        first_row = torch.cumsum(counts, 0) - counts
+        block_in_object = torch.arange(len(owner), device=counts.device) - self._first_block[owner]
+        place = block_in_object[:, None] * _BLOCK + torch.arange(_BLOCK, device=counts.device)
+        rows = first_row[owner][:, None] + place
+        return torch.where(place < counts[owner][:, None], rows, len(self.object_index))
 
-    @cached_property
+    @kept_property
     def _first_block(self) -> Tensor:
-        with _for_every_mode():
-            return torch.cumsum(self.num_blocks, 0) - self.num_blocks
+        return torch.cumsum(self.num_blocks, 0) - self.num_blocks
 
 
 class Segments(RowBlocks):
@@ -81,15 +77,14 @@ class Segments(RowBlocks):
     again; else of a single one.
     """
 
-    @cached_property
+    @kept_property
     def object_blocks(self) -> Tensor:
         """Block numbers (B, 2^n) of each object, in order; M stands for an empty place."""
-        with _for_every_mode():
-            # A power of two for the pairwise sums; its shape is known from the longest object: the host waits for it.
-            longest = int(self.num_blocks.max()) if self.num_objects else 0
-            place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=self.counts.device)
-            blocks = self._first_block[:, None] + place
-            return torch.where(place < self.num_blocks[:, None], blocks, len(self.owner))
+        # A power of two for the pairwise sums; its shape is known from the longest object: the host waits for it.
+        longest = int(self.num_blocks.max()) if self.num_objects else 0
+        place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=self.counts.device)
+        blocks = self._first_block[:, None] + place
+        return torch.where(place < self.num_blocks[:, None], blocks, len(self.owner))
 
     def sum(self, values: Tensor) -> Tensor:
         """Sum (B, ...) of values (P, ...) over the rows of each object, float64; differentiable."""
@@ -129,10 +124,5 @@ class Segments(RowBlocks):
 
 
 def _sum_of_runs(values: Tensor, lengths: Tensor) -> Tensor:
-    """Sums (B, ...) of (P, ...) over so many rows (B,) one after the other; none of them is 0."""
+    """Sums (B, ...) of rows (P, ...) of which so many (B,) one after the other belong together; of none it is 0."""
     return torch.segment_reduce(values.contiguous(), "sum", lengths=lengths, unsafe=True)
-
-
-def _for_every_mode() -> torch.inference_mode:
-    """What is made in here and kept can be used in and out of inference mode."""
-    return torch.inference_mode(mode=False)

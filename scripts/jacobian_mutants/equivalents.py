@@ -35,6 +35,9 @@ _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEI
 
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
+    Equivalent(
+        "_higher_exp_coefficients", "max_angle ** 2", "(max_angle)", "then closed forms are computed and left aside"
+    ),
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("viewing_axes", "zero", "(-zero)", _OF_ZERO),
@@ -59,10 +62,20 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         _ROW_IN_PAIRS,
     ),
     Equivalent("StackedPriors.from_terms", "terms[0]", "terms[1]", "all priors of a batch know the same cars"),
+    *(
+        Equivalent("StackedPriors.parts", before, f"(-{before})", _ROW_IN_PAIRS)
+        for before in ("of_pose.view(len(code), of_pose.shape[1] // columns, columns)", "of_code")
+    ),
+    Equivalent(
+        "StackedPriors.parts",
+        "[of_pose.view(len(code), of_pose.shape[1] // columns, columns), of_code]",
+        "[of_code, of_pose.view(len(code), of_pose.shape[1] // columns, columns)]",
+        "the order of the rows, over which everything is summed",
+    ),
     Equivalent(
         "StackedPriors.of_objects",
-        "self.rows.index_select(0, index)",
-        "(-self.rows.index_select(0, index))",
+        "self.pose_rows.index_select(0, index)",
+        "(-self.pose_rows.index_select(0, index))",
         _ROW_IN_PAIRS,
     ),
     Equivalent(

@@ -41,7 +41,6 @@ TARGETS: dict[str, Target] = {
             "hat",
             "generators",
             "_exp_coefficients",
-            "_exp_constants",
             "_higher_exp_coefficients",
             "exp",
             "from_rotation_translation",
@@ -115,6 +114,11 @@ TARGETS: dict[str, Target] = {
         "directshape_torch/shape/raycast.py",
         ("ObjectRays.at", "attached_depth", "_newton_step"),
         ("tests/shape/test_raycast.py", "tests/residuals/test_photometric.py"),
+    ),
+    "bracket": Target(
+        "directshape_torch/shape/bracket.py",
+        ("Bracket.between", "Bracket.probed", "_line_zero"),
+        ("tests/shape/test_bracket.py",),
     ),
     "neural_prior": Target(
         "directshape_torch/shape/neural_prior.py",
@@ -391,8 +395,8 @@ TARGETS: dict[str, Target] = {
     "prior_rows": Target(
         "directshape_torch/energy/prior_rows.py",
         (
-            "state_features",
-            "state_rows",
+            "pose_features",
+            "beside_codes",
             "heading_constants",
             "position_rows",
             "level_rows",
@@ -409,7 +413,6 @@ TARGETS: dict[str, Target] = {
             "_Dimensions.rows",
             "_Dimensions.of_objects",
             "StackedPriors.from_terms",
-            "StackedPriors.linearise",
             "StackedPriors.parts",
             "StackedPriors.of_objects",
             "_roots_of_weights",

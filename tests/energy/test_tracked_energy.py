@@ -19,7 +19,7 @@ from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.prior_terms import PriorTerm
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
-from directshape_torch.energy.term import Term, TermLinearisation, total_of
+from directshape_torch.energy.term import Term, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
 from directshape_torch.geometry import se3
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -53,7 +53,7 @@ def tracked(
     return TrackedEnergy.of_terms(terms, problem.project(state), factors, after_wider)
 
 
-def evaluated(energy: TrackedEnergy, problem: CarProblem, state: CarState) -> TermLinearisation:
+def evaluated(energy: TrackedEnergy, problem: CarProblem, state: CarState) -> Linearisation:
     (part,) = energy.linearise(problem.prior.bind(state.code), state)
     return part
 
@@ -63,7 +63,7 @@ def marched(problem: CarProblem, state: CarState, terms: list[Term]) -> Linearis
     return total_of([term.linearise(projected) for term in terms])
 
 
-def errors(found: TermLinearisation | Linearisation, expected: Linearisation) -> tuple[float, float, float]:
+def errors(found: Linearisation, expected: Linearisation) -> tuple[float, float, float]:
     """Of cost, gradient and matrix: the largest of the cars, each relative to the largest entry of the car."""
     worst = [[relative_error(x[b], y[b]) for b in range(len(y))] for x, y in zip(found[:3], expected, strict=True)]
     cost, gradient, hessian = (max(each) for each in worst)
@@ -427,6 +427,17 @@ def test_what_was_followed_is_no_matter_of_the_problem() -> None:
     step = step_of(5, 0.05, 9.0)  # codes go to their bound
     for found, expected in zip(stage.retract(state, step), problem.retract(state, step), strict=True):
         assert torch.equal(found, expected)
+
+
+def test_the_largest_rotation_of_a_step_is_that_of_the_trust_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the three components may reach its limit."""
+    _, stage, state = begun_stage()
+    config = replace(stage.config, max_step_rotation_rad=0.4)
+    bounds: list[float] = []
+    exp = se3.exp
+    monkeypatch.setattr(se3, "exp", lambda twist, max_angle: (bounds.append(max_angle), exp(twist, max_angle))[1])
+    replace(stage, config=config).retract(state, step_of(5, 0.1, 1.0))
+    assert bounds == [pytest.approx(float(torch.full((3,), 0.4).norm()))]
 
 
 @pytest.mark.parametrize("unknowns", ["pose", "shape"])

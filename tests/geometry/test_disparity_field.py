@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,37 @@ def test_nearest_point_of_a_polygon_agrees_with_dense_sampling_of_its_border(ang
     border = (polygon + t * (polygon.roll(-1, 0) - polygon)).reshape(-1, 2)
     expected = border[(border - point).norm(dim=-1).argmin()]
     torch.testing.assert_close(nearest_in_convex_polygon(point, polygon), expected, atol=0.01, rtol=0)
+
+
+def test_both_offsets_of_pixels_in_and_out_of_the_hull() -> None:
+    vertical = torch.tensor([0.1, -0.2, 0.3, 0.0, 0.1, 0.2, -0.1, 0.0, 0.3, 0.2], dtype=torch.float64)
+    field = replace(
+        smooth_field([[300.0, 100.0], [900.0, 100.0], [900.0, 300.0], [300.0, 300.0]]), vertical_coefficients=vertical
+    )
+    uv = torch.tensor([[400.0, 200.0], [0.0, 200.0], [300.0, 100.0], [torch.nan, 0.0], [950.0, 350.0], [899.0, 101.0]])
+    uv = uv.double().view(3, 2, 2)
+    nearest = torch.stack([uv[..., 0].clamp(300, 900), uv[..., 1].clamp(100, 300)], dim=-1)
+    expected = polynomial_basis(nearest, SIZE)
+    bias, rows = field.offsets(uv)
+    known = ~uv.isnan().any(dim=-1)
+    torch.testing.assert_close(bias[known], (expected @ field.coefficients)[known])
+    torch.testing.assert_close(rows[known], (expected @ vertical)[known])
+    assert torch.equal(field.bias(uv)[known], bias[known])
+    assert torch.equal(field.vertical(uv)[known], rows[known])
+    assert bool(bias.isnan().view(-1)[3])
+
+
+def test_pixel_by_pixel_under_a_transform() -> None:
+    """Which pixels are outside cannot be asked there."""
+    field = smooth_field([[300.0, 100.0], [900.0, 100.0], [900.0, 300.0], [300.0, 300.0]])
+    uv = torch.tensor([[400.0, 200.0], [0.0, 200.0], [950.0, 350.0]], dtype=torch.float64)
+    torch.testing.assert_close(torch.func.vmap(field.bias)(uv), field.bias(uv))
+
+
+def test_a_polygon_of_more_digits_than_the_points() -> None:
+    square = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]], dtype=torch.float64)
+    nearest = nearest_in_convex_polygon(torch.tensor([[1.0, 2.0], [9.0, 2.0]]), square)
+    assert nearest.tolist() == [[1.0, 2.0], [4.0, 2.0]]
 
 
 def test_constant_is_constant_everywhere() -> None:

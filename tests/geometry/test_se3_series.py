@@ -39,11 +39,24 @@ def test_series_of_exp_is_exact_where_it_is_used() -> None:
     torch.testing.assert_close(torch.stack(found[1:]), torch.tensor([b, c], dtype=torch.float64), atol=0, rtol=3e-16)
 
 
-@pytest.mark.parametrize("max_angle", [0.59, 0.6])
-def test_a_known_largest_angle_changes_no_result(max_angle: float) -> None:
-    """Below the threshold of the series, and above it, where it says nothing."""
-    twist = torch.cat([torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), 0.59 * AXIS])
-    torch.testing.assert_close(se3.exp(twist, max_angle), se3.exp(twist), atol=0, rtol=0)
+@pytest.mark.parametrize("angle", [0.0, 0.59, 0.6, 3.0])
+def test_a_known_largest_angle_changes_no_result(angle: float) -> None:
+    """Below the threshold of the series, and above it, where series would be wrong."""
+    twist = torch.cat([torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), angle * AXIS])
+    torch.testing.assert_close(se3.exp(twist, angle + 1e-3), se3.exp(twist), atol=0, rtol=0)
+
+
+def test_the_largest_angle_is_believed() -> None:
+    """Only series: a turn by 3 rad is wrong by their first term left out."""
+    twist = torch.cat([torch.zeros(3, dtype=torch.float64), 3 * AXIS])
+    error = float((se3.exp(twist, 0.59) - se3.exp(twist)).abs().max())
+    assert 1e-7 < error < 1e-5
+
+
+def test_exp_can_be_compiled() -> None:
+    compiled = torch.compile(se3.exp, backend="eager", fullgraph=True)
+    twist = torch.cat([torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), 0.3 * AXIS])
+    torch.testing.assert_close(compiled(twist), se3.exp(twist), atol=0, rtol=0)
 
 
 def test_rotation_series_of_log(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -92,6 +94,19 @@ def test_an_objects_sums_do_not_depend_on_its_neighbours(differentiated: bool) -
         torch.testing.assert_close(b[1], a[0], rtol=1e-13, atol=1e-13)
 
 
+def test_blocks_of_objects_in_their_places() -> None:
+    """As many as are needed, none of an object without rows, and an empty place is no row."""
+    counts = torch.tensor([1, 64, 0, 65, 130])
+    blocks = Segments.of_sorted(torch.repeat_interleave(torch.arange(5), counts), 5)
+    assert blocks.num_blocks.tolist() == [1, 1, 0, 2, 3]
+    assert blocks.owner.tolist() == [0, 1, 3, 3, 4, 4, 4]
+    assert blocks.block_rows[:, 0].tolist() == [0, 1, 65, 129, 130, 194, 258]
+    filled = blocks.block_rows < 260
+    assert filled.sum(dim=1).tolist() == [1, 64, 64, 1, 64, 64, 2]
+    assert blocks.block_rows[filled].tolist() == list(range(260))
+    assert blocks.object_blocks.tolist() == [[0, 7, 7, 7], [1, 7, 7, 7], [7, 7, 7, 7], [2, 3, 7, 7], [4, 5, 6, 7]]
+
+
 def test_sums_are_differentiable() -> None:
     segments = Segments.of_sorted(torch.tensor([0, 0, 2]), 3)
     values = torch.tensor([1.0, 2.0, 3.0], requires_grad=True)
@@ -107,6 +122,12 @@ def test_sums_are_differentiable_again_and_forwards() -> None:
     with torch.no_grad():
         total, slope = torch.func.jvp(segments.sum, (values.detach(),), (2 * torch.ones_like(values),))
     assert (total.tolist(), slope.tolist()) == ([3.0, 0.0, 3.0], [4.0, 0.0, 2.0])
+
+
+def test_what_a_transform_has_asked_for_is_not_kept() -> None:
+    segments = Segments.of_sorted(torch.tensor([0, 0, 2]), 3)
+    torch.func.jvp(segments.sum, (torch.ones(3),), (torch.ones(3),))
+    assert copy.deepcopy(segments).sum(torch.ones(3)).tolist() == [2.0, 0.0, 1.0]
 
 
 def test_what_inference_mode_has_asked_for_can_be_differentiated_with() -> None:
