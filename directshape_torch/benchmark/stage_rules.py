@@ -98,7 +98,11 @@ RULES = (
     Rule(r"refiner|admission|result|status|backward|checks|config.*|scene", _ANY, "bookkeeping"),
     Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms|stage_unknowns)", _ANY, "bookkeeping"),
     Rule(r"geometry\..*|image\..*|shape\..*|tracking\.(blocks|field|rays)", _ANY, None),
-    Rule(r"residuals\.(robust|state_chain)|compil.*|device_constants|full_precision|car_rows|table_lookup", _ANY, None),
+    Rule(
+        r"residuals\.(robust|state_chain)|compil.*|device_constants|full_precision|car_rows|.*_(lookup|mode)",
+        _ANY,
+        None,
+    ),
 )
 
 
