@@ -7,12 +7,13 @@ wherever it was made, and nothing is kept that a transform or a tracer of PyTorc
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, Generic, TypeVar, overload
 
 import torch
 from torch import Tensor
 
-from directshape_torch.gradient_mode import is_plain
+from directshape_torch.gradient_mode import is_forward_mode, is_plain
 
 _T = TypeVar("_T")
 
@@ -39,6 +40,7 @@ def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tens
     """
     constants: dict[_Key, Any] = {}
 
+    @wraps(make)
     def like(tensor: Tensor) -> _T:
         return _kept(constants, (), tensor, make)
 
@@ -57,12 +59,13 @@ def _kept(
     make: Callable[[torch.dtype, torch.device], _T],
 ) -> _T:
     key = (values, like.dtype, like.device)
-    if not torch.compiler.is_compiling() and key in constants:
-        known: _T = constants[key]
+    # A tracer's tensors go with its own constants alone; those of `torch.func` with all.
+    known: _T | None = None if torch.compiler.is_compiling() or type(like) is not Tensor else constants.get(key)
+    if known is not None:
         return known
     with torch.inference_mode(False):
         made = make(like.dtype, like.device)
-        if not torch.compiler.is_compiling() and is_plain(torch.empty(0, device=like.device)):
+        if is_plain(torch.empty(0, device=like.device)):
             if len(constants) >= _MOST_KEPT:
                 constants.clear()
             constants[key] = made
@@ -70,7 +73,7 @@ def _kept(
 
 
 class kept_property(Generic[_T]):  # noqa: N801  used as `functools.cached_property` is
-    """A `functools.cached_property` for a tensor that an object makes of its own.
+    """A `functools.cached_property` for a tensor that an object makes of its own, one without a graph.
 
     Example:
         >>> class Row:
@@ -86,7 +89,7 @@ class kept_property(Generic[_T]):  # noqa: N801  used as `functools.cached_prope
     """
 
     def __init__(self, make: Callable[[Any], _T]) -> None:
-        self._make = make
+        self.__wrapped__ = make
         self.__doc__ = make.__doc__
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -102,8 +105,12 @@ class kept_property(Generic[_T]):  # noqa: N801  used as `functools.cached_prope
         if instance is None:
             return self
         with torch.inference_mode(False):
-            made = self._make(instance)
-        # Found there before this is asked again.
-        if isinstance(made, Tensor) and not torch.compiler.is_compiling() and is_plain(made):
+            made = self.__wrapped__(instance)
+        if isinstance(made, Tensor) and is_plain(made) and not (_is_of_its_mode(made) or is_forward_mode()):
+            # Found there before this is asked again.
             instance.__dict__[self._name] = made
         return made
+
+
+def _is_of_its_mode(tensor: Tensor) -> bool:
+    return tensor.requires_grad or tensor.is_inference()

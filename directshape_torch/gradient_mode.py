@@ -34,10 +34,13 @@ def is_forward_mode() -> bool:
 def is_plain(tensor: Tensor) -> bool:
     """Whether a tensor is one of numbers alone: not a wrapper of `torch.func`, nor a tracer's without any numbers.
 
-    Only such ones may be kept for later: the others mean nothing outside of the call that made them.
+    Only such ones may be kept for later, and asked for numbers: the others mean nothing outside of the call that made
+    them. Of code that is being compiled none is.
 
     Example:
         >>> is_plain(torch.ones(1)), torch.func.grad(lambda x: x * is_plain(x))(torch.tensor(2.0)).item()
         (True, 0.0)
     """
-    return type(tensor) in (Tensor, torch.nn.Parameter) and not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+    if torch.compiler.is_compiling() or type(tensor) not in (Tensor, torch.nn.Parameter):
+        return False
+    return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)

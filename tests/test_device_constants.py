@@ -8,17 +8,29 @@ import pytest
 import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from directshape_torch.device_constants import constant_like, kept_property, made_once
 
 
-def constants_of(like: Tensor, first: float) -> tuple[Tensor, Tensor]:
-    return constant_like((first, 2.0), like), _ramp(like)
+class Constants:
+    """Two that nobody has asked for before."""
 
+    def __init__(self, first: float) -> None:
+        self.first = first
 
-@made_once
-def _ramp(dtype: torch.dtype, device: torch.device) -> Tensor:
-    return torch.arange(2, dtype=dtype, device=device)
+        @made_once
+        def ramp(dtype: torch.dtype, device: torch.device) -> Tensor:
+            return torch.arange(2, dtype=dtype, device=device)
+
+        self.ramp = ramp
+
+    def of(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        return constant_like((self.first, 2.0), like), self.ramp(like)
+
+    def product(self, x: Tensor) -> Tensor:
+        one, other = self.of(x)
+        return x * (one + other)
 
 
 class Numbers:
@@ -30,42 +42,67 @@ class Numbers:
         return 2 * self.numbers
 
 
-def _asked_in_jvp(first: float) -> None:
+def _asked_plainly(constants: Constants) -> None:
+    assert constants.product(torch.ones(2)).tolist() == [constants.first, 3.0]
+
+
+def _asked_in_jvp(constants: Constants) -> None:
     ones = torch.ones(2)
-    torch.func.jvp(lambda x: x * sum(constants_of(x, first)), (ones,), (ones,))
+    value, slope = torch.func.jvp(constants.product, (ones,), (ones,))
+    assert value.tolist() == slope.tolist() == [constants.first, 3.0]
 
 
-def _asked_in_grad(first: float) -> None:
-    torch.func.grad(lambda x: (x * sum(constants_of(x, first))).sum())(torch.ones(2))
+def _asked_in_grad(constants: Constants) -> None:
+    slope = torch.func.grad(lambda x: constants.product(x).sum())(torch.ones(2))
+    assert slope.tolist() == [constants.first, 3.0]
 
 
-def _asked_of_fakes(first: float) -> None:
+def _asked_of_fakes(constants: Constants) -> None:
     with FakeTensorMode():
-        constants_of(torch.ones(2), first)
+        assert constants.product(torch.ones(2)).shape == (2,)
 
 
-def _asked_in_inference_mode(first: float) -> None:
+def _asked_by_a_tracer(constants: Constants) -> None:
+    def product(x: Tensor) -> Tensor:  # a tracer would count the `self` of a method
+        return constants.product(x)
+
+    traced = make_fx(product, tracing_mode="fake")(torch.ones(2))
+    assert traced(torch.ones(2)).tolist() == [constants.first, 3.0]
+
+
+def _asked_in_inference_mode(constants: Constants) -> None:
     with torch.inference_mode():
-        constants_of(torch.ones(2), first)
+        assert constants.product(torch.ones(2)).tolist() == [constants.first, 3.0]
 
 
-ASKED = (_asked_in_jvp, _asked_in_grad, _asked_of_fakes, _asked_in_inference_mode)
+ASKED = (
+    _asked_plainly,
+    _asked_in_jvp,
+    _asked_in_grad,
+    _asked_of_fakes,
+    _asked_by_a_tracer,
+    _asked_in_inference_mode,
+)
 
 
-@pytest.mark.parametrize("number", range(len(ASKED)))
-def test_constants_are_plain_whoever_asked_first(number: int) -> None:
-    first = 10.0 + number  # one that nobody has asked for before
-    ASKED[number](first)
-    for constant, numbers in zip(constants_of(torch.ones(2), first), ([first, 2.0], [0.0, 1.0]), strict=True):
+@pytest.mark.parametrize("then", range(len(ASKED)))
+@pytest.mark.parametrize("before", range(len(ASKED)))
+def test_constants_are_right_whoever_asked_before(before: int, then: int) -> None:
+    constants = Constants(10.0 + before * len(ASKED) + then)
+    for asked in (ASKED[before], ASKED[then]):
+        asked(constants)
+    for constant, numbers in zip(constants.of(torch.ones(2)), ([constants.first, 2.0], [0.0, 1.0]), strict=True):
         assert type(constant) is Tensor
         assert not constant.is_inference()
         assert copy.deepcopy(constant).tolist() == numbers
-    assert constant_like((first, 2.0), torch.ones(2)) is constant_like((first, 2.0), torch.zeros(1))
+    for one, other in zip(constants.of(torch.ones(2)), constants.of(torch.zeros(1)), strict=True):
+        assert one is other
 
 
 def test_constants_of_another_type_are_others() -> None:
-    double, single = (_ramp(torch.ones(1, dtype=dtype)) for dtype in (torch.float64, torch.float32))
-    assert (double.dtype, single.dtype) == (torch.float64, torch.float32)
+    constants = Constants(5.0)
+    for dtype in (torch.float64, torch.float32):
+        assert [x.dtype for x in constants.of(torch.ones(1, dtype=dtype))] == [dtype, dtype]
 
 
 def test_a_property_is_kept() -> None:
@@ -78,6 +115,17 @@ def test_a_property_of_a_transform_is_not_kept() -> None:
     numbers = Numbers(torch.ones(2))
     torch.func.jvp(lambda x: x * numbers.doubled, (torch.ones(2),), (torch.ones(2),))
     assert copy.deepcopy(numbers).doubled.tolist() == [2.0, 2.0]
+
+
+def test_a_property_with_a_graph_or_a_tangent_is_not_kept() -> None:
+    numbers = Numbers(torch.ones(2, requires_grad=True))
+    for _ in range(2):
+        numbers.doubled.sum().backward()
+    with torch.autograd.forward_ad.dual_level():
+        dual = Numbers(torch.autograd.forward_ad.make_dual(torch.ones(2), torch.ones(2)))
+        assert dual.doubled.tolist() == [2.0, 2.0]
+    assert "doubled" not in numbers.__dict__
+    assert "doubled" not in dual.__dict__
 
 
 def test_a_property_that_inference_mode_asked_for_can_be_differentiated_with() -> None:

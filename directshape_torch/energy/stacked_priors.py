@@ -1,8 +1,8 @@
 """All prior terms of a batch of cars at once: the sums of the terms by themselves, in a few small operations.
 
 The rows of height, tilt and pose come from one product with constants (`prior_rows`), what is linear in the code has
-constant slopes, and one square of them all is the whole matrix. With five cars the terms one by one are hundreds of
-operations on a handful of numbers each.
+constant slopes, and one square of them all is the whole matrix; dimensions that are curved in the code add theirs.
+With five cars the terms one by one are hundreds of operations on a handful of numbers each.
 """
 
 from __future__ import annotations

@@ -26,7 +26,8 @@ from directshape_torch.tracking.field import block_field
 class TrackedEnergy:
     """The terms of a stage whose rays are followed, and the priors: one sum over blocks of all of them.
 
-    For iterations: sums over blocks cannot be differentiated (`CarProblem.linearise_differentiably` can).
+    For iterations: sums over blocks have no forward mode and no second derivative, which
+    `CarProblem.linearise_differentiably` has.
 
     Attributes:
         silhouettes, photometric, priors: those that there are.

@@ -103,7 +103,7 @@ def exp(twist: Tensor, max_angle: float = math.inf) -> Tensor:
     Args:
         twist: :math:`(*, 6)`, `(v, omega)` in metres and radians.
         max_angle: no rotation is larger, radians. Where it is below 0.59 there are fewer operations, and a larger
-            rotation would be wrong by its angle to the 14th power over 16!.
+            rotation would be wrong by its angle to the 16th power over 16!.
 
     Returns:
         Rigid transforms :math:`(*, 4, 4)`.

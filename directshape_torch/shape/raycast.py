@@ -157,7 +157,7 @@ def first_crossing(
     num_iterations: int = 8,
     closest_sdf: Tensor | None = None,
 ) -> Root:
-    """First depth at which the signed distance falls below zero, by bracketing and Illinois' false position.
+    """First depth at which the signed distance falls below zero, by bracketing and false position (`Bracket`).
 
     The refined point of closest approach counts as a sample too, so thin parts between two samples are not missed.
     """

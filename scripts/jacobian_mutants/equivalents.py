@@ -35,9 +35,6 @@ _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEI
 
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
-    Equivalent(
-        "_higher_exp_coefficients", "max_angle ** 2", "(max_angle)", "then closed forms are computed and left aside"
-    ),
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("viewing_axes", "zero", "(-zero)", _OF_ZERO),

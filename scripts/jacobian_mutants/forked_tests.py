@@ -102,13 +102,13 @@ def put_into_effect(mutant: Mutant, source: bytes, root: Path) -> None:
     file = str(module.__file__)
     if Path(file).resolve() != (root / mutant.path).resolve():
         raise ValueError(f"{mutant.path} was imported from {file}")
-    function = _function(module, mutant.function)
+    function = function_of(module, mutant.function)
     if _code_of(source, file, mutant.function).co_code != function.__code__.co_code:
         raise ValueError(f"{mutant.path} has changed since its mutants were made")
     function.__code__ = _code_of(mutant.apply(source), file, mutant.function)
 
 
-def _function(module: object, qualified_name: str) -> FunctionType:
+def function_of(module: object, qualified_name: str) -> FunctionType:
     """The plain function behind decorators, properties and static methods."""
     owner = module
     *classes, name = qualified_name.split(".")

@@ -107,6 +107,13 @@ def test_pixel_by_pixel_under_a_transform() -> None:
     torch.testing.assert_close(torch.func.vmap(field.bias)(uv), field.bias(uv))
 
 
+def test_the_nearest_point_can_be_compiled() -> None:
+    square = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
+    points = torch.tensor([[1.0, 2.0], [9.0, 2.0]])
+    compiled = torch.compile(nearest_in_convex_polygon, backend="eager", fullgraph=True)
+    assert torch.equal(compiled(points, square), nearest_in_convex_polygon(points, square))
+
+
 def test_a_polygon_of_more_digits_than_the_points() -> None:
     square = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]], dtype=torch.float64)
     nearest = nearest_in_convex_polygon(torch.tensor([[1.0, 2.0], [9.0, 2.0]]), square)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 
 import mutate_jacobians
 import pytest
 from jacobian_mutants.equivalents import EQUIVALENTS, reason_for
+from jacobian_mutants.forked_tests import function_of
 from jacobian_mutants.mutants import Mutant, mutants_of
 from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError
 from jacobian_mutants.targets import TARGETS, Target
@@ -76,6 +78,9 @@ def test_methods_are_found_by_qualified_name_and_missing_ones_are_an_error() -> 
 def test_named_functions_and_tests_exist(name: str) -> None:
     target = TARGETS[name]
     assert mutants_of(target.path, (_ROOT / target.path).read_bytes(), target.functions)
+    module = importlib.import_module(target.path.removesuffix(".py").replace("/", "."))
+    for function in target.functions:
+        assert function_of(module, function).__qualname__ == function
     for test in target.tests:
         path, _, function = test.partition("::")
         assert f"def {function}" in (_ROOT / path).read_text(encoding="utf-8")
