@@ -82,7 +82,7 @@ RULES = (
     Rule(r"residuals\.photometric", r"depth_state_jacobian|surface_slope", "ray depth"),
     Rule(r"residuals\.photometric_profile", r"warp_lines", "sampling"),
     Rule(r"(energy|residuals)\.photometric.*|energy\.brightness", _ANY, "warp"),
-    Rule(r"(energy|residuals)\.(prior|stacked_priors|point_cloud).*", _ANY, "priors"),
+    Rule(r"(energy|residuals)\.(prior|stacked_priors|pose_rows|point_cloud).*", _ANY, "priors"),
     Rule(r"tracking\.blocks", r"weighted_products|sums", "normal equations"),
     Rule(r"tracking\.(silhouette|photometric)", r"accumulate", "normal equations"),
     Rule(r"tracking\.silhouette", r"_residual_and_jacobian", "silhouette Jacobian"),

@@ -1,6 +1,6 @@
 """All prior terms of a batch of cars at once: the sums of the terms by themselves, in a few small operations.
 
-The rows of height, tilt and pose come from one product with constants (`prior_rows`), what is linear in the code has
+The rows of height, tilt and pose come from one product with constants (`pose_rows`), what is linear in the code has
 constant slopes, and one square of them all is the whole matrix; dimensions that are curved in the code add theirs.
 With five cars the terms one by one are hundreds of operations on a handful of numbers each.
 """
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from directshape_torch.device_constants import constant_like
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.prior_rows import (
+from directshape_torch.energy.pose_rows import (
     beside_codes,
     cosine_rows,
     heading_constants,
@@ -76,7 +76,7 @@ class _Dimensions:
 class StackedPriors:
     """The sum of several `PriorTerm`s, in float64 throughout but for the dimensions that a shape prior computes itself.
 
-    Of each row `[J r]` as they enter squares, times the roots of the weights.
+    Rows are `[J r]`, times the roots of the terms' weights: their square has matrix, gradient and cost.
 
     Attributes:
         pose_rows: (B, R (D + 1), F) from the features of a pose to the rows of its priors.

@@ -392,8 +392,8 @@ TARGETS: dict[str, Target] = {
         ("scaled", "total_of", "sum_of"),
         (f"{_TRACKED}::test_factors_of_single_cars",),
     ),
-    "prior_rows": Target(
-        "directshape_torch/energy/prior_rows.py",
+    "pose_rows": Target(
+        "directshape_torch/energy/pose_rows.py",
         (
             "pose_features",
             "beside_codes",

@@ -14,7 +14,7 @@ from torch import Tensor
 # origin in the camera frame; the angle from the detector's heading, and its derivatives by -omega_z and omega_y.
 _ONE, _MINUS_ORIGIN, _ANGLE, _J_MINUS_Z, _J_Y, _NUM_FEATURES = 15, 16, 19, 20, 21, 22
 # The columns of a row: its Jacobian by the twist (v, omega), then the residual.
-_OMEGA, RESIDUAL, NUM_COLUMNS = 3, 6, 7
+_OMEGA, _RESIDUAL, _NUM_COLUMNS = 3, 6, 7
 
 
 def pose_features(
@@ -39,7 +39,7 @@ def beside_codes(
     num_codes: int,
 ) -> Tensor:  # (B, R, 6 + K + 1, F)
     """Among the columns of a state, (v, omega, code) and the residual."""
-    twist, residual = torch.split_with_sizes(rows, [RESIDUAL, 1], dim=2)
+    twist, residual = torch.split_with_sizes(rows, [_RESIDUAL, 1], dim=2)
     return torch.cat([twist, rows.new_zeros(*rows.shape[:2], num_codes, rows.shape[3]), residual], dim=2)
 
 
@@ -61,8 +61,8 @@ def position_rows(
     rows = no_rows(axes_cam, axes_cam.shape[1])
     for i in range(3):
         rows[:, :, i, 4 * i : 4 * i + 3] = -axes_cam
-    rows[:, :, RESIDUAL, _MINUS_ORIGIN : _MINUS_ORIGIN + 3] = -axes_cam
-    rows[:, :, RESIDUAL, _ONE] = offset
+    rows[:, :, _RESIDUAL, _MINUS_ORIGIN : _MINUS_ORIGIN + 3] = -axes_cam
+    rows[:, :, _RESIDUAL, _ONE] = offset
     return rows
 
 
@@ -78,14 +78,14 @@ def cosine_rows(normal_cam: Tensor, scale: Tensor) -> Tensor:
     """`r = scale + n_obj.y` of `tilt_prior_cosine` for normals (B, 3) of length `scale` (B,); (B, 1, 7, F)."""
     rows = no_rows(normal_cam, 1)
     _put_normal(rows[:, 0], normal_cam, residual=1, J_omega={0: (2, -1), 2: (0, 1)})
-    rows[:, 0, RESIDUAL, _ONE] = scale
+    rows[:, 0, _RESIDUAL, _ONE] = scale
     return rows
 
 
 def heading_rows(scale: Tensor) -> Tensor:
     """`r = scale * angle from the detector's heading`, (B, 1, 7, F) for scales (B,)."""
     rows = no_rows(scale[:, None], 1)
-    rows[:, 0, RESIDUAL, _ANGLE] = scale
+    rows[:, 0, _RESIDUAL, _ANGLE] = scale
     rows[:, 0, _OMEGA + 1, _J_Y] = scale
     rows[:, 0, _OMEGA + 2, _J_MINUS_Z] = -scale
     return rows
@@ -98,11 +98,11 @@ def without_heading(rows: Tensor) -> Tensor:
 
 def no_rows(like: Tensor, count: int = 0) -> Tensor:
     """Rows (B, count, 7, F) of zeros for B cars."""
-    return like.new_zeros(len(like), count, NUM_COLUMNS, _NUM_FEATURES)
+    return like.new_zeros(len(like), count, _NUM_COLUMNS, _NUM_FEATURES)
 
 
 def _put_normal(row: Tensor, normal_cam: Tensor, residual: int, J_omega: dict[int, tuple[int, int]]) -> None:
     """Components of `n_obj = R_obj_cam n` as residual and, with a sign, as its derivatives by parts of omega."""
-    row[:, RESIDUAL, 4 * residual : 4 * residual + 3] = normal_cam
+    row[:, _RESIDUAL, 4 * residual : 4 * residual + 3] = normal_cam
     for part, (component, sign) in J_omega.items():
         row[:, _OMEGA + part, 4 * component : 4 * component + 3] = sign * normal_cam
