@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
 import torch
 from torch import Tensor
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 def nothing_is_differentiated() -> bool:
@@ -29,6 +36,34 @@ def is_forward_mode() -> bool:
         True
     """
     return torch.autograd.forward_ad._current_level >= 0
+
+
+def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Mark a function whose result, a tensor or a named tuple of some, is a constant to whoever differentiates.
+
+    `torch.no_grad` holds back gradients alone: the tangents of a forward mode pass through it.
+
+    Example:
+        >>> @as_constant
+        ... def doubled(x: torch.Tensor) -> torch.Tensor:
+        ...     return 2 * x
+        >>> torch.func.jvp(lambda x: x + doubled(x), (torch.ones(1),), (torch.ones(1),))
+        (tensor([3.]), tensor([1.]))
+    """
+
+    @functools.wraps(function)
+    def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with torch.no_grad():
+            result = function(*args, **kwargs)
+        return _detached(result) if is_forward_mode() else result
+
+    return call
+
+
+def _detached(result: Any) -> Any:
+    if isinstance(result, Tensor):
+        return result.detach()
+    return result if result is None else type(result)(*map(_detached, result))
 
 
 def is_plain(tensor: Tensor) -> bool:

@@ -16,6 +16,7 @@ from directshape_torch.energy.stage_unknowns import moving_unknowns, step_limits
 from directshape_torch.energy.term import Term, TermLinearisation, scaled, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
 from directshape_torch.energy.tracked_problem import TrackedProblem
+from directshape_torch.gradient_mode import is_plain, nothing_is_differentiated
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.problem import Linearisation, Stage, StageProblem, Unknowns
@@ -101,7 +102,7 @@ class CarProblem:
         plain = frozen is None and root_iterations == ROOT_ITERATIONS and not moving_depths
         of_prior = [tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters())]
         versions = _versions(*state, *of_prior)
-        if not plain or torch.is_grad_enabled() or versions is None:
+        if not plain or versions is None:
             return self._new_projection(state, frozen, root_iterations, moving_depths)
         for then, known in self._projections:
             if then == versions and all(mine is theirs for mine, theirs in zip(known.state, state, strict=True)):
@@ -131,7 +132,7 @@ class CarProblem:
         """Cost (B, T) of each term; differentiable by autograd."""
         projected = self.project(state)
         versions = _versions(*([] if self.term_weights is None else [self.term_weights]))
-        if torch.is_grad_enabled() or versions is None:
+        if versions is None:
             return self._new_costs(projected)
         versions = (*versions, *map(id, self.terms))
         for then, known, costs in self._costs:
@@ -201,7 +202,11 @@ _Versions = tuple[int, ...]
 
 
 def _versions(*tensors: Tensor) -> _Versions | None:
-    """Which tensors these are and how often they were written to; None where that is not counted."""
-    if any(tensor.is_inference() for tensor in tensors):
+    """Which tensors these are and how often they were written to.
+
+    None where that is not counted, and where what is made of them must be made anew: to be differentiated, or inside a
+    transform of `torch.func`, which it would outlive.
+    """
+    if not nothing_is_differentiated() or any(tensor.is_inference() or not is_plain(tensor) for tensor in tensors):
         return None
     return tuple(number for tensor in tensors for number in (id(tensor), tensor._version))

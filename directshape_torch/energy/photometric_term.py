@@ -19,6 +19,7 @@ from directshape_torch.energy.photometric_pixels import GreyPair, PixelSet, neig
 from directshape_torch.energy.projected_state import ProjectedState, SeenSurface
 from directshape_torch.energy.term import ResidualRows, TermLinearisation
 from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.gradient_mode import nothing_is_differentiated
 from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.observation.occlusion import OcclusionCrops
 from directshape_torch.observation.packing import PixelSamples
@@ -96,7 +97,7 @@ class PhotometricTerm:
 
     def pixel_cost(self, projected: ProjectedState) -> Tensor:
         """Weighted Huber norm (Q,), summed over the neighbourhood, of each pixel of the set; differentiable."""
-        if torch.is_grad_enabled():
+        if not nothing_is_differentiated():
             usable, at = self._usable_and_residual(projected, attached=True)
             return self._weighted_cost(self._norm(at.residual).rho, usable)
         usable, difference = self._compared(*self._surface(projected, self.pixel_set.pixel_index))

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
-import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
@@ -15,6 +14,7 @@ from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.stage_unknowns import step_limits, without_held
 from directshape_torch.energy.term import TermLinearisation, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy
+from directshape_torch.gradient_mode import nothing_is_differentiated
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_grid import GridMemory
 from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
@@ -59,7 +59,7 @@ class TrackedProblem:
 
     def _bound(self, code: Tensor) -> BoundShape:
         # Not by `isinstance`: a prior made from this one may bind in its own way.
-        if type(self.prior) is PCAShapePrior and not torch.is_grad_enabled():
+        if type(self.prior) is PCAShapePrior and nothing_is_differentiated():
             return self.prior.bind(code, self.memory)
         return self.prior.bind(code)
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.gradient_mode import nothing_is_differentiated
+from directshape_torch.gradient_mode import as_constant, nothing_is_differentiated
 from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.compiled_march import RayRows, interval, neighbours, sample_grids, vertex_offset
 from directshape_torch.shape.grid_lookup import value_at
@@ -61,7 +61,7 @@ class Root(NamedTuple):
     found: Tensor  # (P,) bool
 
 
-@torch.no_grad()
+@as_constant
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
     if type(shape) is GridShape and sample_grids.may_be_compiled(rays.origin_obj):
@@ -95,13 +95,13 @@ def _sdf_of_all(shape: BoundShape, rays: ObjectRays, depths: Tensor) -> Tensor:
     return shape.value(points.reshape(-1, 3), index.reshape(-1)).view_as(depths)
 
 
-@torch.no_grad()
+@as_constant
 def sdf_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
     """Signed distance (P,) at one depth (P,) of each ray, a constant."""
     return shape.value(rays.at(depth), rays.object_index)
 
 
-@torch.no_grad()
+@as_constant
 def gradient_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tensor:
     """Gradient (P, 3) of the signed distance at one depth (P,) of each ray, a constant."""
     # Not `isinstance`: a shape that looks up in its own way must be asked. Derivatives by the code cost the most.
@@ -110,7 +110,7 @@ def gradient_on_rays(shape: BoundShape, rays: ObjectRays, depth: Tensor) -> Tens
     return shape.value_and_derivatives(rays.at(depth), rays.object_index).gradient
 
 
-@torch.no_grad()
+@as_constant
 def closest_approach_depth(marched: RayMarch) -> Tensor:
     """Depth (P,) at which each ray comes closest to the surface from outside, or is deepest inside.
 
@@ -148,7 +148,7 @@ def _least_sample(sdf: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
     return best, neighbours(best, sdf.shape[1])
 
 
-@torch.no_grad()
+@as_constant
 def first_crossing(
     shape: BoundShape,
     rays: ObjectRays,
@@ -212,7 +212,7 @@ def _sdf_along(shape: BoundShape, rays: ObjectRays) -> Callable[[Tensor], Tensor
     return lambda depth: value_at(shape.field, torch.addcmul(origin, depth, direction), rays.object_index, constant)
 
 
-@torch.no_grad()
+@as_constant
 def polished_depth(shape: BoundShape, rays: ObjectRays, root: Root, num_steps: int) -> Tensor:
     """Depth (P,) of roots known nearly, by Newton steps: for states next to the one that the root belongs to."""
     depth = root.depth

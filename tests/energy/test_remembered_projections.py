@@ -68,3 +68,31 @@ def test_projections_die_with_their_problem() -> None:
         assert seen() is None
     finally:
         gc.enable()
+
+
+def test_forward_mode_sees_every_term_though_gradients_are_off() -> None:
+    """With what is remembered of the same tensors there already."""
+    problem, state = begun()
+    tangent = CarState(torch.zeros_like(state.T_obj_cam), torch.full_like(state.code, 0.1))
+    tangent.T_obj_cam[:, :3, 3] = 0.01
+    inputs = tuple(x.clone().requires_grad_() for x in state)
+    terms = problem.term_costs(CarState(*inputs)).sum(dim=0)
+    gradients = [torch.autograd.grad(cost, inputs, retain_graph=True) for cost in terms]
+    expected = [sum((g * t).sum() for g, t in zip(of_term, tangent, strict=True)) for of_term in gradients]
+    with torch.no_grad():
+        before = problem.term_costs(state)
+        values, found = torch.func.jvp(lambda *x: problem.term_costs(CarState(*x)), tuple(state), tuple(tangent))
+        assert problem.term_costs(state) is before
+    torch.testing.assert_close(values, before, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found.sum(dim=0), torch.stack(expected), rtol=1e-6, atol=1e-9)
+    assert (found.sum(dim=0) != 0).sum() >= 3
+
+
+@torch.no_grad()
+def test_nothing_is_remembered_of_a_transform() -> None:
+    problem, state = begun()
+    problem.project(state)
+    known = list(problem._projections)
+    shifts = 0.01 * torch.arange(2.0, dtype=state.code.dtype)
+    torch.func.vmap(lambda shift: problem.project(CarState(state.T_obj_cam, state.code + shift)).shape.values)(shifts)
+    assert problem._projections == known
