@@ -9,6 +9,7 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
+from directshape_torch.gradient_mode import is_forward_mode
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch
@@ -18,6 +19,20 @@ from directshape_torch.stereo_matching.car_points import PointSamples
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
 _MIN_DEPTH_M = 1.0
+
+
+def check_differentiation_mode() -> None:
+    """Raise `InputError` inside of a region of forward-mode differentiation.
+
+    What the iterations hold constant, they hold back from gradients; tangents would pass through it and come out wrong.
+    """
+    if is_forward_mode():
+        raise InputError(
+            "refiner",
+            "a call outside of forward-mode differentiation (torch.func.jvp, jacfwd)",
+            "one inside",
+            "differentiate in reverse mode: .backward(), torch.func.vjp or jacrev, with backward.mode",
+        )
 
 
 def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:

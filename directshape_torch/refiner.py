@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.admission import check_fit, refusals, without_empty_masks
+from directshape_torch.admission import check_differentiation_mode, check_fit, refusals, without_empty_masks
 from directshape_torch.backward import attached_state
 from directshape_torch.compilation.regions import compiling
 from directshape_torch.compilation.together import compiled_together
@@ -80,7 +80,7 @@ class DirectShapeRefiner(nn.Module):
 
         Raises:
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
-                wanted of a prior that has none.
+                wanted of a prior that has none, or in forward mode.
             CompilationError: `compile: on` where something must be compiled and cannot be.
         """
         if torch.compiler.is_compiling():
@@ -91,6 +91,7 @@ class DirectShapeRefiner(nn.Module):
     def _checked_refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
+        check_differentiation_mode()
         check_fit(frames, detections, self.prior)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
         with (

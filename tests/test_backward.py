@@ -135,6 +135,21 @@ def test_a_nan_image_gives_no_nan_gradient(inputs: StreetInputs, mode: str) -> N
     assert gradient[detections.frame_index == 0].abs().max() > 0
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_a_nan_pixel_that_nobody_needs_gives_no_nan_gradient(inputs: StreetInputs, mode: str) -> None:
+    """As in rectified images whose borders have no values."""
+    frames, detections = inputs.scene.frames, replace(inputs.detections, mask_left=inputs.mask)
+    known = torch.ones_like(frames.images_left, dtype=torch.bool)
+    known[0, :, 2, :] = False
+    gain = torch.ones(3, 1, 1, dtype=torch.float64, requires_grad=True)
+    images = torch.where(known, frames.images_left * gain, torch.nan)
+    result = DirectShapeRefiner(inputs.prior, with_mode(mode))(replace(frames, images_left=images), detections)
+    assert result.refined.all()
+    (gradient,) = torch.autograd.grad(summary(result), gain)
+    assert gradient.isfinite().all()
+    assert gradient.abs().max() > 0
+
+
 def _two_frames(inputs: StreetInputs) -> tuple[FrameBatch, Detections]:
     d = replace(inputs.detections, mask_left=inputs.mask)
     size_hw = tuple(inputs.scene.frames.images_left.shape[2:])

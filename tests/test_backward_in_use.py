@@ -51,6 +51,20 @@ def test_no_graph_without_a_mode_and_under_no_grad(inputs: StreetInputs) -> None
         assert not inputs.refine(with_mode("unroll")).T_cam_obj.requires_grad
 
 
+@pytest.mark.parametrize("mode", ["none", "unroll", "implicit"])
+def test_forward_mode_is_refused(inputs: StreetInputs, mode: str) -> None:
+    """Tangents pass through what gradients are held back from: they would come out wrong, without a word."""
+    config = SETTLED if mode == "none" else with_mode(mode)
+    frames, detections = inputs.scene.frames, replace(inputs.detections, mask_left=inputs.mask)
+    refiner = DirectShapeRefiner(inputs.prior, config)
+
+    def refined(images: Tensor) -> Tensor:
+        return refiner(replace(frames, images_left=images), detections).T_cam_obj
+
+    with pytest.raises(InputError, match=r"outside of forward-mode differentiation.*reverse mode"):
+        torch.func.jvp(refined, (frames.images_left,), (torch.ones_like(frames.images_left),))
+
+
 def test_an_unconverged_car_is_named_and_has_a_zero_gradient(inputs: StreetInputs) -> None:
     config = with_mode("implicit", replace(SETTLED, stages=(StageConfig(1.0, 0, 1),)), max_remaining_step=1e-6)
     with pytest.warns(NotStationaryWarning, match="problems 0, 1"):

@@ -16,7 +16,7 @@ from directshape_torch.energy.stage_unknowns import moving_unknowns, step_limits
 from directshape_torch.energy.term import Term, TermLinearisation, scaled, total_of
 from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
 from directshape_torch.energy.tracked_problem import TrackedProblem
-from directshape_torch.gradient_mode import is_plain, nothing_is_differentiated
+from directshape_torch.energy.unchanged import Origin
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.problem import Linearisation, Stage, StageProblem, Unknowns
@@ -30,7 +30,7 @@ class CarProblem:
 
     Args:
         prior: the family of shapes.
-        terms: summands of the energy.
+        terms: summands of the energy; objects that never change, their tensors neither.
         left: packed pixels of the left image whose rays the terms share.
         right: the same of the right image.
         config: stages, trust region, samples per ray.
@@ -54,8 +54,8 @@ class CarProblem:
         self.config = config
         self.term_weights = term_weights
         self.unknowns = unknowns
-        self._projections: list[tuple[_Versions, ProjectedState]] = []
-        self._costs: list[tuple[_Versions, ProjectedState, Tensor]] = []  # of the present stage
+        self._projections: list[tuple[Origin, ProjectedState]] = []
+        self._costs: list[tuple[Origin, Tensor]] = []  # of the present stage
 
     def stages(self) -> list[Stage]:
         return method_stages(self.config)
@@ -101,14 +101,16 @@ class CarProblem:
         """
         plain = frozen is None and root_iterations == ROOT_ITERATIONS and not moving_depths
         of_prior = [tensor for _, tensor in (*self.prior.named_buffers(), *self.prior.named_parameters())]
-        versions = _versions(*state, *of_prior)
-        if not plain or versions is None:
+        modules = self.prior.modules() if isinstance(self.prior, torch.nn.Module) else ()
+        spacings = [s for s in (getattr(module, "spacing_m", None) for module in modules) if isinstance(s, float)]
+        origin = Origin.of([*state, *of_prior], numbers=spacings)
+        if not plain or origin is None:
             return self._new_projection(state, frozen, root_iterations, moving_depths)
         for then, known in self._projections:
-            if then == versions and all(mine is theirs for mine, theirs in zip(known.state, state, strict=True)):
+            if origin.is_same(then):
                 return known
         projected = self._new_projection(state, None, ROOT_ITERATIONS, False)
-        self._projections = [(versions, projected), *self._projections[: _REMEMBERED - 1]]
+        self._projections = [(origin, projected), *self._projections[: _REMEMBERED - 1]]
         return projected
 
     def _new_projection(
@@ -131,15 +133,14 @@ class CarProblem:
     def term_costs(self, state: CarState) -> Tensor:
         """Cost (B, T) of each term; differentiable by autograd."""
         projected = self.project(state)
-        versions = _versions(*([] if self.term_weights is None else [self.term_weights]))
-        if versions is None:
+        origin = Origin.of([] if self.term_weights is None else [self.term_weights], [projected, *self.terms])
+        if origin is None:
             return self._new_costs(projected)
-        versions = (*versions, *map(id, self.terms))
-        for then, known, costs in self._costs:
-            if then == versions and known is projected:
+        for then, costs in self._costs:
+            if origin.is_same(then):
                 return costs
         costs = self._new_costs(projected)
-        self._costs = [(versions, projected, costs), *self._costs[:1]]
+        self._costs = [(origin, costs), *self._costs[:1]]
         return costs
 
     def _new_costs(self, projected: ProjectedState) -> Tensor:
@@ -196,17 +197,3 @@ class CarProblem:
             None if self.term_weights is None else self.term_weights[keep],
             self.unknowns,
         )
-
-
-_Versions = tuple[int, ...]
-
-
-def _versions(*tensors: Tensor) -> _Versions | None:
-    """Which tensors these are and how often they were written to.
-
-    None where that is not counted, and where what is made of them must be made anew: to be differentiated, or inside a
-    transform of `torch.func`, which it would outlive.
-    """
-    if not nothing_is_differentiated() or any(tensor.is_inference() or not is_plain(tensor) for tensor in tensors):
-        return None
-    return tuple(number for tensor in tensors for number in (id(tensor), tensor._version))

@@ -98,6 +98,9 @@ def length_2d(
 ) -> Tensor:
     """`gradient_magnitude` of components that lie in tensors of their own.
 
+    A length that is not finite has no derivative either: 0 and not NaN, which a product with the 0 of whoever does not
+    use it would spread over the image.
+
     Example:
         >>> flat = torch.zeros(1, requires_grad=True)
         >>> length_2d(flat, flat).backward()
@@ -107,8 +110,11 @@ def length_2d(
     square = (d_u * d_u).add_(d_v * d_v)
     if not square.requires_grad:
         return square.sqrt_()
-    flat = square.detach() == 0
-    return torch.where(flat, 0, torch.where(flat, 1, square).sqrt())
+    constant = square.detach().sqrt()
+    has_slope = (constant > 0) & constant.isfinite()
+    d_u, d_v = (torch.where(has_slope, d, 0) for d in (d_u, d_v))
+    square = torch.where(has_slope, d_u * d_u + d_v * d_v, 1)
+    return torch.where(has_slope, square.sqrt(), constant)
 
 
 def _central_difference(

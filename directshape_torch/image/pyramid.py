@@ -42,11 +42,13 @@ def halve_sizes(
 ) -> Tensor:
     """(height, width) of each frame one level up; integer division, as `halve` drops an odd last row or column.
 
+    A side of one pixel stays one: a lookup must find a pixel in every frame of a batch.
+
     Example:
         >>> halve_sizes(torch.tensor([[375, 1242]]))
         tensor([[187, 621]])
     """
-    return torch.div(sizes, 2, rounding_mode="floor")
+    return torch.div(sizes, 2, rounding_mode="floor").clamp_min(1)
 
 
 def halve_intrinsics(

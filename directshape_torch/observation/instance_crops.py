@@ -30,7 +30,7 @@ class InstanceCrops:
         boxes: (F, 4) integer (u0, v0, u1, v1), half open, around the instances of each frame; all 0 where none is.
         start: (F,) first row of each frame in `covering`.
         covering: (A, W) int32, the instances that cover each pixel, row-major; two more rows, which nothing covers.
-        bits: (N, W) int32, the bit of each instance, in one of the W words.
+        bits: (N, W) int32, the bit of each instance, in one of the W words (1, 4, 16, ...).
     """
 
     boxes: Tensor
@@ -65,7 +65,7 @@ def instance_crops(
     places, around = _places(torch.cat([frame_index[:, None], boxes], dim=1).tolist(), num_frames)
     width = [u1 - u0 for u0, _, u1, _ in around]
     start = [0, *accumulate((v1 - v0) * (u1 - u0) for u0, v0, u1, v1 in around)]
-    num_words = max((place.rank for place in places), default=0) // _BITS_OF_A_WORD + 1
+    num_words = _num_words(max((place.rank for place in places), default=0) + 1)
     covering = torch.zeros(start[-1] + _SPARE_ROWS, num_words, dtype=torch.int32, device=boxes.device)
     bits = [[0] * num_words for _ in boxes]
     every_mask = [mask for stack in masks for mask in stack.detach().unbind()]
@@ -85,6 +85,14 @@ def instance_crops(
         covering,
         covering.new_tensor(bits).view(len(boxes), num_words),
     )
+
+
+def _num_words(num_instances: int) -> int:
+    """1, 4, 16, ...: more than are needed, but each number of words is a compilation of whatever looks them up."""
+    words = 1
+    while words * _BITS_OF_A_WORD < num_instances:
+        words *= 4
+    return words
 
 
 class _Place(NamedTuple):

@@ -98,7 +98,6 @@ class PCAShapePrior(nn.Module):
         self.register_buffer("dimensions_std_hwl", dimensions_std_hwl)
         self.spacing_m = float(spacing_m)
         self.provenance = provenance
-        self._lipschitz: float | None = None
 
     @property
     def num_codes(self) -> int:
@@ -113,9 +112,7 @@ class PCAShapePrior(nn.Module):
     @property
     def lipschitz(self) -> float:
         """Bound of |gradient| on the grid over all codes of norm up to `CODE_NORM_IN_USE`."""
-        if self._lipschitz is None:
-            self._lipschitz = self.lipschitz_within(CODE_NORM_IN_USE)
-        return self._lipschitz
+        return self.lipschitz_within(CODE_NORM_IN_USE)
 
     def lipschitz_within(self, code_norm: float) -> float:
         """Bound of |gradient| on the grid over all codes of norm up to `code_norm`."""
@@ -287,7 +284,6 @@ class PCAShapePrior(nn.Module):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self.spacing_m = float(state["spacing_m"])
-        self._lipschitz = None
 
 
 def training_codes(

@@ -48,6 +48,24 @@ def test_what_was_changed_in_place_is_evaluated_anew(what: str) -> None:
     assert not torch.isclose(problem.cost(state), before, rtol=1e-6).any()
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("what", ["prior's tensor", "spacing", "weights"])
+def test_what_is_replaced_again_and_again_is_never_taken_for_what_was_there_before(what: str) -> None:
+    """Memory that was given back is used again: an address is no name."""
+    problem, state = begun()
+    spacing, mean = problem.prior.spacing_m, problem.prior.mean
+    seen = set()
+    for number in range(1, 13):
+        if what == "prior's tensor":
+            problem.prior.mean = mean + 0.01 * number
+        elif what == "spacing":
+            problem.prior.spacing_m = spacing * (1 + 0.01 * number)
+        else:
+            problem.term_weights = torch.full((5, len(problem.terms)), float(number), dtype=torch.float64)
+        seen.add(float(problem.cost(state).sum()))
+    assert len(seen) == 12
+
+
 def test_inference_tensors_are_not_remembered() -> None:
     problem, state = begun()
     with torch.inference_mode():

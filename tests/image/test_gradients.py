@@ -65,6 +65,16 @@ def test_flat_images_have_a_derivative() -> None:
     assert grey.grad.tolist() == [[[0.0, -0.5, -0.5, 1.0]]]
 
 
+def test_what_is_not_finite_has_no_derivative() -> None:
+    """Nor spoils that of the pixels beside it, which look at it as little as at the rest of the image."""
+    grey = torch.tensor([[[1.0, 2.0, 4.0, 4.0, torch.nan, torch.inf, 3.0]]], requires_grad=True)
+    magnitude = gradient_magnitude(image_gradient(grey))
+    assert magnitude.detach().isfinite().flatten().tolist() == [True, True, True, False, False, False, False]
+    torch.where(magnitude.isfinite(), magnitude, 0).sum().backward()
+    assert grey.grad is not None
+    assert grey.grad.tolist() == [[[-1.0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0]]]
+
+
 def test_wrong_input_is_named() -> None:
     with pytest.raises(InputError, match=r"images: expected shape \(F, 3, H, W\), got \(2, 4, 5\)"):
         grey_levels(torch.zeros(2, 4, 5))

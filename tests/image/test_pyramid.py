@@ -18,7 +18,7 @@ def test_halve_is_the_mean_of_each_block() -> None:
 def test_odd_last_row_and_column_are_dropped() -> None:
     images = torch.arange(15.0).reshape(1, 1, 3, 5)
     assert halve(images).tolist() == [[[[3.0, 5.0]]]]  # (0+1+5+6)/4, (2+3+7+8)/4
-    assert halve_sizes(torch.tensor([[3, 5]])).tolist() == [[1, 2]]
+    assert halve_sizes(torch.tensor([[3, 5], [1, 4]])).tolist() == [[1, 2], [1, 2]]
 
 
 def test_intrinsics_follow_the_image() -> None:

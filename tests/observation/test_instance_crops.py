@@ -29,8 +29,15 @@ def test_bits_give_back_the_masks(counts: tuple[int, ...]) -> None:
         found = torch.zeros(9, 12, dtype=torch.bool)
         found[v0:v1, u0:u1] = ((covering & crops.bits[number]) != 0).any(dim=-1)
         assert torch.equal(found, masks[number] if boxes[number].any() else torch.zeros_like(found))
-    in_frame = torch.bincount(frame, minlength=3)
-    assert crops.bits.shape[1] == max(int(in_frame.max()) - 1, 0) // 31 + 1
+
+
+@pytest.mark.parametrize(("count", "words"), [(1, 1), (31, 1), (32, 4), (124, 4), (125, 16)])
+def test_few_numbers_of_words_occur(count: int, words: int) -> None:
+    """Each of them is compiled for by itself."""
+    boxes = torch.tensor([[0, 0, 2, 1]]).expand(count, -1)
+    crops = instance_crops([torch.ones(count, 1, 2)], boxes, torch.zeros(count, dtype=torch.long), num_frames=1)
+    assert crops.bits.shape == (count, words)
+    assert crops.covering.shape[1] == words
 
 
 def test_frames_without_instances_take_no_memory() -> None:

@@ -114,6 +114,15 @@ def test_code_from_dimensions_is_the_minimum_of_its_cost(prior):
     assert prior.code_from_dimensions(measured[:0]).shape == (0, 4)
 
 
+def test_the_lipschitz_bound_is_that_of_the_present_tensors(prior):
+    changed = copy.deepcopy(prior)
+    before = changed.lipschitz
+    with torch.no_grad():
+        changed.mean.mul_(2)
+        changed.basis.mul_(2)
+    assert changed.lipschitz == pytest.approx(2 * before)
+
+
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_values_are_linear_and_within_the_lipschitz_bound(prior, seed):
