@@ -22,6 +22,7 @@ import torch
 from command_line import run_command
 
 from directshape_torch.benchmark.run import SUITES, BenchmarkOptions, run_benchmark
+from directshape_torch.errors import InputError
 
 BASELINE = Path(__file__).parent / "benchmark_baseline.json"
 
@@ -29,7 +30,13 @@ BASELINE = Path(__file__).parent / "benchmark_baseline.json"
 def run(args: argparse.Namespace) -> int:
     """Measure, print and write; the exit code is 1 where `--check` found a regression."""
     if args.threads is not None:
+        if args.threads < 1:
+            raise InputError("--threads", "at least 1", str(args.threads))
         torch.set_num_threads(args.threads)
+    if args.quick and args.check and args.baseline == BASELINE:
+        raise InputError("--check", "a run without --quick", "--quick", "quick figures are of fewer cars")
+    if args.plots is not None and "scaling" not in (args.suite or SUITES):
+        raise InputError("--plots", "the suite scaling, whose curves they are", f"--suite {' '.join(args.suite)}")
     data = args.data or os.environ.get("DIRECTSHAPE_DATA")
     options = BenchmarkOptions(
         suites=tuple(args.suite or (() if args.profile else SUITES)),
@@ -55,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--profile", action="store_true", help="time of one eager refinement by stage")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure, the machine and the settings")
     parser.add_argument("--plots", type=Path, metavar="DIR", help="write the curves of the suite scaling as PNG")
-    parser.add_argument("--check", action="store_true", help="exit with 1 where a figure is worse than the baseline")
+    check_help = "exit with 1 where a figure is worse than the baseline, with 2 where there is none to compare"
+    parser.add_argument("--check", action="store_true", help=check_help)
     parser.add_argument("--write-baseline", action="store_true", help="replace the rows of these suites")
     parser.add_argument("--baseline", type=Path, default=BASELINE, metavar="FILE", help="default: %(default)s")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="default: DIRECTSHAPE_DATA")

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from directshape_torch.benchmark.rows import COMPARABLE, Kind, Row
+from directshape_torch.benchmark.rows import COMPARABLE, Kind, Row, SuiteResult
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.atomic_files import write_json
 
@@ -54,28 +54,46 @@ def make_baseline(rows: Iterable[Row]) -> dict[str, Expected]:
     return {r.key: Expected(r.value, r.kind, r.better, _TOLERANCES[r.kind]) for r in rows if r.kind in COMPARABLE}
 
 
-def regressions(rows: Iterable[Row], baseline: dict[str, Expected], suites: Iterable[str]) -> list[str]:
-    """A sentence for every row that is worse than the baseline allows, or that is missing though its suite ran.
+@dataclass(frozen=True)
+class Comparison:
+    """Rows of a run beside those of a baseline.
+
+    Attributes:
+        num_compared: rows that both have.
+        regressions: a sentence for every row that is worse than the baseline allows, or that has vanished.
+        not_measured: keys of rows that this machine cannot measure.
+    """
+
+    num_compared: int
+    regressions: tuple[str, ...]
+    not_measured: tuple[str, ...]
+
+
+def compare(suites: Iterable[SuiteResult], baseline: dict[str, Expected]) -> Comparison:
+    """What has become worse.
 
     Args:
-        rows: of this run.
+        suites: of this run; rows of others are not expected, nor is what a suite was `without`.
         baseline: by key.
-        suites: that this run was asked for; rows of others are not expected.
     """
-    found = {row.key: row for row in rows}
-    ran = set(suites)
-    sentences = []
+    ran = {suite.suite: suite for suite in suites}
+    found = {row.key: row for suite in ran.values() for row in suite.rows}
+    compared, sentences, not_measured = 0, [], []
     for key, expected in baseline.items():
-        if key.partition(": ")[0] not in ran:
+        name, _, row = key.partition(": ")
+        if name not in ran:
             continue
-        if key not in found:
+        if key in found:
+            compared += 1
+            if not expected.allows(found[key].value):
+                side = "at most" if expected.better == "lower" else "at least"
+                allowed = f"{side} {expected.limit:.3g} allowed (baseline {expected.value:.3g})"
+                sentences.append(f"{key}: {found[key].value:.3g}, {allowed}")
+        elif any(word in row for word in ran[name].without):
+            not_measured.append(key)
+        else:
             sentences.append(f"{key}: was not measured; the baseline has {expected.value:.3g}")
-        elif not expected.allows(found[key].value):
-            side = "at most" if expected.better == "lower" else "at least"
-            sentences.append(
-                f"{key}: {found[key].value:.3g}, {side} {expected.limit:.3g} allowed (baseline {expected.value:.3g})"
-            )
-    return sentences
+    return Comparison(compared, tuple(sentences), tuple(not_measured))
 
 
 def write_baseline(path: Path | str, baseline: dict[str, Expected]) -> None:

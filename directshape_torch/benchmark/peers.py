@@ -26,7 +26,7 @@ from directshape_torch.benchmark.peers_task import (
     with_jacobian,
     with_marched_rays,
 )
-from directshape_torch.benchmark.presets import available_modes, make_refiner
+from directshape_torch.benchmark.presets import available_modes, make_refiner, unavailable_modes
 from directshape_torch.benchmark.rows import Goal, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import time_interleaved
@@ -80,7 +80,8 @@ def run_peers_suite(settings: SuiteSettings) -> SuiteResult:
         notes += case.costs_in_words()
         if _PYPOSE in peers and not settings.quick and not documented:
             documented = _documented_rows(case.tasks[0])
-    return SuiteResult(SUITE, (*_all_rows(figures, own), *documented), notes=tuple(notes))
+    rows, without = (*_all_rows(figures, own), *documented), (*missing, *unavailable_modes())
+    return SuiteResult(SUITE, rows, notes=tuple(notes), without=without)
 
 
 def missing_libraries() -> dict[str, str]:

@@ -17,6 +17,11 @@ def available_modes() -> tuple[str, ...]:
     return tuple(MODES) if compiler_problem() is None else ("eager",)
 
 
+def unavailable_modes() -> tuple[str, ...]:
+    """The other ones."""
+    return tuple(mode for mode in MODES if mode not in available_modes())
+
+
 def make_refiner(preset: str, mode: str, overrides: Sequence[str] = ()) -> DirectShapeRefiner:
     """A refiner with a preset's settings, on the CPU.
 

@@ -122,7 +122,11 @@ def read_run(path: Path | str) -> BenchmarkRun:
 
 def _suite(item: dict[str, Any]) -> SuiteResult:
     return SuiteResult(
-        item["suite"], tuple(map(_row, item["rows"])), tuple(map(_curve, item["curves"])), tuple(item["notes"])
+        item["suite"],
+        tuple(map(_row, item["rows"])),
+        tuple(map(_curve, item["curves"])),
+        tuple(item["notes"]),
+        tuple(item.get("without", ())),
     )
 
 

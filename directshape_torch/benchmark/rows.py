@@ -99,9 +99,11 @@ class SuiteResult:
         rows: figures.
         curves: to be drawn; may be empty.
         notes: what was measured on, and what was left out and why, a sentence each.
+        without: what this machine cannot measure: words of the names of rows that nobody should miss.
     """
 
     suite: str
     rows: tuple[Row, ...]
     curves: tuple[Curve, ...] = ()
     notes: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()

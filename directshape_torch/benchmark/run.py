@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from directshape_torch.benchmark.baseline import (
     Expected,
+    compare,
     make_baseline,
     read_baseline,
-    regressions,
     updated,
     write_baseline,
 )
@@ -19,6 +20,7 @@ from directshape_torch.benchmark.machine import describe_machine
 from directshape_torch.benchmark.report import BenchmarkRun, format_machine, format_suite, write_run
 from directshape_torch.benchmark.rows import SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
+from directshape_torch.benchmark.workloads import check_data_root
 from directshape_torch.config_files import config_to_mapping, load_config
 from directshape_torch.errors import InputError
 from directshape_torch.io.figure_files import check_figures
@@ -35,6 +37,9 @@ SUITES = {
 }
 
 Progress = Callable[[str], None]
+
+# Beside our own threads, of which there are as many as cores at most.
+_OTHERS_LOAD = 0.5
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ def run_benchmark(options: BenchmarkOptions, progress: Progress) -> int:
     """Run the suites and print their tables; returns the exit code, 1 for a regression.
 
     Raises:
-        InputError: a baseline is to be made of a quick run.
+        InputError: a baseline is to be made of a quick run; a data folder without frames; nothing to compare.
         DataFormatError: no baseline to compare with.
         MissingDependencyError: pictures are asked for and matplotlib is not installed.
     """
@@ -79,8 +84,14 @@ def run_benchmark(options: BenchmarkOptions, progress: Progress) -> int:
     baseline = read_baseline(options.baseline_path) if options.check else {}
     if options.plots_dir is not None:
         check_figures("benchmark.py --plots")
+    if options.data_root is not None:
+        check_data_root(options.data_root)
+    if options.json_path is not None:
+        _check_writable(options.json_path.parent)
     machine = describe_machine()
     print(format_machine(machine), flush=True)
+    if options.quick:
+        print("QUICK: everything is cut short, no figure here is to be quoted", flush=True)
     settings = SuiteSettings.make(options.data_root, options.quick, progress)
     results = []
     for name in (*(["profile"] if options.profile else []), *options.suites):
@@ -92,11 +103,30 @@ def run_benchmark(options: BenchmarkOptions, progress: Progress) -> int:
     return _report_regressions(run, baseline) if options.check else 0
 
 
+def _check_writable(folder: Path) -> None:
+    """Before minutes of measuring, not after."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError("--json", "a file in a folder that can be written to", f"{folder}: {error}") from error
+
+
 def _run_suite(name: str, settings: SuiteSettings) -> SuiteResult:
     module, function = ("suite_profile", "run_profile") if name == "profile" else SUITES[name]
     result = getattr(importlib.import_module(f"{_PACKAGE}.{module}"), function)(settings)
     assert isinstance(result, SuiteResult)
-    return result
+    return _with_note_on_load(result)
+
+
+def _with_note_on_load(result: SuiteResult) -> SuiteResult:
+    """Several threads that wait for one another stand still where something else has one of the cores."""
+    machine = describe_machine()
+    if machine.load is None or machine.load < machine.cores + _OTHERS_LOAD:
+        return result
+    note = f"load {machine.load:.1f} on {machine.cores} cores: something else was running, not to be quoted"
+    return replace(result, notes=(*result.notes, note))
 
 
 def _write_files(run: BenchmarkRun, options: BenchmarkOptions) -> None:
@@ -110,20 +140,31 @@ def _write_files(run: BenchmarkRun, options: BenchmarkOptions) -> None:
         for path in write_plots(options.plots_dir, curves):
             print(f"wrote {path}")
     if options.write_baseline:
+        new = make_baseline(run.rows)
+        if not new:
+            raise InputError("--write-baseline", "suites with ratios, slopes or counts", "none of these")
         old = read_baseline(options.baseline_path) if options.baseline_path.is_file() else {}
-        write_baseline(options.baseline_path, updated(old, make_baseline(run.rows), _measured(run)))
+        write_baseline(options.baseline_path, updated(old, new, [suite.suite for suite in _measured(run)]))
         print(f"wrote {options.baseline_path}")
 
 
 def _report_regressions(run: BenchmarkRun, baseline: dict[str, Expected]) -> int:
-    sentences = regressions(run.rows, baseline, _measured(run))
-    for sentence in sentences:
+    found = compare(_measured(run), baseline)
+    print(f"\ncompared {found.num_compared} rows with the baseline")
+    for key in found.not_measured:
+        print(f"cannot be measured here: {key}")
+    for sentence in found.regressions:
         print(f"regression: {sentence}")
-    if not sentences:
-        print("\nno regression")
-    return 1 if sentences else 0
+    if found.regressions:
+        return 1
+    if not found.num_compared:
+        raise InputError(
+            "--check", "suites with rows in the baseline that can run here", "none of these", "see the notes"
+        )
+    print("no regression")
+    return 0
 
 
-def _measured(run: BenchmarkRun) -> list[str]:
+def _measured(run: BenchmarkRun) -> list[SuiteResult]:
     """Suites that could run here: one without rows found nothing to run on."""
-    return [suite.suite for suite in run.suites if suite.rows]
+    return [suite for suite in run.suites if suite.rows]

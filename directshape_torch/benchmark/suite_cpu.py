@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
 from directshape_torch.benchmark.accuracy import mean_bev_iou
 from directshape_torch.benchmark.compile_cost import compile_rows
-from directshape_torch.benchmark.presets import available_modes, make_refiner
+from directshape_torch.benchmark.presets import available_modes, make_refiner, unavailable_modes
 from directshape_torch.benchmark.rows import Goal, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import Scene, load_scenes
+from directshape_torch.benchmark.yardstick import Yardstick
 from directshape_torch.compilation.machine import compiler_problem
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
@@ -22,6 +25,8 @@ _SUITE = "cpu"
 _PRESETS = ("default", "fast")
 _ROUNDS = 3  # of each frame; the median over the frames needs few
 _BATCH_FRAMES = 8  # of a call by somebody who refines a data set and does not wait for single frames
+_DATA_SETS = ("demo", "rendered", "kitti")
+_YARDSTICK = "the yardstick"
 
 _GOALS_MS_PER_CAR = {("default", "compiled"): 10.0, ("default", "eager"): 50.0, ("fast", "compiled"): 4.0}
 _GOALS_MS_PER_FRAME = {("default", "compiled"): 50.0}
@@ -37,13 +42,16 @@ def run_cpu(settings: SuiteSettings) -> SuiteResult:
     rows: list[Row] = []
     problem = compiler_problem()
     notes = [] if problem is None else [f"compiled: not measured, {problem}"]
-    for scene in load_scenes(settings.data_root, settings.max_frames):
+    scenes = load_scenes(settings.data_root, settings.max_frames)
+    for scene in scenes:
         rows += _scene_rows(scene, sides, settings)
         rows += _batch_rows(scene, sides, settings)
         notes.append(f"{scene.name}: {len(scene.frames)} frames with {scene.num_cars} cars")
     if "compiled" in available_modes():
         rows += compile_rows(settings)
-    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
+    others = [name for name in _DATA_SETS if name not in {scene.name for scene in scenes}]
+    without = (*(f"{name}, " for name in others), *unavailable_modes())
+    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes), without=without)
 
 
 @dataclass
@@ -62,26 +70,29 @@ class _Side:
 def _scene_rows(scene: Scene, sides: dict[str, _Side], settings: SuiteSettings) -> list[Row]:
     repetitions = replace(settings.repetitions, warm_up=1, rounds=min(_ROUNDS, settings.repetitions.rounds))
     times: list[InterleavedTimes] = []
+    yardstick = Yardstick()
     for number, loaded in enumerate(scene.frames):
         settings.progress(f"cpu: {scene.name}, frame {number + 1} of {len(scene.frames)}")
-        calls = {name: partial(side.refine, loaded) for name, side in sides.items()}
-        times.append(time_interleaved(calls, repetitions))
+        calls: dict[str, Callable[[], object]] = {name: partial(side.refine, loaded) for name, side in sides.items()}
+        times.append(time_interleaved({**calls, _YARDSTICK: yardstick}, repetitions))
     cars = [len(loaded.detections) for loaded in scene.frames]
     rows = [row for name, side in sides.items() for row in _side_rows(scene, name, side, times, cars)]
-    return rows + _ratio_rows(scene, times)
+    return rows + _ratio_rows(scene, times) + _yardstick_rows(f"{scene.name}, ", sides, times)
 
 
 def _batch_rows(scene: Scene, sides: dict[str, _Side], settings: SuiteSettings) -> list[Row]:
     """The same frames, several in a call, so that they share what a call costs whatever is in it."""
     repetitions = replace(settings.repetitions, warm_up=1, rounds=min(_ROUNDS, settings.repetitions.rounds))
-    batches = [scene.frames[first : first + _BATCH_FRAMES] for first in range(0, len(scene.frames), _BATCH_FRAMES)]
+    # The last one is filled up with the first frames again: each is a call of the size that its name says.
+    endless, count = itertools.cycle(scene.frames), -(-len(scene.frames) // _BATCH_FRAMES)
+    batches = [list(itertools.islice(endless, _BATCH_FRAMES)) for _ in range(count)]
     times: list[InterleavedTimes] = []
+    yardstick = Yardstick()
     for number, batch in enumerate(batches):
         settings.progress(f"cpu: {scene.name}, batch {number + 1} of {len(batches)}")
         inputs = collate(batch)
-        times.append(
-            time_interleaved({name: partial(side.refiner, *inputs) for name, side in sides.items()}, repetitions)
-        )
+        calls: dict[str, Callable[[], object]] = {n: partial(side.refiner, *inputs) for n, side in sides.items()}
+        times.append(time_interleaved({**calls, _YARDSTICK: yardstick}, repetitions))
     cars = [sum(len(loaded.detections) for loaded in batch) for batch in batches]
     rows = []
     for name, side in sides.items():
@@ -93,7 +104,7 @@ def _batch_rows(scene: Scene, sides: dict[str, _Side], settings: SuiteSettings) 
             _time_row(f"{several}, per car", per_car, _GOALS_MS_PER_CAR.get(key), "batches"),
             _time_row(f"{several}, per frame", per_frame, _GOALS_MS_PER_FRAME.get(key), "batches"),
         ]
-    return rows
+    return rows + _yardstick_rows(f"{scene.name}, {_BATCH_FRAMES} frames in a call, ", sides, times)
 
 
 def _side_rows(scene: Scene, name: str, side: _Side, times: list[InterleavedTimes], cars: list[int]) -> list[Row]:
@@ -120,6 +131,16 @@ def _time_row(name: str, milliseconds: list[float], goal_ms: float | None, over:
     goal = None if goal_ms is None else Goal("at most", goal_ms)
     note = f"median and quartiles over {over}"
     return Row(_SUITE, name, spread.median, "ms", "time", spread.low, spread.high, spread.count, goal=goal, note=note)
+
+
+def _yardstick_rows(where: str, sides: dict[str, _Side], times: list[InterleavedTimes]) -> list[Row]:
+    """Whole calls over the yardstick within one frame or batch: what shows that all of them have become slower."""
+    rows = []
+    for name in sides:
+        ratio = Spread.of([each.ratio(name, _YARDSTICK).median for each in times])
+        what = f"{where}{name} over {_YARDSTICK}"
+        rows.append(Row(_SUITE, what, ratio.median, "", "ratio", ratio.low, ratio.high, ratio.count))
+    return rows
 
 
 def _ratio_rows(scene: Scene, times: list[InterleavedTimes]) -> list[Row]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.benchmark.needed_lookups import NeededLookups, needed_lookups
-from directshape_torch.benchmark.presets import available_modes, make_refiner
+from directshape_torch.benchmark.presets import available_modes, make_refiner, unavailable_modes
 from directshape_torch.benchmark.rows import Goal, Kind, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
@@ -54,7 +54,7 @@ def run_kernels(settings: SuiteSettings) -> SuiteResult:
     notes.append(f"needed: 3 values and once derivatives for {rays} rays near contours, 1 and once for {pixels} pixels")
     settings.progress("kernels: parts")
     rows += _sum_and_solve_rows(frames, detections, settings)
-    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
+    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes), without=unavailable_modes())
 
 
 def _needed(frames: FrameBatch, detections: Detections) -> tuple[NeededLookups, GridField]:

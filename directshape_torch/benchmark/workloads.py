@@ -66,13 +66,19 @@ def _scenes(data_root: Path | None, max_frames: int | None) -> Iterator[Scene]:
     if data_root is None:
         yield demo_scene()
         return
+    check_data_root(data_root)
     rendered, kitti = data_root / "rendered", data_root / "kitti"
-    if not rendered.is_dir() and not kitti.is_dir():
-        raise InputError("--data", "a folder that holds rendered or kitti", str(data_root), "or leave it out")
     if rendered.is_dir():
         yield _scene(rendered, "stereo", None, max_frames)
     if kitti.is_dir():
         yield _scene(kitti, "noisy_stereo", _rig_field(kitti), max_frames)
+
+
+def check_data_root(data_root: Path) -> None:
+    """Raise `InputError` unless a data folder holds rendered or KITTI frames."""
+    if not (data_root / "rendered").is_dir() and not (data_root / "kitti").is_dir():
+        cure = "or leave both out for the bundled frame"
+        raise InputError("--data or DIRECTSHAPE_DATA", "a folder that holds rendered or kitti", str(data_root), cure)
 
 
 def demo_scene() -> Scene:

@@ -9,14 +9,15 @@ from typing import Literal
 import pytest
 
 from directshape_torch.benchmark.baseline import (
+    Comparison,
     Expected,
+    compare,
     make_baseline,
     read_baseline,
-    regressions,
     updated,
     write_baseline,
 )
-from directshape_torch.benchmark.rows import Kind, Row
+from directshape_torch.benchmark.rows import Kind, Row, SuiteResult
 from directshape_torch.errors import DataFormatError
 
 
@@ -24,6 +25,10 @@ def row(
     name: str, value: float, kind: Kind = "ratio", better: Literal["lower", "higher"] = "lower", suite: str = "kernels"
 ) -> Row:
     return Row(suite, name, value, "", kind, better=better)
+
+
+def compared(rows: list[Row], baseline: dict[str, Expected]) -> Comparison:
+    return compare([SuiteResult("kernels", tuple(rows))], baseline)
 
 
 def test_absolute_figures_are_never_in_a_baseline() -> None:
@@ -51,13 +56,13 @@ def test_the_limit_by_hand(expected: Expected, passes: float, fails: float) -> N
 def test_a_better_figure_is_no_regression() -> None:
     baseline = make_baseline([row("a", 4.0), row("b", 4.0, better="higher")])
 
-    assert regressions([row("a", 0.1), row("b", 100.0, better="higher")], baseline, ["kernels"]) == []
+    assert compared([row("a", 0.1), row("b", 100.0, better="higher")], baseline) == Comparison(2, (), ())
 
 
 def test_a_regression_names_row_figure_and_limit() -> None:
     baseline = {"kernels: a": Expected(4.0, "ratio", "lower", 0.25)}
 
-    (sentence,) = regressions([row("a", 6.0)], baseline, ["kernels"])
+    (sentence,) = compared([row("a", 6.0)], baseline).regressions
 
     assert sentence == "kernels: a: 6, at most 5 allowed (baseline 4)"
 
@@ -65,8 +70,20 @@ def test_a_regression_names_row_figure_and_limit() -> None:
 def test_a_row_that_vanished_is_a_regression_only_where_its_suite_ran() -> None:
     baseline = make_baseline([row("a", 4.0), row("b", 2.0, suite="gpu")])
 
-    assert regressions([row("a", 4.0)], baseline, ["kernels"]) == []
-    assert "was not measured" in regressions([row("a", 4.0)], baseline, ["kernels", "gpu"])[0]
+    assert compared([row("a", 4.0)], baseline) == Comparison(1, (), ())
+    both = [SuiteResult("kernels", (row("a", 4.0),)), SuiteResult("gpu", ())]
+    assert "was not measured" in compare(both, baseline).regressions[0]
+
+
+def test_a_row_that_the_machine_cannot_measure_is_none() -> None:
+    """Without a compiler, a data set or another library: named by the suite, and by nobody else."""
+    baseline = make_baseline([row("a, eager", 4.0), row("a, compiled", 2.0)])
+    eager = (row("a, eager", 4.0),)
+
+    without = compare([SuiteResult("kernels", eager, without=("compiled",))], baseline)
+
+    assert without == Comparison(1, (), ("kernels: a, compiled",))
+    assert "a, compiled: was not measured" in compare([SuiteResult("kernels", eager)], baseline).regressions[0]
 
 
 def test_a_baseline_survives_its_file(tmp_path: Path) -> None:

@@ -25,7 +25,8 @@ SMALLEST = SuiteSettings(quick=True, repetitions=Repetitions(warm_up=0, rounds=1
 
 def test_speed_and_accuracy_of_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite_cpu, "_PRESETS", ("fast",))
-    monkeypatch.setattr(suite_cpu, "available_modes", lambda: ("eager",))
+    for name, modes in (("available_modes", ("eager",)), ("unavailable_modes", ("compiled",))):
+        monkeypatch.setattr(suite_cpu, name, lambda modes=modes: modes)
     monkeypatch.setattr(suite_cpu, "compiler_problem", lambda: "no compiler was found")
 
     result = suite_cpu.run_cpu(SMALLEST)
@@ -37,6 +38,13 @@ def test_speed_and_accuracy_of_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "input 0.700" in overlap.note
     assert "demo: 1 frames with 6 cars" in result.notes
     assert "compiled: not measured, no compiler was found" in result.notes
+    assert result.without == ("rendered, ", "kitti, ", "compiled")
+    # The one frame eight times, so that the name of the row is true; and each call over the same piece of work.
+    batch = "demo, fast eager, 8 frames in a call"
+    assert rows[f"{batch}, per frame"].value == pytest.approx(6 * rows[f"{batch}, per car"].value)
+    alone, together = (rows[f"demo, {where}fast eager over the yardstick"] for where in ("", "8 frames in a call, "))
+    assert alone.kind == together.kind == "ratio"
+    assert 0 < alone.value < together.value
 
 
 def test_what_compiling_costs_is_the_first_calls_less_the_second(monkeypatch: pytest.MonkeyPatch) -> None:
