@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from directshape_torch.batch.timing import RunTimings, device_name, peak_memory_mb
+from directshape_torch.compilation.regions import num_forms
 from directshape_torch.status import Status
 
 
@@ -102,7 +103,9 @@ def _timing_lines(timings: RunTimings) -> list[str]:
     if timings.ms_per_frame is not None:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "
         where = device_name(timings.device)
-        lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only, {where})")
+        # It is part of the calls in which it happens, and of a short run most of the time.
+        compiling = " with compiling or loading code" if num_forms() else ""
+        lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only{compiling}, {where})")
     if timings.workers > 1 and timings.wall_s:
         rate = timings.num_frames / timings.wall_s
         lines.append(f"rate     {rate:.2f} frames a second by {timings.workers} workers (everything included)")

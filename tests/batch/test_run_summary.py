@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from directshape_torch.batch import run_summary
 from directshape_torch.batch.run_summary import RunSummary, count_statuses, find_warnings, format_summary
 from directshape_torch.batch.timing import CallTiming, RunTimings, peak_memory_mb, write_timings
 
@@ -56,7 +57,9 @@ def test_warnings(frames: dict[str, Any], expected: list[str]) -> None:
         assert warning.startswith(start)
 
 
-def test_report() -> None:
+@pytest.mark.parametrize(("forms", "compiling"), [(0, ""), (3, " with compiling or loading code")])
+def test_report(forms: int, compiling: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_summary, "num_forms", lambda: forms)
     frames = {"000000": done(converged=2), "000001": done(converged=3, no_mask=1), "000002": FAILED}
     summary = RunSummary(frames, ("000000",), {"000002": "cut short"}, (), timings())
     assert summary.exit_code == 1
@@ -65,7 +68,7 @@ def test_report() -> None:
     assert lines[0] == "frames   2 done, 1 of them in an earlier run, 1 failed"
     assert lines[1] == "cars     6: converged 5, no_mask 1"
     # 0.9 s over 6 cars and 3 frames.
-    assert lines[2] == "time     150 ms per car, 300 ms per frame (refinement only, cpu)"
+    assert lines[2] == f"time     150 ms per car, 300 ms per frame (refinement only{compiling}, cpu)"
     assert lines[3].startswith("memory   ")
 
 

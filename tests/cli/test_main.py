@@ -23,6 +23,13 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         assert re.search(rf"^ {{4}}{command.replace('_', '-')}\s", text, re.MULTILINE)
 
 
+def test_the_package_is_the_program() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "directshape_torch", "--help"], capture_output=True, text=True, check=True
+    )
+    assert "calibrate-stereo" in done.stdout
+
+
 @pytest.mark.parametrize("arguments", [[], ["refin"], ["refine"], ["compare", "--labels", "x"]])
 def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
