@@ -14,18 +14,60 @@ _ROTATION_TOLERANCE = 1e-3
 
 
 def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str], cure: str = "") -> None:
-    """Raise `InputError` unless `tensor` has the expected shape; letters stand for any size.
+    """Raise `InputError` unless `tensor` is a tensor of the expected shape; letters stand for any size.
 
     Example:
         >>> import torch
         >>> check_shape("points", torch.zeros(7, 3), ("P", 3))
     """
+    wanted = "(" + ", ".join(str(n) for n in expected) + ("," if len(expected) == 1 else "") + ")"
+    if not isinstance(tensor, Tensor):
+        # Arrays and lists come from whoever has just read a file.
+        made = "" if tensor is None else "make one with torch.as_tensor or torch.stack"
+        raise InputError(name, f"a tensor of shape {wanted}", type(tensor).__name__, cure or made)
     fits = tensor.ndim == len(expected) and all(
         isinstance(want, str) or want == have for want, have in zip(expected, tensor.shape, strict=True)
     )
     if not fits:
-        wanted = "(" + ", ".join(str(n) for n in expected) + ")"
         raise InputError(name, f"shape {wanted}", f"{tuple(tensor.shape)}", cure)
+
+
+def check_integer(name: str, tensor: Tensor) -> None:
+    """Raise `InputError` unless `tensor` is int32 or int64, which index others; uint8 would be taken for a mask.
+
+    Example:
+        >>> import torch
+        >>> check_integer("frame_index", torch.zeros(7, dtype=torch.int64))
+    """
+    if tensor.dtype not in (torch.int32, torch.int64):
+        raise InputError(name, "int64 or int32", str(tensor.dtype), "convert it with .long()")
+
+
+def check_flags(name: str, tensor: Tensor) -> None:
+    """Raise `InputError` unless `tensor` is bool.
+
+    Example:
+        >>> import torch
+        >>> check_flags("has_mask_left", torch.tensor([True]))
+    """
+    if tensor.dtype != torch.bool:
+        raise InputError(name, "bool", str(tensor.dtype), "convert it with .bool()")
+
+
+def check_mask_dtype(name: str, masks: Tensor) -> None:
+    """Raise `InputError` unless `masks` are bool or floating point.
+
+    Example:
+        >>> import torch
+        >>> check_mask_dtype("mask_left", torch.zeros(1, 4, 6, dtype=torch.bool))
+    """
+    if masks.dtype != torch.bool and not masks.is_floating_point():
+        raise InputError(
+            name,
+            "bool, or foreground probabilities in [0, 1] in floating point",
+            str(masks.dtype),
+            "divide by 255 where it holds 0..255, and make 0 and 1 bool with .bool()",
+        )
 
 
 def check_rotation(

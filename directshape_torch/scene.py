@@ -7,18 +7,27 @@ with the centre of the top-left pixel at (0, 0).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from directshape_torch.checks import check_rotation, check_shape, check_sigmas
+from directshape_torch.checks import (
+    check_flags,
+    check_integer,
+    check_mask_dtype,
+    check_rotation,
+    check_shape,
+    check_sigmas,
+)
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 
 # Resampling by cubic kernels overshoots a little.
 _BRIGHTEST = 1.01
+_DARKEST = -0.01
 
 
 class _TensorRecord:
@@ -164,7 +173,7 @@ class FrameBatch(_TensorRecord):
     Attributes:
         images_left: (F, 3, H, W), RGB in [0, 1].
         images_right: (F, 3, H, W).
-        sizes: (F, 2) integer (height, width) of each frame without padding.
+        sizes: (F, 2) int64 or int32 (height, width) of each frame without padding.
         camera: calibration of the frames.
         ground: a ground plane for each frame, in the left camera frame.
         frame_ids: a name for each frame.
@@ -185,8 +194,10 @@ class FrameBatch(_TensorRecord):
         check_shape("images_right", self.images_right, tuple(self.images_left.shape))
         num_frames, _, height, width = self.images_left.shape
         check_shape("sizes", self.sizes, (num_frames, 2))
-        if not self.images_left.is_floating_point() or not self.images_right.is_floating_point():
-            raise InputError("images", "floating point in [0, 1]", str(self.images_left.dtype), "divide by 255")
+        check_integer("sizes", self.sizes)
+        for name in ("images_left", "images_right"):
+            if not getattr(self, name).is_floating_point():
+                raise InputError(name, "floating point in [0, 1]", str(getattr(self, name).dtype), "divide by 255")
         for what in ("dtype", "device"):
             left, right = getattr(self.images_left, what), getattr(self.images_right, what)
             if left != right:
@@ -196,8 +207,8 @@ class FrameBatch(_TensorRecord):
             if self.disparity.dtype != self.images_left.dtype or self.disparity.device != self.images_left.device:
                 got = f"{self.disparity.dtype} on {self.disparity.device}"
                 raise InputError("disparity", f"{self.images_left.dtype} on {self.images_left.device}", got)
-        _check_at_most_one("images_left", self.images_left)
-        _check_at_most_one("images_right", self.images_right)
+        _check_brightness("images_left", self.images_left)
+        _check_brightness("images_right", self.images_right)
         if len(self.frame_ids) != num_frames:
             raise InputError("frame_ids", f"{num_frames} names", f"{len(self.frame_ids)}")
         for name, count in (("camera", self.camera.num_frames), ("ground", len(self.ground.normal))):
@@ -220,8 +231,8 @@ class Occluders(_TensorRecord):
     """M further instances (any class) that may hide cars; the detections themselves need not be repeated here.
 
     Attributes:
-        frame_index: (M,) integer.
-        mask_left, mask_right: (M, H, W), bool or foreground probability in [0, 1].
+        frame_index: (M,) int64 or int32.
+        mask_left, mask_right: (M, H, W), bool or foreground probability in [0, 1]; 0 beyond the frame's own size.
         depth_m: (M,) distance along the optical axis, NaN where unknown.
         bottom_v: (M,) lower edge of the 2D box in the left image, pixels.
     """
@@ -234,9 +245,11 @@ class Occluders(_TensorRecord):
 
     def __post_init__(self) -> None:
         check_shape("frame_index", self.frame_index, ("M",))
+        check_integer("frame_index", self.frame_index)
         count = len(self.frame_index)
-        check_shape("mask_left", self.mask_left, (count, "H", "W"))
-        check_shape("mask_right", self.mask_right, (count, "H", "W"))
+        for name in ("mask_left", "mask_right"):
+            check_shape(name, getattr(self, name), (count, "H", "W"))
+            check_mask_dtype(name, getattr(self, name))
         check_shape("depth_m", self.depth_m, (count,))
         check_shape("bottom_v", self.bottom_v, (count,))
 
@@ -246,13 +259,14 @@ class Detections(_TensorRecord):
     """B rough 3D boxes with instance masks, over all frames of a call, in any order.
 
     Attributes:
-        frame_index: (B,) integer, the frame of each object.
+        frame_index: (B,) int64 or int32, the frame of each object.
         T_cam_obj: (B, 4, 4) initial pose, object to left camera (KITTI's object frame: x forward, y down, origin on
             the ground under the box centre). A row with NaN is a car that is not refined.
         dimensions_hwl: (B, 3) height, width, length of the initial box, metres.
         box_2d: (B, 4) left-image box (u_min, v_min, u_max, v_max), pixels.
         score: (B,) the detector's score, any scale.
-        mask_left, mask_right: (B, H, W) foreground probability in [0, 1], floating point or bool.
+        mask_left, mask_right: (B, H, W) foreground probability in [0, 1], floating point or bool. 0 beyond the frame's
+            own size, for extents and areas of masks count the padding too.
         has_mask_left, has_mask_right: (B,) bool; a mask that is absent is never read.
         occluders: other instances that may hide the cars, or None.
         pose_sigma: (B, 4) standard deviations of the detector's own error: along the viewing ray of the object origin
@@ -261,7 +275,8 @@ class Detections(_TensorRecord):
             collated with frames that have some, infinity stands for none.
 
     Raises:
-        InputError: wrong shapes, a rotation that is none, or a standard deviation that is not above 0.
+        InputError: wrong shapes or types, a rotation that is none, or a standard deviation that is not above 0.
+            Whether masks are within [0, 1] is checked when they are read, in a refinement.
     """
 
     frame_index: Tensor
@@ -278,6 +293,7 @@ class Detections(_TensorRecord):
 
     def __post_init__(self) -> None:
         check_shape("frame_index", self.frame_index, ("B",))
+        check_integer("frame_index", self.frame_index)
         count = len(self.frame_index)
         check_shape("T_cam_obj", self.T_cam_obj, (count, 4, 4))
         has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
@@ -287,10 +303,14 @@ class Detections(_TensorRecord):
         check_shape("dimensions_hwl", self.dimensions_hwl, (count, 3))
         check_shape("box_2d", self.box_2d, (count, 4))
         check_shape("score", self.score, (count,))
-        check_shape("mask_left", self.mask_left, (count, "H", "W"))
-        check_shape("mask_right", self.mask_right, tuple(self.mask_left.shape))
-        check_shape("has_mask_left", self.has_mask_left, (count,))
-        check_shape("has_mask_right", self.has_mask_right, (count,))
+        for side in ("left", "right"):
+            mask, has_mask = getattr(self, f"mask_{side}"), getattr(self, f"has_mask_{side}")
+            size: tuple[int | str, ...] = (count, "H", "W") if side == "left" else tuple(self.mask_left.shape)
+            cure = f"absent masks: zeros, and has_mask_{side} False" if mask is None else ""
+            check_shape(f"mask_{side}", mask, size, cure)
+            check_mask_dtype(f"mask_{side}", mask)
+            check_shape(f"has_mask_{side}", has_mask, (count,))
+            check_flags(f"has_mask_{side}", has_mask)
         if self.pose_sigma is not None:
             check_shape("pose_sigma", self.pose_sigma, (count, 4))
             check_sigmas("pose_sigma", self.pose_sigma)
@@ -299,8 +319,18 @@ class Detections(_TensorRecord):
         return len(self.frame_index)
 
 
-def _check_at_most_one(name: str, images: Tensor) -> None:
+def _check_brightness(name: str, images: Tensor) -> None:
     """Values that are not finite are left to the refinement, which fails the cars that need them."""
-    brightest = images.detach().nan_to_num(nan=0.0, posinf=0.0).flatten().amax() if images.numel() else 0.0
+    if not images.numel():
+        return
+    values = images.detach()
+    darkest, brightest = torch.stack(values.aminmax()).tolist()
+    if not math.isfinite(brightest - darkest):
+        # One NaN hides all other values, but to copy the images for that is worth it only where there is one.
+        finite = values.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+        darkest, brightest = torch.stack(finite.aminmax()).tolist()
+    if darkest < _DARKEST:
+        cure = "undo the normalisation: images are RGB in [0, 1]"
+        raise InputError(name, "values in [0, 1]", f"a value of {darkest:g}", cure)
     if brightest > _BRIGHTEST:
-        raise InputError(name, "values in [0, 1]", f"a value of {float(brightest):g}", "divide by 255")
+        raise InputError(name, "values in [0, 1]", f"a value of {brightest:g}", "divide by 255")

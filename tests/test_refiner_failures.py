@@ -26,7 +26,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.status import Status
 
 
@@ -207,6 +207,32 @@ def test_a_nan_ground_plane_fails_its_own_frame_only() -> None:
     )
     assert result.status[2:] == [Status.non_finite] * 2
     torch.testing.assert_close(result.T_cam_obj[:2], healthy().T_cam_obj, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["mask_left", "mask_right"])
+@pytest.mark.parametrize("factor", [10.0, 255.0])
+def test_masks_above_1_are_named(name: str, factor: float) -> None:
+    frames, detections = base()
+    wrong = factor * getattr(detections, name)
+    cure = "apply a sigmoid to logits, or divide by 255"
+    with pytest.raises(InputError, match=rf"detections\.{name}: .* a value of {factor:g} in mask 0; {cure}"):
+        refine(frames, replace(detections, **{name: wrong}))
+    occluders = Occluders(
+        detections.frame_index.int(),
+        detections.mask_left,
+        detections.mask_right,
+        detections.T_cam_obj[:, 2, 3],
+        detections.box_2d[:, 3],
+    )
+    with pytest.raises(InputError, match=rf"detections\.occluders\.{name}: .* a value of {factor:g} in mask 0"):
+        refine(frames, replace(detections, occluders=replace(occluders, **{name: wrong})))
+
+
+def test_frames_may_be_numbered_in_32_bits() -> None:
+    frames, detections = base()
+    frames = replace(frames, sizes=frames.sizes.int())
+    result = refine(frames, replace(detections, frame_index=detections.frame_index.int()))
+    assert torch.equal(result.T_cam_obj, healthy().T_cam_obj)
 
 
 @pytest.mark.parametrize("frames_too", [False, True])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.synthetic_scene import cached_street
@@ -68,6 +69,27 @@ def test_images_of_0_to_255_are_refused_and_nan_is_not() -> None:
     assert len(replace(frames, images_left=1.005 * spoiled)) == 1
 
 
+@pytest.mark.parametrize("unknown", [0.5, torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(-0.02, "-0.02; undo the normalisation: images are RGB in"), (1.02, "1.02; divide by 255")],
+)
+def test_values_outside_of_0_to_1_are_found_beside_any_others(unknown: float, value: float, text: str) -> None:
+    frames = cached_street()[1].frames
+    spoiled = frames.images_right.clone()
+    spoiled[0, 0, 0, :2] = torch.tensor([unknown, value], dtype=spoiled.dtype)
+    with pytest.raises(InputError, match=rf"images_right: expected values in \[0, 1\], got a value of {text}"):
+        replace(frames, images_right=spoiled)
+    spoiled[0, 0, 0, 1] = 1.005 if value > 0 else -0.005
+    assert len(replace(frames, images_right=spoiled)) == 1
+
+
+def test_images_normalised_by_mean_and_deviation_are_refused() -> None:
+    frames = cached_street()[1].frames
+    with pytest.raises(InputError, match=r"images_left: .*; undo the normalisation"):
+        replace(frames, images_left=(frames.images_left - 0.45) / 0.225)
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
@@ -86,6 +108,20 @@ def test_images_of_0_to_255_are_refused_and_nan_is_not() -> None:
             "images_right: expected the device of images_left (cpu), got meta",
         ),
         ({"ground": GroundPlane.from_camera_height(1.6, 2)}, "ground: expected 1 frames, got 2"),
+        (
+            {"images_right": torch.zeros(1, 3, 120, 160, dtype=torch.uint8)},
+            "images_right: expected floating point in [0, 1], got torch.uint8; divide by 255",
+        ),
+        (
+            {"images_left": None},
+            "images_left: expected a tensor of shape (F, 3, H, W), got NoneType; stack images",
+        ),
+        (
+            {"images_right": np.zeros((1, 3, 120, 160))},
+            "images_right: expected a tensor of shape (1, 3, 120, 160), got ndarray; make one with torch.as_tensor",
+        ),
+        ({"sizes": [[120, 160]]}, "sizes: expected a tensor of shape (1, 2), got list; make one with torch.as_tensor"),
+        ({"sizes": torch.tensor([[120.0, 160.0]])}, "sizes: expected int64 or int32, got torch.float32; convert it"),
     ],
 )
 def test_wrong_frames_are_named(changes: dict[str, Any], text: str) -> None:
@@ -108,6 +144,55 @@ def test_wrong_frames_are_named(changes: dict[str, Any], text: str) -> None:
 def test_wrong_detections_are_named(name: str, wrong: torch.Tensor) -> None:
     with pytest.raises(InputError, match=f"{name}: expected shape"):
         replace(cached_street()[1].detections, **{name: wrong})
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "text"),
+    [
+        ("frame_index", torch.zeros(2), "expected int64 or int32, got torch.float32; convert it with .long()"),
+        ("frame_index", torch.zeros(2, dtype=torch.uint8), "expected int64 or int32, got torch.uint8"),
+        ("frame_index", [0, 0], "expected a tensor of shape (B,), got list; make one with torch.as_tensor"),
+        ("T_cam_obj", np.zeros((2, 4, 4)), "expected a tensor of shape (2, 4, 4), got ndarray; make one with"),
+        ("score", None, "expected a tensor of shape (2,), got NoneType"),
+        (
+            "mask_left",
+            torch.zeros(2, 120, 160, dtype=torch.uint8),
+            "expected bool, or foreground probabilities in [0, 1] in floating point, got torch.uint8; divide by 255",
+        ),
+        ("mask_right", torch.zeros(2, 120, 160).long(), "in floating point, got torch.int64; divide by 255"),
+        (
+            "mask_left",
+            None,
+            "expected a tensor of shape (2, H, W), got NoneType; absent masks: zeros, and has_mask_left False",
+        ),
+        ("mask_right", None, "got NoneType; absent masks: zeros, and has_mask_right False"),
+        ("mask_right", np.zeros((2, 120, 160)), "got ndarray; make one with torch.as_tensor"),
+        ("has_mask_left", torch.ones(2), "expected bool, got torch.float32; convert it with .bool()"),
+        ("has_mask_right", torch.ones(2).long(), "expected bool, got torch.int64; convert it with .bool()"),
+    ],
+)
+def test_detections_of_the_wrong_type_are_named(name: str, wrong: Any, text: str) -> None:
+    with pytest.raises(InputError) as error:
+        replace(cached_street()[1].detections, **{name: wrong})
+    assert str(error.value).startswith(f"{name}: expected")
+    assert text in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "text"),
+    [
+        ("frame_index", torch.zeros(2), "expected int64 or int32, got torch.float32"),
+        ("mask_left", torch.zeros(2, 4, 4, dtype=torch.uint8), "got torch.uint8; divide by 255"),
+        ("mask_right", None, "expected a tensor of shape (2, H, W), got NoneType"),
+    ],
+)
+def test_occluders_of_the_wrong_type_are_named(name: str, wrong: Any, text: str) -> None:
+    empty, numbers = torch.zeros(2, 4, 4), torch.zeros(2)
+    occluders = Occluders(numbers.int(), empty > 0, empty, numbers, numbers)
+    with pytest.raises(InputError) as error:
+        replace(occluders, **{name: wrong})
+    assert str(error.value).startswith(f"{name}: expected")
+    assert text in str(error.value)
 
 
 def test_ground_planes_point_up_and_are_normalised() -> None:

@@ -88,9 +88,7 @@ def stacked_weights(weights: Mapping[str, Tensor] | None, terms: Sequence[Term],
 
 
 def _check_weight(name: str, weight: Tensor, num_cars: int) -> None:
-    if not isinstance(weight, Tensor):
-        raise InputError(name, f"a tensor of shape ({num_cars},)", type(weight).__name__, "one factor for each car")
-    check_shape(name, weight, (num_cars,))
+    check_shape(name, weight, (num_cars,), "one factor for each car")
     negative = (weight < 0).nonzero()[:, 0].tolist()
     if negative:
         got = f"{float(weight[negative[0]]):.3g} for car {negative[0]}"

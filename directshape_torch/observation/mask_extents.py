@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Literal
 
 import torch
@@ -13,6 +14,9 @@ from directshape_torch.errors import InputError
 from directshape_torch.observation.portions import pixels_at_once, portions
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections
+
+# Resampling by cubic kernels overshoots a little.
+_HIGHEST_PROBABILITY = 1.01
 
 
 @dataclass(frozen=True)
@@ -57,28 +61,39 @@ def scene_extents(detections: Detections) -> SceneExtents:
 
     Args:
         detections: B cars, with M further occluders or without. Absent masks are not read.
+
+    Raises:
+        InputError: occluders of another size, or masks with values above 1.
     """
     d, others = detections, detections.occluders
     if others is not None and others.mask_left.shape[1:] != d.mask_left.shape[1:]:
         got = tuple(others.mask_left.shape[1:])
         raise InputError("occluders", f"masks of {tuple(d.mask_left.shape[1:])}", f"{got}")
     masks, present = [d.mask_left, d.mask_right], [d.has_mask_left, d.has_mask_right]
+    names = ["detections.mask_left", "detections.mask_right"]
     if others is not None and len(others.frame_index):
         masks += [others.mask_left, others.mask_right]
         present += [torch.ones_like(others.frame_index, dtype=torch.bool)] * 2
-    extents = mask_extents(masks, present)
+        names += ["detections.occluders.mask_left", "detections.occluders.mask_right"]
+    extents = mask_extents(masks, present, names)
     if len(extents) == 2:
         nothing = MaskExtents(extents[0].boxes[:0], extents[0].areas[:0])
         extents += [nothing, nothing]
     return SceneExtents(*extents)
 
 
-def mask_extents(masks: Sequence[Tensor], present: Sequence[Tensor]) -> list[MaskExtents]:
+def mask_extents(
+    masks: Sequence[Tensor], present: Sequence[Tensor], names: Sequence[str] | None = None
+) -> list[MaskExtents]:
     """Extents of several stacks of masks, with one host synchronisation in all.
 
     Args:
         masks: stacks (I, H, W) of foreground probabilities, or 0 and 1 in bool; I may differ.
         present: (I,) bool of each stack; absent masks have no extent.
+        names: of the stacks, for errors.
+
+    Raises:
+        InputError: wrong shapes, or values above 1 in a row of pixels without NaN.
 
     Example:
         >>> mask = torch.zeros(1, 6, 8)
@@ -95,9 +110,15 @@ def mask_extents(masks: Sequence[Tensor], present: Sequence[Tensor]) -> list[Mas
     highest = [stack.amax(dim=2) for stack in stacks]
     in_rows = torch.cat([rows > MASK_THRESHOLD for rows in highest]) & torch.cat(list(present))[:, None]
     top, bottom = _first_and_end(in_rows)
-    has_nan = torch.stack([(rows != rows).any() for rows in highest]).long()
-    on_host = torch.cat([top, bottom, has_nan]).tolist()
-    rows = list(zip(on_host[: len(top)], on_host[len(top) : -len(stacks)], strict=True))
+    has_nan = torch.stack([(rows != rows).any() for rows in highest])
+    # The maxima are at hand, so what is no probability costs no further look at the masks, and no further wait.
+    too_high = torch.stack([_too_high(rows, exists).any() for rows, exists in zip(highest, present, strict=True)])
+    on_host = torch.cat([top, bottom, torch.cat([has_nan, too_high]).long()]).tolist()
+    *spans, nan_flags, high_flags = _split(on_host, (len(top), len(top), len(stacks), len(stacks)))
+    if any(high_flags):
+        wrong = high_flags.index(1)
+        _raise_too_high("masks" if names is None else names[wrong], highest[wrong], present[wrong])
+    rows = list(zip(*spans, strict=True))
     columns, numbers = [], iter(rows)
     for stack in stacks:
         columns.append(_foreground_of_columns(stack, [next(numbers) for _ in stack]))
@@ -108,8 +129,30 @@ def mask_extents(masks: Sequence[Tensor], present: Sequence[Tensor]) -> list[Mas
     areas = foreground.sum(dim=1, dtype=torch.float64).long().split_with_sizes(lengths)
     return [
         _plain_extents(stack, exists) if unknown else MaskExtents(*extents)
-        for *extents, stack, exists, unknown in zip(boxes, areas, stacks, present, on_host[-len(stacks) :], strict=True)
+        for *extents, stack, exists, unknown in zip(boxes, areas, stacks, present, nan_flags, strict=True)
     ]
+
+
+def _split(numbers: list[int], lengths: Sequence[int]) -> list[list[int]]:
+    ends = list(accumulate(lengths))
+    return [numbers[end - length : end] for length, end in zip(lengths, ends, strict=True)]
+
+
+def _too_high(
+    highest: Tensor,  # (I, H) maximum of each row of pixels
+    present: Tensor,  # (I,) bool
+) -> Tensor:
+    """Rows (I, H) of masks that are there which hold more than a probability; bool masks never do."""
+    if not highest.is_floating_point():
+        return torch.zeros_like(highest, dtype=torch.bool)
+    return (highest > _HIGHEST_PROBABILITY) & present[:, None]
+
+
+def _raise_too_high(name: str, highest: Tensor, present: Tensor) -> None:
+    values = highest.where(_too_high(highest, present), torch.zeros_like(highest)).amax(dim=1)
+    row = int(values.argmax())
+    got = f"a value of {float(values[row]):g} in mask {row}"
+    raise InputError(name, "foreground probabilities in [0, 1]", got, "apply a sigmoid to logits, or divide by 255")
 
 
 def _comparable(masks: Tensor) -> Tensor:

@@ -67,6 +67,23 @@ def test_nan_counts_for_the_area_alone() -> None:
     assert extents.areas.tolist() == [24]
 
 
+@pytest.mark.parametrize("value", [1.02, 255.0, torch.inf])
+def test_more_than_a_probability_is_named(value: float) -> None:
+    masks = torch.zeros(3, 4, 6)
+    masks[1, 2, 3], masks[2, 1, 1] = value, torch.nan
+    everything = torch.ones(3, dtype=torch.bool)
+    got = f"got a value of {value:g} in mask 1; apply a sigmoid to logits, or divide by 255"
+    with pytest.raises(InputError, match=rf"^right: expected foreground probabilities in \[0, 1\], {got}"):
+        mask_extents([torch.ones(2, 4, 6) > 0, masks], [everything[:2], everything], ["left", "right"])
+    (extents,) = mask_extents([masks], [torch.tensor([True, False, True])])  # an absent mask is never read
+    assert extents.areas.tolist() == [0, 0, 1]
+
+
+def test_masks_may_overshoot_by_resampling() -> None:
+    (extents,) = mask_extents([torch.full((1, 4, 6), 1.009)], [torch.tensor([True])])
+    assert extents.areas.tolist() == [24]
+
+
 def test_wrong_masks_are_named() -> None:
     with pytest.raises(InputError, match=r"masks: expected shape \(1, H, W\)"):
         mask_extents([torch.zeros(4, 6)], [torch.tensor([True])])
