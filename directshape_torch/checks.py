@@ -70,6 +70,22 @@ def check_mask_dtype(name: str, masks: Tensor) -> None:
         )
 
 
+def is_no_rotation(
+    transform: Tensor,  # (N, 4, 4), finite
+) -> Tensor:  # (N,) bool
+    """Where the upper left part of a transform is no rotation.
+
+    Example:
+        >>> import torch
+        >>> is_no_rotation(torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))[None])
+        tensor([True])
+    """
+    rotation = transform.detach()[:, :3, :3].double()
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().amax(dim=(1, 2))
+    wrong: Tensor = (error > _ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
+    return wrong
+
+
 def check_rotation(
     name: str,
     transform: Tensor,  # (N, 4, 4), finite
@@ -80,11 +96,10 @@ def check_rotation(
         >>> import torch
         >>> check_rotation("T_cam_obj", torch.eye(4)[None])
     """
-    rotation = transform.detach()[:, :3, :3].double()
-    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().amax(dim=(1, 2))
-    wrong = (error > _ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
+    wrong = is_no_rotation(transform)
     if wrong.any():
         row = int(wrong.int().argmax())
+        rotation = transform.detach()[:, :3, :3].double()
         raise InputError(
             name,
             "rotations R with R R^T = I and determinant 1",

@@ -21,6 +21,7 @@ from directshape_torch.checks import (
     check_rotation,
     check_shape,
     check_sigmas,
+    is_no_rotation,
 )
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
@@ -99,7 +100,8 @@ class StereoCamera(_TensorRecord):
         """From KITTI's P2 and P3: `K = P[:, :3]`, `t_left = K^-1 P2[:, 3]`, `T_right_cam = [I, t_right - t_left]`.
 
         Raises:
-            InputError: wrong shapes, or a right camera that is not to the right of the left one.
+            InputError: wrong shapes or types, a K that has no inverse, or a right camera that is not to the right of
+                the left one.
 
         Example:
             >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
@@ -111,9 +113,12 @@ class StereoCamera(_TensorRecord):
         """
         check_shape("P_left", P_left, ("F", 3, 4))
         check_shape("P_right", P_right, (len(P_left), 3, 4))
+        if P_left.dtype not in (torch.float32, torch.float64):
+            raise InputError("P_left", "float32 or float64", str(P_left.dtype), "convert it with .float() or .double()")
+        if P_right.dtype != P_left.dtype:
+            raise InputError("P_right", f"the dtype of P_left ({P_left.dtype})", str(P_right.dtype))
         K_left, K_right = P_left[..., :3], P_right[..., :3]
-        t_left = torch.linalg.solve(K_left, P_left[..., 3:])[..., 0]
-        t_right = torch.linalg.solve(K_right, P_right[..., 3:])[..., 0]
+        t_left, t_right = _translation("P_left", P_left), _translation("P_right", P_right)
         T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
         T_right_cam[:, :3, 3] = t_right - t_left
         return cls(K_left.clone(), K_right.clone(), T_right_cam, t_left, disparity_field)
@@ -134,7 +139,7 @@ class GroundPlane(_TensorRecord):
 
     Attributes:
         normal: (F, 3).
-        offset: (F,), metres; the height of the camera above the ground.
+        offset: (F,), metres; the height of the camera above the ground, above 0. NaN: cars of that frame fail.
         source: where each plane came from, F entries: "file", "stereo", "camera_height", or the caller's own word.
     """
 
@@ -147,21 +152,38 @@ class GroundPlane(_TensorRecord):
         check_shape("offset", self.offset, (len(self.normal),))
         if len(self.source) != len(self.normal):
             raise InputError("source", f"{len(self.normal)} entries", f"{len(self.source)}")
-        if (self.normal[:, 1] >= 0).any():
+        downwards = self.normal[:, 1] >= 0
+        not_unit = (self.normal.norm(dim=-1) - 1).abs() > 1e-3
+        buried = self.offset <= 0
+        # One wait for the device for all of them. NaN passes: it fails the cars of its own frame.
+        if not bool((downwards | not_unit | buried).any()):
+            return
+        if downwards.any():
             raise InputError(
                 "normal", "a normal pointing up (negative y)", str(self.normal.tolist()), "flip the plane's signs"
             )
-        if ((self.normal.norm(dim=-1) - 1).abs() > 1e-3).any():
+        if not_unit.any():
             raise InputError("normal", "unit length", str(self.normal.norm(dim=-1).tolist()), "divide the plane by it")
+        raise InputError(
+            "offset",
+            "heights of the camera above the ground, above 0",
+            str(self.offset.tolist()),
+            "with the normal up, normal . x + offset is positive above the ground",
+        )
 
     @classmethod
     def from_camera_height(cls, height_m: float, num_frames: int = 1) -> GroundPlane:
         """A level ground `height_m` below the camera, for rigs without plane files.
 
+        Raises:
+            InputError: a height that is not above 0, or infinite.
+
         Example:
             >>> GroundPlane.from_camera_height(1.65).offset
             tensor([1.6500])
         """
+        if not 0 < height_m < math.inf:
+            raise InputError("height_m", "metres above 0", f"{height_m:g}", "give the camera's height above the road")
         normal = torch.tensor([[0.0, -1.0, 0.0]]).repeat(num_frames, 1)
         return cls(normal, torch.full((num_frames,), height_m), ("camera_height",) * num_frames)
 
@@ -262,7 +284,7 @@ class Detections(_TensorRecord):
         frame_index: (B,) int64 or int32, the frame of each object.
         T_cam_obj: (B, 4, 4) initial pose, object to left camera (KITTI's object frame: x forward, y down, origin on
             the ground under the box centre). A row with NaN is a car that is not refined.
-        dimensions_hwl: (B, 3) height, width, length of the initial box, metres.
+        dimensions_hwl: (B, 3) height, width, length of the initial box, metres, above 0; a car with NaN fails alone.
         box_2d: (B, 4) left-image box (u_min, v_min, u_max, v_max), pixels.
         score: (B,) the detector's score, any scale.
         mask_left, mask_right: (B, H, W) foreground probability in [0, 1], floating point or bool. 0 beyond the frame's
@@ -275,8 +297,8 @@ class Detections(_TensorRecord):
             collated with frames that have some, infinity stands for none.
 
     Raises:
-        InputError: wrong shapes or types, a rotation that is none, or a standard deviation that is not above 0.
-            Whether masks are within [0, 1] is checked when they are read, in a refinement.
+        InputError: wrong shapes or types, a rotation that is none, or dimensions or standard deviations that are not
+            above 0. Whether masks are within [0, 1] is checked when they are read, in a refinement.
     """
 
     frame_index: Tensor
@@ -297,10 +319,12 @@ class Detections(_TensorRecord):
         count = len(self.frame_index)
         check_shape("T_cam_obj", self.T_cam_obj, (count, 4, 4))
         has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
-        check_rotation(
-            "T_cam_obj", torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
-        )
+        T_known = torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
         check_shape("dimensions_hwl", self.dimensions_hwl, (count, 3))
+        # One wait for the device for both. Dimensions that are NaN pass: they fail their own car.
+        if bool((is_no_rotation(T_known) | (self.dimensions_hwl <= 0).any(dim=1).to(T_known.device)).any()):
+            check_rotation("T_cam_obj", T_known)
+            _raise_not_positive("dimensions_hwl", self.dimensions_hwl)
         check_shape("box_2d", self.box_2d, (count, 4))
         check_shape("score", self.score, (count,))
         for side in ("left", "right"):
@@ -317,6 +341,28 @@ class Detections(_TensorRecord):
 
     def __len__(self) -> int:
         return len(self.frame_index)
+
+
+def _raise_not_positive(
+    name: str,
+    dimensions: Tensor,  # (B, 3)
+) -> None:
+    row = int((dimensions <= 0).any(dim=1).int().argmax())
+    got = f"{dimensions[row].tolist()} in row {row}"
+    raise InputError(name, "height, width and length above 0, metres", got, "leave out objects without a 3D box")
+
+
+def _translation(
+    name: str,
+    P: Tensor,  # (F, 3, 4)
+) -> Tensor:
+    """`K^-1 P[:, 3]`, (F, 3)."""
+    try:
+        t: Tensor = torch.linalg.solve(P[..., :3], P[..., 3:])[..., 0]
+        return t
+    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+        cure = "give the projections of the rectified cameras (KITTI: P2 and P3)"
+        raise InputError(name, "intrinsics K = P[:, :3] that can be inverted", "a singular K", cure) from error
 
 
 def _check_brightness(name: str, images: Tensor) -> None:

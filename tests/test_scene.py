@@ -205,6 +205,58 @@ def test_ground_planes_point_up_and_are_normalised() -> None:
         GroundPlane(up, torch.ones(1), ())
 
 
+@pytest.mark.parametrize("offset", [0.0, -1.75])
+def test_cameras_stand_above_the_ground(offset: float) -> None:
+    up, offsets = torch.tensor([[0.0, -1.0, 0.0]]).repeat(2, 1), torch.tensor([torch.nan, offset])
+    with pytest.raises(
+        InputError, match=rf"offset: expected heights .* above 0, got \[nan, {offset:g}.*; with the normal up"
+    ):
+        GroundPlane(up, offsets, ("file",) * 2)
+    offsets[1] = 1.75  # the other one stays unknown, which fails the cars of its own frame alone
+    assert len(GroundPlane(up, offsets, ("file",) * 2).offset) == 2
+
+
+@pytest.mark.parametrize("height_m", [0.0, -1.65, float("nan"), float("inf")])
+def test_camera_heights_are_above_0(height_m: float) -> None:
+    with pytest.raises(InputError, match=rf"height_m: expected metres above 0, got {height_m:g}; give the camera"):
+        GroundPlane.from_camera_height(height_m)
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.5, -torch.inf])
+def test_dimensions_are_above_0(wrong: float) -> None:
+    detections = cached_street()[1].detections
+    dimensions_hwl = detections.dimensions_hwl.clone()
+    dimensions_hwl[0], dimensions_hwl[1, 2] = torch.nan, wrong
+    with pytest.raises(InputError, match=r"dimensions_hwl: expected height, .* in row 1; leave out objects without"):
+        replace(detections, dimensions_hwl=dimensions_hwl)
+    dimensions_hwl[1, 2] = 4.0
+    assert len(replace(detections, dimensions_hwl=dimensions_hwl)) == 2
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_projections_can_be_inverted(side: str) -> None:
+    P = {name: torch.cat([torch.eye(3), torch.tensor([[x], [0.0], [0.0]])], dim=1)[None] for name, x in _SHIFTS}
+    assert StereoCamera.from_projections(P["left"], P["right"]).num_frames == 1
+    P[side] = P[side].clone()
+    P[side][0, 1, 1] = 0.0
+    with pytest.raises(
+        InputError, match=rf"P_{side}: expected intrinsics K .*, got a singular K; give the projections"
+    ):
+        StereoCamera.from_projections(P["left"], P["right"])
+
+
+_SHIFTS = (("left", 0.0), ("right", -0.5))
+
+
+def test_projections_share_a_dtype() -> None:
+    P_left, P_right = (torch.eye(3, 4)[None] for _ in _SHIFTS)
+    with pytest.raises(InputError, match=r"P_right: expected the dtype of P_left \(torch.float32\), got torch.float64"):
+        StereoCamera.from_projections(P_left, P_right.double())
+    for wrong in (torch.int64, torch.float16):
+        with pytest.raises(InputError, match=rf"P_left: expected float32 or float64, got {wrong}; convert it"):
+            StereoCamera.from_projections(P_left.to(wrong), P_right)
+
+
 def test_moving_to_a_dtype_keeps_integers_and_masks() -> None:
     scene = cached_street()[1]
     frames, detections = scene.frames.to(dtype=torch.float32), scene.detections.to(dtype=torch.float32)
