@@ -6,9 +6,9 @@ import dataclasses
 import difflib
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import ConfigError
@@ -30,19 +30,48 @@ def config_from_mapping(cls: type[_ConfigT], mapping: Mapping[str, Any], where: 
         >>> config_from_mapping(RefinerConfig, {"silhouette": {"weight": 6}}).silhouette.weight
         6.0
     """
+    return _from_mapping(cls, mapping, where, _Root(cls, where))
+
+
+class _Root(NamedTuple):
+    """The whole configuration that a key is looked for in, and what stands before its keys."""
+
+    cls: type[Any]
+    where: str
+
+
+def _from_mapping(cls: type[_ConfigT], mapping: Mapping[str, Any], where: str, root: _Root) -> _ConfigT:
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{where or 'configuration'}: expected keys and values, got {mapping!r}")
     hints = typing.get_type_hints(cls)
     for key in mapping:
         if key not in hints:
-            nearest = difflib.get_close_matches(str(key), hints, n=1, cutoff=0.0)
-            raise ConfigError(f"unknown key {where}{key!s}; the nearest known one is {where}{nearest[0]}")
-    return cls(**{key: _convert(hints[key], value, f"{where}{key}") for key, value in mapping.items()})
+            nearest = _nearest_key(str(key), list(hints), where, root)
+            raise ConfigError(f"unknown key {where}{key!s}; the nearest known one is {nearest}")
+    return cls(**{key: _convert(hints[key], value, f"{where}{key}", root) for key, value in mapping.items()})
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
+def _nearest_key(key: str, known: Sequence[str], where: str, root: _Root) -> str:
+    """The nearest key of the same group, or one of another group whose own name is nearer still."""
+    here = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
+    paths = {f"{where}{here}": here} | {f"{root.where}{path}": path.split(".")[-1] for path in _leaves(root.cls)}
+    # Of equally near ones the first, which is of the same group.
+    return max(paths, key=lambda path: difflib.SequenceMatcher(None, paths[path], key).ratio())
+
+
+def _leaves(cls: type[Any]) -> Iterator[str]:
+    """Dotted paths of all settings of a configuration; those of a list's entries as if there were one entry."""
+    for name, hint in typing.get_type_hints(cls).items():
+        kinds = [kind for kind in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(kind)]
+        if kinds:
+            yield from (f"{name}.{leaf}" for leaf in _leaves(typing.cast(type[Any], kinds[0])))
+        else:
+            yield name
+
+
+def _convert(hint: Any, value: Any, where: str, root: _Root) -> Any:
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return config_from_mapping(hint, value, f"{where}.")
+        return _from_mapping(hint, value, f"{where}.", root)
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is tuple:
         if isinstance(value, (str, Mapping)) or not isinstance(value, Sequence):
@@ -51,7 +80,7 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         if len(kinds) != len(value):
             raise ConfigError(f"{where}: expected {len(kinds)} entries, got {value!r}")
         return tuple(
-            _convert(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
+            _convert(kind, item, f"{where}[{i}]", root) for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
         )
     if origin is Literal:
         if isinstance(value, bool) and {"on", "off"} <= set(arguments):

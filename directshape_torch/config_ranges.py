@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import typing
+from functools import lru_cache
 from typing import Any
 
 from directshape_torch.errors import ConfigError
@@ -79,7 +82,7 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 
 def check_ranges(config: Any) -> None:
-    """Raise `ConfigError` naming the first setting of a `RefinerConfig` that is out of range.
+    """Raise `ConfigError` naming the first setting of a `RefinerConfig` that is out of range or no known word.
 
     Example:
         >>> from directshape_torch.config import RefinerConfig
@@ -87,6 +90,7 @@ def check_ranges(config: Any) -> None:
     """
     if not config.stages:
         raise ConfigError("stages: expected at least one stage, got none")
+    _check_words(config)
     for i, stage in enumerate(config.stages):
         for key in ("contour_width_px", "image_level", "max_iterations"):
             _check(f"stages[{i}].{key}", getattr(stage, key), *_RANGES[key])
@@ -104,6 +108,25 @@ def check_ranges(config: Any) -> None:
     ):
         if low_value > high_value:
             raise ConfigError(f"{path}: expected at least {path.replace('max', 'min')} = {low_value}, got {high_value}")
+
+
+def _check_words(config: Any, where: str = "") -> None:
+    """Dataclasses made in Python take any word where a file is read against the hints."""
+    choices = _choices(type(config))  # type: ignore[arg-type]  # mypy: the hash of a class is no method
+    for field in dataclasses.fields(config):
+        value, path = getattr(config, field.name), f"{where}{field.name}"
+        if field.name in choices and value not in choices[field.name]:
+            raise ConfigError(f"{path}: expected one of {', '.join(map(str, choices[field.name]))}, got {value!r}")
+        for i, item in enumerate(value if isinstance(value, tuple) else (value,)):
+            if dataclasses.is_dataclass(item):
+                _check_words(item, f"{path}[{i}]." if isinstance(value, tuple) else f"{path}.")
+
+
+@lru_cache
+def _choices(kind: type) -> dict[str, tuple[Any, ...]]:
+    """The words of each field of a dataclass that takes certain words only."""
+    hints = typing.get_type_hints(kind)
+    return {key: typing.get_args(hint) for key, hint in hints.items() if typing.get_origin(hint) is typing.Literal}
 
 
 def _check_last_stage(config: Any) -> None:

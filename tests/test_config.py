@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from directshape_torch.config import (
     SearchConfig,
     SilhouetteConfig,
     SolverConfig,
+    StageConfig,
 )
 from directshape_torch.config_files import config_from_mapping, config_to_mapping, load_config
 from directshape_torch.config_ranges import _RANGES
@@ -33,6 +35,11 @@ from directshape_torch.errors import ConfigError, DirectShapeError
         ({"silhouette": {"wieght": 3}}, "silhouette.weight"),
         ({"solver": {"max_step_translation": 1}}, "solver.max_step_translation_m"),
         ({"stages": [{"contour_px": 1.0}]}, "stages[0].contour_width_px"),
+        ({"solver": {"max_iteration": 3}}, "stages.max_iterations"),  # a setting of another group
+        ({"max_code": 2}, "solver.max_code"),
+        ({"silhouette": {"huber_grey_level": 2}}, "photometric.huber_grey_levels"),
+        ({"photometric": {"wieght": 3}}, "photometric.weight"),  # of equal names the one of the same group
+        ({"stages": [{"max_iteration": 3}]}, "stages[0].max_iterations"),
     ],
 )
 def test_an_unknown_key_names_the_nearest(mapping: dict[str, Any], nearest: str) -> None:
@@ -92,6 +99,38 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
     with pytest.raises(ConfigError) as error:
         load_config(None, [override])
     assert text in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (
+            lambda: RefinerConfig(method="geometry"),
+            "method: expected one of direct, geometric, combined, got 'geometry'",
+        ),  # type: ignore[arg-type]
+        (lambda: RefinerConfig(compile=True), "compile: expected one of auto, on, off, got True"),  # type: ignore[arg-type]
+        (
+            lambda: RefinerConfig(silhouette=SilhouetteConfig(form="sum")),  # type: ignore[arg-type]
+            "silhouette.form: expected one of closest_approach, product, got 'sum'",
+        ),
+        (
+            lambda: RefinerConfig(backward=BackwardConfig(mode=None)),  # type: ignore[arg-type]
+            "backward.mode: expected one of none, unroll, implicit, implicit_gauss_newton, got None",
+        ),
+        (
+            lambda: RefinerConfig(stages=(StageConfig(0.5, 0, 3), StageConfig(0.5, 0, 3, unknowns="all"))),  # type: ignore[arg-type]
+            "stages[1].unknowns: expected one of both, pose, shape, got 'all'",
+        ),
+        (
+            lambda: dataclasses.replace(RefinerConfig(), sampling=SamplingConfig(mode=["dense"])),  # type: ignore[arg-type]
+            "sampling.mode: expected one of adaptive, round_one, uniform, dense, got ['dense']",
+        ),
+    ],
+)
+def test_words_of_settings_made_in_python_are_checked(make: Callable[[], object], text: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        make()
+    assert str(error.value) == text
 
 
 def test_every_number_has_a_range() -> None:
