@@ -19,6 +19,7 @@ from directshape_torch.stereo_matching.car_points import PointSamples
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
 _MIN_DEPTH_M = 1.0
+_DTYPES = (torch.float32, torch.float64)
 
 
 def check_differentiation_mode() -> None:
@@ -37,6 +38,17 @@ def check_differentiation_mode() -> None:
 
 def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
     """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
+    for name, given, kind in (("frames", frames, FrameBatch), ("detections", detections, Detections)):
+        if not isinstance(given, kind):
+            raise InputError(name, f"a {kind.__name__}", type(given).__name__, "call it as refiner(frames, detections)")
+    if frames.images_left.dtype not in _DTYPES:
+        # A refiner in half precision would be asked for next: said before dtypes are compared.
+        raise InputError(
+            "frames",
+            "float32 or float64",
+            str(frames.images_left.dtype),
+            "refine outside of half precision: .to(dtype=torch.float32) of frames, detections and refiner",
+        )
     tensors = {"frames": frames.images_left, "detections": detections.T_cam_obj}
     if detections.pose_sigma is not None:
         tensors["detections.pose_sigma"] = detections.pose_sigma

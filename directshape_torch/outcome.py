@@ -160,7 +160,8 @@ def assemble(
         quality=outcome.quality.spread(rows, count).where(judged),
         observability=outcome.observability.spread(rows, count).where(refined),
         profile=outcome.profile.spread(rows, count).where(judged),
-        input_dimensions_hwl=detections.dimensions_hwl,
+        # The caller may reuse the tensor for the next call.
+        input_dimensions_hwl=detections.dimensions_hwl.clone(),
         ground_source=_ground_sources(frames, detections),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
         prior=prior,

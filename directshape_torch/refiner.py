@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import PurePath
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.direct_terms import stacked_weights
 from directshape_torch.energy.method import method_terms
+from directshape_torch.errors import InputError
 from directshape_torch.full_precision import full_precision
 from directshape_torch.geometry import se3
 from directshape_torch.initial_search import search_start
@@ -44,7 +46,8 @@ class DirectShapeRefiner(nn.Module):
         config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
 
     Raises:
-        InputError: a prior without the members or derivatives that `ShapePrior` lists.
+        InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
+            `RefinerConfig`.
 
     Example:
         >>> refiner = DirectShapeRefiner()
@@ -54,6 +57,10 @@ class DirectShapeRefiner(nn.Module):
 
     def __init__(self, prior: ShapePrior | None = None, config: RefinerConfig | None = None) -> None:
         super().__init__()
+        if isinstance(prior, RefinerConfig):
+            raise InputError("prior", "a ShapePrior", "RefinerConfig", "pass it as config=")
+        if config is not None and not isinstance(config, RefinerConfig):
+            raise InputError("config", "a RefinerConfig", repr(config), _config_cure(config))
         self.prior: ShapePrior = PCAShapePrior.load_bundled() if prior is None else prior
         self.config = RefinerConfig() if config is None else config
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
@@ -80,7 +87,8 @@ class DirectShapeRefiner(nn.Module):
 
         Raises:
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
-                wanted of a prior that has none, or in forward mode.
+                wanted of a prior that has none, or in forward mode; masks with values above 1.
+            ConfigError: every term has weight zero.
             CompilationError: `compile: on` where something must be compiled and cannot be.
         """
         if torch.compiler.is_compiling():
@@ -168,6 +176,13 @@ class DirectShapeRefiner(nn.Module):
             outcome = replace(outcome, status=minimum.status)
         state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)
         return replace(outcome, state=state)
+
+
+def _config_cure(config: object) -> str:
+    """How to come to settings from what was given instead of them."""
+    if isinstance(config, (str, PurePath)):
+        return f'pass config=load_config("{config}")'
+    return 'pass config=load_config("fast"), or config_from_mapping(RefinerConfig, ...) of nested keys'
 
 
 class _Seen(NamedTuple):

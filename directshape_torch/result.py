@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.disparity_profile import DisparityProfile
+from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.observability import Observability
@@ -142,8 +143,12 @@ class RefinementResult:
         """Surface of one car in the left camera frame, metres, outward normals.
 
         Raises:
-            IndexError: no such car.
+            InputError: no such car.
         """
+        if not 0 <= index < len(self):
+            raise InputError(
+                "index", f"a car of 0..{len(self) - 1}" if len(self) else "no car", f"{index}: {len(self)} cars"
+            )
         from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 
         values = self.prior.values(self.code[index : index + 1])[0]

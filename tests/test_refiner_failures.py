@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import lru_cache
+from typing import Literal
 
 import pytest
 import torch
@@ -22,7 +23,7 @@ from helpers.synthetic_scene import (
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.errors import InputError
+from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
@@ -226,6 +227,76 @@ def test_masks_above_1_are_named(name: str, factor: float) -> None:
     )
     with pytest.raises(InputError, match=rf"detections\.occluders\.{name}: .* a value of {factor:g} in mask 0"):
         refine(frames, replace(detections, occluders=replace(occluders, **{name: wrong})))
+
+
+def test_arguments_of_the_wrong_kind_are_named() -> None:
+    frames, detections = base()
+    refiner = DirectShapeRefiner(cached_street()[0], DEFAULT)
+    cure = r"; call it as refiner\(frames, detections\)"
+    with pytest.raises(InputError, match=r"^frames: expected a FrameBatch, got Detections" + cure):
+        refiner(detections, frames)
+    with pytest.raises(InputError, match=r"^detections: expected a Detections, got dict" + cure):
+        refiner(frames, {})
+    with pytest.raises(InputError, match=r"^frames: expected a FrameBatch, got NoneType" + cure):
+        refiner.problem(None, detections)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_refused(dtype: torch.dtype) -> None:
+    frames, detections = base()
+    with pytest.raises(InputError, match=rf"frames: expected float32 or float64, got {dtype}; refine outside of half"):
+        refine(frames.to(dtype=dtype), detections)
+
+
+@pytest.mark.parametrize(
+    ("config", "cure"),
+    [
+        ("fast", r'got \'fast\'; pass config=load_config\("fast"\)$'),
+        ("mine.yaml", r'pass config=load_config\("mine.yaml"\)$'),
+        (
+            {"method": "direct"},
+            r'got \{\'method\': \'direct\'\}; pass config=load_config\("fast"\), or config_from_mapping',
+        ),
+    ],
+)
+def test_settings_that_are_none_name_the_cure(config: object, cure: str) -> None:
+    with pytest.raises(InputError, match=r"config: expected a RefinerConfig, .*" + cure):
+        DirectShapeRefiner(config=config)  # type: ignore[arg-type]
+
+
+def test_settings_in_the_place_of_the_prior_are_named() -> None:
+    with pytest.raises(InputError, match=r"prior: expected a ShapePrior, got RefinerConfig; pass it as config="):
+        DirectShapeRefiner(DEFAULT)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("method", ["direct", "geometric", "combined"])
+def test_weights_that_are_all_zero_are_named(method: Literal["direct", "geometric", "combined"]) -> None:
+    priors = replace(DEFAULT.priors, shape_weight=0.0, height_weight=0.0, tilt_weight=0.0, dimensions_weight=0.0)
+    config = replace(
+        DEFAULT,
+        method=method,
+        silhouette=replace(DEFAULT.silhouette, weight=0.0),
+        photometric=replace(DEFAULT.photometric, weight=0.0),
+        point_cloud=replace(DEFAULT.point_cloud, weight=0.0, combined_weight=0.0),
+        priors=priors,
+    )
+    with pytest.raises(ConfigError, match=rf"method {method}: expected a term of weight above 0, got none: silhouette"):
+        refine(*base(), config)
+
+
+@pytest.mark.parametrize("index", [2, 99, -1])
+def test_a_car_that_does_not_exist_has_no_mesh(index: int) -> None:
+    with pytest.raises(InputError, match=rf"index: expected a car of 0\.\.1, got {index}: 2 cars"):
+        healthy().mesh(index)
+
+
+def test_what_the_caller_writes_into_his_dimensions_is_not_in_the_result() -> None:
+    frames, detections = base()
+    detections = replace(detections, dimensions_hwl=detections.dimensions_hwl.clone())
+    result = refine(frames, detections)
+    before = result.input_dimensions_hwl.clone()
+    detections.dimensions_hwl.zero_()
+    assert torch.equal(result.input_dimensions_hwl, before)
 
 
 def test_frames_may_be_numbered_in_32_bits() -> None:

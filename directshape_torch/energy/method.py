@@ -7,11 +7,15 @@ from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.direct_terms import direct_terms
 from directshape_torch.energy.geometric_terms import combined_terms, geometric_terms
 from directshape_torch.energy.term import Term
+from directshape_torch.errors import ConfigError
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.problem import Stage
 from directshape_torch.stereo_matching.car_points import PointSamples
+
+# Those of "point_cloud" hold for the methods with points, the first two for the others.
+_WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
 
 
 def method_terms(
@@ -28,11 +32,18 @@ def method_terms(
     Args:
         config, prior, frames, detections, cars, observation: as for `direct_terms`.
         points: stereo points of the cars; None for the method "direct".
+
+    Raises:
+        ConfigError: every term has weight zero, so there is nothing to minimise.
     """
     if config.method == "geometric" and points is not None:
-        return geometric_terms(config, prior, cars, points)
-    direct = direct_terms(config, prior, frames, detections, cars, observation)
-    return direct if points is None else combined_terms(config, direct, points)
+        terms = geometric_terms(config, prior, cars, points)
+    else:
+        terms = direct_terms(config, prior, frames, detections, cars, observation)
+        terms = terms if points is None else combined_terms(config, terms, points)
+    if not terms:
+        raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
+    return terms
 
 
 def method_stages(config: RefinerConfig) -> list[Stage]:
