@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.host_traffic import host_traffic
 from torch import Tensor
 
 from directshape_torch.errors import InputError
@@ -77,6 +78,13 @@ def test_more_than_a_probability_is_named(value: float) -> None:
         mask_extents([torch.ones(2, 4, 6) > 0, masks], [everything[:2], everything], ["left", "right"])
     (extents,) = mask_extents([masks], [torch.tensor([True, False, True])])  # an absent mask is never read
     assert extents.areas.tolist() == [0, 0, 1]
+
+
+def test_the_range_is_read_with_the_extents() -> None:
+    """A look at it by itself would make the host wait once more, which has a name among the operations."""
+    stacks = [torch.zeros(2, 4, 6), torch.full((1, 4, 6), torch.nan), torch.ones(2, 4, 6) > 0]
+    present = [torch.ones(len(stack), dtype=torch.bool) for stack in stacks]
+    assert host_traffic(lambda: mask_extents(stacks, present)).found == []
 
 
 def test_masks_may_overshoot_by_resampling() -> None:
