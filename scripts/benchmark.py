@@ -1,4 +1,4 @@
-"""How long refinements take, what memory they need, and whether that has become worse (docs/performance.md).
+"""How long refinements take, what memory they need, and whether that has become worse (docs/benchmarking.md).
 
     python scripts/benchmark.py                              # everything that this machine can measure
     python scripts/benchmark.py --suite cpu kernels --json out/benchmark.json
