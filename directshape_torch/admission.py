@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
+from dataclasses import fields, is_dataclass
 
 import torch
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
@@ -22,24 +25,44 @@ _MIN_DEPTH_M = 1.0
 _DTYPES = (torch.float32, torch.float64)
 
 
-def check_differentiation_mode() -> None:
-    """Raise `InputError` inside of a region of forward-mode differentiation.
+def check_no_tangents(*records: object) -> None:
+    """Raise `InputError` where a tensor of a record is a dual number of forward-mode differentiation.
 
     What the iterations hold constant, they hold back from gradients; tangents would pass through it and come out wrong.
+
+    Args:
+        records: mappings of tensors, and dataclasses of tensors and of further such dataclasses.
     """
-    if is_forward_mode():
+    # Of the whole process, other threads' regions too: what counts is whether these tensors take part.
+    if is_forward_mode() and any(map(_has_tangent, _tensors(records))):
         raise InputError(
             "refiner",
-            "a call outside of forward-mode differentiation (torch.func.jvp, jacfwd)",
-            "one inside",
+            "tensors without tangents of forward-mode differentiation (torch.func.jvp, jacfwd)",
+            "some with",
             "differentiate in reverse mode: .backward(), torch.func.vjp or jacrev, with backward.mode",
         )
 
 
+def _has_tangent(tensor: Tensor) -> bool:
+    return unpack_dual(tensor).tangent is not None  # type: ignore[no-untyped-call]
+
+
+def _tensors(records: Iterable[object]) -> Iterator[Tensor]:
+    for record in records:
+        if isinstance(record, Tensor):
+            yield record
+        elif isinstance(record, Mapping):
+            yield from _tensors(record.values())
+        elif is_dataclass(record):
+            yield from _tensors(getattr(record, field.name) for field in fields(record))
+
+
 def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
     """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
-    for name, given, kind in (("frames", frames, FrameBatch), ("detections", detections, Detections)):
-        if not isinstance(given, kind):
+    # By what they have and not by `isinstance`: a record of one's own will do.
+    needed = ("frames", frames, FrameBatch, "images_left"), ("detections", detections, Detections, "mask_left")
+    for name, given, kind, member in needed:
+        if not hasattr(given, member):
             raise InputError(name, f"a {kind.__name__}", type(given).__name__, "call it as refiner(frames, detections)")
     if frames.images_left.dtype not in _DTYPES:
         # A refiner in half precision would be asked for next: said before dtypes are compared.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.admission import check_differentiation_mode, check_fit, refusals, without_empty_masks
+from directshape_torch.admission import check_fit, check_no_tangents, refusals, without_empty_masks
 from directshape_torch.backward import attached_state
 from directshape_torch.compilation.regions import compiling
 from directshape_torch.compilation.together import compiled_together
@@ -99,8 +99,9 @@ class DirectShapeRefiner(nn.Module):
     def _checked_refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
-        check_differentiation_mode()
         check_fit(frames, detections, self.prior)
+        of_prior = dict((*self.prior.named_buffers(), *self.prior.named_parameters()))
+        check_no_tangents(frames, detections, term_weights, of_prior)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
         with (
             torch.set_grad_enabled(differentiate),

@@ -33,13 +33,14 @@ def run(args: argparse.Namespace) -> int:
         if args.threads < 1:
             raise InputError("--threads", "at least 1", str(args.threads))
         torch.set_num_threads(args.threads)
-    if args.quick and args.check and args.baseline == BASELINE:
+    suites = tuple(args.suite or (() if args.profile else SUITES))
+    if args.quick and args.check and args.baseline.resolve() == BASELINE.resolve():
         raise InputError("--check", "a run without --quick", "--quick", "quick figures are of fewer cars")
-    if args.plots is not None and "scaling" not in (args.suite or SUITES):
-        raise InputError("--plots", "the suite scaling, whose curves they are", f"--suite {' '.join(args.suite)}")
+    if args.plots is not None and "scaling" not in suites:
+        raise InputError("--plots", "the suite scaling, whose curves they are", f"--suite {' '.join(suites) or 'none'}")
     data = args.data or os.environ.get("DIRECTSHAPE_DATA")
     options = BenchmarkOptions(
-        suites=tuple(args.suite or (() if args.profile else SUITES)),
+        suites=suites,
         data_root=Path(data) if data else None,
         quick=args.quick,
         json_path=args.json,

@@ -61,8 +61,17 @@ def test_forward_mode_is_refused(inputs: StreetInputs, mode: str) -> None:
     def refined(images: Tensor) -> Tensor:
         return refiner(replace(frames, images_left=images), detections).T_cam_obj
 
-    with pytest.raises(InputError, match=r"outside of forward-mode differentiation.*reverse mode"):
+    with pytest.raises(InputError, match=r"without tangents of forward-mode differentiation.*reverse mode"):
         torch.func.jvp(refined, (frames.images_left,), (torch.ones_like(frames.images_left),))
+
+
+def test_a_constant_of_somebody_elses_derivative_is_refined(inputs: StreetInputs) -> None:
+    refiner = DirectShapeRefiner(inputs.prior, SETTLED)
+    frames, detections = inputs.scene.frames, replace(inputs.detections, mask_left=inputs.mask)
+    one = torch.ones(1, dtype=torch.float64)
+    found, tangent = torch.func.jvp(lambda x: x * refiner(frames, detections).T_cam_obj, (one,), (one,))
+    torch.testing.assert_close(found, refiner(frames, detections).T_cam_obj, rtol=0, atol=1e-6)
+    assert torch.equal(tangent, found)
 
 
 def test_an_unconverged_car_is_named_and_has_a_zero_gradient(inputs: StreetInputs) -> None:

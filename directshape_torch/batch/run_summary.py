@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from directshape_torch.batch.timing import RunTimings, device_name, peak_memory_mb
-from directshape_torch.compilation.regions import num_forms
 from directshape_torch.status import Status
 
 
@@ -104,7 +103,7 @@ def _timing_lines(timings: RunTimings) -> list[str]:
         per_car = "" if timings.ms_per_car is None else f"{timings.ms_per_car:.0f} ms per car, "
         where = device_name(timings.device)
         # It is part of the calls in which it happens, and of a short run most of the time.
-        compiling = " with compiling or loading code" if num_forms() else ""
+        compiling = " with compiling or loading code" if any(call.compiled for call in timings.calls) else ""
         lines.append(f"time     {per_car}{timings.ms_per_frame:.0f} ms per frame (refinement only{compiling}, {where})")
     if timings.workers > 1 and timings.wall_s:
         rate = timings.num_frames / timings.wall_s

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from directshape_torch.compilation.regions import num_forms
 from directshape_torch.io.atomic_files import write_json
 
 TIMINGS_SCHEMA_VERSION = 1
@@ -18,11 +19,19 @@ TIMINGS_SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class CallTiming:
-    """One call of the refiner: its frames, its cars and the seconds it took, reading and writing not included."""
+    """One call of the refiner, reading and writing not included.
+
+    Attributes:
+        frame_ids: its frames.
+        num_cars: its cars.
+        refine_s: seconds that it took.
+        compiled: functions that were compiled or loaded in it.
+    """
 
     frame_ids: tuple[str, ...]
     num_cars: int
     refine_s: float
+    compiled: int = 0
 
 
 @dataclass
@@ -53,10 +62,11 @@ class RunTimings:
     def measure(self, frame_ids: Sequence[str], num_cars: int) -> Iterator[None]:
         """Time the body as one call; waits for the device before and after."""
         _wait_for(self.device)
-        start = time.perf_counter()
+        start, forms = time.perf_counter(), num_forms()
         yield
         _wait_for(self.device)
-        self.calls.append(CallTiming(tuple(frame_ids), num_cars, time.perf_counter() - start))
+        seconds = time.perf_counter() - start
+        self.calls.append(CallTiming(tuple(frame_ids), num_cars, seconds, num_forms() - forms))
 
     def add(self, calls: Sequence[CallTiming], peak_mb: float | None, peak_device_mb: float | None) -> None:
         """Take in what a worker says."""

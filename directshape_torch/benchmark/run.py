@@ -125,7 +125,9 @@ def _with_note_on_load(result: SuiteResult) -> SuiteResult:
     machine = describe_machine()
     if machine.load is None or machine.load < machine.cores + _OTHERS_LOAD:
         return result
-    note = f"load {machine.load:.1f} on {machine.cores} cores: something else was running, not to be quoted"
+    note = (
+        f"load {machine.load:.1f} on {machine.cores} cores: if something else was running, figures are not to be quoted"
+    )
     return replace(result, notes=(*result.notes, note))
 
 

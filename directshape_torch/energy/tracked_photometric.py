@@ -151,7 +151,7 @@ def _right_view(term: PhotometricTerm, owner: Tensor) -> RightView:
     to_full[:, 1] = 0.5 * per_level - 0.5
     return RightView(
         images.right.reshape(-1),
-        torch.stack([frame * (height * width), torch.full_like(frame, width), last_column, last_row], dim=1),
+        torch.stack([frame * (height * width), torch.full_like(frame, width), last_column, last_row], dim=1).long(),
         to_full,
         *_hidden(term, owner),
     )

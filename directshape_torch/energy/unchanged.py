@@ -11,7 +11,7 @@ from torch import Tensor
 from directshape_torch.gradient_mode import is_plain, nothing_is_differentiated
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Origin:
     """Objects that something was computed from.
 

@@ -30,7 +30,7 @@ class InstanceCrops:
         boxes: (F, 4) integer (u0, v0, u1, v1), half open, around the instances of each frame; all 0 where none is.
         start: (F,) first row of each frame in `covering`.
         covering: (A, W) int32, the instances that cover each pixel, row-major; two more rows, which nothing covers.
-        bits: (N, W) int32, the bit of each instance, in one of the W words (1, 4, 16, ...).
+        bits: (N, W) int32, the bit of each instance, in one of the W words (1, 4, 8, ...).
     """
 
     boxes: Tensor
@@ -88,10 +88,10 @@ def instance_crops(
 
 
 def _num_words(num_instances: int) -> int:
-    """1, 4, 16, ...: more than are needed, but each number of words is a compilation of whatever looks them up."""
+    """1, 4, 8, 16, ...: more than are needed, but each number of words is a compilation of whatever looks them up."""
     words = 1
     while words * _BITS_OF_A_WORD < num_instances:
-        words *= 4
+        words = max(4, 2 * words)
     return words
 
 

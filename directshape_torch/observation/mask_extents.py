@@ -15,8 +15,8 @@ from directshape_torch.observation.portions import pixels_at_once, portions
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections
 
-# Resampling by cubic kernels overshoots a little.
-_HIGHEST_PROBABILITY = 1.01
+# Resampling by cubic kernels overshoots by a quarter at an edge; logits and 0..255 go far beyond.
+_HIGHEST_PROBABILITY = 1.5
 
 
 @dataclass(frozen=True)

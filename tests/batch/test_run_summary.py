@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 import torch
 
-from directshape_torch.batch import run_summary
 from directshape_torch.batch.run_summary import RunSummary, count_statuses, find_warnings, format_summary
 from directshape_torch.batch.timing import CallTiming, RunTimings, peak_memory_mb, write_timings
 
@@ -26,8 +25,8 @@ def done(**statuses: int) -> dict[str, Any]:
 FAILED = {"state": "failed", "reason": "cut short"}
 
 
-def timings() -> RunTimings:
-    calls = [CallTiming(("000000",), 2, 0.3), CallTiming(("000001", "000002"), 4, 0.6)]
+def timings(forms: int = 0) -> RunTimings:
+    calls = [CallTiming(("000000",), 2, 0.3, forms), CallTiming(("000001", "000002"), 4, 0.6)]
     return RunTimings(torch.device("cpu"), calls)
 
 
@@ -58,10 +57,9 @@ def test_warnings(frames: dict[str, Any], expected: list[str]) -> None:
 
 
 @pytest.mark.parametrize(("forms", "compiling"), [(0, ""), (3, " with compiling or loading code")])
-def test_report(forms: int, compiling: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_summary, "num_forms", lambda: forms)
+def test_report(forms: int, compiling: str) -> None:
     frames = {"000000": done(converged=2), "000001": done(converged=3, no_mask=1), "000002": FAILED}
-    summary = RunSummary(frames, ("000000",), {"000002": "cut short"}, (), timings())
+    summary = RunSummary(frames, ("000000",), {"000002": "cut short"}, (), timings(forms))
     assert summary.exit_code == 1
     assert summary.num_cars == 6
     lines = format_summary(summary).splitlines()

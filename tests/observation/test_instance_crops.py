@@ -31,7 +31,7 @@ def test_bits_give_back_the_masks(counts: tuple[int, ...]) -> None:
         assert torch.equal(found, masks[number] if boxes[number].any() else torch.zeros_like(found))
 
 
-@pytest.mark.parametrize(("count", "words"), [(1, 1), (31, 1), (32, 4), (124, 4), (125, 16)])
+@pytest.mark.parametrize(("count", "words"), [(1, 1), (31, 1), (32, 4), (124, 4), (125, 8), (249, 16)])
 def test_few_numbers_of_words_occur(count: int, words: int) -> None:
     """Each of them is compiled for by itself."""
     boxes = torch.tensor([[0, 0, 2, 1]]).expand(count, -1)

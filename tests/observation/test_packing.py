@@ -125,7 +125,7 @@ def test_more_instances_in_a_frame_than_bits_in_a_word() -> None:
     frames, detections = random_scene(12, count=150, num_frames=1, others=30)
     seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig())
     assert seen.hidden_right is not None
-    assert seen.hidden_right.covering.shape[1] == 16  # of which 5 are in use
+    assert seen.hidden_right.covering.shape[1] == 8  # of which 5 are in use
 
 
 @pytest.mark.parametrize("num_frames", [0, 2])
