@@ -87,7 +87,7 @@ class DirectShapeRefiner(nn.Module):
 
         Raises:
             InputError: frames, detections and prior do not fit together; a term that does not exist; gradients are
-                wanted of a prior that has none, or in forward mode; masks with values above 1.
+                wanted of a prior that has none, or in forward mode; masks with values above 1.5.
             ConfigError: every term has weight zero.
             CompilationError: `compile: on` where something must be compiled and cannot be.
         """

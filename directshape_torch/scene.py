@@ -291,7 +291,7 @@ class Detections(_TensorRecord):
 
     Raises:
         InputError: wrong shapes or types, a rotation that is none, or dimensions or standard deviations that are not
-            above 0. Whether masks are within [0, 1] is checked when they are read, in a refinement.
+            above 0. Masks with values above 1.5 (logits, 0..255) are refused when they are read, in a refinement.
     """
 
     frame_index: Tensor

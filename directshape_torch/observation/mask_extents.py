@@ -63,7 +63,7 @@ def scene_extents(detections: Detections) -> SceneExtents:
         detections: B cars, with M further occluders or without. Absent masks are not read.
 
     Raises:
-        InputError: occluders of another size, or masks with values above 1.
+        InputError: occluders of another size, or masks with values above 1.5.
     """
     d, others = detections, detections.occluders
     if others is not None and others.mask_left.shape[1:] != d.mask_left.shape[1:]:
@@ -93,7 +93,7 @@ def mask_extents(
         names: of the stacks, for errors.
 
     Raises:
-        InputError: wrong shapes, or values above 1 in a row of pixels without NaN.
+        InputError: wrong shapes, or values above 1.5 in a row of pixels without NaN.
 
     Example:
         >>> mask = torch.zeros(1, 6, 8)

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+from directshape_torch.batch import timing
 from directshape_torch.batch.run_summary import RunSummary, count_statuses, find_warnings, format_summary
 from directshape_torch.batch.timing import CallTiming, RunTimings, peak_memory_mb, write_timings
 
@@ -68,6 +69,16 @@ def test_report(forms: int, compiling: str) -> None:
     # 0.9 s over 6 cars and 3 frames.
     assert lines[2] == f"time     150 ms per car, 300 ms per frame (refinement only{compiling}, cpu)"
     assert lines[3].startswith("memory   ")
+
+
+def test_a_call_counts_what_was_compiled_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    forms = iter((5, 8, 8, 8))
+    monkeypatch.setattr(timing, "num_forms", lambda: next(forms))
+    run = RunTimings(torch.device("cpu"))
+    for frame in ("000000", "000001"):
+        with run.measure((frame,), 2):
+            pass
+    assert [call.compiled for call in run.calls] == [3, 0]
 
 
 def test_a_run_without_work_has_no_time() -> None:
