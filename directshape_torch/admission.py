@@ -19,6 +19,7 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
 from directshape_torch.stereo_matching.car_points import PointSamples
+from directshape_torch.table_lookup import occurrences
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
 _MIN_DEPTH_M = 1.0
@@ -140,7 +141,7 @@ def refusals(
 
 def _lacking_pixels(pixels: Observation, least: int) -> list[tuple[Tensor, Status]]:
     areas = pixels.mask_areas
-    left, right = (torch.bincount(x.object_index, minlength=len(areas)) for x in (pixels.left, pixels.right))
+    left, right = (occurrences(x.object_index, len(areas)) for x in (pixels.left, pixels.right))
     # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
     too_few = torch.minimum(left + right, areas.sum(dim=1)) < least
     return [(too_few, Status.too_few_pixels), (~(areas > 0).any(dim=1), Status.no_mask)]

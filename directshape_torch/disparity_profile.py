@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.car_rows import kept, placed
+from directshape_torch.device_constants import made_once
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
@@ -77,7 +78,7 @@ class DisparityProfile:
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> DisparityProfile:
         """Of `count` cars of which nothing is known."""
-        offsets = profile_offsets().to(like.device)
+        offsets = _default_offsets(like)
         nan = torch.full((count, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)
         return cls(offsets, nan, nan, nan[:, 0])
 
@@ -138,7 +139,16 @@ def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
     return step_px * torch.arange(-steps, steps + 1, dtype=torch.float64)
 
 
-@torch.no_grad()
+@made_once
+def _constant_offsets(_: torch.dtype, device: torch.device) -> Tensor:
+    return profile_offsets().to(device)
+
+
+def _default_offsets(like: Tensor) -> Tensor:
+    """`profile_offsets` on the device of a tensor; a copy, for results are their owners' to write to."""
+    return _constant_offsets(like).clone()
+
+
 def disparity_profile(
     problem: CarProblem,
     before: CarState,
@@ -154,7 +164,7 @@ def disparity_profile(
         offsets_px: (n,) evenly spaced, 0 among them; default -3 to 3 px in steps of 0.25.
         max_pixels: of each car; of more, every second, third, ...
     """
-    offsets = profile_offsets().to(after.code.device) if offsets_px is None else offsets_px
+    offsets = _default_offsets(after.code) if offsets_px is None else offsets_px
     for term in problem.terms:
         if isinstance(term, PhotometricTerm):
             return _profile_of(term, (problem.project(before), problem.project(after)), offsets, max_pixels)

@@ -123,7 +123,7 @@ class DirectShapeRefiner(nn.Module):
         state, status = self._input_state(detections.T_cam_obj.detach()), failure
         outcome = Outcome.nothing(problem, state)
         if len(rows):
-            outcome = self._minimise(problem, self._input_state(detections.T_cam_obj[usable]), cars)
+            outcome = self._minimise(problem, self._input_state(detections.T_cam_obj.index_select(0, rows)), cars)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
         return assemble(self.prior, frames, detections, state, status, rows, outcome)

@@ -80,7 +80,10 @@ class CarProblem:
 
     def _of_terms(self, numbers: Sequence[int]) -> CarProblem:
         terms = [self.terms[number] for number in numbers]
-        weights = None if self.term_weights is None else self.term_weights[:, list(numbers)]
+        weights = None
+        if self.term_weights is not None:
+            # Column by column: a list of numbers would have to be sent to the device.
+            weights = torch.stack([self.term_weights[:, number] for number in numbers], dim=1)
         return CarProblem(self.prior, terms, self.left, self.right, self.config, weights, self.unknowns)
 
     def follow(self, accepted: Tensor) -> None:

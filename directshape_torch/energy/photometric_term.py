@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig
+from directshape_torch.device_constants import made_once
 from directshape_torch.energy.brightness import matched_brightness
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.photometric_pixels import GreyPair, PixelSet, neighbours_on_car
@@ -38,6 +39,12 @@ from directshape_torch.solver.normal_equations import Segments
 from directshape_torch.solver.problem import Stage
 
 _CENTRE = DSO_PATTERN.index((0, 0))
+
+
+@made_once
+def _pattern(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`DSO_PATTERN` as a tensor (N, 2)."""
+    return torch.tensor(DSO_PATTERN, dtype=dtype, device=device)
 
 
 class _ResidualInputs(NamedTuple):
@@ -219,8 +226,7 @@ class PhotometricTerm:
         """The pixels of a set with the left image's side of their residuals."""
         chosen = self.pixels.select(pixel_index)
         frame = self.cars.frame_index[chosen.object_index]
-        pattern = torch.tensor(DSO_PATTERN, dtype=chosen.uv.dtype, device=chosen.uv.device)
-        uv_level = ((chosen.uv + 0.5) * images.scale - 0.5)[:, None] + pattern
+        uv_level = ((chosen.uv + 0.5) * images.scale - 0.5)[:, None] + _pattern(chosen.uv)
         intensity, _, _ = bilinear_with_gradient(images.left, frame[:, None], uv_level, images.sizes)
         uv_full = (uv_level + 0.5) / images.scale - 0.5
         rays = rays_from_pixels(uv_full, self.cars.K_left[chosen.object_index][:, None])

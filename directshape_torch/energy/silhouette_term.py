@@ -114,7 +114,7 @@ class SilhouetteTerm:
         return ResidualRows(residual, self.pixels.object_index, crosses), J
 
     def of_objects(self, keep: Tensor) -> SilhouetteTerm:
-        rows = keep[self.pixels.object_index]
+        rows = keep[self.pixels.object_index].nonzero()[:, 0]
         pixels = self.pixels.of_objects(keep)
         return replace(
             self,

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
+from directshape_torch.device_constants import constant_like
 from directshape_torch.solver.problem import Linearisation, Unknowns
 
 
@@ -26,7 +27,7 @@ def without_held(at: Linearisation, unknowns: Unknowns) -> Linearisation:
 
 
 def step_limits(config: SolverConfig, num_codes: int, device: torch.device) -> Tensor:
-    """Largest trusted step (D,) of each unknown, float64."""
+    """Largest trusted step (D,) of each unknown, float64; not to be written to."""
     limits = [config.max_step_translation_m] * 3 + [config.max_step_rotation_rad] * 3
     limits += [config.max_step_code] * num_codes
-    return torch.tensor(limits, dtype=torch.float64, device=device)
+    return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=device))

@@ -126,7 +126,8 @@ class TrackedSilhouettes:
         """Those of the objects where `keep` (B,) holds: `numbers` of them, as the host knows them."""
         blocks, kept = self.blocks.of_objects(keep, numbers)
         rows = self.rows.select(kept, blocks.owner)
-        return TrackedSilhouettes(blocks, rows, self.weight[kept], self.constant[keep], self.anchor_obj[:, kept])
+        constant = self.constant.index_select(0, torch.nonzero_static(keep, size=len(numbers))[:, 0])
+        return TrackedSilhouettes(blocks, rows, self.weight[kept], constant, self.anchor_obj[:, kept])
 
     def _of_blocks(self, T_obj_cam: Tensor) -> Tensor:
         return self.rows.rays.of_blocks(T_obj_cam)

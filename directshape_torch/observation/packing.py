@@ -87,12 +87,13 @@ class Observation:
 
     def of_objects(self, keep: Tensor) -> Observation:
         """What the objects where `keep` (B,) holds see; occlusion and areas stay those of all detections."""
+        index = keep.nonzero()[:, 0]
         return replace(
             self,
             left=self.left.of_objects(keep),
             right=self.right.of_objects(keep),
-            region_left=self.region_left[keep],
-            region_right=self.region_right[keep],
+            region_left=self.region_left.index_select(0, index),
+            region_right=self.region_right.index_select(0, index),
         )
 
 

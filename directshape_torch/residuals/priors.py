@@ -130,12 +130,12 @@ def pose_prior(
     T_cam_obj = se3.inverse(T_obj_cam)
     R_cam_obj, axes = T_cam_obj[:, :3, :3], viewing_axes(detector_T_cam_obj[:, :3, 3])
     moved = (axes @ (T_cam_obj[:, :3, 3:] - detector_T_cam_obj[:, :3, 3:]))[..., 0]
-    x_axis, x_detector = R_cam_obj[:, [0, 2], 0], detector_T_cam_obj[:, [0, 2], 0]
+    x_axis, x_detector = R_cam_obj[:, 0::2, 0], detector_T_cam_obj[:, 0::2, 0]
     sine = x_axis[:, 0] * x_detector[:, 1] - x_axis[:, 1] * x_detector[:, 0]
     turned = torch.atan2(sine, (x_axis * x_detector).sum(-1))
     # The x axis h moves by R_cam_obj (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], its angle atan2(-h_z, h_x) by
     # (h_z dh_x - h_x dh_z) / |h|^2.
-    dh_y, dh_z = R_cam_obj[:, [0, 2], 2], -R_cam_obj[:, [0, 2], 1]
+    dh_y, dh_z = R_cam_obj[:, 0::2, 2], -R_cam_obj[:, 0::2, 1]
     by_y, by_z = (x_axis[:, 1] * dh[:, 0] - x_axis[:, 0] * dh[:, 1] for dh in (dh_y, dh_z))
     J_yaw_omega = torch.stack([torch.zeros_like(by_y), by_y, by_z], dim=-1) / (x_axis * x_axis).sum(-1, keepdim=True)
     J = T_obj_cam.new_zeros(len(T_obj_cam), 4, 6 + num_codes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from directshape_torch.device_constants import kept_property
 from directshape_torch.gradient_mode import nothing_is_differentiated
+from directshape_torch.table_lookup import occurrences
 
 _BLOCK = 64
 
@@ -34,7 +36,7 @@ class RowBlocks:
             >>> RowBlocks.of_sorted(torch.tensor([0, 0, 2]), 3).owner
             tensor([0, 2])
         """
-        return cls(object_index, torch.bincount(object_index, minlength=num_objects))
+        return cls(object_index, occurrences(object_index, num_objects))
 
     @property
     def num_objects(self) -> int:
@@ -45,11 +47,16 @@ class RowBlocks:
         """Blocks (B,) of each object."""
         return (self.counts + _BLOCK - 1) // _BLOCK
 
+    @cached_property
+    def known_num_blocks(self) -> tuple[int, ...]:
+        """The same on the host, which waits for them once."""
+        return tuple(self.num_blocks.tolist())
+
     @kept_property
     def owner(self) -> Tensor:
         """Object (M,) of each block."""
         objects = torch.arange(self.num_objects, device=self.counts.device)
-        return torch.repeat_interleave(objects, self.num_blocks)
+        return torch.repeat_interleave(objects, self.num_blocks, output_size=sum(self.known_num_blocks))
 
     @kept_property
     def block_rows(self) -> Tensor:
@@ -80,8 +87,8 @@ class Segments(RowBlocks):
     @kept_property
     def object_blocks(self) -> Tensor:
         """Block numbers (B, 2^n) of each object, in order; M stands for an empty place."""
-        # A power of two for the pairwise sums; its shape is known from the longest object: the host waits for it.
-        longest = int(self.num_blocks.max()) if self.num_objects else 0
+        # A power of two for the pairwise sums.
+        longest = max(self.known_num_blocks, default=0)
         place = torch.arange(1 << max(longest - 1, 0).bit_length(), device=self.counts.device)
         blocks = self._first_block[:, None] + place
         return torch.where(place < self.num_blocks[:, None], blocks, len(self.owner))

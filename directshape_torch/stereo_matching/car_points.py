@@ -11,6 +11,7 @@ from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.points import points_from_disparity
+from directshape_torch.table_lookup import occurrences
 
 _MASK_THRESHOLD = 0.5
 
@@ -76,7 +77,7 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     )
     passed = _passes(frames, detections, config, object_index, points_cam.detach()).nonzero()[:, 0]
     object_index, points_cam = object_index[passed], points_cam[passed]
-    counts = torch.bincount(object_index, minlength=len(detections))
+    counts = occurrences(object_index, len(detections))
     kept = _every_nth(object_index, counts, config.max_points)
     return PointSamples(object_index[kept], points_cam[kept], counts)
 

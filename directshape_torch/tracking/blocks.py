@@ -126,7 +126,7 @@ class PackedBlocks(NamedTuple):
         filled = cut.block_rows < len(cut.object_index)
         # An empty place must not bring another object's numbers, which may be NaN, nor an index out of range.
         rows = torch.where(filled, cut.block_rows, cut.block_rows[:, :1])
-        return cls(Blocks(cut.owner, tuple(cut.num_blocks.tolist())), rows, filled)
+        return cls(Blocks(cut.owner, cut.known_num_blocks), rows, filled)
 
 
 def weighted_products(

@@ -1,0 +1,180 @@
+"""Refinements on the processor and on a pretended card, in a process of their own: `python -m helpers.card_cases FILE`.
+
+Writes a JSON object: for each case the largest difference, or what the waits of the host were.
+"""
+
+from __future__ import annotations
+
+import copy
+import filecmp
+import json
+import sys
+import tempfile
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from directshape_torch.cli.main import main as command
+from directshape_torch.config import RefinerConfig
+from directshape_torch.config_files import load_config
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from helpers.exact_disparity import measured_street
+from helpers.five_cars import five_cars, with_solver
+from helpers.pretended_card import CARD, CardTensor, noted_waits, pretended_card
+from helpers.priors import prior_of
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import disturbed
+
+_SHIPPED = load_config("default", ["compile=off"])
+_SIGMAS = {"pose_sigma_along_m": 0.5, "pose_sigma_across_m": 0.3, "pose_sigma_vertical_m": 0.2}
+
+SETTINGS: dict[str, RefinerConfig] = {
+    "default": _SHIPPED,
+    "product form": replace(DEFAULT, silhouette=replace(DEFAULT.silhouette, form="product")),
+    "marched rays": with_solver(DEFAULT, rays="marched"),
+    "every step": with_solver(DEFAULT, initial_damping=0.0, accept_every_step=True),
+    "other residuals": replace(
+        DEFAULT,
+        photometric=replace(
+            DEFAULT.photometric, patch="normalised", brightness="affine", truncated=True, pixel_set="hit"
+        ),
+        sampling=replace(DEFAULT.sampling, mode="uniform"),
+    ),
+    "other priors": replace(DEFAULT, priors=replace(DEFAULT.priors, tilt_form="cosine", **_SIGMAS)),
+    "search": replace(DEFAULT, search=replace(DEFAULT.search, disparity_offsets_px=(-1.0, 1.0))),
+    "point cloud": replace(DEFAULT, method="geometric"),
+    "point cloud and images": replace(DEFAULT, method="combined"),
+    "implicit gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="implicit")),
+    "unrolled gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="unroll")),
+}
+
+
+def compare(config: RefinerConfig, prior: ShapePrior | None = None) -> dict[str, float]:
+    """The largest difference between the devices of each figure, its gradients among them."""
+    if config.method == "direct":
+        street_prior, frames, detections = five_cars()
+    else:
+        street_prior, street = measured_street()
+        frames, detections = street.frames, disturbed(street.detections, 0.25, 0.08)
+    prior = street_prior if prior is None else prior
+    expected = _figures(DirectShapeRefiner(prior, config), frames, detections, torch.device("cpu"))
+    found = _figures(DirectShapeRefiner(copy.deepcopy(prior).to(CARD), config), frames, detections, CARD)
+    return {name: _difference(found[name], expected[name]) for name in expected}
+
+
+def _figures(
+    refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections, device: torch.device
+) -> dict[str, Tensor]:
+    """All tensors of a result, on the processor; they must have been on the device."""
+    differentiate = refiner.config.backward.mode != "none"
+    images = frames.images_right.detach().clone().requires_grad_(differentiate)
+    weights = {"shape": torch.linspace(0.5, 1.0, len(detections), dtype=images.dtype, device=device)}
+    frames = replace(frames, images_right=images).to(device)
+    result = refiner(frames, detections.to(device), weights)
+    figures = _tensors(result)
+    away = [name for name, tensor in figures.items() if tensor.device != device]
+    assert not away, f"not on {device}: {away}"
+    figures["boxes"] = torch.as_tensor(result.boxes().location_ref)
+    row = [status.is_refined for status in result.status].index(True)
+    figures["mesh"] = torch.as_tensor(result.mesh(row).vertices)
+    if differentiate:
+        (result.T_cam_obj.sum() + result.code.sum()).backward()
+        assert images.grad is not None
+        figures["gradient"] = images.grad
+    return {name: tensor.detach().cpu() for name, tensor in figures.items()}
+
+
+def _tensors(result: RefinementResult) -> dict[str, Tensor]:
+    parts = [result, result.quality, result.observability, result.profile]
+    return {
+        f"{type(part).__name__}.{f.name}": value
+        for part in parts
+        for f in fields(part)
+        if isinstance(value := getattr(part, f.name), Tensor)
+    }
+
+
+def _difference(found: Tensor, expected: Tensor) -> float:
+    if found.shape != expected.shape or found.dtype != expected.dtype:
+        return float("inf")
+    if found.numel() == 0 or torch.equal(found.nan_to_num(), expected.nan_to_num()):
+        return 0.0 if torch.equal(found.isnan(), expected.isnan()) else float("inf")
+    return float((found.double() - expected.double()).abs().nan_to_num(nan=torch.inf).max())
+
+
+def waits_of_blocks() -> dict[str, Any]:
+    """Of the iterations of a refinement: what the host waits for between the beginnings and ends of stages."""
+    prior, frames, detections = five_cars()
+    refiner = DirectShapeRefiner(copy.deepcopy(prior).to(CARD), _SHIPPED)
+    inputs = frames.to(CARD), detections.to(CARD)
+    refiner(*inputs)  # sends the constants
+    with noted_waits() as waits:
+        result = refiner(*inputs)
+    of_blocks = [wait for wait in waits if "_run_stage" in wait.functions]
+    block = _SHIPPED.solver.block_iterations
+    return {
+        "blocks": sum(-(-stage.max_iterations // block) for stage in _SHIPPED.stages),
+        "iterations": result.iterations.tolist(),
+        "in all": Counter(f"{wait.operation} in {' < '.join(wait.functions[:2])}" for wait in waits),
+        "by place": Counter(f"{wait.operation} in {wait.functions[0]}" for wait in of_blocks),
+    }
+
+
+def waits_of_nothing() -> dict[str, Any]:
+    """That what is to be noted is: a program that mixes devices, and one that reads."""
+    x = torch.arange(6, device=CARD).view(2, 3)
+    problems = []
+    for mix in (lambda: x + torch.ones(3), lambda: x[torch.tensor([0])], lambda: torch.cat([x, torch.ones(1, 3)])):
+        try:
+            mix()
+        except RuntimeError as error:
+            problems.append(str(error))
+    with noted_waits() as waits:
+        assert isinstance(x + 1, CardTensor)
+        float(x.sum()), x.tolist(), x.nonzero(), x[x > 2], x.cpu(), torch.ones(2).to(CARD), x.new_tensor([1, 2])
+    return {"problems": len(problems), "waits": [wait.operation for wait in waits]}
+
+
+def demo() -> dict[str, list[str]]:
+    """Files of the demo that differ between the devices."""
+    with tempfile.TemporaryDirectory() as folder:
+        roots = [Path(folder) / device for device in ("cpu", "card")]
+        for root in roots:
+            assert command(["demo", "--out", str(root), "--device", root.name]) == 0
+        names = sorted({str(p.relative_to(root)) for root in roots for p in root.rglob("*") if p.is_file()})
+        _, differ, missing = filecmp.cmpfiles(*roots, names, shallow=False)
+    return {"names": names, "differ": [*differ, *missing]}
+
+
+CASES: dict[str, Callable[[], Any]] = {
+    **{name: lambda config=config: compare(config) for name, config in SETTINGS.items()},  # type: ignore[misc]
+    "neural prior": lambda: compare(DEFAULT, prior_of("neural")),
+    "waits of blocks": waits_of_blocks,
+    "the card itself": waits_of_nothing,
+    "demo": demo,
+}
+
+
+def main() -> None:
+    found = {}
+    with pretended_card():
+        for name, case in CASES.items():
+            try:
+                found[name] = case()
+            except Exception:
+                found[name] = {"error": traceback.format_exc()}
+            print(name, file=sys.stderr, flush=True)
+    Path(sys.argv[1]).write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

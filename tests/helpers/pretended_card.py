@@ -1,0 +1,240 @@
+"""A device that keeps its tensors to itself as a graphics card does, in the memory of the processor.
+
+`torch.device("card")` has every operation that PyTorch has on a processor, computed there, so results are the same to
+the bit. But tensors of both do not mix, numbers go over only where the program says so, and each time that the host has
+to wait for the device is noted with its place. What a real card does of its own (other kernels, other orders of sums,
+memory) it does not show.
+
+The device belongs to the process that imports this module, so tests do it in one of its own (`card_cases`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils import backend_registration
+from torch.utils._python_dispatch import return_and_correct_aliasing
+from torch.utils._pytree import tree_flatten, tree_map
+
+from directshape_torch import gradient_mode
+
+
+class _Module(backend_registration._DummyBackendModule):
+    """`torch.card`: what PyTorch asks of any device."""
+
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return [torch.float16]
+
+
+backend_registration._setup_privateuseone_for_python_backend("card", _Module())
+CARD = torch.device("card:0")
+
+# Their results, or the shapes of their results, are read by the host.
+_READS = {
+    "aten._local_scalar_dense",
+    "aten.is_nonzero",
+    "aten.equal",
+    "aten.nonzero",
+    "aten.masked_select",
+    "aten.bincount",
+    "aten._unique2",
+    "aten.unique_dim",
+    "aten.unique_consecutive",
+}
+# By a mask they ask how many places it has.
+_INDEXED = {"aten.index", "aten.index_put", "aten.index_put_", "aten._index_put_impl_"}
+
+
+class Wait(NamedTuple):
+    """One wait of the host."""
+
+    operation: str
+    functions: tuple[str, ...]  # of the package, from the one that asked outwards
+
+
+_waits: list[Wait] = []
+
+
+@contextmanager
+def noted_waits() -> Iterator[list[Wait]]:
+    """Those inside, in order."""
+    _waits.clear()
+    found: list[Wait] = []
+    yield found
+    found += _waits
+
+
+def _note(operation: str) -> None:
+    functions, frame = [], sys._getframe(1)
+    at: FrameType | None = frame
+    while at is not None:
+        if "directshape_torch" in at.f_code.co_filename:
+            functions.append(at.f_code.co_name)
+        at = at.f_back
+    _waits.append(Wait(operation, tuple(functions)))
+
+
+class CardTensor(torch.Tensor):
+    """A tensor that says it is on the card."""
+
+    held: Tensor
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    @staticmethod
+    def __new__(cls, held: Tensor) -> CardTensor:
+        made: CardTensor = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+            cls,
+            held.shape,
+            strides=held.stride(),
+            storage_offset=held.storage_offset(),
+            dtype=held.dtype,
+            layout=held.layout,
+            device=CARD,
+        )
+        made.held = held
+        return made
+
+    @classmethod
+    def __torch_dispatch__(
+        cls, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        return _run(func, *args, **(kwargs or {}))
+
+    # PyTorch's own versions are for `torch.Tensor` alone.
+    def tolist(self) -> Any:
+        _note("tolist")
+        return self.held.tolist()
+
+    def __repr__(self, *, tensor_contents: object = None) -> str:
+        return f"on the card: {self.held!r}"
+
+    def __format__(self, spec: str) -> str:
+        return format(self.item() if self.dim() == 0 else repr(self), spec)
+
+
+def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
+    """An operation with at least one tensor of the card, or that makes one."""
+    name = str(func.overloadpacket)
+    tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
+    on_card = [x for x in tensors if isinstance(x, CardTensor)]
+    elsewhere = [x for x in tensors if not isinstance(x, CardTensor)]
+    device = kwargs.get("device")
+    if on_card and any(x.dim() for x in elsewhere) and name != "aten.copy_":
+        # Single numbers travel with the operation, on a real card too.
+        raise RuntimeError(f"{name}: expected all tensors on one device, {[tuple(x.shape) for x in elsewhere]} are not")
+    if not on_card and device is None:
+        raise RuntimeError(f"{name}: neither a tensor of the card nor its name")
+    unsized = name == "aten.repeat_interleave" and kwargs.get("output_size") is None
+    leaves = name == "aten._to_copy" and device is not None and torch.device(device).type == "cpu"
+    arrives = name == "aten._to_copy" and not on_card
+    if (
+        leaves
+        or arrives
+        or unsized
+        or name in _READS
+        or (name == "aten.copy_" and elsewhere)
+        or _is_by_mask(name, args)
+    ):
+        _note(name)
+    if device is not None:
+        kwargs["device"] = torch.device("cpu")
+    result = func(*tree_map(_held, args), **tree_map(_held, kwargs))
+    if any(x.shape != x.held.shape for x in on_card):
+        raise NotImplementedError(f"{name}: the pretended card has no operations that resize a tensor")
+    if leaves or name == "aten._local_scalar_dense":
+        return result
+    if name == "aten.copy_" and not isinstance(args[0], CardTensor):
+        return args[0]
+    return return_and_correct_aliasing(func, args, kwargs, tree_map(_put, result))
+
+
+def _is_by_mask(name: str, args: tuple[Any, ...]) -> bool:
+    masks = (torch.bool, torch.uint8)
+    return name in _INDEXED and any(index is not None and index.dtype in masks for index in args[1])
+
+
+def _held(x: Any) -> Any:
+    return x.held if isinstance(x, CardTensor) else x
+
+
+def _put(x: Any) -> Any:
+    return CardTensor(x) if isinstance(x, Tensor) else x
+
+
+def _made_elsewhere(operation: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    def made(*args: Any, **kwargs: Any) -> Tensor:
+        return CardTensor(operation(*args, **{**kwargs, "device": "cpu"}))
+
+    return made
+
+
+# What makes a tensor of nothing has no tensor to be asked by.
+_FACTORIES = torch.library.Library("_", "IMPL")
+_FACTORIES.fallback(_run, "PrivateUse1")
+# PyTorch's own versions of these would resize an empty one.
+_RESIZING = torch.library.Library("aten", "IMPL")
+for _name in ("arange", "arange.start", "arange.start_step", "eye", "eye.m"):
+    _packet, _, _overload = _name.partition(".")
+    _operation = getattr(getattr(torch.ops.aten, _packet), _overload or "default")
+    _RESIZING.impl(_name, _made_elsewhere(_operation), "PrivateUse1")
+
+
+class _NumbersOfTheHost(TorchFunctionMode):
+    """`torch.tensor` and its like, which go around everything else: numbers of the host that are sent over."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        device = kwargs.get("device")
+        if func in (torch.tensor, torch.as_tensor) and device is not None and torch.device(device).type == CARD.type:
+            return func(*args, **{**kwargs, "device": "cpu"}).to(CARD)
+        if func is Tensor.new_tensor and isinstance(args[0], CardTensor):
+            return torch.tensor(*args[1:], **{"dtype": args[0].dtype, **kwargs}).to(CARD)
+        return func(*args, **kwargs)
+
+
+_constants: dict[Any, Any] = {}
+
+
+def _kept(constants: Any, values: Any, like: Tensor, make: Callable[[torch.dtype, torch.device], Any]) -> Any:
+    """As `device_constants` keeps constants of plain tensors, which those of a real card are."""
+    key = (id(constants), values, like.dtype, like.device)
+    if key not in _constants:
+        _constants[key] = make(like.dtype, like.device)
+    return _constants[key]
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    """As `gradient_mode` says it of plain tensors."""
+    return type(tensor) is CardTensor or gradient_mode.is_plain(tensor)
+
+
+@contextmanager
+def pretended_card() -> Iterator[torch.device]:
+    """Region in which the device can be used.
+
+    The package takes subclasses of tensors for what a tracer has made, and keeps nothing of them; here it must.
+    """
+    replaced = {"_kept": _kept, "is_plain": _is_plain}
+    of_package = [
+        (module, name, vars(module)[name])
+        for path, module in list(sys.modules.items())
+        if path.startswith("directshape_torch.") and module is not gradient_mode
+        for name in replaced.keys() & vars(module).keys()
+    ]
+    for module, name, _ in of_package:
+        setattr(module, name, replaced[name])
+    try:
+        with _NumbersOfTheHost():
+            yield CARD
+    finally:
+        for module, name, own in of_package:
+            setattr(module, name, own)

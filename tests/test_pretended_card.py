@@ -1,0 +1,105 @@
+"""Whole refinements on a device whose tensors do not mix with the processor's (`helpers.pretended_card`).
+
+It stands in for a graphics card where there is none: what is left on the wrong device, and what lets the host wait.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from torch.utils import backend_registration
+
+pytestmark = pytest.mark.skipif(
+    not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="this PyTorch has no devices that are written in Python",
+)
+
+_TESTS = Path(__file__).parent
+_COMPARED = [
+    "default",
+    "product form",
+    "marched rays",
+    "every step",
+    "other residuals",
+    "other priors",
+    "search",
+    "point cloud",
+    "point cloud and images",
+    "implicit gradients",
+    "unrolled gradients",
+    "neural prior",
+]
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What `helpers.card_cases` finds, once for all: the device belongs to its process."""
+    file = tmp_path_factory.mktemp("card") / "found.json"
+    paths = [str(_TESTS), str(_TESTS.parent), os.environ.get("PYTHONPATH", "")]
+    done = subprocess.run(
+        [sys.executable, "-m", "helpers.card_cases", str(file)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    cases: dict[str, Any] = json.loads(file.read_text())
+    return cases
+
+
+def _of(found: dict[str, Any], case: str) -> dict[str, Any]:
+    assert "error" not in found[case], found[case]["error"]
+    figures: dict[str, Any] = found[case]
+    return figures
+
+
+@pytest.mark.parametrize("case", _COMPARED)
+def test_a_card_gives_the_results_of_the_processor_to_the_bit(found: dict[str, Any], case: str) -> None:
+    differences = _of(found, case)
+    assert len(differences) > 20
+    assert {name for name, largest in differences.items() if largest != 0} == set()
+    assert ("gradient" in differences) == case.endswith("gradients")
+
+
+def test_iterations_let_the_host_wait_once_a_block_and_compactions_not_at_all(found: dict[str, Any]) -> None:
+    waits = _of(found, "waits of blocks")
+    # Cars end in different blocks, so there were compactions.
+    assert len({-(-count // 4) for count in waits["iterations"]}) > 1
+    assert waits["by place"] == {"tolist in _read": waits["blocks"]}
+
+
+def test_a_whole_call_lets_the_host_wait_51_times(found: dict[str, Any]) -> None:
+    """A guard, and the figure of docs/performance.md: places and pixels that are counted, numbers that are sent."""
+    by_place = _of(found, "waits of blocks")["in all"]
+    assert sum(by_place.values()) == 51, by_place
+    # No operation is asked for its places by a mask: each such index is one wait more.
+    assert not any(place.startswith("aten.index") for place in by_place)
+
+
+def test_the_demo_writes_the_same_files(found: dict[str, Any]) -> None:
+    demo = _of(found, "demo")
+    assert len(demo["names"]) > 10
+    # These name the device, and what it took.
+    assert demo["differ"] == ["run.json", "timings.json"]
+
+
+def test_what_a_card_would_refuse_is_refused_and_what_it_waits_for_is_noted(found: dict[str, Any]) -> None:
+    card = _of(found, "the card itself")
+    assert card["problems"] == 3
+    assert card["waits"] == [
+        "aten._local_scalar_dense",
+        "tolist",
+        "aten.nonzero",
+        "aten.index",
+        "aten._to_copy",
+        "aten.copy_",
+        "aten.copy_",
+    ]
