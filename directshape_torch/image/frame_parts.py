@@ -1,4 +1,4 @@
-"""Gradients of rectangular parts of frames: work where something is to be seen, not in whole frames."""
+"""Gradients of parts of frames and of single pixels: work where something is to be seen, not in whole frames."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.image.gradients import grey_of_channels, length_2d
+from directshape_torch.table_lookup import take
 
 
 def gradient_magnitude_of_part(
@@ -37,3 +38,43 @@ def gradient_magnitude_of_part(
         grey = torch.nn.functional.pad(grey[None], missing, mode="replicate")[0]
     d_u, d_v = grey[1:-1, 2:] - grey[1:-1, :-2], grey[2:, 1:-1] - grey[:-2, 1:-1]
     return length_2d(d_u, d_v).mul_(0.5)
+
+
+def gradient_magnitude_at(
+    images: Tensor,  # (F, 3, H, W)
+    sizes: Tensor,  # (F, 2)
+    frame_index: Tensor,  # (P,)
+    uv: Tensor,  # (P, 2)
+) -> Tensor:
+    """`gradient_magnitude` at single pixels, the same numbers as in whole frames; differentiable by the images.
+
+    Args:
+        images: (F, 3, H, W), RGB in [0, 1], padded at the right and bottom.
+        sizes: (F, 2) integer (height, width) of each frame without padding; at its own edge the edge is replicated.
+        frame_index: (P,) frame of each pixel.
+        uv: (P, 2) integer, within their frames.
+
+    Returns:
+        (P,), grey levels per pixel.
+
+    Example:
+        >>> ramp = torch.arange(40.0).expand(1, 3, 40, 40) / 255
+        >>> gradient_magnitude_at(ramp, torch.tensor([[40, 40]]), torch.tensor([0, 0]), torch.tensor([[0, 8], [1, 8]]))
+        tensor([0.5000, 1.0000])
+    """
+    num_pixels, width = images.shape[2] * images.shape[3], images.shape[3]
+    last_v, last_u = (sizes - 1).index_select(0, frame_index).unbind(1)
+    u, v = uv.unbind(1)
+    row, first = v * width, frame_index * (3 * num_pixels)
+    places = torch.stack(
+        [
+            row + torch.minimum(u + 1, last_u),
+            row + (u - 1).clamp_min(0),
+            torch.minimum(v + 1, last_v) * width + u,
+            (v - 1).clamp_min(0) * width + u,
+        ]
+    )
+    flat = images.reshape(-1)
+    channels = (take(flat, places + (first + channel * num_pixels)) for channel in range(3))
+    right, left, below, above = grey_of_channels(*channels).unbind(0)
+    return length_2d(right - left, below - above).mul_(0.5)

@@ -15,14 +15,16 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
+from directshape_torch.image.frame_parts import gradient_magnitude_at
+from directshape_torch.observation.even_pixels import even_pixels
 from directshape_torch.observation.gradient_cells import GradientCells, ImageRegion, gradient_cells
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides
-from directshape_torch.observation.pixel_sampling import candidate_pixels
+from directshape_torch.observation.pixel_sampling import CellPixels, candidate_pixels
 from directshape_torch.observation.portions import pixels_at_once, portions
 from directshape_torch.observation.regions import RegionPixels, region_boxes
 from directshape_torch.observation.sampling_settings import SamplingSettings
-from directshape_torch.observation.strongest_pixels import StrongestPixels, strongest_pixels
+from directshape_torch.observation.strongest_pixels import strongest_pixels
 from directshape_torch.scene import Detections, FrameBatch
 
 # Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
@@ -183,6 +185,8 @@ def _chosen_pixels(
 ) -> tuple[_Chosen, _Chosen]:
     """The visible ones of the pixels that `select_pixels` chooses, of the regions (2 B, 4) of both images."""
     count, settings = len(detections), sampling_settings(config)
+    if settings.mode == "uniform":
+        return _even_pixels(frames, detections, regions, hidden, settings)
     images, sizes = (frames.images_left, frames.images_right), frames.sizes.tolist()
     boxes, frame = regions.tolist(), detections.frame_index.tolist()
     areas = [(u1 - u0) * (v1 - v0) for u0, v0, u1, v1 in boxes]
@@ -206,6 +210,29 @@ def _chosen_pixels(
     return left, right
 
 
+def _even_pixels(
+    frames: FrameBatch,
+    detections: Detections,
+    regions: Tensor,  # (2 B, 4)
+    hidden: OcclusionCrops | None,
+    settings: SamplingSettings,
+) -> tuple[_Chosen, _Chosen]:
+    """Those of the mode that looks at no other pixels than it chooses."""
+    count, found = len(detections), even_pixels(regions, settings)
+    object_index, uv, _ = _unhidden(found, found.object_index, hidden)
+    num_left = int((object_index < count).sum())
+
+    def of_side(images: Tensor, part: slice, first_object: int) -> _Chosen:
+        car = object_index[part] - first_object
+        frame = detections.frame_index.index_select(0, car)
+        return _Chosen(car, uv[part], gradient_magnitude_at(images, frames.sizes, frame, uv[part]))
+
+    return (
+        of_side(frames.images_left, slice(None, num_left), 0),
+        of_side(frames.images_right, slice(num_left, None), count),
+    )
+
+
 def _visible(
     cells: GradientCells,
     regions: Tensor,  # (R, 4)
@@ -216,28 +243,29 @@ def _visible(
 ) -> _Chosen:
     """The chosen pixels of some regions that no instance hides."""
     found = _candidates(regions, cells, image_width, settings)
-    object_index, uv, exists = (
-        number.index_select(0, found.object_index),
-        torch.stack([found.u, found.v], 1),
-        found.exists,
-    )
+    object_index, uv, kept = _unhidden(found, number.index_select(0, found.object_index), hidden)
+    magnitude = cells.magnitude_at(found.object_index.index_select(0, kept), uv)
+    return _Chosen(object_index, uv, magnitude)
+
+
+def _unhidden(found: CellPixels, object_index: Tensor, hidden: OcclusionCrops | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Objects (P,) and uv (P, 2) of the pixels that no instance hides, and which (P,) of those found they are."""
+    uv, exists = torch.stack([found.u, found.v], 1), found.exists
     if hidden is not None:
         exists = exists & ~hidden.at(object_index, uv)
     kept = exists.nonzero()[:, 0]
-    uv = uv.index_select(0, kept)
-    magnitude = cells.magnitude_at(found.object_index.index_select(0, kept), uv)
-    return _Chosen(object_index.index_select(0, kept), uv, magnitude)
+    return object_index.index_select(0, kept), uv.index_select(0, kept), kept
 
 
-def _candidates(regions: Tensor, cells: GradientCells, image_width: int, settings: SamplingSettings) -> StrongestPixels:
+def _candidates(regions: Tensor, cells: GradientCells, image_width: int, settings: SamplingSettings) -> CellPixels:
     if settings.mode in ("adaptive", "round_one"):
         return strongest_pixels(cells, regions, image_width, settings)
-    # The other modes do not look at the image.
+    # The mode "dense" does not look at the image.
     pixels = RegionPixels.of(regions)
     unseen = torch.zeros(len(pixels), device=regions.device)
     chosen = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
     object_index, uv = pixels.uv_of(chosen.pixel)
-    return StrongestPixels(object_index, uv[:, 0], uv[:, 1], chosen.exists)
+    return CellPixels(object_index, uv[:, 0], uv[:, 1], chosen.exists)
 
 
 def _pack_side(frames: FrameBatch, detections: Detections, side: Side, chosen: _Chosen) -> PixelSamples:

@@ -118,6 +118,15 @@ def sample_pixels(
     return PixelSelection(pixels.object_index[chosen], uv, above[chosen])
 
 
+class CellPixels(NamedTuple):
+    """One for each small cell of all regions, in order; numbers mean nothing where there is none."""
+
+    object_index: Tensor  # (N,)
+    u: Tensor  # (N,)
+    v: Tensor  # (N,)
+    exists: Tensor  # (N,) bool
+
+
 class Candidates(NamedTuple):
     """One for each cell of all regions, in order; `pixel` means nothing where there is none."""
 

@@ -12,19 +12,10 @@ import torch
 from torch import Tensor
 
 from directshape_torch.observation.gradient_cells import GradientCells
-from directshape_torch.observation.pixel_sampling import small_cell_side
+from directshape_torch.observation.pixel_sampling import CellPixels, small_cell_side
 from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 
 _INT32_MIN, _INT64_MIN = torch.iinfo(torch.int32).min, torch.iinfo(torch.int64).min
-
-
-class StrongestPixels(NamedTuple):
-    """One for each small cell of all regions, in order; numbers mean nothing where there is none."""
-
-    object_index: Tensor  # (N,)
-    u: Tensor  # (N,)
-    v: Tensor  # (N,)
-    exists: Tensor  # (N,) bool
 
 
 def strongest_pixels(
@@ -32,7 +23,7 @@ def strongest_pixels(
     regions: Tensor,  # (B, 4)
     image_width: int,
     settings: SamplingSettings = DEFAULT_SETTINGS,
-) -> StrongestPixels:
+) -> CellPixels:
     """What `candidate_pixels` finds in the modes "adaptive" and "round_one".
 
     Args:
@@ -57,7 +48,7 @@ def strongest_pixels(
         exists &= upper >= 0
     position = (-1 - lower.long()).clamp_min_(0)
     v = torch.div(position, image_width, rounding_mode="floor")
-    return StrongestPixels(grid.object_index(), position - v * image_width, v, exists)
+    return CellPixels(grid.object_index(), position - v * image_width, v, exists)
 
 
 def _ranks(

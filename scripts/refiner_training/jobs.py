@@ -30,7 +30,12 @@ Kind = Literal["fixed", "constant", "network"]
 # Beside `fast.yaml`: fewer pixels while training. Costs are means over pixels, so weights keep their meaning.
 # A result that is not returned has no gradient and says nothing of what a network has learnt.
 EVERY_RESULT = "acceptance.min_probability_not_worse=0"
-TRAINING_OVERRIDES = ("sampling.min_pixels=200", "sampling.max_pixels=200", EVERY_RESULT)
+TRAINING_OVERRIDES = (
+    "sampling.min_pixels=200",
+    "sampling.max_pixels=200",
+    "sampling.mode=adaptive",  # as where the networks are judged
+    EVERY_RESULT,
+)
 UNROLLED_ITERATIONS = 3
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.image.frame_parts import gradient_magnitude_of_part
+from directshape_torch.image.frame_parts import gradient_magnitude_at, gradient_magnitude_of_part
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
 
 # Of a frame of 41 x 33 pixels: inside, along each edge, in corners, single pixels, all of it.
@@ -37,3 +37,21 @@ def test_where_an_image_is_flat_the_derivative_is_zero() -> None:
     gradient_magnitude_of_part(image, (5, 5), (1, 1, 4, 4)).sum().backward()
     assert image.grad is not None
     assert image.grad.abs().max() == 0
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_at_pixels_are_those_of_the_frames(dtype: torch.dtype) -> None:
+    images = torch.rand(2, 3, 50, 70, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    sizes = torch.tensor([[41, 33], [50, 70]])
+    whole = gradient_magnitude(image_gradient(grey_levels(images), sizes))
+    for frame, (height, width) in enumerate(sizes.tolist()):
+        v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+        uv = torch.stack([u, v], dim=-1).reshape(-1, 2)
+        got = gradient_magnitude_at(images, sizes, torch.full((len(uv),), frame), uv)
+        assert torch.equal(got.view(height, width), whole[frame, :height, :width])
+
+
+def test_derivatives_at_pixels_by_the_images_are_exact() -> None:
+    images = torch.rand(2, 3, 4, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(1)).requires_grad_()
+    sizes, frame, uv = torch.tensor([[4, 5], [3, 4]]), torch.tensor([0, 1, 1]), torch.tensor([[4, 0], [3, 2], [1, 1]])
+    assert torch.autograd.gradcheck(lambda x: gradient_magnitude_at(x, sizes, frame, uv), images)
