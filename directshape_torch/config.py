@@ -227,6 +227,7 @@ class SamplingConfig:
 
     Attributes:
         mode: "adaptive" (both rounds of the paper), "round_one", "uniform" or "dense".
+        mode_right: the same for the right image, whose pixels serve the silhouette alone; "as_left": that of the left.
         density: share of the region's pixels.
         min_pixels, max_pixels: bounds of the number of cells.
         region_margin_px, region_margin_share: the region is grown by the larger of the two.
@@ -236,6 +237,7 @@ class SamplingConfig:
     """
 
     mode: Literal["adaptive", "round_one", "uniform", "dense"] = "adaptive"
+    mode_right: Literal["as_left", "adaptive", "round_one", "uniform", "dense"] = "as_left"
     density: float = 0.05
     min_pixels: int = 400
     max_pixels: int = 1000

@@ -6,8 +6,6 @@ Pixels are packed over cars and frames, sorted by object, because a near car has
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from itertools import groupby
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,16 +13,10 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
-from directshape_torch.image.frame_parts import gradient_magnitude_at
-from directshape_torch.observation.even_pixels import even_pixels
-from directshape_torch.observation.gradient_cells import GradientCells, ImageRegion, gradient_cells
+from directshape_torch.observation.chosen_pixels import ChosenPixels, chosen_pixels
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides
-from directshape_torch.observation.pixel_sampling import CellPixels, candidate_pixels
-from directshape_torch.observation.portions import pixels_at_once, portions
-from directshape_torch.observation.regions import RegionPixels, region_boxes
-from directshape_torch.observation.sampling_settings import SamplingSettings
-from directshape_torch.observation.strongest_pixels import strongest_pixels
+from directshape_torch.observation.regions import region_boxes
 from directshape_torch.scene import Detections, FrameBatch
 
 # Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
@@ -117,7 +109,7 @@ def pack_pixels(
     both, hidden = torch.cat(regions), None
     if config.occlusion:
         hidden = crops_of_sides(detections, ("left", "right"), extents, both, len(frames), config.occlusion_order)
-    left, right = _chosen_pixels(frames, detections, both, hidden, config)
+    left, right = chosen_pixels(frames, detections, both, hidden, config)
     if hidden is not None:
         strips = _strips_in_right_image(regions[0], frames.sizes[detections.frame_index])
         hidden = hidden.objects(slice(len(detections), None)).within(strips)
@@ -150,11 +142,6 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
     return field.offsets(uv_left)
 
 
-def sampling_settings(config: SamplingConfig) -> SamplingSettings:
-    """The part of the configuration that chooses pixels within a region."""
-    return SamplingSettings(config.mode, config.density, config.min_pixels, config.max_pixels)
-
-
 def car_regions(
     frames: FrameBatch, d: Detections, config: SamplingConfig, extents: SceneExtents | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -172,103 +159,7 @@ def car_regions(
     return left * d.has_mask_left[:, None], right
 
 
-class _Chosen(NamedTuple):
-    """P pixels of one image."""
-
-    object_index: Tensor  # (P,)
-    uv: Tensor  # (P, 2) integer
-    gradient_magnitude: Tensor  # (P,)
-
-
-def _chosen_pixels(
-    frames: FrameBatch, detections: Detections, regions: Tensor, hidden: OcclusionCrops | None, config: SamplingConfig
-) -> tuple[_Chosen, _Chosen]:
-    """The visible ones of the pixels that `select_pixels` chooses, of the regions (2 B, 4) of both images."""
-    count, settings = len(detections), sampling_settings(config)
-    if settings.mode == "uniform":
-        return _even_pixels(frames, detections, regions, hidden, settings)
-    images, sizes = (frames.images_left, frames.images_right), frames.sizes.tolist()
-    boxes, frame = regions.tolist(), detections.frame_index.tolist()
-    areas = [(u1 - u0) * (v1 - v0) for u0, v0, u1, v1 in boxes]
-    # Cars of one frame stay together, where they are neighbours in the batch.
-    runs = [list(run) for _, run in groupby(range(count), key=frame.__getitem__)]
-    amounts = [sum(areas[n] + areas[count + n] for n in run) for run in runs]
-    number = torch.arange(2 * count, device=regions.device)
-    sides: tuple[list[_Chosen], list[_Chosen]] = ([], [])
-    for part in portions(amounts, pixels_at_once(regions.device)) or [slice(0, 0)]:
-        cars = [n for run in runs[part] for n in run]
-        of_images = [ImageRegion(side, frame[n], boxes[side * count + n]) for side in (0, 1) for n in cars]
-        cells = gradient_cells(images, sizes, of_images, settings)
-        begin, end = (cars[0], cars[-1] + 1) if cars else (0, 0)
-        both = torch.cat([number[begin:end], number[count + begin : count + end]])
-        visible = _visible(cells, regions[both], both, images[0].shape[3], hidden, settings)
-        num_left = int((visible.object_index < count).sum())
-        left, right = (_Chosen(*x) for x in zip(*(x.tensor_split([num_left]) for x in visible), strict=True))
-        sides[0].append(left)
-        sides[1].append(right._replace(object_index=right.object_index - count))
-    left, right = (_Chosen(*(torch.cat(x) for x in zip(*parts, strict=True))) for parts in sides)
-    return left, right
-
-
-def _even_pixels(
-    frames: FrameBatch,
-    detections: Detections,
-    regions: Tensor,  # (2 B, 4)
-    hidden: OcclusionCrops | None,
-    settings: SamplingSettings,
-) -> tuple[_Chosen, _Chosen]:
-    """Those of the mode that looks at no other pixels than it chooses."""
-    count, found = len(detections), even_pixels(regions, settings)
-    object_index, uv, _ = _unhidden(found, found.object_index, hidden)
-    num_left = int((object_index < count).sum())
-
-    def of_side(images: Tensor, part: slice, first_object: int) -> _Chosen:
-        car = object_index[part] - first_object
-        frame = detections.frame_index.index_select(0, car)
-        return _Chosen(car, uv[part], gradient_magnitude_at(images, frames.sizes, frame, uv[part]))
-
-    return (
-        of_side(frames.images_left, slice(None, num_left), 0),
-        of_side(frames.images_right, slice(num_left, None), count),
-    )
-
-
-def _visible(
-    cells: GradientCells,
-    regions: Tensor,  # (R, 4)
-    number: Tensor,  # (R,) of each region among all of them
-    image_width: int,
-    hidden: OcclusionCrops | None,
-    settings: SamplingSettings,
-) -> _Chosen:
-    """The chosen pixels of some regions that no instance hides."""
-    found = _candidates(regions, cells, image_width, settings)
-    object_index, uv, kept = _unhidden(found, number.index_select(0, found.object_index), hidden)
-    magnitude = cells.magnitude_at(found.object_index.index_select(0, kept), uv)
-    return _Chosen(object_index, uv, magnitude)
-
-
-def _unhidden(found: CellPixels, object_index: Tensor, hidden: OcclusionCrops | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Objects (P,) and uv (P, 2) of the pixels that no instance hides, and which (P,) of those found they are."""
-    uv, exists = torch.stack([found.u, found.v], 1), found.exists
-    if hidden is not None:
-        exists = exists & ~hidden.at(object_index, uv)
-    kept = exists.nonzero()[:, 0]
-    return object_index.index_select(0, kept), uv.index_select(0, kept), kept
-
-
-def _candidates(regions: Tensor, cells: GradientCells, image_width: int, settings: SamplingSettings) -> CellPixels:
-    if settings.mode in ("adaptive", "round_one"):
-        return strongest_pixels(cells, regions, image_width, settings)
-    # The mode "dense" does not look at the image.
-    pixels = RegionPixels.of(regions)
-    unseen = torch.zeros(len(pixels), device=regions.device)
-    chosen = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
-    object_index, uv = pixels.uv_of(chosen.pixel)
-    return CellPixels(object_index, uv[:, 0], uv[:, 1], chosen.exists)
-
-
-def _pack_side(frames: FrameBatch, detections: Detections, side: Side, chosen: _Chosen) -> PixelSamples:
+def _pack_side(frames: FrameBatch, detections: Detections, side: Side, chosen: ChosenPixels) -> PixelSamples:
     left = side == "left"
     object_index, uv = chosen.object_index, chosen.uv
     mask = detections.mask_left if left else detections.mask_right

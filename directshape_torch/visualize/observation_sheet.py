@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
-from directshape_torch.observation.packing import car_regions, sampling_settings
+from directshape_torch.observation.chosen_pixels import sampling_settings
+from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.visualize.sampling_picture import occlusion_picture, sampling_picture
@@ -36,7 +37,7 @@ def observation_sheet(
     config = SamplingConfig() if config is None else config
     left, _ = car_regions(frames, detections, config)
     magnitude = gradient_magnitude(image_gradient(grey_levels(frames.images_left), frames.sizes))
-    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, left, sampling_settings(config))
+    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, left, sampling_settings(config, "left"))
     order = config.occlusion_order
     panels = [
         sampling_picture(frames, detections, left, chosen, object_number, order=order),

@@ -27,13 +27,15 @@ from refiner_training.training import Epoch, TrainingSettings, train
 BackwardMode = Literal["unroll", "implicit", "implicit_gauss_newton"]
 Kind = Literal["fixed", "constant", "network"]
 
-# Beside `fast.yaml`: fewer pixels while training. Costs are means over pixels, so weights keep their meaning.
+# Beside `fast.yaml`, whatever that one has of these. Costs are means over pixels, so weights keep their meaning.
 # A result that is not returned has no gradient and says nothing of what a network has learnt.
 EVERY_RESULT = "acceptance.min_probability_not_worse=0"
 TRAINING_OVERRIDES = (
     "sampling.min_pixels=200",
     "sampling.max_pixels=200",
-    "sampling.mode=adaptive",  # as where the networks are judged
+    "sampling.mode_right=as_left",
+    "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 6}, "
+    "{contour_width_px: 0.5, image_level: 0, max_iterations: 8}]",
     EVERY_RESULT,
 )
 UNROLLED_ITERATIONS = 3

@@ -13,9 +13,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.occlusion import Side, hidden_pixels
-from directshape_torch.observation.packing import Observation, car_regions, pack_pixels, sampling_settings
+from directshape_torch.observation.packing import Observation, car_regions, pack_pixels
 from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
 from tests.helpers.synthetic_scene import stereo_camera
@@ -29,7 +30,7 @@ def whole_frame_side(frames: FrameBatch, d: Detections, side: Side, regions: Ten
         (frames.images_left, d.mask_left) if side == "left" else (frames.images_right, d.mask_right)
     )  # fmt: skip
     magnitude = gradient_magnitude(image_gradient(grey_levels(images), frames.sizes))
-    chosen = select_pixels(magnitude, frames.sizes, d.frame_index, regions, sampling_settings(config))
+    chosen = select_pixels(magnitude, frames.sizes, d.frame_index, regions, sampling_settings(config, side))
     object_index, uv = chosen.object_index, chosen.uv
     if config.occlusion:
         visible = ~hidden_pixels(d, side, object_index, uv, config.occlusion_order)
@@ -119,6 +120,16 @@ def test_every_mode_and_order_equals_the_whole_frame_form(mode: str, order: str 
     config = SamplingConfig(mode=mode, occlusion=order is not None, occlusion_order=order or "depth")
     frames, detections = random_scene(11, count=7)
     assert_equal_to_whole_frames(frames, detections, config)
+
+
+@pytest.mark.parametrize("mode", ["adaptive", "uniform", "dense"])
+@pytest.mark.parametrize("mode_right", ["as_left", "adaptive", "round_one", "uniform", "dense"])
+def test_the_right_image_can_have_a_mode_of_its_own(mode: Any, mode_right: Any) -> None:
+    frames, detections = random_scene(14, count=7)
+    seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig(mode=mode, mode_right=mode_right))
+    alone = pack_pixels(frames, detections, SamplingConfig(mode=mode))
+    assert torch.equal(seen.left.uv, alone.left.uv)
+    assert torch.equal(seen.right.uv, alone.right.uv) == (mode_right in ("as_left", mode))
 
 
 def test_more_instances_in_a_frame_than_bits_in_a_word() -> None:

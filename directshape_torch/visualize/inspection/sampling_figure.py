@@ -14,8 +14,9 @@ from directshape_torch.image.gradients import gradient_magnitude, grey_levels, i
 from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.figure_files import new_figure
 from directshape_torch.io.instance_masks import SIDES
+from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.occlusion import Side, hidden_pixels
-from directshape_torch.observation.packing import car_regions, sampling_settings
+from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.panels import draw_lines, show_crop, write_figure
@@ -42,7 +43,7 @@ def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
     left, right = car_regions(frames, detections, config)
     images, regions = (frames.images_left, left) if side == "left" else (frames.images_right, right)
     magnitude = gradient_magnitude(image_gradient(grey_levels(images), frames.sizes))
-    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config))
+    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config, side))
     mine = chosen.object_index == view.car
     uv, above = chosen.uv[mine], chosen.above_threshold[mine]
     hidden = hidden_pixels(detections, side, chosen.object_index[mine], uv, config.occlusion_order)
