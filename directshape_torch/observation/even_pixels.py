@@ -1,4 +1,4 @@
-"""The pixel selection of `pixel_sampling` in the mode "uniform", without a look at pixels that are not chosen.
+"""The mode "uniform": the pixel nearest to the middle of each small cell, without a look at any other.
 
 How near a pixel is to the centre of its cell is a sum over both axes, so the nearest row and the nearest column are
 found by themselves: of a region a few numbers a row and a column of cells.
@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.observation.pixel_sampling import CellPixels, small_cell_side
 from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
+from directshape_torch.observation.small_cells import CellPixels, small_cell_side
 
 # Pixels: what rounding makes of distances that are equal.
 _ROUNDING_PX = 1e-6
@@ -22,7 +22,7 @@ def even_pixels(
     regions: Tensor,  # (B, 4)
     settings: SamplingSettings = DEFAULT_SETTINGS,
 ) -> CellPixels:
-    """The pixel nearest to the centre of each small cell, of two the first in row-major order.
+    """The pixel nearest to the middle of each small cell; of those that differ by rounding the first, row-major.
 
     Args:
         regions: (B, 4) integer (u0, v0, u1, v1), half open.

@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.observation.even_pixels import even_pixels
 from directshape_torch.observation.gradient_thresholds import cell_thresholds, cells_of_regions
 from directshape_torch.observation.regions import RegionPixels
 from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
+from directshape_torch.observation.small_cells import small_cell_side
 
 _INT32_MIN, _INT64_MIN = torch.iinfo(torch.int32).min, torch.iinfo(torch.int64).min
 
@@ -118,15 +120,6 @@ def sample_pixels(
     return PixelSelection(pixels.object_index[chosen], uv, above[chosen])
 
 
-class CellPixels(NamedTuple):
-    """One for each small cell of all regions, in order; numbers mean nothing where there is none."""
-
-    object_index: Tensor  # (N,)
-    u: Tensor  # (N,)
-    v: Tensor  # (N,)
-    exists: Tensor  # (N,) bool
-
-
 class Candidates(NamedTuple):
     """One for each cell of all regions, in order; `pixel` means nothing where there is none."""
 
@@ -153,15 +146,12 @@ def candidate_pixels(
     if settings.mode == "dense":
         every = torch.arange(len(pixels), device=regions.device)
         return Candidates(every, torch.ones_like(above_threshold))
-    side = small_cell_side(regions, settings)
-    cell, num_cells = _small_cells(regions, side, pixels)
     if settings.mode == "uniform":
-        uv = torch.stack([pixels.u, pixels.v], dim=-1)
-        strength, preferred = _closeness_to_cell_centre(regions, side, pixels.object_index, uv), None
-    else:
-        strength = magnitude.detach().float().nan_to_num(nan=0.0, posinf=0.0)
-        preferred = above_threshold
-    index, exists = _strongest_of_each_cell(strength, preferred, cell, num_cells)
+        even = even_pixels(regions, settings)
+        return Candidates(pixels.number_at(regions, even.object_index, even.u, even.v) * even.exists, even.exists)
+    cell, num_cells = _small_cells(regions, small_cell_side(regions, settings), pixels)
+    strength = magnitude.detach().float().nan_to_num(nan=0.0, posinf=0.0)
+    index, exists = _strongest_of_each_cell(strength, above_threshold, cell, num_cells)
     if settings.mode == "round_one" and len(pixels):
         exists = exists & above_threshold[index]
     return Candidates(index, exists)
@@ -169,7 +159,7 @@ def candidate_pixels(
 
 def _strongest_of_each_cell(
     strength: Tensor,  # (A,) float32, not negative
-    preferred: Tensor | None,  # (A,) bool
+    preferred: Tensor,  # (A,) bool
     cell: Tensor,  # (A,)
     num_cells: int,
 ) -> tuple[Tensor, Tensor]:
@@ -178,23 +168,12 @@ def _strongest_of_each_cell(
     # ordered as the floats are, and the sign bit puts all that are not preferred behind. Its lower half, without sign:
     # the reversed index.
     upper = strength.contiguous().view(torch.int32)
-    if preferred is not None:
-        upper = torch.where(preferred, upper, upper + _INT32_MIN)
+    upper = torch.where(preferred, upper, upper + _INT32_MIN)
     lower = torch.arange(-1, -1 - len(strength), -1, dtype=torch.int32, device=strength.device)
     key = torch.stack([lower, upper], dim=-1).view(torch.int64)[:, 0]
     best = key.new_full((num_cells,), _INT64_MIN).scatter_reduce_(0, cell, key, "amax")
     exists = best != _INT64_MIN
     return (-1 - best.view(torch.int32)[::2]).long() * exists, exists
-
-
-def small_cell_side(
-    regions: Tensor,  # (B, 4)
-    settings: SamplingSettings,
-) -> Tensor:
-    """Side of the cells of each region, (B,) float64, pixels; at least one pixel."""
-    areas = ((regions[:, 3] - regions[:, 1]) * (regions[:, 2] - regions[:, 0])).double()
-    wanted = (settings.density * areas).clamp(settings.min_pixels, settings.max_pixels)
-    return (areas / wanted).sqrt().clamp(min=1.0)
 
 
 def _small_cells(
@@ -215,19 +194,6 @@ def _small_cells(
     column_cell = (torch.arange(longest, device=regions.device) / side[:, None]).floor().long().flatten()
     column = column_cell.index_select(0, pixels.rising((of * longest - regions[of, 0] + pixels.run_u).int()))
     return column.add_(pixels.of_runs(run_cell)), total
-
-
-def _closeness_to_cell_centre(
-    regions: Tensor,  # (B, 4)
-    side: Tensor,  # (B,)
-    object_index: Tensor,  # (A,)
-    uv: Tensor,  # (A, 2)
-) -> Tensor:
-    """One minus the squared distance (A,) of each pixel's centre to its cell's centre, in cells, float32."""
-    along = (uv - regions[object_index, :2]) / side[object_index, None]
-    # The centre of a pixel lies half a pixel into it.
-    offset = along - along.floor() + 0.5 / side[object_index, None] - 0.5
-    return (1 - offset.square().sum(dim=1)).clamp(min=0).float()
 
 
 def _check_sampling(magnitude: Tensor, thresholds: Tensor, regions: Tensor, frame_index: Tensor) -> None:

@@ -113,6 +113,13 @@ class RegionPixels:
         u = (self.run_u - self.run_start).index_select(0, run) + pixel
         return self.run_object.index_select(0, run), torch.stack([u, self.run_v.index_select(0, run)], dim=-1)
 
+    def number_at(self, regions: Tensor, object_index: Tensor, u: Tensor, v: Tensor) -> Tensor:
+        """Numbers (P,) of pixels, by region and position, the inverse of `uv_of`; any number outside of the region."""
+        heights = regions[:, 3] - regions[:, 1]
+        row = (heights.cumsum(0) - heights - regions[:, 1]).index_select(0, object_index) + v
+        first = self.run_start - self.run_u
+        return first.index_select(0, row.clamp(0, max(len(first) - 1, 0))) + u
+
     @classmethod
     def of(
         cls,

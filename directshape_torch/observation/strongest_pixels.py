@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.observation.gradient_cells import GradientCells
-from directshape_torch.observation.pixel_sampling import CellPixels, small_cell_side
 from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
+from directshape_torch.observation.small_cells import CellPixels, small_cell_side
 
 _INT32_MIN, _INT64_MIN = torch.iinfo(torch.int32).min, torch.iinfo(torch.int64).min
 

@@ -133,14 +133,22 @@ def waits_of_nothing() -> dict[str, Any]:
     """That what is to be noted is: a program that mixes devices, and one that reads."""
     x = torch.arange(6, device=CARD).view(2, 3)
     problems = []
-    for mix in (lambda: x + torch.ones(3), lambda: x[torch.tensor([0])], lambda: torch.cat([x, torch.ones(1, 3)])):
+    number, of_card = torch.tensor(1.0), x[0, 0].float()
+    for mix in (
+        lambda: x + torch.ones(3),
+        lambda: torch.cat([x, torch.ones(1, 3)]),
+        lambda: torch.stack([of_card, number]),
+        lambda: number.clone().add_(of_card),
+    ):
         try:
             mix()
         except RuntimeError as error:
             problems.append(str(error))
     with noted_waits() as waits:
         assert isinstance(x + 1, CardTensor)
+        assert isinstance(of_card + number, CardTensor)
         float(x.sum()), x.tolist(), x.nonzero(), x[x > 2], x.cpu(), torch.ones(2).to(CARD), x.new_tensor([1, 2])
+        torch.linalg.eigh(torch.eye(2, device=CARD))
     return {"problems": len(problems), "waits": [wait.operation for wait in waits]}
 
 

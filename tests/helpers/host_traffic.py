@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 # Their results, or the shapes of their results, are read by the host.
-_WAITS = {
+WAITS = {
     "aten._local_scalar_dense",
     "aten.is_nonzero",
     "aten.equal",
@@ -22,9 +22,13 @@ _WAITS = {
     "aten.unique_dim",
     "aten.unique_consecutive",
     "aten.unique_dim_consecutive",
+    # Whether a decomposition has failed; `cholesky_ex` and its like leave the question to the caller.
+    "aten._linalg_check_errors",
+    "aten._linalg_eigh",
+    "aten.linalg_lstsq",
 }
 # By a mask they ask how many places it has.
-_INDEXED = {"aten.index", "aten.index_put", "aten.index_put_", "aten._index_put_impl_"}
+INDEXED = {"aten.index", "aten.index_put", "aten.index_put_", "aten._index_put_impl_"}
 # `torch.tensor` of Python numbers: a copy from pageable memory on each call.
 _COPIES = {"aten.lift_fresh", "aten.lift_fresh_copy"}
 
@@ -46,9 +50,9 @@ class HostTraffic(TorchDispatchMode):
     ) -> Any:
         self.operations += 1
         name = str(func.overloadpacket)
-        by_mask = name in _INDEXED and any(_is_mask(index) for index in args[1])
+        by_mask = name in INDEXED and any(_is_mask(index) for index in args[1])
         unsized = name == "aten.repeat_interleave" and (kwargs or {}).get("output_size") is None
-        if name in _WAITS or name in _COPIES or by_mask or unsized:
+        if name in WAITS or name in _COPIES or by_mask or unsized:
             self.found.append(name)
         return func(*args, **(kwargs or {}))
 

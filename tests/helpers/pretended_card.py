@@ -2,7 +2,8 @@
 
 `torch.device("card")` has every operation that PyTorch has on a processor, computed there, so results are the same to
 the bit. But tensors of both do not mix, numbers go over only where the program says so, and each time that the host has
-to wait for the device is noted with its place. What a real card does of its own (other kernels, other orders of sums,
+to wait for the device is noted with its place, as far as operations tell it by their names. It is stricter than a real
+card with indices that lie on the processor. What a real card does of its own (other kernels, other orders of sums,
 memory) it does not show.
 
 The device belongs to the process that imports this module, so tests do it in one of its own (`card_cases`).
@@ -13,6 +14,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
@@ -24,6 +26,7 @@ from torch.utils._python_dispatch import return_and_correct_aliasing
 from torch.utils._pytree import tree_flatten, tree_map
 
 from directshape_torch import gradient_mode
+from helpers.host_traffic import INDEXED, WAITS
 
 
 class _Module(backend_registration._DummyBackendModule):
@@ -36,20 +39,9 @@ class _Module(backend_registration._DummyBackendModule):
 backend_registration._setup_privateuseone_for_python_backend("card", _Module())
 CARD = torch.device("card:0")
 
-# Their results, or the shapes of their results, are read by the host.
-_READS = {
-    "aten._local_scalar_dense",
-    "aten.is_nonzero",
-    "aten.equal",
-    "aten.nonzero",
-    "aten.masked_select",
-    "aten.bincount",
-    "aten._unique2",
-    "aten.unique_dim",
-    "aten.unique_consecutive",
-}
-# By a mask they ask how many places it has.
-_INDEXED = {"aten.index", "aten.index_put", "aten.index_put_", "aten._index_put_impl_"}
+# On a card tensors of a single number from the processor go with operations element by element, and with no others.
+_NO_SINGLE_NUMBERS = {"aten.cat", "aten.stack"}
+_PACKAGE = str(Path(gradient_mode.__file__).parent)
 
 
 class Wait(NamedTuple):
@@ -67,15 +59,17 @@ def noted_waits() -> Iterator[list[Wait]]:
     """Those inside, in order."""
     _waits.clear()
     found: list[Wait] = []
-    yield found
-    found += _waits
+    try:
+        yield found
+    finally:
+        found += _waits
 
 
 def _note(operation: str) -> None:
     functions, frame = [], sys._getframe(1)
     at: FrameType | None = frame
     while at is not None:
-        if "directshape_torch" in at.f_code.co_filename:
+        if at.f_code.co_filename.startswith(_PACKAGE):
             functions.append(at.f_code.co_name)
         at = at.f_back
     _waits.append(Wait(operation, tuple(functions)))
@@ -126,22 +120,14 @@ def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
     on_card = [x for x in tensors if isinstance(x, CardTensor)]
     elsewhere = [x for x in tensors if not isinstance(x, CardTensor)]
     device = kwargs.get("device")
-    if on_card and any(x.dim() for x in elsewhere) and name != "aten.copy_":
-        # Single numbers travel with the operation, on a real card too.
+    if on_card and not _may_mix(func, args, elsewhere):
         raise RuntimeError(f"{name}: expected all tensors on one device, {[tuple(x.shape) for x in elsewhere]} are not")
     if not on_card and device is None:
         raise RuntimeError(f"{name}: neither a tensor of the card nor its name")
     unsized = name == "aten.repeat_interleave" and kwargs.get("output_size") is None
     leaves = name == "aten._to_copy" and device is not None and torch.device(device).type == "cpu"
     arrives = name == "aten._to_copy" and not on_card
-    if (
-        leaves
-        or arrives
-        or unsized
-        or name in _READS
-        or (name == "aten.copy_" and elsewhere)
-        or _is_by_mask(name, args)
-    ):
+    if leaves or arrives or unsized or name in WAITS or (name == "aten.copy_" and elsewhere) or _is_by_mask(name, args):
         _note(name)
     if device is not None:
         kwargs["device"] = torch.device("cpu")
@@ -155,9 +141,18 @@ def _run(func: Any, *args: Any, **kwargs: Any) -> Any:
     return return_and_correct_aliasing(func, args, kwargs, tree_map(_put, result))
 
 
+def _may_mix(func: Any, args: tuple[Any, ...], elsewhere: list[Tensor]) -> bool:
+    """Whether an operation with a tensor of the card takes these tensors of the processor."""
+    name = str(func.overloadpacket)
+    if name == "aten.copy_" or not elsewhere:
+        return True
+    writes_elsewhere = func._schema.is_mutable and not isinstance(args[0], CardTensor)
+    return not writes_elsewhere and name not in _NO_SINGLE_NUMBERS and all(x.dim() == 0 for x in elsewhere)
+
+
 def _is_by_mask(name: str, args: tuple[Any, ...]) -> bool:
     masks = (torch.bool, torch.uint8)
-    return name in _INDEXED and any(index is not None and index.dtype in masks for index in args[1])
+    return name in INDEXED and any(index is not None and index.dtype in masks for index in args[1])
 
 
 def _held(x: Any) -> Any:

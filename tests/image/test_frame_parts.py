@@ -47,8 +47,9 @@ def test_gradients_at_pixels_are_those_of_the_frames(dtype: torch.dtype) -> None
     for frame, (height, width) in enumerate(sizes.tolist()):
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         uv = torch.stack([u, v], dim=-1).reshape(-1, 2)
-        got = gradient_magnitude_at(images, sizes, torch.full((len(uv),), frame), uv)
-        assert torch.equal(got.view(height, width), whole[frame, :height, :width])
+        for given in (images, images.contiguous(memory_format=torch.channels_last)):
+            got = gradient_magnitude_at(given, sizes, torch.full((len(uv),), frame), uv)
+            assert torch.equal(got.view(height, width), whole[frame, :height, :width])
 
 
 def test_derivatives_at_pixels_by_the_images_are_exact() -> None:

@@ -9,15 +9,29 @@ from torch import Tensor
 
 from directshape_torch.observation.even_pixels import even_pixels
 from directshape_torch.observation.pixel_sampling import candidate_pixels
-from directshape_torch.observation.regions import RegionPixels
+from directshape_torch.observation.regions import RegionPixels, region_pixels
 from directshape_torch.observation.sampling_settings import SamplingSettings
+from directshape_torch.observation.small_cells import small_cell_side
 
 
 def by_pixels(regions: Tensor, settings: SamplingSettings) -> tuple[Tensor, Tensor]:
-    pixels = RegionPixels.of(regions)
-    unseen = torch.zeros(len(pixels))
-    candidates = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
-    return pixels.uv_of(candidates.pixel[candidates.exists])
+    """Of all pixels of each cell the nearest one to its middle, one cell after the other."""
+    index, uv = [], []
+    for number, (region, side) in enumerate(zip(regions.tolist(), small_cell_side(regions, settings), strict=True)):
+        _, all_uv = region_pixels(torch.tensor([region]))
+        within = (all_uv - torch.tensor(region[:2])).double()
+        cell = (within / side).floor()
+        # Along an axis distances that differ by rounding are equal: then the lower pixel is the first.
+        offset = within + 0.5 - (cell + 0.5) * side
+        distance = offset.abs() + 1e-6 * (offset > 0)
+        for row in cell[:, 1].unique():
+            for column in cell[:, 0].unique():
+                mine = ((cell[:, 0] == column) & (cell[:, 1] == row)).nonzero()[:, 0]
+                if len(mine):
+                    index.append(number)
+                    uv.append(all_uv[mine[distance[mine].square().sum(dim=1).argmin()]])
+    pixels = torch.stack(uv) if uv else torch.zeros(0, 2, dtype=torch.long)
+    return torch.tensor(index, dtype=torch.long), pixels
 
 
 def by_lines(regions: Tensor, settings: SamplingSettings) -> tuple[Tensor, Tensor]:
@@ -34,10 +48,10 @@ def random_regions(generator: torch.Generator, longest: int) -> Tensor:
     return torch.cat([corner, corner + lengths], dim=1)
 
 
-@pytest.mark.parametrize("longest", [3, 12, 60, 300])
-def test_random_regions(longest: int) -> None:
+@pytest.mark.parametrize(("longest", "times"), [(3, 60), (12, 60), (60, 12), (300, 4)])
+def test_random_regions(longest: int, times: int) -> None:
     generator = torch.Generator().manual_seed(longest)
-    for _ in range(100):
+    for _ in range(times):
         regions = random_regions(generator, longest)
         density = 0.01 + 0.5 * float(torch.rand((), generator=generator))
         least, more = torch.randint(1, 300, (2,), generator=generator).tolist()
@@ -55,6 +69,24 @@ def test_borders_and_middles_on_pixels(side: int, size: tuple[int, int]) -> None
     regions = torch.tensor([[3, 5, 3 + u, 5 + v], [0, 0, 0, 0], [9, 9, 9 + v, 9 + u]])
     for found, expected in zip(by_lines(regions, settings), by_pixels(regions, settings), strict=True):
         assert torch.equal(found, expected)
+
+
+def test_middles_that_are_nearly_between_two_pixels() -> None:
+    """Of large cells: both pixels are equally near to the seventh digit, whole columns of them."""
+    regions, settings = torch.tensor([[0, 0, 866, 274], [0, 0, 401, 209]]), SamplingSettings("uniform", 0.05, 200, 200)
+    for found, expected in zip(by_lines(regions, settings), by_pixels(regions, settings), strict=True):
+        assert torch.equal(found, expected)
+
+
+def test_the_selection_by_pixels_takes_the_same() -> None:
+    regions = torch.tensor([[3, 5, 90, 40], [0, 0, 0, 0], [7, 7, 9, 60], [0, 0, 866, 274]])
+    settings = SamplingSettings("uniform", 0.05, 100, 200)
+    pixels = RegionPixels.of(regions)
+    unseen = torch.zeros(len(pixels))
+    candidates = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
+    found = pixels.uv_of(candidates.pixel[candidates.exists])
+    for by_number, expected in zip(found, by_lines(regions, settings), strict=True):
+        assert torch.equal(by_number, expected)
 
 
 def test_no_regions() -> None:
