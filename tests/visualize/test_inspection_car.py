@@ -85,6 +85,20 @@ def test_sampled_pixels_are_those_of_the_observation(view: CarView, side: str) -
     assert 0 < sampled.above_threshold.sum() < len(expected)
 
 
+def test_pixels_that_no_gradient_chose_are_not_said_to_be_strong(view: CarView) -> None:
+    """`fast` has evenly spaced pixels in the right image."""
+    left, right = (sampled_pixels(view, side) for side in ("left", "right"))
+    strong = int(left.above_threshold.sum())
+    assert (
+        left.in_words == f"{strong} by their gradient, {len(left.uv) - strong} to fill cells, {left.num_hidden} hidden"
+    )
+    assert [name for _, _, name in left.groups] == ["strong gradient", "strongest of cell"]
+    assert right.in_words == f"{len(right.uv)} whatever their gradient, {right.num_hidden} hidden"
+    ((shown, _, name),) = right.groups
+    assert shown.all()
+    assert name == "whatever the gradient"
+
+
 @pytest.mark.parametrize("number", [0, -1])
 def test_residuals_of_the_pixels_make_the_costs_of_the_trace(view: CarView, number: int) -> None:
     trace = view.trace

@@ -23,7 +23,7 @@ from directshape_torch.visualize.inspection.panels import draw_lines, show_crop,
 from directshape_torch.visualize.sampling_picture import PANEL_GAP_PX, occlusion_picture
 
 _PANEL_INCHES, _ROOM_INCHES = 6.0, 0.8
-_STRONG_INK, _FILL_INK = "lime", "red"
+_STRONG_INK, _FILL_INK, _EVEN_INK = "lime", "red", "yellow"
 # Of the region of a far car in the occlusion picture.
 _LEAST_HEIGHT_PX = 180
 
@@ -34,6 +34,23 @@ class SampledPixels(NamedTuple):
     uv: NDArray[np.int64]  # (P, 2)
     above_threshold: NDArray[np.bool_]  # (P,) chosen for a strong gradient, not to fill its cell
     num_hidden: int  # chosen pixels that a nearer instance hides: they are left out
+    by_gradient: bool  # chosen by their gradients at all
+
+    @property
+    def groups(self) -> list[tuple[NDArray[np.bool_], str, str]]:
+        """Which (P,) belong together, with their ink and name."""
+        strong = self.above_threshold
+        if not self.by_gradient:
+            return [(np.ones_like(strong), _EVEN_INK, "whatever the gradient")]
+        return [(strong, _STRONG_INK, "strong gradient"), (~strong, _FILL_INK, "strongest of cell")]
+
+    @property
+    def in_words(self) -> str:
+        """How many there are, and why."""
+        strong = int(self.above_threshold.sum())
+        by_gradient = f"{strong} by their gradient, {len(self.uv) - strong} to fill cells"
+        chosen = by_gradient if self.by_gradient else f"{len(self.uv)} whatever their gradient"
+        return f"{chosen}, {self.num_hidden} hidden"
 
 
 def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
@@ -48,7 +65,8 @@ def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
     uv, above = chosen.uv[mine], chosen.above_threshold[mine]
     hidden = hidden_pixels(detections, side, chosen.object_index[mine], uv, config.occlusion_order)
     kept = ~hidden if config.occlusion else torch.ones_like(hidden)
-    return SampledPixels(np.asarray(uv[kept].cpu()), np.asarray(above[kept].cpu()), int((~kept).sum()))
+    by_gradient = sampling_settings(config, side).mode in ("adaptive", "round_one")
+    return SampledPixels(np.asarray(uv[kept].cpu()), np.asarray(above[kept].cpu()), int((~kept).sum()), by_gradient)
 
 
 def write_sampling_figure(path: Path | str, view: CarView) -> None:
@@ -59,15 +77,15 @@ def write_sampling_figure(path: Path | str, view: CarView) -> None:
     """
     figure = new_figure(2 * _PANEL_INCHES, _PANEL_INCHES * view.panel_aspect() + _ROOM_INCHES, "drawing sampled pixels")
     figure.suptitle(view.title)
-    for axes, side in zip(figure.subplots(1, 2), SIDES, strict=True):
-        pixels = sampled_pixels(view, side)
-        strong = pixels.above_threshold
-        title = f"{side}: {strong.sum()} by their gradient, {(~strong).sum()} to fill cells, {pixels.num_hidden} hidden"
-        show_crop(axes, view.image(side), view.window(side), title)
+    left, right = (sampled_pixels(view, side) for side in SIDES)
+    for axes, side, pixels in zip(figure.subplots(1, 2), SIDES, (left, right), strict=True):
+        show_crop(axes, view.image(side), view.window(side), f"{side}: {pixels.in_words}")
         draw_lines(axes, view.mask_lines(side), "white", "mask", linewidth=1.0)
-        for chosen, ink, name in ((strong, _STRONG_INK, "strong gradient"), (~strong, _FILL_INK, "strongest of cell")):
+        for chosen, ink, name in pixels.groups:
             axes.plot(*pixels.uv[chosen].T, ".", color=ink, markersize=4, label=name)
-    axes.legend(loc="lower right", fontsize=8, facecolor="0.3", labelcolor="white")
+        # One for both where they have the same colours.
+        if side == "right" or left.by_gradient != right.by_gradient:
+            axes.legend(loc="lower right", fontsize=8, facecolor="0.3", labelcolor="white")
     write_figure(path, figure)
 
 
