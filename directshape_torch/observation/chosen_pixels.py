@@ -21,8 +21,6 @@ from directshape_torch.observation.small_cells import CellPixels
 from directshape_torch.observation.strongest_pixels import strongest_pixels
 from directshape_torch.scene import Detections, FrameBatch
 
-SIDES: tuple[Side, Side] = ("left", "right")
-
 
 class ChosenPixels(NamedTuple):
     """P pixels of one image."""
@@ -48,7 +46,7 @@ def chosen_pixels(
         hidden: where nearer instances hide the cars, by row of the regions; None: nowhere.
         config: density and modes.
     """
-    left, right = (sampling_settings(config, side) for side in SIDES)
+    left, right = sampling_settings(config, "left"), sampling_settings(config, "right")
     if left.mode == right.mode:
         return _in_mode(frames, detections, regions, hidden, left)
     of_left, of_right = regions.tensor_split(2)
@@ -68,7 +66,7 @@ def sampling_settings(config: SamplingConfig, side: Side) -> SamplingSettings:
 def _in_mode(
     frames: FrameBatch,
     detections: Detections,
-    regions: Tensor,
+    regions: Tensor,  # (2 B, 4)
     hidden: OcclusionCrops | None,
     settings: SamplingSettings,
 ) -> tuple[ChosenPixels, ChosenPixels]:
