@@ -89,10 +89,18 @@ def _helper(request: CompileRequest) -> Iterator[tuple[subprocess.Popen[bytes], 
 
 
 def _send(process: subprocess.Popen[bytes], request: CompileRequest) -> None:
-    """The request; the pipe stays open, for at its end the helper ends."""
+    """The request; the pipe stays open, for at its end the helper ends.
+
+    A helper that has ended before it could read says why when it is awaited, and that is what the user needs to know.
+    """
     assert process.stdin is not None
-    process.stdin.write(pickle.dumps(request))
-    process.stdin.flush()
+    try:
+        process.stdin.write(pickle.dumps(request))
+        process.stdin.flush()
+    except OSError:
+        # What is left in the buffer cannot be written either.
+        with suppress(OSError):
+            process.stdin.close()
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -125,18 +125,38 @@ def test_what_a_helper_compiles_is_what_is_compiled_here() -> None:
         assert torch.equal(mine, other)
 
 
+def failing_helper(folder: Path) -> Path:
+    script = folder / "python"
+    script.write_text("#!/bin/sh\necho 'no module here' >&2\nexit 1\n")
+    script.chmod(0o755)
+    return script
+
+
 @pytest.mark.usefixtures("_folder")
 @pytest.mark.parametrize("command", ["false", "missing"])
 def test_a_helper_that_fails_says_why_and_stops_nothing(command, monkeypatch, caplog, tmp_path: Path) -> None:
-    script = tmp_path / "python"
-    script.write_text("#!/bin/sh\necho 'no module here' >&2\nexit 1\n")
-    script.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(script if command == "false" else tmp_path / "missing"))
+    script = failing_helper(tmp_path) if command == "false" else tmp_path / "missing"
+    monkeypatch.setattr(sys, "executable", str(script))
     with caplog.at_level(logging.INFO), compiled_by_helpers([march_request()]):
         pass
     assert "compiled here instead" in caplog.text
     assert ("no module here" in caplog.text) == (command == "false")
     assert stored_file(sample_grids.plain, march_request().variant) is None
+
+
+@pytest.mark.usefixtures("_folder")
+def test_a_helper_that_ends_before_it_is_sent_anything_says_why(monkeypatch, caplog, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "executable", str(failing_helper(tmp_path)))
+    send = helpers._send
+
+    def send_late(process: subprocess.Popen[bytes], request: CompileRequest) -> None:
+        process.wait()
+        send(process, request)
+
+    monkeypatch.setattr(helpers, "_send", send_late)
+    with caplog.at_level(logging.INFO), compiled_by_helpers([march_request()]):
+        pass
+    assert "a process that compiles failed (no module here): compiled here instead" in caplog.text
 
 
 def endless_helper(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Path:
