@@ -17,12 +17,15 @@ class StageConfig:
         image_level: pyramid level of the photometric term; 0 is full resolution.
         max_iterations: Gauss-Newton iterations at most.
         unknowns: which of them move: "both", "pose" or "shape".
+        over_relaxation: steps are so many times as long as Gauss-Newton's, but after one that did not pay. Reweighted
+            terms bend less than their matrix says, so that plain steps (1, the paper's) stop short.
     """
 
     contour_width_px: float = 0.5
     image_level: int = 0
     max_iterations: int = 20
     unknowns: Literal["both", "pose", "shape"] = "both"
+    over_relaxation: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -237,7 +240,7 @@ class SamplingConfig:
     """
 
     mode: Literal["adaptive", "round_one", "uniform", "dense"] = "adaptive"
-    mode_right: Literal["as_left", "adaptive", "round_one", "uniform", "dense"] = "as_left"
+    mode_right: Literal["as_left", "adaptive", "round_one", "uniform", "dense"] = "uniform"
     density: float = 0.05
     min_pixels: int = 400
     max_pixels: int = 1000
@@ -290,8 +293,8 @@ class RefinerConfig:
     method: Literal["direct", "geometric", "combined"] = "direct"
     compile: Literal["auto", "on", "off"] = "auto"
     stages: tuple[StageConfig, ...] = (
-        StageConfig(contour_width_px=2.0, image_level=1, max_iterations=10),
-        StageConfig(contour_width_px=0.5, image_level=0, max_iterations=12),
+        StageConfig(contour_width_px=2.0, image_level=1, max_iterations=6, over_relaxation=1.6),
+        StageConfig(contour_width_px=0.5, image_level=0, max_iterations=6, over_relaxation=1.6),
     )
     solver: SolverConfig = field(default_factory=SolverConfig)
     silhouette: SilhouetteConfig = field(default_factory=SilhouetteConfig)

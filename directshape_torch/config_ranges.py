@@ -19,6 +19,8 @@ _RANGES: dict[str, tuple[float, float]] = {
     "contour_width_px": _POSITIVE,
     "image_level": (0, 8),
     "max_iterations": _NOT_NEGATIVE,
+    # Of 2 and more no quadratic energy would fall.
+    "over_relaxation": (1, 1.99),
     "solver.initial_damping": _NOT_NEGATIVE,
     "solver.damping_decrease": (_TINY, 1),
     "solver.damping_increase": (1, math.inf),
@@ -92,7 +94,7 @@ def check_ranges(config: Any) -> None:
         raise ConfigError("stages: expected at least one stage, got none")
     _check_words(config)
     for i, stage in enumerate(config.stages):
-        for key in ("contour_width_px", "image_level", "max_iterations"):
+        for key in ("contour_width_px", "image_level", "max_iterations", "over_relaxation"):
             _check(f"stages[{i}].{key}", getattr(stage, key), *_RANGES[key])
     for path, (low, high) in _RANGES.items():
         group, _, key = path.partition(".")

@@ -56,11 +56,11 @@ def method_stages(config: RefinerConfig) -> list[Stage]:
         ['pose', 'shape', 'pose', 'shape']
     """
     if config.method != "geometric":
-        return [Stage(s.contour_width_px, s.image_level, s.max_iterations, s.unknowns) for s in config.stages]
+        return [Stage(**vars(stage)) for stage in config.stages]
     # Contour and pyramid level mean nothing to a point cloud: the last stage's, for whoever draws or measures.
     last, cloud = config.stages[-1], config.point_cloud
     pose_stage, shape_stage, joint_stage = (
-        Stage(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns)
+        Stage(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns=unknowns)
         for unknowns in ("pose", "shape", "both")
     )
     return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig, SolverConfig
+from directshape_torch.config import RefinerConfig, SamplingConfig, SolverConfig, StageConfig
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
@@ -104,7 +104,12 @@ def paper_refinements(
 ) -> list[PaperRefinement]:
     """Refine the cars of a scene from disturbed detections, with both derivatives and both solvers."""
     # Marched: one of the two terms could not be followed, and nothing but the steps may differ.
-    config = RefinerConfig(solver=SolverConfig(rays="marched", cost_tolerance=1e-4))
+    config = RefinerConfig(
+        # Plain steps and pixels of both rounds, as in the paper.
+        stages=(StageConfig(2.0, 1, 10), StageConfig(0.5, 0, 12)),
+        sampling=SamplingConfig(mode_right="as_left"),
+        solver=SolverConfig(rays="marched", cost_tolerance=1e-4),
+    )
     undamped = replace(config, solver=replace(config.solver, initial_damping=0.0, accept_every_step=True))
     twice = replace(config, solver=replace(config.solver, initial_damping=2 * config.solver.initial_damping))
     regime = REGIMES["typical"]

@@ -24,7 +24,7 @@ class StepShift(NamedTuple):
 
 
 def gauss_newton_step(problem: CarProblem, parts: Sequence[TermLinearisation]) -> Tensor:
-    """The first step (B, D) that the solver would take from these linearisations: damped, within the trust region."""
+    """The first step (B, D) from these linearisations as the solver takes it where it does not over-relax."""
     gradient = torch.stack([p.gradient for p in parts]).sum(dim=0)
     hessian = torch.stack([p.hessian for p in parts]).sum(dim=0)
     damping = torch.full_like(gradient[:, 0], problem.config.solver.initial_damping)

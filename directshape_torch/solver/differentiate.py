@@ -1,7 +1,7 @@
 """Derivatives of a minimum by whatever the problem is made of: unrolled iterations, or the implicit function theorem.
 
 Both give back the minimum's own values with an autograd graph attached. Sets that a stage fixes (pixels, counts, zeta),
-accepted steps and damping are constants.
+accepted steps, their damping and lengths are constants.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def unrolled_state(
         if iteration.stage != begun:
             begun = iteration.stage
             problem.begin_stage(stages[begun], take_rows(minimum.stage_starts[begun], rows))
-        state = where_rows(taken, _step(problem, state, iteration.damping), state)
+        state = where_rows(taken, _step(problem, state, iteration), state)
     return _with_values(take_rows(minimum.state, rows), state)
 
 
@@ -156,9 +156,10 @@ def _listed(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
 
 
-def _step(problem: DifferentiableProblem[StateT], state: StateT, damping: Tensor) -> StateT:
+def _step(problem: DifferentiableProblem[StateT], state: StateT, iteration: Iteration[StateT]) -> StateT:
     at = problem.linearise_differentiably(state)
-    step, _ = damped_step(at.hessian, at.gradient, damping)
+    step, _ = damped_step(at.hessian, at.gradient, iteration.damping)
+    step = step * iteration.lengths[:, None]
     return problem.retract(state, limit_step(step, problem.step_limits().to(step)))
 
 
@@ -167,6 +168,7 @@ def _rows_of(iteration: Iteration[StateT], rows: Tensor) -> Iteration[StateT]:
         iteration.stage,
         take_rows(iteration.state, rows),
         iteration.damping[rows],
+        iteration.lengths[rows],
         iteration.accepted[rows],
         iteration.improved[rows],
     )

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
+from directshape_torch.solver.damped_solve import step_lengths
 from directshape_torch.solver.iteration import RUNNING, Outcome, begin, has_failed, iterate
 from directshape_torch.solver.problem import (
     Problem,
@@ -30,6 +31,7 @@ class Iteration(Generic[StateT]):
         stage: number of its stage.
         state: states before it.
         damping: (B,) Marquardt's mu.
+        lengths: (B,) what the steps were multiplied by, before their limits.
         accepted: (B,) bool: the step was taken; false for problems that took no part.
         improved: (B,) bool: it led to the best state of the stage so far.
     """
@@ -37,6 +39,7 @@ class Iteration(Generic[StateT]):
     stage: int
     state: StateT
     damping: Tensor
+    lengths: Tensor
     accepted: Tensor
     improved: Tensor
 
@@ -69,19 +72,25 @@ class _Log(Generic[StateT]):
     """What is kept of the iterations of one stage: rows of a compacted batch, put in their places a block at a time."""
 
     def __init__(
-        self, history: list[Tensor], trajectory: list[Iteration[StateT]] | None, stage: int, all_states: StateT
+        self,
+        history: list[Tensor],
+        trajectory: list[Iteration[StateT]] | None,
+        stage: int,
+        all_states: StateT,
+        over_relaxation: float,
     ) -> None:
         self.history, self.trajectory, self.stage, self.all_states = history, trajectory, stage, all_states
+        self.over_relaxation = over_relaxation
         self.costs: list[Tensor] = []
         self.running: list[Tensor] = []
 
-    def add(self, rows: Tensor, before: tuple[StateT, Tensor], outcome: Outcome, cost: Tensor) -> None:
-        """One iteration: state and damping before it, then what came of it, all for these rows."""
+    def add(self, rows: Tensor, before: tuple[StateT, Tensor, Tensor], outcome: Outcome, cost: Tensor) -> None:
+        """One iteration: state, damping and which steps were stretched, then what came of it, all for these rows."""
         self.costs.append(cost)
         self.running.append(outcome.running)
         if self.trajectory is None:
             return
-        state, damping = before
+        state, damping, stretched = before
         zeros = cost.new_zeros(len(self.all_states[0]))
         none = torch.zeros_like(zeros, dtype=torch.bool)
         self.trajectory.append(
@@ -89,6 +98,7 @@ class _Log(Generic[StateT]):
                 self.stage,
                 put_rows(self.all_states, rows, state),
                 zeros.index_copy(0, rows, damping),
+                zeros.index_copy(0, rows, step_lengths(stretched, self.over_relaxation).to(damping.dtype)),
                 none.index_copy(0, rows, outcome.accepted),
                 none.index_copy(0, rows, outcome.improved),
             )
@@ -144,7 +154,7 @@ def minimise(
         for stage in problem.stages():
             part = problem.begin_stage(stage, state)
             starts.append(state)
-            log = _Log(history, trajectory, len(starts) - 1, state)
+            log = _Log(history, trajectory, len(starts) - 1, state, stage.over_relaxation)
             state, ended, done, unfailed = _run_stage(part, stage, state, ended, unfailed, config, log)
             iterations = iterations + done
         status = _final_status(problem, initial, state, ended)
@@ -181,8 +191,8 @@ def _run_stage(
     done = 0
     while done < stage.max_iterations and numbers:
         for _ in range(min(config.block_iterations, stage.max_iterations - done)):
-            before = (progress.state, progress.damping)
-            outcome = iterate(part, progress, config, limits)
+            before = (progress.state, progress.damping, progress.stretched)
+            outcome = iterate(part, progress, config, limits, stage.over_relaxation)
             log.add(rows, before, outcome, progress.at_state.cost)
             done += 1
         log.end_block(rows)

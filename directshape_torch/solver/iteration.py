@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
-from directshape_torch.solver.damped_solve import damped_step, is_finite, limited_step
+from directshape_torch.solver.damped_solve import damped_step, is_finite, limited_step, step_lengths
 from directshape_torch.solver.problem import Linearisation, StageProblem, StateT, put_rows, take_rows, where_rows
 from directshape_torch.status import Status
 
 # Of a problem that goes on; else the code of the status with which it ended.
 RUNNING = -1
+# Of tolerances: where a step promises and changes no more, its refusal is no overshoot that damping could mend, but the
+# roughness of a cost at its lowest.
+_FLAT = 10.0
 
 
 class Outcome(NamedTuple):
@@ -34,6 +37,7 @@ class Progress(Generic[StateT]):
     best_cost: Tensor  # (B,)
     at_state: Linearisation
     damping: Tensor  # (B,)
+    stretched: Tensor  # (B,) bool: where steps are over-relaxed, the next one is
     ended: Tensor  # (B,) status code or RUNNING
     iterations: Tensor  # (B,)
 
@@ -45,6 +49,7 @@ class Progress(Generic[StateT]):
             self.best_cost[index],
             take_rows(self.at_state, index),
             self.damping[index],
+            self.stretched[index],
             self.ended[index],
             self.iterations[index],
         )
@@ -78,13 +83,20 @@ def begin(problem: StageProblem[StateT], state: StateT, ended: Tensor, config: S
         best_cost=at_state.cost,
         at_state=at_state,
         damping=torch.full_like(at_state.cost, config.initial_damping),
+        stretched=torch.ones_like(fresh, dtype=torch.bool),
         # Of the stage before only failures count: what has converged there goes on.
         ended=torch.where(has_failed(ended), ended, fresh),
         iterations=torch.zeros_like(ended),
     )
 
 
-def iterate(problem: StageProblem[StateT], p: Progress[StateT], config: SolverConfig, limits: Tensor) -> Outcome:
+def iterate(
+    problem: StageProblem[StateT],
+    p: Progress[StateT],
+    config: SolverConfig,
+    limits: Tensor,
+    over_relaxation: float = 1.0,
+) -> Outcome:
     """One iteration of a batch, whose progress is written to.
 
     Args:
@@ -92,8 +104,11 @@ def iterate(problem: StageProblem[StateT], p: Progress[StateT], config: SolverCo
         p: where they are.
         config: damping, acceptance, convergence.
         limits: (D,) largest trusted step of each unknown.
+        over_relaxation: of the stage.
     """
     step, solvable = damped_step(p.at_state.hessian, p.at_state.gradient, p.damping)
+    if over_relaxation != 1:
+        step = step * step_lengths(p.stretched, over_relaxation).to(step.dtype).unsqueeze(1)
     step, size = limited_step(step, limits)
     candidate = problem.retract(p.state, step)
     at_candidate = problem.linearise(candidate)
@@ -110,7 +125,13 @@ def iterate(problem: StageProblem[StateT], p: Progress[StateT], config: SolverCo
     small_decrease = decrease <= config.cost_tolerance * p.at_state.cost.abs()
     if config.accept_every_step:
         small_decrease = small_decrease & downhill
-    settled = usable & ((size < config.step_tolerance) | torch.where(accepted, small_decrease, at_limit))
+    has_settled = accepted & small_decrease
+    if over_relaxation != 1:
+        # A longer step may end beyond the minimum and about as high: it is for a plain one to say that this is all.
+        at_rest = takeable & ~accepted & _changes_little(p.at_state, step, decrease, config)
+        has_settled, at_limit = ~p.stretched & (has_settled | at_rest), at_limit & ~p.stretched
+        p.stretched = downhill & ~small_decrease
+    settled = usable & ((size < config.step_tolerance) | has_settled | ~accepted & at_limit)
     p.ended = torch.where(settled, Status.converged.code, p.ended)
     hopeless = running & ~solvable
     if config.initial_damping > 0:
@@ -120,6 +141,13 @@ def iterate(problem: StageProblem[StateT], p: Progress[StateT], config: SolverCo
         p.ended = torch.where(usable & ~takeable, Status.non_finite.code, p.ended)
     improved = _move(p, candidate, at_candidate, accepted, config)
     return Outcome(running, accepted, improved)
+
+
+def _changes_little(at: Linearisation, step: Tensor, decrease: Tensor, config: SolverConfig) -> Tensor:
+    """Where (B,) a step that was refused promised next to nothing, and raised the cost by no more than that."""
+    little = _FLAT * config.cost_tolerance * at.cost.abs()
+    promised = -0.5 * (at.gradient * step).sum(dim=1)
+    return (promised <= little) & (-decrease <= little)
 
 
 def _move(

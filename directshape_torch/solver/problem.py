@@ -30,12 +30,14 @@ class Stage:
         image_level: pyramid level of the photometric term, 0 is full resolution.
         max_iterations: Gauss-Newton iterations at most.
         unknowns: which of them move; the others are constants of the stage, a matter of the problem alone.
+        over_relaxation: factor of steps (`step_lengths`).
     """
 
     contour_width_px: float
     image_level: int
     max_iterations: int
     unknowns: Unknowns = "both"
+    over_relaxation: float = 1.0
 
 
 StateT = TypeVar("StateT", bound=tuple[Tensor, ...])

@@ -57,7 +57,7 @@ def _walked_on(problem: CarProblem, minimum: Minimum[CarState], steps: int) -> M
     state, trajectory = minimum.state, []
     every, none = torch.ones(len(ROWS), dtype=torch.bool), torch.zeros(len(ROWS), dtype=torch.float64)
     for _ in range(steps):
-        trajectory.append(Iteration(last, state, none, every, every))
+        trajectory.append(Iteration(last, state, none, torch.ones_like(none), every, every))
         at = problem.linearise(state)
         state = problem.retract(state, -torch.linalg.solve(at.hessian, at.gradient))
     assert at.gradient.abs().max() < 1e-9

@@ -127,7 +127,7 @@ def test_every_mode_and_order_equals_the_whole_frame_form(mode: str, order: str 
 def test_the_right_image_can_have_a_mode_of_its_own(mode: Any, mode_right: Any) -> None:
     frames, detections = random_scene(14, count=7)
     seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig(mode=mode, mode_right=mode_right))
-    alone = pack_pixels(frames, detections, SamplingConfig(mode=mode))
+    alone = pack_pixels(frames, detections, SamplingConfig(mode=mode, mode_right="as_left"))
     assert torch.equal(seen.left.uv, alone.left.uv)
     assert torch.equal(seen.right.uv, alone.right.uv) == (mode_right in ("as_left", mode))
 

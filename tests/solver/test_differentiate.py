@@ -128,12 +128,14 @@ def test_implicit_gradient_by_differences_of_the_whole_minimisation() -> None:
     assert torch.autograd.gradcheck(_implicit, (_theta().requires_grad_(),), eps=1e-5, atol=1e-6)
 
 
-def test_unrolled_gradient_by_differences_of_the_whole_minimisation() -> None:
+@pytest.mark.parametrize("over_relaxation", [1.0, 1.6])
+def test_unrolled_gradient_by_differences_of_the_whole_minimisation(over_relaxation: float) -> None:
     """A fixed number of undamped steps, far from convergence: data and start both matter."""
     config = replace(EXACT, initial_damping=0.0, accept_every_step=True)
 
     def few(theta: Tensor, start: Tensor) -> Tensor:
-        problem = Curved(theta, [Stage(2.0, 1, 1), Stage(1.0, 0, 2)])
+        stages = [Stage(2.0, 1, n, over_relaxation=over_relaxation) for n in (1, 2)]
+        problem = Curved(theta, stages)
         minimum = _minimum(problem, start, config)
         assert minimum.iterations.tolist() == [3, 3, 3]
         return unrolled_state(problem, Vector(start), minimum, torch.arange(len(theta)), 10).x

@@ -1,0 +1,200 @@
+"""Steps that are longer than Gauss-Newton's: by how much, when, and what they are good for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from helpers.quadratics import ResidualProblem, Vector, linear_problem
+from torch import Tensor
+
+from directshape_torch.config import SolverConfig
+from directshape_torch.config_files import load_config
+from directshape_torch.energy.method import method_stages
+from directshape_torch.errors import ConfigError
+from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.gauss_newton import minimise
+from directshape_torch.solver.problem import Linearisation, Stage
+
+DAMPED = SolverConfig()
+PURE = SolverConfig(initial_damping=0.0, accept_every_step=True, cost_tolerance=0.0, step_tolerance=0.0)
+FACTOR = 1.6
+
+
+class GeometricMedians(ResidualProblem):
+    """The points with the least sum of distances to others, by reweighting: the matrix lacks what the weights do."""
+
+    def __init__(self, points: Tensor, identity: Tensor, stages: Sequence[Stage]) -> None:
+        super().__init__(lambda x, _: x, identity, 2, stages)
+        self.points = points
+
+    def _distances(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        offset = x[:, None] - self.points[self.identity]
+        return offset, (offset.square().sum(-1) + 1e-6).sqrt()
+
+    def cost(self, state: Vector) -> Tensor:
+        return self._distances(state.x)[1].sum(1)
+
+    def linearise(self, state: Vector) -> Linearisation:
+        offset, distance = self._distances(state.x)
+        gradient = (offset / distance[..., None]).sum(1)
+        return Linearisation(distance.sum(1), gradient, (1 / distance).sum(1)[:, None, None] * torch.eye(2))
+
+    def compact(self, keep: Tensor, numbers: Sequence[int]) -> GeometricMedians:
+        return GeometricMedians(self.points, self.identity[keep], self._stages)
+
+
+def zeros(count: int, unknowns: int) -> Vector:
+    return Vector(torch.zeros(count, unknowns, dtype=torch.float64))
+
+
+def test_on_a_quadratic_energy_what_is_left_shrinks_by_the_factor_less_one() -> None:
+    problem, solution = linear_problem(3, 3, [Stage(1.0, 0, 4, over_relaxation=FACTOR)])
+    result = minimise(problem, zeros(3, 3), PURE, record=True)
+    states = torch.stack([iteration.state.x for iteration in result.trajectory])
+    powers = (1 - FACTOR) ** torch.arange(4, dtype=torch.float64)
+    torch.testing.assert_close(states - solution, powers[:, None, None] * -solution, rtol=1e-5, atol=1e-6)
+
+
+def test_reweighted_problems_settle_in_fewer_iterations_at_the_same_minimum() -> None:
+    points = torch.randn(8, 9, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    config = replace(DAMPED, cost_tolerance=1e-12, min_damping=0.0, step_tolerance=0.0)
+    plain, longer = (
+        minimise(
+            GeometricMedians(points, torch.arange(8), [Stage(1.0, 0, 300, over_relaxation=factor)]), zeros(8, 2), config
+        )
+        for factor in (1.0, FACTOR)
+    )
+    assert plain.status.tolist() == longer.status.tolist() == [0] * 8
+    torch.testing.assert_close(longer.state.x, plain.state.x, rtol=0, atol=1e-4)
+    assert longer.iterations.sum() < 0.75 * plain.iterations.sum()
+
+
+@pytest.mark.parametrize("solver", [{}, {"initial_damping": 1.0}, {"initial_damping": 1e-9}], ids=str)
+def test_what_was_refused_is_tried_again_plain(solver: dict[str, float]) -> None:
+    # From 3 a Gauss-Newton step on the arcus tangent leads to -9.5, where the cost is higher.
+    stages = [Stage(1.0, 0, 25, over_relaxation=FACTOR)]
+    problem = ResidualProblem(lambda x, _: torch.atan(x), torch.arange(1), 1, stages)
+    config = replace(DAMPED, cost_tolerance=0.0, step_tolerance=0.0, **solver)
+    trajectory = minimise(problem, Vector(torch.full((1, 1), 3.0, dtype=torch.float64)), config, record=True).trajectory
+    taken = [bool(iteration.accepted) for iteration in trajectory]
+    assert set(taken) == {True, False}
+    lengths = [float(iteration.lengths) for iteration in trajectory]
+    assert lengths == pytest.approx([FACTOR, *(FACTOR if before else 1.0 for before in taken[:-1])])
+    for now, then in pairwise(trajectory):
+        at = problem.linearise(now.state)
+        step = damped_step(at.hessian, at.gradient, now.damping)[0] * now.lengths[:, None]
+        expected = now.state.x + step if bool(now.accepted) else now.state.x
+        torch.testing.assert_close(then.state.x, expected, rtol=1e-6, atol=1e-9)
+
+
+class Bent(ResidualProblem):
+    """A distance to 1 whose matrix is too small by a factor, so that plain steps are so many times too long."""
+
+    def __init__(self, factor: float, stages: Sequence[Stage]) -> None:
+        super().__init__(
+            lambda x, _: torch.cat([x - 1, torch.full_like(x, 9.0)], dim=1), torch.arange(1), 1, stages, 8.0
+        )
+        self.factor = factor
+
+    def linearise(self, state: Vector) -> Linearisation:
+        at = super().linearise(state)
+        return at._replace(hessian=at.hessian / self.factor)
+
+
+def test_undamped_steps_that_are_refused_are_plain_ones_next() -> None:
+    """Steps of 1.3 times 1.6 end higher than they began, and no damping is there to shorten them."""
+    problem = Bent(1.3, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    result = minimise(problem, zeros(1, 1), replace(DAMPED, initial_damping=0.0, cost_tolerance=1e-6))
+    torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=1e-2)
+
+
+def test_a_long_step_to_the_other_side_is_not_taken_for_the_end() -> None:
+    """Steps of a little less than 2 in all: the cost hardly falls, and the minimum is in the middle."""
+    problem = Bent(1.2499, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    result = minimise(problem, zeros(1, 1), replace(DAMPED, initial_damping=1e-9, min_damping=1e-9))
+    assert float(result.cost_history[0, 0]) > 40.999  # of 41
+    torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=0.1)
+    assert result.status.tolist() == [0]
+
+
+def test_two_steps_in_a_row_that_change_next_to_nothing_are_the_end() -> None:
+    problem = Bent(2.5, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    near = Vector(torch.full((1, 1), 1.0001, dtype=torch.float64))
+    result = minimise(problem, near, replace(DAMPED, step_tolerance=0.0))
+    assert (result.status.tolist(), result.iterations.tolist()) == ([0], [2])
+
+
+def test_two_steps_in_a_row_that_overshoot_are_not() -> None:
+    problem = ResidualProblem(
+        lambda x, _: torch.atan(x), torch.arange(1), 1, [Stage(1.0, 0, 30, over_relaxation=FACTOR)], 20.0
+    )
+    start = Vector(torch.full((1, 1), 4.0, dtype=torch.float64))
+    result = minimise(problem, start, DAMPED, record=True)
+    assert [bool(iteration.accepted) for iteration in result.trajectory[:2]] == [False, False]
+    assert result.status.tolist() == [0]
+    assert float(result.state.x.abs()) < 0.05
+
+
+def test_a_mirror_image_of_the_start_is_not_the_end() -> None:
+    """The longer step is refused for a large rise, the plain one for a rise of a hundredth, but promises much more."""
+    problem = Bent(2.02, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    result = minimise(problem, zeros(1, 1), replace(DAMPED, initial_damping=1e-6, min_damping=1e-6))
+    torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=0.1)
+
+
+def test_a_candidate_that_is_not_finite_is_not_the_end() -> None:
+    class Broken(Bent):
+        """Beyond 1.2 there is a lower cost, but nothing else."""
+
+        def linearise(self, state: Vector) -> Linearisation:
+            at = super().linearise(state)
+            broken = state.x[:, 0] > 1.2
+            return at._replace(
+                cost=torch.where(broken, 0.0, at.cost), gradient=torch.where(broken[:, None], torch.nan, at.gradient)
+            )
+
+        def compact(self, keep: Tensor, numbers: Sequence[int]) -> Broken:
+            return self
+
+    problem = Broken(1.5, [Stage(1.0, 0, 30, over_relaxation=FACTOR)])
+    result = minimise(problem, zeros(1, 1), DAMPED)
+    assert 0.5 < float(result.state.x) < 1.2
+
+
+def test_uphill_steps_that_are_taken_are_followed_by_plain_ones() -> None:
+    problem = Bent(1.3, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    config = replace(DAMPED, initial_damping=0.0, accept_every_step=True, cost_tolerance=1e-6)
+    result = minimise(problem, zeros(1, 1), config)
+    torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=1e-2)
+
+
+@pytest.mark.parametrize("block", [1, 3, 100])
+def test_compaction_changes_nothing(block: int) -> None:
+    points = torch.randn(8, 9, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    reference, result = (
+        minimise(
+            GeometricMedians(points, torch.arange(8), [Stage(1.0, 0, 60, over_relaxation=FACTOR)]),
+            zeros(8, 2),
+            replace(DAMPED, block_iterations=length, cost_tolerance=1e-6, step_tolerance=0.0),
+        )
+        for length in (1000, block)
+    )
+    assert len(set(reference.iterations.tolist())) > 1
+    assert torch.equal(result.iterations, reference.iterations)
+    torch.testing.assert_close(result.state.x, reference.state.x, rtol=0, atol=1e-13)
+
+
+def test_rounds_of_the_rival_take_plain_steps() -> None:
+    assert {stage.over_relaxation for stage in method_stages(load_config("default"))} == {FACTOR}
+    assert {stage.over_relaxation for stage in method_stages(load_config("default", ["method=geometric"]))} == {1.0}
+    assert {stage.over_relaxation for stage in load_config("paper").stages} == {1.0}
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_factors_that_do_not_converge_are_refused(factor: float) -> None:
+    with pytest.raises(ConfigError, match=r"stages\[0\].over_relaxation: expected .* at least 1 .*got " + str(factor)):
+        load_config("default", [f"stages=[{{over_relaxation: {factor}}}]"])
