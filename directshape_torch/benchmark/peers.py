@@ -1,10 +1,10 @@
 """Suite `peers`: one refinement, from the same states and of the same energy, by our solver and by other libraries.
 
 The other libraries get the residuals, weights and norms of `CarEnergy`, which marches every ray at every state, the
-iterations, damping and tolerance of our own solver, and each stage begins where ours begins it. Ours runs as it is
-shipped, with rays that are followed; its row with marched rays says how much of a ratio is due to that. Costs are
-always those of the marched energy. PyPose and Theseus are wanted for this comparison alone; what is not installed is
-left out with a note.
+damping and tolerance of our own solver and, as their steps are plain, twice its iterations; each stage begins where
+ours begins it. Ours runs as it is shipped, with rays that are followed; its row with marched rays says how much of a
+ratio is due to that. Costs are always those of the marched energy. PyPose and Theseus are wanted for this comparison
+alone; what is not installed is left out with a note.
 """
 
 from __future__ import annotations

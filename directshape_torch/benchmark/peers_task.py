@@ -21,6 +21,8 @@ from directshape_torch.solver.gauss_newton import Minimum, minimise
 
 # A cost up to this factor above ours counts as the same.
 _NEAR = 1.01
+# The other solvers take plain steps: with as many iterations as ours they would end before they are as far.
+_PLAIN_STEPS_FOR_A_LONGER_ONE = 2
 
 
 class Trace(NamedTuple):
@@ -64,7 +66,7 @@ class StageTask:
     Attributes:
         problem: B cars, the stage begun at `start`.
         start: where our own solver begins the stage.
-        max_iterations: of the stage.
+        max_iterations: that another solver may take.
         solver: damping and tolerances of the own solver.
         target_cost: (B,) where our own solver ends, by the energy with marched rays, whichever it went by.
         near_iterations: of our own solver until the costs of all cars stay near where it ends.
@@ -177,7 +179,8 @@ def stage_tasks(own: OwnSolver) -> list[StageTask]:
             # In the terms of its own iterations, which are costs of followed rays where rays are followed.
             reached = minimum.cost_history.nan_to_num(torch.inf).amin(dim=1)
             near = iterations_to(_NEAR * reached, minimum.cost_history)
-            tasks.append(StageTask(problem, state, stage.max_iterations, own.solver, cost, near))
+            allowed = stage.max_iterations * (1 if stage.over_relaxation == 1 else _PLAIN_STEPS_FOR_A_LONGER_ONE)
+            tasks.append(StageTask(problem, state, allowed, own.solver, cost, near))
             state = minimum.state
     return tasks
 

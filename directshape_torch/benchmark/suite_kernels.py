@@ -95,7 +95,7 @@ def _iteration_rows(
 
 
 def _endless(mode: str, iterations: int) -> DirectShapeRefiner:
-    """A refiner that does exactly so many iterations of the default's last stage."""
+    """A refiner that does exactly so many iterations of the default's last stage, of plain steps."""
     stage = f"stages=[{{contour_width_px: 0.5, image_level: 0, max_iterations: {iterations}}}]"
     return make_refiner("default", mode, [stage, *_ENDLESS])
 
