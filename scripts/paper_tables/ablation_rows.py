@@ -28,13 +28,35 @@ class Row:
     start: str = "main"
 
 
-_COARSE_POSE = "{contour_width_px: 2.0, image_level: 1, max_iterations: 10, unknowns: pose}"
-_FINE_POSE = "{contour_width_px: 0.5, image_level: 0, max_iterations: 12, unknowns: pose}"
+_COARSE_POSE = "{contour_width_px: 2.0, image_level: 1, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
+_FINE_POSE = "{contour_width_px: 0.5, image_level: 0, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
 _NO_PRIORS = ("priors.shape_weight=0", "priors.height_weight=0", "priors.tilt_weight=0", "priors.dimensions_weight=0")
 _SAMPLINGS = {
-    "round one only": ("sampling.mode=round_one",),
-    "uniform": ("sampling.mode=uniform",),
-    "dense": ("sampling.mode=dense",),
+    name: (f"sampling.mode={mode}", "sampling.mode_right=as_left")
+    for name, mode in {
+        "both rounds in the right image too": "adaptive",
+        "round one only": "round_one",
+        "uniform": "uniform",
+        "dense": "dense",
+    }.items()
+}
+
+
+def _steps(coarse: int, fine: int, over_relaxation: float) -> tuple[str, ...]:
+    """Iterations of the two stages at most, and how long their steps are."""
+    of_both = f"over_relaxation: {over_relaxation:g}"
+    return (
+        f"stages=[{{contour_width_px: 2.0, image_level: 1, max_iterations: {coarse}, {of_both}}}, "
+        f"{{contour_width_px: 0.5, image_level: 0, max_iterations: {fine}, {of_both}}}]",
+    )
+
+
+_STEPS = {
+    "6 and 6 plain steps": _steps(6, 6, 1.0),
+    "10 and 12 plain steps": _steps(10, 12, 1.0),
+    "10 and 12 over-relaxed steps": _steps(10, 12, 1.6),
+    "30 and 30 plain steps": _steps(30, 30, 1.0),
+    "10 and 12 plain steps, both rounds in both images": (*_steps(10, 12, 1.0), "sampling.mode_right=as_left"),
 }
 
 
@@ -102,6 +124,7 @@ ROWS: tuple[Row, ...] = (
     Row("occlusion", "order by box bottoms (the paper)", Settings(("sampling.occlusion_order=box_bottom",))),
     *(Row("sampling", name, Settings(overrides)) for name, overrides in _SAMPLINGS.items()),
     *(Row("points a car", f"{number}", _points(number)) for number in (50, 100, 200, 400, 1000, 3000)),
+    *(Row("steps", name, Settings(overrides)) for name, overrides in _STEPS.items()),
     Row("stages", "fine stage only", Settings((f"stages=[{_FINE_POSE.replace('pose', 'both')}]",))),
     *(Row("start states kept by cost", name, Settings(overrides)) for name, overrides in _SEARCHES.items()),
     *(Row("rays", name, Settings(overrides)) for name, overrides in _RAYS.items()),
@@ -123,6 +146,7 @@ ROWS: tuple[Row, ...] = (
     Row("far start", "adaptive (default)", start="mono"),
     Row("far start", "the detector's pose and its sigmas", _pose_sigmas(0.05, 0.25, 0.06, 9.0), "mono"),
     *(Row("far start", name, Settings(overrides), "mono") for name, overrides in _SAMPLINGS.items()),
+    *(Row("far start", name, Settings(overrides), "mono") for name, overrides in _STEPS.items()),
     Row("far start", "rays marched at every state", Settings(_RAYS["marched at every state"]), "mono"),
     Row("far start", "silhouette only", Settings(("photometric.weight=0",)), "mono"),
     Row("far start", "photometric only", Settings(("silhouette.weight=0",)), "mono"),
