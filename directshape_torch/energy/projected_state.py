@@ -97,7 +97,9 @@ class ProjectedView:
 
     @cached_property
     def _gradient_at_entry(self) -> Tensor:
-        """Gradient (P, 3) of the field where the rays enter, a constant; zero for those that do not."""
+        """Gradient (P, 3) of the field where the rays enter, a constant; zero for those that cannot."""
+        if self._entry.gradient is not None:
+            return self._entry.gradient
         entering = self._entry.found.nonzero()[:, 0]
         gradient = gradient_on_rays(self._shape, self.rays.select(entering), self._entry.depth[entering])
         return gradient.new_zeros(len(self._entry.found), 3).index_copy(0, entering, gradient).detach()
@@ -108,7 +110,7 @@ class ProjectedView:
         if self._frozen is not None:
             root = self._frozen.surface(rows)[1]
             return rays, root._replace(depth=polished_depth(self._shape, rays, root, self._root_iterations))
-        root = Root(*(x.index_select(0, rows) for x in self._entry))
+        root = Root(*(x.index_select(0, rows) for x in (self._entry.depth, self._entry.found)))
         if self._moving_depths:
             root = root._replace(depth=attached_depth(self._shape, rays, root.depth, root.found))
         return rays, root

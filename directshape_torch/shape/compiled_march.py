@@ -32,18 +32,18 @@ class RayRows(NamedTuple):
     def of(cls, origin_obj: Tensor, direction_obj: Tensor, object_index: Tensor) -> RayRows:
         """Of origins and directions (P, 3) and objects (P,)."""
         rays = torch.cat([origin_obj.mT, direction_obj.mT])
-        return cls(len(object_index), _in_rows(rays), _in_rows(object_index))
+        return cls(len(object_index), cls.in_rows(rays), cls.in_rows(object_index))
+
+    @staticmethod
+    def in_rows(rays: Tensor) -> Tensor:
+        """Of each of the rays (..., P) in rows (..., M, ROW), zero in the empty places."""
+        count = rays.shape[-1]
+        rows = max(2, -(-count // ROW))
+        return torch.nn.functional.pad(rays, (0, rows * ROW - count)).view(*rays.shape[:-1], rows, ROW)
 
     def packed(self, rows: Tensor) -> Tensor:
         """What rows (..., M, ROW) hold of the rays, (..., P)."""
         return rows.flatten(-2)[..., : self.num_rays]
-
-
-def _in_rows(rays: Tensor) -> Tensor:
-    """Of each ray (..., P) in rows (..., M, ROW), zero in the empty places."""
-    count = rays.shape[-1]
-    rows = max(2, -(-count // ROW))
-    return torch.nn.functional.pad(rays, (0, rows * ROW - count)).view(*rays.shape[:-1], rows, ROW)
 
 
 class SampledRays(NamedTuple):

@@ -17,9 +17,10 @@ from directshape_torch.benchmark.workloads import demo_scene, with_cars
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.compiled_march import sample_grids
+from directshape_torch.shape.compiled_probe import probe_grids
 from directshape_torch.tracking import photometric, silhouette
 
-FUNCTIONS = (sample_grids, silhouette._of_grids, photometric._of_grids)
+FUNCTIONS = (sample_grids, probe_grids, silhouette._of_grids, photometric._of_grids)
 FEW_STEPS = (
     "compile=on",
     "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 2}, "
@@ -47,7 +48,7 @@ def graphs() -> int:
 def test_other_numbers_of_cars_and_pixels_compile_nothing_anew() -> None:
     frames = demo_scene().frames
     DirectShapeRefiner(config=load_config(None, FEW_STEPS))(*with_cars(frames, 3))
-    assert [function.num_variants for function in FUNCTIONS] == [1, 1, 1]
+    assert [function.num_variants for function in FUNCTIONS] == [1] * len(FUNCTIONS)
     assert graphs() == len(FUNCTIONS)
     fewer_pixels = load_config(None, (*FEW_STEPS, "sampling.max_pixels=450"))
     for config, num_cars in ((load_config(None, FEW_STEPS), 1), (fewer_pixels, 2), (fewer_pixels, 8)):

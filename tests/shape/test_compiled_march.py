@@ -1,6 +1,8 @@
-"""Rays sampled in grids in rows, plain and compiled, against the general path."""
+"""Rays sampled in grids, and where they enter, in rows: plain and compiled, against the general path."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from torch import Tensor
 from directshape_torch.compilation.regions import compiling
 from directshape_torch.shape import raycast
 from directshape_torch.shape.compiled_march import ROW, RayRows, sample_grids
+from directshape_torch.shape.compiled_probe import Probed, probe_grids
 from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import SdfDerivatives
@@ -71,16 +74,52 @@ def assert_same(
     assert found[3].depth.isfinite().all()
 
 
+def assert_gradients(shape: GridShape, rays: ObjectRays, root: Root) -> None:
+    """Those that came with the roots are the field's own there; rays that cannot enter have none."""
+    assert root.gradient is not None
+    enters = root.found
+    expected = raycast.gradient_on_rays(shape, rays, root.depth)
+    # A face between two cells, where the gradient jumps, is as near to both sides as rounding.
+    same = torch.isclose(root.gradient, expected, rtol=1e-3, atol=1e-3).all(dim=1)
+    assert same[enters].double().mean() > 0.98
+    assert (root.gradient != 0).any(dim=1)[enters].all()
+    assert (root.gradient == 0).all(dim=1).any()
+
+
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
 @pytest.mark.parametrize("samples", [7, SAMPLES])
 def test_grids_are_cast_as_any_other_shape(
     monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, tolerance: float, samples: int
 ) -> None:
     """In rows, as where they are compiled, but plainly."""
-    monkeypatch.setattr(sample_grids, "may_be_compiled", lambda _: True)
-    monkeypatch.setattr(sample_grids, "compiled", sample_grids.plain)
+    for function in (sample_grids, probe_grids):
+        monkeypatch.setattr(function, "may_be_compiled", lambda _: True)
+        monkeypatch.setattr(function, "compiled", function.plain)
     shape, rays, bounds = scene(400, dtype)
-    assert_same(cast(shape, rays, bounds, samples), cast(AnyShape(shape), rays, bounds, samples), tolerance)
+    found = cast(shape, rays, bounds, samples)
+    assert_same(found, cast(AnyShape(shape), rays, bounds, samples), tolerance)
+    assert_gradients(shape, rays, found[3])
+
+
+@pytest.mark.parametrize("last_call", [0, 3, 8])
+def test_a_search_that_is_not_compiled_to_its_end_goes_the_general_path(
+    monkeypatch: pytest.MonkeyPatch, last_call: int
+) -> None:
+    calls = 0
+
+    def some_calls(*arguments: Any) -> Probed | None:
+        nonlocal calls
+        calls += 1
+        return probe_grids.plain(*arguments) if calls <= last_call else None
+
+    monkeypatch.setattr(probe_grids, "may_be_compiled", lambda _: True)
+    monkeypatch.setattr(probe_grids, "compiled", some_calls)
+    shape, rays, bounds = scene(60, torch.float64)
+    *_, root = cast(shape, rays, bounds)
+    *_, expected = cast(AnyShape(shape), rays, bounds)
+    assert calls == last_call + 1
+    assert root.gradient is None
+    torch.testing.assert_close(root.depth[root.found], expected.depth[root.found], rtol=0, atol=1e-12)
 
 
 def test_parts_of_the_rays_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +171,8 @@ def test_compiled_rays_are_the_plain_ones_for_any_number_of_them() -> None:
         with compiling("on", 3):
             compiled = cast(shape, rays, bounds)
         assert_same(compiled, cast(shape, rays, bounds), 1e-4)
-    assert sample_grids.num_variants == 1
+        assert_gradients(shape, rays, compiled[3])
+    assert sample_grids.num_variants == probe_grids.num_variants == 1
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, 2), (1, 2), (2 * ROW, 2), (2 * ROW + 1, 3)])
