@@ -64,29 +64,32 @@ class TrackedSilhouettes:
 
         `after_wider`: an earlier stage had a wider contour, so that this one has less to move.
         """
-        pairs = zip(terms, factors, strict=True)
-        sides = [_side(term, term.view(projected), factor, after_wider) for term, factor in pairs]
-        rows = [side.rows for side in sides]
-        rays = [r.rays for r in rows]
-        joined = SilhouetteRows(
-            rays=BlockRays(
-                torch.cat([r.owner for r in rays]),
-                torch.cat([r.centre_cam for r in rays]),
-                torch.cat([r.ray_cam for r in rays], dim=1),
-            ),
-            zeta=torch.cat([r.zeta for r in rows]),
-            foreground=torch.cat([r.foreground for r in rows]),
-            filled=torch.cat([r.filled for r in rows]),
-            bounds_obj=rows[0].bounds_obj,
-            saturation=rows[0].saturation,
-            residual_floor=rows[0].residual_floor,
+        views = [term.view(projected) for term in terms]
+        weights = [_weight(term, factor) for term, factor in zip(terms, factors, strict=True)]
+        count = len(weights[0])
+        seen = _Seen.of(terms, views, count)
+        in_play = seen.in_play(after_wider)
+        chosen = in_play.nonzero()[:, 0]
+        # Sides are packed as if each showed objects of its own.
+        packed = PackedBlocks.of_sorted(seen.object_of_side.index_select(0, chosen), count * len(terms))
+        blocks, places = packed.blocks.of_sides(len(terms)), chosen[packed.rows]
+        config, bounds_obj = terms[0].config, views[0].bounds_obj
+        rows = SilhouetteRows(
+            rays=BlockRays.of_places(blocks.owner, seen.centre_cam, seen.ray_cam, places),
+            zeta=seen.zeta[places[:, :1]],
+            foreground=seen.foreground[places],
+            filled=packed.filled,
+            bounds_obj=bounds_obj,
+            saturation=config.saturation,
+            residual_floor=config.residual_floor,
         )
+        anchor = seen.closest_points(chosen, bounds_obj)[packed.rows]
         return cls(
-            blocks=Blocks.join([side.blocks for side in sides]),
-            rows=joined,
-            weight=torch.cat([side.weight for side in sides]),
-            constant=torch.stack([side.constant for side in sides]).sum(dim=0),
-            anchor_obj=torch.cat([side.anchor_obj for side in sides], dim=1),
+            blocks=blocks,
+            rows=rows,
+            weight=torch.cat(weights)[packed.blocks.owner],
+            constant=_cost_at_rest(terms, views, weights, in_play),
+            anchor_obj=anchor.movedim(-1, 0).contiguous(),
         )
 
     def linearise(self, field: BlockField, T_obj_cam: Tensor) -> BlockParts:
@@ -137,42 +140,68 @@ class TrackedSilhouettes:
         return BlockParts(sums.cost, sums.products)
 
 
-class _Side(NamedTuple):
-    """One image's part of `TrackedSilhouettes`."""
+class _Seen(NamedTuple):
+    """The P rays of all sides, those of one after the other's, at the state where a stage begins."""
 
-    blocks: Blocks
-    rows: SilhouetteRows
-    weight: Tensor
-    constant: Tensor
-    anchor_obj: Tensor
+    object_of_side: Tensor  # (P,) objects, numbered on from side to side
+    closest_sdf: Tensor  # (P,) metres
+    closest_depth: Tensor  # (P,) metres
+    crosses: Tensor  # (P,) bool
+    zeta: Tensor  # (P,) per metre
+    foreground: Tensor  # (P,)
+    origin_obj: Tensor  # (P, 3)
+    direction_obj: Tensor  # (P, 3)
+    centre_cam: Tensor  # (P, 3)
+    ray_cam: Tensor  # (P, 3)
+
+    @classmethod
+    def of(cls, terms: Sequence[SilhouetteTerm], views: Sequence[ProjectedView], num_objects: int) -> _Seen:
+        of_sides = [
+            (
+                term.pixels.object_index + side * num_objects,
+                view.closest_sdf,
+                view.closest_depth,
+                view.march.crosses_bounds,
+                term.zeta,
+                term.foreground,
+                view.rays.origin_obj,
+                view.rays.direction_obj,
+                term.pixels.origin_cam,
+                term.pixels.ray_cam,
+            )
+            for side, (term, view) in enumerate(zip(terms, views, strict=True))
+        ]
+        return cls(*(torch.cat(parts) for parts in zip(*of_sides, strict=True)))
+
+    def in_play(self, after_wider: bool) -> Tensor:
+        """Which rays (P,) are near a contour, or may come to be."""
+        margin = _IN_PLAY_MARGIN_M * self.zeta
+        if after_wider:
+            margin = margin.clamp_max(_MARGIN_EXPONENT_AFTER_WIDER)
+        return (self.closest_sdf.abs() * self.zeta < IN_PLAY_EXPONENT + margin) | ~self.crosses
+
+    def closest_points(self, chosen: Tensor, bounds_obj: Tensor) -> Tensor:
+        """Where some of the rays (R,) are closest, (R, 3) in the frames of their objects."""
+        of_rays = (self.origin_obj, self.direction_obj, self.closest_depth, self.crosses)
+        origin, direction, depth, crosses = (x.index_select(0, chosen) for x in of_rays)
+        # A ray that misses the bounds has no closest point yet; should it come in, it will come by the middle.
+        middle = bounds_obj.mean(dim=0)
+        by_the_middle = ((middle - origin) * direction).sum(-1) / (direction * direction).sum(-1)
+        return torch.addcmul(origin, torch.where(crosses, depth, by_the_middle)[:, None], direction)
 
 
-def _side(term: SilhouetteTerm, view: ProjectedView, factor: Tensor | None, after_wider: bool) -> _Side:
-    """The rays of one term that are near its contours."""
-    crosses = view.march.crosses_bounds
-    margin = _IN_PLAY_MARGIN_M * term.zeta
-    if after_wider:
-        margin = margin.clamp_max(_MARGIN_EXPONENT_AFTER_WIDER)
-    in_play = (view.closest_sdf.abs() * term.zeta < IN_PLAY_EXPONENT + margin) | ~crosses
-    weight = term.weight() if factor is None else term.weight() * factor.to(torch.float64)
-    at_rest = torch.where(in_play, torch.zeros_like(term.zeta), term.residual_at(view))
-    chosen = in_play.nonzero()[:, 0]
-    pixels = term.pixels.select(chosen)
-    packed = PackedBlocks.of_sorted(pixels.object_index, len(weight))
-    rows = SilhouetteRows(
-        rays=BlockRays.of_pixels(pixels, packed),
-        zeta=term.zeta[chosen][packed.rows[:, :1]],
-        foreground=term.foreground[chosen][packed.rows],
-        filled=packed.filled,
-        bounds_obj=view.bounds_obj,
-        saturation=term.config.saturation,
-        residual_floor=term.config.residual_floor,
-    )
-    # A ray that misses the bounds has no closest point yet; should it come in, it will come by the middle.
-    middle = view.bounds_obj.mean(dim=0)
-    direction = view.rays.direction_obj
-    by_the_middle = ((middle - view.rays.origin_obj) * direction).sum(-1) / (direction * direction).sum(-1)
-    points = view.rays.at(torch.where(crosses, view.closest_depth, by_the_middle))
-    anchor = points[chosen][packed.rows].movedim(-1, 0).contiguous()
-    constant = term.segments.sum(at_rest) * weight
-    return _Side(packed.blocks, rows, weight[packed.blocks.owner], constant, anchor)
+def _weight(term: SilhouetteTerm, factor: Tensor | None) -> Tensor:
+    """Of the term for each object (B,), float64."""
+    return term.weight() if factor is None else term.weight() * factor.to(torch.float64)
+
+
+def _cost_at_rest(
+    terms: Sequence[SilhouetteTerm], views: Sequence[ProjectedView], weights: Sequence[Tensor], in_play: Tensor
+) -> Tensor:
+    """Cost (B,) of the rays of all sides that are not in play (P,)."""
+    sides = zip(terms, views, weights, in_play.split_with_sizes([len(term.pixels) for term in terms]), strict=True)
+    costs = [
+        term.segments.sum(torch.where(moving, torch.zeros_like(term.zeta), term.residual_at(view))) * weight
+        for term, view, weight, moving in sides
+    ]
+    return torch.stack(costs).sum(dim=0)

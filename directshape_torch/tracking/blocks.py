@@ -50,6 +50,17 @@ class Blocks(NamedTuple):
         counts = tuple(map(sum, zip(*(part.counts for part in parts), strict=True)))
         return cls(torch.cat([part.owner for part in parts]), counts)
 
+    def of_sides(self, num_sides: int) -> Blocks:
+        """Blocks of objects that were numbered on from image to image, as blocks of the objects themselves.
+
+        Example:
+            >>> Blocks(torch.tensor([0, 1, 1, 3]), (1, 2, 0, 1)).of_sides(2)
+            Blocks(owner=tensor([0, 1, 1, 1]), counts=(1, 3))
+        """
+        count = len(self.counts) // num_sides
+        sides = (self.counts[side * count : (side + 1) * count] for side in range(num_sides))
+        return Blocks(self.owner % max(count, 1), tuple(map(sum, zip(*sides, strict=True))))
+
     def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> tuple[Blocks, Tensor]:
         """The blocks of the objects where `keep` (B,) holds, renumbered, and which (R,) of the blocks they are.
 

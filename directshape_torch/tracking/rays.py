@@ -22,8 +22,12 @@ class BlockRays(NamedTuple):
     @classmethod
     def of_pixels(cls, pixels: PixelSamples, packed: PackedBlocks) -> BlockRays:
         """The rays of pixels that were packed so."""
-        ray = pixels.ray_cam[packed.rows].movedim(-1, 0).contiguous()
-        return cls(packed.blocks.owner, pixels.origin_cam[packed.rows[:, 0]], ray)
+        return cls.of_places(packed.blocks.owner, pixels.origin_cam, pixels.ray_cam, packed.rows)
+
+    @classmethod
+    def of_places(cls, owner: Tensor, centre_cam: Tensor, ray_cam: Tensor, rows: Tensor) -> BlockRays:
+        """Of blocks of objects (M,) that hold rows (M, 64) of camera centres and rays (P, 3)."""
+        return cls(owner, centre_cam[rows[:, 0]], ray_cam[rows].movedim(-1, 0).contiguous())
 
     def select(self, blocks: Tensor, owner: Tensor) -> BlockRays:
         """Some of the blocks, of objects that are numbered anew."""
