@@ -91,16 +91,18 @@ def _helper(request: CompileRequest) -> Iterator[tuple[subprocess.Popen[bytes], 
 def _send(process: subprocess.Popen[bytes], request: CompileRequest) -> None:
     """The request; the pipe stays open, for at its end the helper ends.
 
-    A helper that has ended before it could read says why when it is awaited, and that is what the user needs to know.
+    A helper that has ended before it could read says why when it is awaited, which is more than the pipe knows.
     """
     assert process.stdin is not None
     try:
         process.stdin.write(pickle.dumps(request))
         process.stdin.flush()
-    except OSError:
+    except OSError as error:
         # What is left in the buffer cannot be written either.
         with suppress(OSError):
             process.stdin.close()
+        _logger.info("a process that compiles has not read what to compile (%s)", error)
+        _end(process)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -97,7 +97,7 @@ class ProjectedView:
 
     @cached_property
     def _gradient_at_entry(self) -> Tensor:
-        """Gradient (P, 3) of the field where the rays enter, a constant; zero for those that cannot."""
+        """Gradient (P, 3) of the field where the rays enter, a constant; zero for those that do not."""
         if self._entry.gradient is not None:
             return self._entry.gradient
         entering = self._entry.found.nonzero()[:, 0]

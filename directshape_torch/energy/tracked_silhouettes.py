@@ -201,7 +201,7 @@ def _cost_at_rest(
     """Cost (B,) of the rays of all sides that are not in play (P,)."""
     sides = zip(terms, views, weights, in_play.split_with_sizes([len(term.pixels) for term in terms]), strict=True)
     costs = [
-        term.segments.sum(torch.where(moving, torch.zeros_like(term.zeta), term.residual_at(view))) * weight
-        for term, view, weight, moving in sides
+        term.segments.sum(torch.where(of_side, torch.zeros_like(term.zeta), term.residual_at(view))) * weight
+        for term, view, weight, of_side in sides
     ]
     return torch.stack(costs).sum(dim=0)

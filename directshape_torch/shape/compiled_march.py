@@ -35,11 +35,11 @@ class RayRows(NamedTuple):
         return cls(len(object_index), cls.in_rows(rays), cls.in_rows(object_index))
 
     @staticmethod
-    def in_rows(rays: Tensor) -> Tensor:
-        """Of each of the rays (..., P) in rows (..., M, ROW), zero in the empty places."""
-        count = rays.shape[-1]
+    def in_rows(values: Tensor) -> Tensor:
+        """What belongs to P rays (..., P) in rows (..., M, ROW), zero in the empty places."""
+        count = values.shape[-1]
         rows = max(2, -(-count // ROW))
-        return torch.nn.functional.pad(rays, (0, rows * ROW - count)).view(*rays.shape[:-1], rows, ROW)
+        return torch.nn.functional.pad(values, (0, rows * ROW - count)).view(*values.shape[:-1], rows, ROW)
 
     def packed(self, rows: Tensor) -> Tensor:
         """What rows (..., M, ROW) hold of the rays, (..., P)."""

@@ -17,15 +17,11 @@ from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.grid_lookup import derivatives_at
 
 
-class Entry(NamedTuple):
-    """Where P rays enter."""
+def compiled_entry(field: GridField, rows: RayRows, bracket: Bracket, num_probes: int) -> tuple[Tensor, Tensor] | None:
+    """Where P rays enter grids: best depth (P,) of their bracket after so many probes, and the gradient (P, 3) there.
 
-    depth: Tensor  # (P,) metres
-    gradient: Tensor | None  # (P, 3) of the signed distance there, where it is known
-
-
-def compiled_entry(field: GridField, rows: RayRows, bracket: Bracket, num_probes: int) -> Entry | None:
-    """The best of a bracket of P rays in grids after so many probes; None where nothing is compiled."""
+    None where nothing is compiled.
+    """
     parts = rows.in_rows(torch.stack([part for part in bracket if part.is_floating_point()]))
     for _ in range(num_probes):
         probed = probe_grids.compiled(*field, rows.rays_obj, rows.object_index, parts)
@@ -35,7 +31,7 @@ def compiled_entry(field: GridField, rows: RayRows, bracket: Bracket, num_probes
     best = _bracket(parts).best
     # What would be probed next is the best itself, for its gradient.
     at_best = probe_grids.compiled(*field, rows.rays_obj, rows.object_index, torch.cat([best[None], parts[1:]]))
-    return None if at_best is None else Entry(rows.packed(best), rows.packed(at_best.gradient).mT)
+    return None if at_best is None else (rows.packed(best), rows.packed(at_best.gradient).mT)
 
 
 class Probed(NamedTuple):
@@ -65,5 +61,6 @@ def probe_grids(
 
 
 def _bracket(parts: Tensor) -> Bracket:
+    # The one part that is no number follows from another.
     depth, latest, latest_sdf, *others = parts
     return Bracket(depth, latest, latest_sdf, latest_sdf < 0, *others)

@@ -16,7 +16,7 @@ from torch import Tensor
 from directshape_torch.gradient_mode import as_constant, nothing_is_differentiated
 from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.compiled_march import RayRows, interval, neighbours, sample_grids, vertex_offset
-from directshape_torch.shape.compiled_probe import Entry, compiled_entry, probe_grids
+from directshape_torch.shape.compiled_probe import compiled_entry, probe_grids
 from directshape_torch.shape.grid_lookup import value_at
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import BoundShape
@@ -60,8 +60,8 @@ class Root(NamedTuple):
 
     depth: Tensor  # (P,) metres
     found: Tensor  # (P,) bool
-    # Where it came with the search, of rays that may enter; zero elsewhere:
-    gradient: Tensor | None = None  # (P, 3) of the signed distance there
+    # Where it came with the search:
+    gradient: Tensor | None = None  # (P, 3) of the signed distance there, zero for rays that do not enter
 
 
 @as_constant
@@ -170,13 +170,13 @@ def first_crossing(
     entering = (marched.crosses_bounds & ((marched.sdf < 0).any(dim=1) | (closest_sdf < 0))).nonzero()[:, 0]
     samples = marched.depths[entering], marched.sdf[entering]
     bracket, usable = _first_bracket(*samples, closest_depth[entering], closest_sdf[entering])
-    entry = _entry(shape, rays.select(entering), bracket, num_iterations)
+    root, gradient = _entry(shape, rays.select(entering), bracket, num_iterations)
     found = torch.zeros_like(marched.crosses_bounds).index_copy(0, entering, usable)
-    depth = closest_depth.index_copy(0, entering, entry.depth)
-    if entry.gradient is None:
+    depth = closest_depth.index_copy(0, entering, root)
+    if gradient is None:
         return Root(depth, found)
-    nothing = entry.gradient.new_zeros(len(depth), 3)
-    return Root(depth, found, nothing.index_copy(0, entering, entry.gradient))
+    gradient = torch.where(usable[:, None], gradient, 0.0)
+    return Root(depth, found, gradient.new_zeros(len(depth), 3).index_copy(0, entering, gradient))
 
 
 def _first_bracket(
@@ -202,13 +202,13 @@ def _first_bracket(
     return Bracket.between(before, before_sdf, behind, behind_sdf), is_outside | is_closest
 
 
-def _entry(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> Entry:
-    """Where rays enter a shape; with the gradient where that costs next to nothing."""
+def _entry(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> tuple[Tensor, Tensor | None]:
+    """Depth (Q,) at which rays enter a shape, and the gradient (Q, 3) there where it costs next to nothing."""
     if type(shape) is GridShape and probe_grids.may_be_compiled(rays.origin_obj):
         entry = compiled_entry(shape.field, RayRows.of(*_fields(rays)), bracket, num_iterations)
         if entry is not None:
             return entry
-    return Entry(_false_position(shape, rays, bracket, num_iterations), None)
+    return _false_position(shape, rays, bracket, num_iterations), None
 
 
 def _false_position(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> Tensor:

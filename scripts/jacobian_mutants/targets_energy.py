@@ -61,6 +61,7 @@ TARGETS: dict[str, Target] = {
         "directshape_torch/tracking/blocks.py",
         (
             "Blocks.join",
+            "Blocks.of_sides",
             "Blocks.of_objects",
             "WeightedBlocks.of",
             "WeightedBlocks.sums",
@@ -74,6 +75,7 @@ TARGETS: dict[str, Target] = {
         "directshape_torch/tracking/rays.py",
         (
             "BlockRays.of_pixels",
+            "BlockRays.of_places",
             "BlockRays.select",
             "BlockRays.of_blocks",
             "BlockRays.in_objects",
@@ -140,7 +142,11 @@ TARGETS: dict[str, Target] = {
             "TrackedSilhouettes.follow",
             "TrackedSilhouettes.of_objects",
             "TrackedSilhouettes._noted",
-            "_side",
+            "_Seen.of",
+            "_Seen.in_play",
+            "_Seen.closest_points",
+            "_weight",
+            "_cost_at_rest",
         ),
         (
             f"{_TRACKED}::test_sums_of_the_silhouettes_ray_by_ray",

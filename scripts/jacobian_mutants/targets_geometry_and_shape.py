@@ -90,6 +90,11 @@ TARGETS: dict[str, Target] = {
         ("ObjectRays.at", "attached_depth", "_newton_step"),
         ("tests/shape/test_raycast.py", "tests/residuals/test_photometric.py"),
     ),
+    "compiled_probe": Target(
+        "directshape_torch/shape/compiled_probe.py",
+        ("compiled_entry", "probe_grids", "_bracket"),
+        ("tests/shape/test_compiled_march.py",),
+    ),
     "bracket": Target(
         "directshape_torch/shape/bracket.py",
         ("Bracket.between", "Bracket.probed", "_line_zero"),

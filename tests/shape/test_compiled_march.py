@@ -74,16 +74,23 @@ def assert_same(
     assert found[3].depth.isfinite().all()
 
 
-def assert_gradients(shape: GridShape, rays: ObjectRays, root: Root) -> None:
-    """Those that came with the roots are the field's own there; rays that cannot enter have none."""
+def assert_gradients(shape: GridShape, rays: ObjectRays, root: Root, exactly: bool) -> None:
+    """Those that came with the roots are the field's own there; rays that do not enter have none."""
     assert root.gradient is not None
-    enters = root.found
     expected = raycast.gradient_on_rays(shape, rays, root.depth)
+    assert (root.gradient[~root.found] == 0).all()
+    if exactly:
+        assert torch.equal(root.gradient[root.found], expected[root.found])
+        return
     # A face between two cells, where the gradient jumps, is as near to both sides as rounding.
     same = torch.isclose(root.gradient, expected, rtol=1e-3, atol=1e-3).all(dim=1)
-    assert same[enters].double().mean() > 0.98
-    assert (root.gradient != 0).any(dim=1)[enters].all()
-    assert (root.gradient == 0).all(dim=1).any()
+    assert same[root.found].double().mean() > 0.98
+
+
+def in_rows_but_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
+    for function in (sample_grids, probe_grids):
+        monkeypatch.setattr(function, "may_be_compiled", lambda _: True)
+        monkeypatch.setattr(function, "compiled", function.plain)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
@@ -92,13 +99,24 @@ def test_grids_are_cast_as_any_other_shape(
     monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype, tolerance: float, samples: int
 ) -> None:
     """In rows, as where they are compiled, but plainly."""
-    for function in (sample_grids, probe_grids):
-        monkeypatch.setattr(function, "may_be_compiled", lambda _: True)
-        monkeypatch.setattr(function, "compiled", function.plain)
+    in_rows_but_plainly(monkeypatch)
     shape, rays, bounds = scene(400, dtype)
     found = cast(shape, rays, bounds, samples)
     assert_same(found, cast(AnyShape(shape), rays, bounds, samples), tolerance)
-    assert_gradients(shape, rays, found[3])
+    assert_gradients(shape, rays, found[3], exactly=True)
+
+
+def test_a_ray_that_is_inside_from_the_start_enters_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_rows_but_plainly(monkeypatch)
+    shape, rays, bounds = scene(60, torch.float64)
+    marched, closest, sdf, before = cast(shape, rays, bounds)
+    ray = int(before.found.nonzero()[0])
+    inside, depth = marched.sdf.clone(), closest.clone()
+    inside[ray], depth[ray] = -0.5, marched.depths[ray, 1]
+    sdf[ray] = -0.6
+    root = raycast.first_crossing(shape, rays, marched._replace(sdf=inside), depth, closest_sdf=sdf)
+    assert not root.found[ray]
+    assert_gradients(shape, rays, root, exactly=True)
 
 
 @pytest.mark.parametrize("last_call", [0, 3, 8])
@@ -171,7 +189,7 @@ def test_compiled_rays_are_the_plain_ones_for_any_number_of_them() -> None:
         with compiling("on", 3):
             compiled = cast(shape, rays, bounds)
         assert_same(compiled, cast(shape, rays, bounds), 1e-4)
-        assert_gradients(shape, rays, compiled[3])
+        assert_gradients(shape, rays, compiled[3], exactly=False)
     assert sample_grids.num_variants == probe_grids.num_variants == 1
 
 

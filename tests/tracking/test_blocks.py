@@ -100,6 +100,16 @@ def _of_both(blocks: Blocks, parts: list[PackedBlocks], weight: Tensor) -> tuple
     return WeightedBlocks.of(blocks, weight[blocks.owner]).sums(of_each)
 
 
+@pytest.mark.parametrize("sides", [[LEFT, RIGHT], [RIGHT], [[], []], [[0, 0], [65, 0], [0, 1]]])
+def test_blocks_of_objects_numbered_on_from_side_to_side_are_those_of_the_sides_joined(sides: list[list[int]]) -> None:
+    count = len(sides[0])
+    expected = Blocks.join([PackedBlocks.of_sorted(index_of(counts), count).blocks for counts in sides])
+    everything = [number for counts in sides for number in counts]
+    found = PackedBlocks.of_sorted(index_of(everything), len(everything)).blocks.of_sides(len(sides))
+    assert torch.equal(found.owner, expected.owner)
+    assert found.counts == expected.counts
+
+
 def test_joined_blocks_add_what_their_parts_give() -> None:
     blocks, parts = _joined()
     weight = weights(4)
