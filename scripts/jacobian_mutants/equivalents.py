@@ -51,6 +51,9 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("_hidden", "nowhere", "(-nowhere)", _OF_ZERO),
     Equivalent("_hidden", "nowhere[:, :1]", "(-nowhere[:, :1])", _OF_ZERO),
     Equivalent("_hidden", "nowhere[:, :1]", "nowhere[:, 1:2]", "another column of the same zeros"),
+    Equivalent("_Seen.of", "view.closest_sdf", "(-view.closest_sdf)", "its size alone is asked for"),
+    Equivalent("compiled_entry", "parts[1:]", "(-parts[1:])", "the gradient there depends on the depth alone"),
+    Equivalent("probe_grids", "basis", "(-basis)", "its shape alone is asked for"),
     Equivalent("are_tracked", "(*sides, *photometric)", "(*photometric, *sides)", "only membership is asked"),
     Equivalent(
         "_Dimensions.rows",

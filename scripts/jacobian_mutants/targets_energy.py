@@ -150,6 +150,7 @@ TARGETS: dict[str, Target] = {
         ),
         (
             f"{_TRACKED}::test_sums_of_the_silhouettes_ray_by_ray",
+            f"{_TRACKED}::test_a_ray_that_crosses_the_bounds_begins_where_its_march_was_closest",
             f"{_TRACKED}::test_a_ray_that_misses_the_bounds_waits_by_their_middle",
             f"{_TRACKED}::test_factors_of_single_cars",
             *_FOLLOWING,

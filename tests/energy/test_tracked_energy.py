@@ -281,6 +281,23 @@ def residuals_by_definition(
     return residuals(zero), torch.func.jacfwd(residuals)(zero)
 
 
+def test_a_ray_that_crosses_the_bounds_begins_where_its_march_was_closest() -> None:
+    problem, _, state = begun_stage()
+    terms = kind_of(problem, SilhouetteTerm)
+    energy = tracked(problem, state, terms).silhouettes
+    assert energy is not None
+    points, crosses = [], []
+    for term in terms:
+        assert isinstance(term, SilhouetteTerm)
+        view = term.view(problem.project(state))
+        in_play = (term.zeta * view.closest_sdf.abs() < 8 + 0.2 * term.zeta) | ~view.march.crosses_bounds
+        points.append(view.rays.at(view.closest_depth)[in_play])
+        crosses.append(view.march.crosses_bounds[in_play])
+    begin, crossing = energy.anchor_obj.movedim(0, -1)[energy.rows.filled], torch.cat(crosses)
+    assert int(crossing.sum()) > 1000
+    torch.testing.assert_close(begin[crossing], torch.cat(points)[crossing], rtol=0, atol=1e-12)
+
+
 def test_a_ray_that_misses_the_bounds_waits_by_their_middle() -> None:
     """Should it come in, it will come by there: the point of the ray that is next to it, whatever its march says."""
     problem, _, state = begun_stage()
