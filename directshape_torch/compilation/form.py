@@ -81,7 +81,10 @@ class CompiledForm:
         return type(self._function).serialize(self._function).serialized_data
 
     def fits(self, values: Sequence[object]) -> bool:
-        """Whether it holds for these arguments: what tracing has assumed of sizes is checked."""
+        """Whether it holds for these arguments: all that tracing has assumed of the tensors that it reads is checked.
+
+        Types, dtypes, devices, sizes, memory layout and gradients; not the settings of PyTorch (`global_settings`).
+        """
         return self._function.guard_check(*values)
 
     def __call__(self, values: Sequence[object]) -> Any:

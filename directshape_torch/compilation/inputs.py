@@ -35,6 +35,16 @@ def normal(value: object) -> object:
     return detached.contiguous()
 
 
+def constants_of(values: Iterable[object]) -> list[object]:
+    """The arguments that are no tensors: what they are is part of compiled code.
+
+    Example:
+        >>> constants_of([torch.ones(2), 3, "sum"])
+        [3, 'sum']
+    """
+    return [value for value in values if not isinstance(value, Tensor)]
+
+
 def distinct(values: Iterable[object]) -> tuple[object, ...]:
     """The arguments with another object in place of a tensor that is among them already.
 

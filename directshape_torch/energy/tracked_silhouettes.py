@@ -130,7 +130,7 @@ class TrackedSilhouettes:
         blocks, kept = self.blocks.of_objects(keep, numbers)
         rows = self.rows.select(kept, blocks.owner)
         constant = self.constant.index_select(0, torch.nonzero_static(keep, size=len(numbers))[:, 0])
-        return TrackedSilhouettes(blocks, rows, self.weight[kept], constant, self.anchor_obj[:, kept])
+        return TrackedSilhouettes(blocks, rows, self.weight[kept], constant, self.anchor_obj.index_select(1, kept))
 
     def _of_blocks(self, T_obj_cam: Tensor) -> Tensor:
         return self.rows.rays.of_blocks(T_obj_cam)

@@ -74,11 +74,11 @@ class PhotometricRows(NamedTuple):
         """Some of the blocks (R,), of objects (R,) that are numbered anew."""
         return PhotometricRows(
             self.rays.select(kept, owner),
-            self.along_ray[:, :, kept],
-            self.along_baseline[:, kept],
-            self.intensity_left[:, kept],
-            self.pixel_weight[kept],
-            self.neighbour_weight[:, kept],
+            self.along_ray.index_select(2, kept),
+            self.along_baseline.index_select(1, kept),
+            self.intensity_left.index_select(1, kept),
+            self.pixel_weight.index_select(0, kept),
+            self.neighbour_weight.index_select(1, kept),
             self.right.select(kept),
         )
 
@@ -277,7 +277,8 @@ def surface_under(
     on_surface = depth - torch.where(found, at.value / slope, torch.zeros_like(slope))
     last = SdfDerivatives(at.value, at.gradient.movedim(0, -1), at.J_value_code)
     there = depth_state_jacobian(near.movedim(0, -1), last, rays.direction_obj.movedim(0, -1), settings.min_ray_cosine)
-    new = Hits(torch.where(found, near, points), torch.where(found, at.gradient, normal))
+    # In the memory order that compiled code takes them in, or they would be copied there at each evaluation.
+    new = Hits(torch.where(found, near, points).contiguous(), torch.where(found, at.gradient, normal).contiguous())
     return Surface(on_surface, found & ~there.grazing, there.J_depth_state, depth, slope, new)
 
 

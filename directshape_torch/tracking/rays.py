@@ -31,7 +31,7 @@ class BlockRays(NamedTuple):
 
     def select(self, blocks: Tensor, owner: Tensor) -> BlockRays:
         """Some of the blocks, of objects that are numbered anew."""
-        return BlockRays(owner, self.centre_cam[blocks], self.ray_cam[:, blocks])
+        return BlockRays(owner, self.centre_cam[blocks], self.ray_cam.index_select(1, blocks))
 
     def of_blocks(self, T_obj_cam: Tensor) -> Tensor:
         """Poses (M, 3, 4) of the blocks from those (B, 4, 4) of the objects."""

@@ -123,7 +123,9 @@ def _of_any(field: BlockField, rows: SilhouetteRows, T_obj_cam: Tensor, anchor_o
     depth, crosses = closest_depth(field, rows, rays, anchor_obj)
     points = rays.at(depth)
     residual, J = _residual_and_jacobian(field, rows, points, crosses)
-    return accumulate_silhouettes(rows, residual, J, torch.where(crosses, points, anchor_obj))
+    # In the memory order that compiled code takes them in, or they would be copied there at each evaluation.
+    closest = torch.where(crosses, points, anchor_obj).contiguous()
+    return accumulate_silhouettes(rows, residual, J, closest)
 
 
 def accumulate_silhouettes(rows: SilhouetteRows, residual: Tensor, J: Tensor, points_obj: Tensor) -> SilhouetteSums:

@@ -17,7 +17,7 @@ from torch._dynamo.utils import counters
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch.compilation.machine import compiler_problem
-from directshape_torch.compilation.regions import compiling
+from directshape_torch.compilation.regions import _Latest, compilable, compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 
@@ -57,6 +57,55 @@ def test_layout_parameters_keywords_and_gradient_mode_make_no_further_variant(ne
     for values in again:
         assert torch.equal(values[0], first[0])
     assert counters["stats"]["unique_graphs"] == 1
+
+
+def scaled(x: Tensor, by: float, offsets: Tensor) -> Tensor:
+    return x * by + offsets.sum()
+
+
+@needs_compiler
+def test_what_the_latest_call_took_is_taken_again_for_the_like_alone() -> None:
+    """The shortcut asks what the long way asks: constants, settings, kinds of tensors, and what may be compiled."""
+    function = compilable(sizes={"x": 0, "offsets": 0})(scaled)
+    x, none = torch.ones(4, 3), torch.zeros(5)
+    with compiling("on", 1):
+        assert function(x, 2.0, none).tolist() == [[2.0] * 3] * 4
+        assert function(x[:2], by=2.0, offsets=none).tolist() == [[2.0] * 3] * 2
+        assert function.num_variants == 1
+        assert function(x, 3.0, none).tolist() == [[3.0] * 3] * 4
+        assert function.num_variants == 2
+        assert function(x, 2.0, none).tolist() == [[2.0] * 3] * 4
+        assert function.num_variants == 2
+        assert function(torch.ones(2, 4), 2.0, none).shape == (2, 4)
+        assert function.num_variants == 3
+        before = counters["stats"]["unique_graphs"]
+        # Plain, each for a reason of its own.
+        assert function(torch.ones(1, 4), 2.0, none).shape == (1, 4)
+        assert function(torch.ones(2, 4).double(), 2.0, none).dtype == torch.float64
+        assert function(torch.ones(2, 4, requires_grad=True), 2.0, none).requires_grad
+        with torch.autocast("cpu"):
+            assert function(torch.ones(2, 4), 2.0, none).shape == (2, 4)
+    assert function(torch.ones(2, 4), 2.0, none).shape == (2, 4)
+    assert counters["stats"]["unique_graphs"] == before
+
+
+@needs_compiler
+def test_a_form_that_another_thread_takes_meanwhile_is_not_the_one_that_was_checked(monkeypatch) -> None:
+    function = compilable(sizes={"x": 0, "offsets": 0})(scaled)
+    x, none = torch.ones(4, 3), torch.zeros(5)
+    with compiling("on", 1):
+        function(x, 3.0, none)
+        other = function._latest
+        function(x, 2.0, none)
+        fits = _Latest.fits
+
+        def and_then_comes_another(latest: _Latest, values: tuple[object, ...]) -> bool:
+            found = fits(latest, values)
+            function._latest = other
+            return found
+
+        monkeypatch.setattr(_Latest, "fits", and_then_comes_another)
+        assert function(x, 2.0, none).tolist() == [[2.0] * 3] * 4
 
 
 @needs_compiler
