@@ -102,10 +102,12 @@ def _lookup(images: Tensor, frame_index: Tensor, uv: Tensor) -> Tensor:
     if num_frames > 1:
         below = torch.stack([torch.zeros_like(frame_index), frame_index * height])
         start = start + (below * per_uv[:, None])[:, None, None]
-    grid = torch.addcmul(start, uv, scale).flatten(1, 2).permute(1, 2, 0)
+    grid = torch.addcmul(start, uv, scale).permute(1, 2, 3, 0)
+    # One image for each offset, all the same memory: threads share the work by images. (Backward would make a gradient
+    # of each; nothing here has one.)
     values = torch.nn.functional.grid_sample(
-        images.reshape(1, 1, num_frames * height, width),
-        grid[None],
+        images.reshape(1, 1, num_frames * height, width).expand(len(grid), -1, -1, -1),
+        grid,
         mode="bilinear",
         padding_mode="border",
         align_corners=False,
