@@ -11,6 +11,7 @@ from torch import Tensor
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.term import ResidualRows, Term
+from directshape_torch.gradient_mode import nothing_is_differentiated
 
 
 class TermsOverStates(Protocol):
@@ -33,6 +34,10 @@ def rows_by_autograd(problem: TermsOverStates, state: CarState) -> list[tuple[Re
     """
     unknowns = 6 + state.code.shape[1]
     at_state = problem.project(state)
+    if nothing_is_differentiated():
+        # The projection may be remembered, so what it finds on demand must be found before the transform, not inside.
+        for term in problem.terms:
+            term.residuals(at_state)
 
     def values_and_rows(delta: Tensor) -> tuple[list[Tensor], list[ResidualRows]]:
         moved = retract(state, delta.expand(len(state.code), unknowns))
