@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.term import TermLinearisation, sum_of
+from directshape_torch.energy.term import sum_of
 
 
 def tangent_covariance(problem: CarProblem, state: CarState) -> Tensor:
@@ -18,12 +16,11 @@ def tangent_covariance(problem: CarProblem, state: CarState) -> Tensor:
     Silhouette pixels count with weight 1 (not the solver's 1/r), sums run over effective pixels (not means). It is
     uncalibrated: multiply by the s^2 fitted on data with ground truth.
     """
-    return covariance_of(problem.linearise_terms(state, with_fisher=True))
+    return covariance_of(sum_of([part.fisher for part in problem.linearise_terms(state, with_fisher=True)]))
 
 
-def covariance_of(linearisations: Sequence[TermLinearisation]) -> Tensor:
-    """`tangent_covariance` (B, D, D) from the linearisations of all terms, made with their Fisher information."""
-    fisher = sum_of([part.fisher for part in linearisations])
+def covariance_of(fisher: Tensor) -> Tensor:
+    """`tangent_covariance` (B, D, D) from the Fisher information (B, D, D) of all terms."""
     finite = fisher.flatten(1).isfinite().all(1)
     identity = torch.eye(fisher.shape[-1], dtype=fisher.dtype, device=fisher.device)
     factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], fisher, identity))

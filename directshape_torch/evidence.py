@@ -14,9 +14,10 @@ from directshape_torch.device_constants import constant_like
 from directshape_torch.disparity_profile import DisparityProfile
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState
+from directshape_torch.energy.end_linearisation import EndLinearisation
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.prior_terms import PriorTerm
-from directshape_torch.energy.term import Term, TermLinearisation, sum_of
+from directshape_torch.energy.term import Term, sum_of
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.shape.shape_prior import DimensionsDerivative
@@ -80,7 +81,7 @@ class Course:
         before, after: input and final state.
         detector_hwl: (B, 3) metres, of the input.
         cost_before, cost_after: (B, T) at the final stage.
-        linearisations: of the T terms at the final state.
+        at_end: the energy at the final state.
         covariance: (B, D, D) in the tangent of `retract`, uncalibrated.
         covariance_xyz_yaw: (B, 4, 4), uncalibrated.
         unsettled: (B,) bool, the iterations ran out.
@@ -92,7 +93,7 @@ class Course:
     detector_hwl: Tensor
     cost_before: Tensor
     cost_after: Tensor
-    linearisations: Sequence[TermLinearisation]
+    at_end: EndLinearisation
     covariance: Tensor
     covariance_xyz_yaw: Tensor
     unsettled: Tensor
@@ -212,7 +213,7 @@ def _costs(problem: CarProblem, course: Course) -> dict[str, Tensor]:
         "silhouette_decrease": decrease[0],
         "photometric_decrease": decrease[2],
         "relative_decrease": decrease[3],
-        "log_conflict": _conflict(course, photometric, everything[1]),
+        "log_conflict": _conflict(course.at_end, everything[1]),
     }
 
 
@@ -239,13 +240,11 @@ def _profile(profile: DisparityProfile) -> dict[str, Tensor]:
     }
 
 
-def _conflict(course: Course, photometric: list[bool], cost: Tensor) -> Tensor:
+def _conflict(at_end: EndLinearisation, cost: Tensor) -> Tensor:
     """log(1 + 100 g_p^T H^-1 g_p / 2 / cost): what photometry alone asks for at the minimum of the sum."""
-    pulls = [part.gradient for part, chosen in zip(course.linearisations, photometric, strict=True) if chosen]
-    if not pulls:
+    if at_end.photometric_gradient is None:
         return torch.zeros_like(cost)
-    hessian = sum_of([part.hessian for part in course.linearisations])
-    gain = 0.5 * _mahalanobis(sum_of(pulls), hessian).square()
+    gain = 0.5 * _mahalanobis(at_end.photometric_gradient, at_end.hessian).square()
     return torch.log1p(100 * gain / cost.clamp_min(_TINY))
 
 

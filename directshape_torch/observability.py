@@ -11,8 +11,6 @@ from torch import Tensor
 
 from directshape_torch.car_rows import kept, placed
 from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.prior_terms import PriorTerm
-from directshape_torch.energy.term import Term, TermLinearisation, sum_of
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -113,23 +111,19 @@ def direction_in_words(direction: Sequence[float]) -> str:
     return f"{', '.join(names[:-1])} and {names[-1]} trade {ratios}"
 
 
-def observability_of(
-    prior: ShapePrior, state: CarState, terms: Sequence[Term], linearisations: Sequence[TermLinearisation]
-) -> Observability:
+def observability_of(prior: ShapePrior, state: CarState, seen: Tensor | None) -> Observability:
     """Principal directions of the car's quantities under the Fisher information of the terms that are no priors.
 
     Args:
         prior: the shapes, for the dimensions.
         state: B cars.
-        terms: of the energy.
-        linearisations: of the same terms at that state, made with their Fisher information.
+        seen: (B, D, D) that information at that state; None without such a term.
     """
-    seen = [part.fisher for term, part in zip(terms, linearisations, strict=True) if not isinstance(term, PriorTerm)]
     T_cam_obj = se3.inverse(state.T_obj_cam)
     alpha = alpha_from_kitti(T_cam_obj[:, :3, 3], rotation_y_from_pose(T_cam_obj)).to(torch.float64)
-    if not seen:
+    if seen is None:
         return Observability.nothing(alpha, len(alpha))
-    sigmas, directions = _principal(sum_of(seen), quantities_jacobian(prior, state))
+    sigmas, directions = _principal(seen, quantities_jacobian(prior, state))
     return Observability(sigmas, directions, alpha)
 
 

@@ -75,23 +75,22 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     the solver gave their input back show nothing of it in a result but their costs.
     """
     end, refined = minimum.end, is_refined(minimum.status)
-    linearisations = problem.linearise_terms(end, with_fisher=True)
-    cost_before = problem.term_costs(initial)
-    cost_end = torch.stack([part.cost for part in linearisations], dim=1)
-    covariance = covariance_of(linearisations) + _rig_covariance(problem, end, cars)
+    at_end = problem.linearise_end(end)
+    cost_before, cost_end = problem.term_costs(initial), problem.term_costs(end)
+    covariance = covariance_of(at_end.fisher) + _rig_covariance(problem, end, cars)
     course = Course(
         before=initial,
         after=end,
         detector_hwl=cars.detector_hwl,
         cost_before=cost_before,
         cost_after=torch.where(refined[:, None], cost_end, cost_before),
-        linearisations=linearisations,
+        at_end=at_end,
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
         profile=disparity_profile(problem, initial, end),
     )
-    unseen = observability_of(problem.prior, end, problem.terms, linearisations)
+    unseen = observability_of(problem.prior, end, at_end.fisher_seen)
     return Outcome(
         state=minimum.state,
         status=minimum.status,

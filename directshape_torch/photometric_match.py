@@ -77,10 +77,8 @@ def matching_costs(term: PhotometricTerm, rows: Tensor, seen: SeenSurface, offse
 
 def agreement(term: PhotometricTerm, projected: ProjectedState) -> tuple[Tensor, Tensor]:
     """Mean absolute residual (B,) in grey levels of the usable pixels, and their share (B,) of the pixel set."""
-    fixed, everything = stage_pixels(term), slice(None)
-    seen = seen_surface(term, projected, everything)
-    found = match(term, everything, seen, seen.depth.new_zeros(1))
-    residual, usable = found.residual[0], found.usable[0]
+    fixed = stage_pixels(term)
+    usable, residual = term.values(projected)
     weight = fixed.neighbour_weight * usable[:, None]
     per_pixel = [(weight * residual.abs()).sum(dim=1), weight.sum(dim=1), usable.to(weight.dtype)]
     error, total, compared = fixed.segments.sum(torch.stack(per_pixel, dim=1)).unbind(dim=1)

@@ -26,13 +26,14 @@ def course_at_truth() -> tuple[CarProblem, Course]:
     """Cars that begin and end at the same place, and cost half as much at the end."""
     prior, scene = cached_street()
     problem, state = begun_problem(prior, scene.frames, scene.detections)
-    parts = problem.linearise_terms(state, with_fisher=True)
-    costs, covariance = problem.term_costs(state), covariance_of(parts)
+    with torch.no_grad():
+        at_end = problem.linearise_end(state)
+    costs, covariance = problem.term_costs(state), covariance_of(at_end.fisher)
     xyz_yaw = covariance_xyz_yaw(covariance, state.T_obj_cam)
     hwl = prior.dimensions_and_derivative(state.code).hwl
     settled = torch.tensor([False, True])
     profile = disparity_profile(problem, state, state)
-    return problem, Course(state, state, hwl, 2 * costs, costs, parts, covariance, xyz_yaw, settled, profile)
+    return problem, Course(state, state, hwl, 2 * costs, costs, at_end, covariance, xyz_yaw, settled, profile)
 
 
 def agreement(**changes: float) -> Agreement:
@@ -103,16 +104,12 @@ def test_sigmas_are_along_and_across_the_viewing_ray() -> None:
 
 def test_conflict_is_what_photometry_alone_would_gain() -> None:
     """With a unit matrix and a pull of length 0.2 at a cost of 1: log(1 + 100 * 0.02)."""
-    problem, course = course_at_truth()
-    identity, zero = torch.eye(9).double().expand(2, 9, 9), torch.zeros(2, 9, 9).double()
+    _, course = course_at_truth()
     pull = torch.zeros(2, 9).double()
     pull[:, 3] = 0.2
-    parts = [
-        part._replace(hessian=identity if term.name == "photometric" else zero, gradient=pull)
-        for term, part in zip(problem.terms, course.linearisations, strict=True)
-    ]
+    at_end = course.at_end._replace(hessian=torch.eye(9).double().expand(2, 9, 9), photometric_gradient=pull)
     cost = torch.full_like(course.cost_after, 1 / course.cost_after.shape[1])
-    found = columns(replace(course, linearisations=parts, cost_after=cost))
+    found = columns(replace(course, at_end=at_end, cost_after=cost))
     torch.testing.assert_close(found["log_conflict"], torch.full((2,), math.log(3)).double())
 
 

@@ -35,7 +35,8 @@ def seen(rotation_y: float, **priors: float) -> Observability:
     scene = street(prior, [(0.0, CAMERA_HEIGHT_M, 9.0)], [rotation_y])
     config = replace(DEFAULT, priors=replace(DEFAULT.priors, **priors))
     problem, state = begun_problem(prior, scene.frames, scene.detections, config)
-    return observability_of(prior, state, problem.terms, problem.linearise_terms(state, with_fisher=True))
+    with torch.no_grad():
+        return observability_of(prior, state, problem.linearise_end(state).fisher_seen)
 
 
 def test_from_behind_length_is_what_is_missing_and_depth_goes_with_it() -> None:
@@ -99,10 +100,12 @@ def test_broken_information_gives_nan_and_no_words() -> None:
     prior = ellipsoid_prior()
     scene = street(prior, [(-2.0, CAMERA_HEIGHT_M, 9.0), (2.0, CAMERA_HEIGHT_M, 9.0)], [0.3, 0.3])
     problem, state = begun_problem(prior, scene.frames, scene.detections)
-    parts = problem.linearise_terms(state, with_fisher=True)
-    broken = parts[0].fisher.clone()
-    broken[1] = torch.nan
-    view = observability_of(prior, state, problem.terms, [parts[0]._replace(fisher=broken), *parts[1:]])
+    with torch.no_grad():
+        seen = problem.linearise_end(state).fisher_seen
+    assert seen is not None
+    broken = seen.clone()
+    broken[1, 0, 2] = torch.nan
+    view = observability_of(prior, state, broken)
     assert view.sigmas_m[1].isnan().all()
     assert view.words()[0]
     assert not view.words()[1]
@@ -114,7 +117,7 @@ def test_no_cars_and_no_images() -> None:
     prior = ellipsoid_prior()
     scene = street(prior, [(0.0, CAMERA_HEIGHT_M, 9.0)], [0.3])
     _, state = begun_problem(prior, scene.frames, scene.detections)
-    assert observability_of(prior, state, [], []).words() == [""]
+    assert observability_of(prior, state, None).words() == [""]
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,8 @@ def test_pixels_that_are_hidden_in_the_right_image_are_lost(monkeypatch: pytest.
         return uv[..., 0] > 80
 
     monkeypatch.setattr(OcclusionCrops, "at", right_half)
+    # Another projection of the same state: this one knows what it has found.
+    projected = problem.project(CarState(*(x.clone() for x in state)))
     found, (_, share) = matching_costs(term, rows, seen, offset)[0], agreement(term, projected)
     expected = term.pixel_cost(projected).detach()
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)

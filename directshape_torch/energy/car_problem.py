@@ -10,10 +10,12 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_state import CarState, retract
+from directshape_torch.energy.end_blocks import EndBlocks
+from directshape_torch.energy.end_linearisation import EndLinearisation
 from directshape_torch.energy.method import method_stages
 from directshape_torch.energy.projected_state import ROOT_ITERATIONS, ProjectedState
 from directshape_torch.energy.stage_unknowns import moving_unknowns, step_limits, without_held
-from directshape_torch.energy.term import Term, TermLinearisation, scaled, total_of
+from directshape_torch.energy.term import Term, TermLinearisation, total_of, weighted
 from directshape_torch.energy.tracked_energy import TrackedEnergy, are_tracked
 from directshape_torch.energy.tracked_problem import TrackedProblem
 from directshape_torch.energy.unchanged import Origin
@@ -56,19 +58,22 @@ class CarProblem:
         self.unknowns = unknowns
         self._projections: list[tuple[Origin, ProjectedState]] = []
         self._costs: list[tuple[Origin, Tensor]] = []  # of the present stage
+        self._end_blocks: EndBlocks | None = None  # of the present stage
 
     def stages(self) -> list[Stage]:
         return method_stages(self.config)
 
     def begin_stage(self, stage: Stage, state: CarState) -> StageProblem[CarState]:
         self.unknowns = stage.unknowns
-        self._costs = []
+        self._costs, self._end_blocks = [], None
         projected = self.project(state)
         self.terms = [term.at_stage(stage, projected) for term in self.terms]
         # What is differentiated afterwards is `linearise_differentiably`, so its root must be found.
         if self.config.solver.rays == "marched" or self.config.backward.mode != "none":
             return self
         energy = TrackedEnergy.of_terms(self.terms, projected, self.term_weights, self._follows_a_wider(stage))
+        if self.config.solver.jacobian != "autograd":
+            self._end_blocks = EndBlocks.of(self.terms, self.term_weights, energy)
         others = [number for number, tracked in enumerate(are_tracked(self.terms)) if not tracked]
         marched = self._of_terms(others) if others else None
         return TrackedProblem(self.prior, energy, marched, self.config.solver, self.unknowns)
@@ -163,6 +168,16 @@ class CarProblem:
         projected = self.project(state)
         return self._weighted([term.linearise(projected, with_fisher) for term in self.terms])
 
+    def linearise_end(self, state: CarState) -> EndLinearisation:
+        """What `linearise_terms` says with Fisher information, where a stage has ended.
+
+        If the stage was followed, and nothing is to be differentiated, by its blocks (`EndBlocks`); else term by term.
+        """
+        blocks = self._end_blocks
+        if blocks is None or not blocks.are_of(self.terms, self.term_weights):
+            return EndLinearisation.of_parts(self.terms, self.linearise_terms(state, with_fisher=True))
+        return blocks.linearise(self.project(state))
+
     def linearise_differentiably(self, state: CarState) -> Linearisation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
         projected = self.project(state, moving_depths=True)
@@ -178,10 +193,7 @@ class CarProblem:
         return without_held(at, self.unknowns)
 
     def _weighted(self, parts: list[TermLinearisation]) -> list[TermLinearisation]:
-        if self.term_weights is None:
-            return parts
-        columns = self.term_weights.to(torch.float64).unbind(dim=1)
-        return [scaled(part, factor) for part, factor in zip(parts, columns, strict=True)]
+        return weighted(parts, self.term_weights)
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         return retract(state, step, self.config.solver.max_code)

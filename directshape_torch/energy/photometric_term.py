@@ -107,9 +107,17 @@ class PhotometricTerm:
         if not nothing_is_differentiated():
             usable, at = self._usable_and_residual(projected, attached=True)
             return self._weighted_cost(self._norm(at.residual).rho, usable)
-        usable, difference = self._compared(*self._surface(projected, self.pixel_set.pixel_index))
-        residual = patch_residual(*self._patch_inputs(difference))
+        usable, residual = self.values(projected)
         return self._weighted_cost(self._norm(residual).rho, usable)
+
+    def values(self, projected: ProjectedState) -> tuple[Tensor, Tensor]:
+        """Which pixels (Q,) of the set are usable, and the residuals (Q, N) of their neighbourhoods: constants."""
+
+        def find() -> tuple[Tensor, Tensor]:
+            usable, difference = self._compared(*self._surface(projected, self.pixel_set.pixel_index))
+            return usable, patch_residual(*self._patch_inputs(difference))
+
+        return projected.once(self, find)
 
     def _compared(self, depth: Tensor, on_surface: Tensor) -> tuple[Tensor, Tensor]:
         """Which pixels (Q,) of the set are usable, and right minus left (Q, N): values alone, without derivatives."""
@@ -173,11 +181,16 @@ class PhotometricTerm:
 
     def _linearisation(self, pixel_cost: Tensor, gradient: Tensor, hessian: Tensor) -> TermLinearisation:
         fixed, c = self.pixel_set, self.weight()
-        # The neighbourhoods of neighbouring samples overlap: a pixel counts once, with its neighbourhood's mean.
-        per_pixel = fixed.segments.counts.to(torch.float64) / self.config.huber_grey_levels**2 / self.config.weight
-        fisher = (c * per_pixel)[:, None, None] * hessian
+        fisher = (c * self.fisher_factor())[:, None, None] * hessian
         cost = fixed.segments.sum(pixel_cost) * c
         return TermLinearisation(cost, c[:, None] * gradient, c[:, None, None] * hessian, fisher)
+
+    def fisher_factor(self) -> Tensor:
+        """Fisher information over the Gauss-Newton matrix (B,), float64.
+
+        The neighbourhoods of neighbouring samples overlap: a pixel counts once, with its neighbourhood's mean.
+        """
+        return self.support() / self.config.huber_grey_levels**2 / self.config.weight
 
     def support(self) -> Tensor:
         """Pixels (B,) of the stage's pixel set, float64."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar, cast
 
 from torch import Tensor
 
@@ -27,6 +28,9 @@ from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
 
 # Superlinear from a bracket of one sample distance: 8 reach float32's and nearly float64's precision.
 ROOT_ITERATIONS = 8
+
+
+_T = TypeVar("_T")
 
 
 class SeenSurface(NamedTuple):
@@ -178,6 +182,16 @@ class ProjectedState:
         self._pixels, self._frozen = (left, right), frozen
         self._bounds_obj, self._samples = prior.bounds_obj, samples_per_ray
         self._root_iterations, self._moving_depths = root_iterations, moving_depths
+        self._known: list[tuple[object, object]] = []
+
+    def once(self, owner: object, find: Callable[[], _T]) -> _T:
+        """What `find` gives, a constant, found once for an owner that never changes: for those who ask here again."""
+        for then, known in self._known:
+            if then is owner:
+                return cast(_T, known)
+        found = find()
+        self._known.append((owner, found))
+        return found
 
     # No closure over `self` anywhere: a cycle would keep every march alive until the garbage collector comes by.
     def _view(self, pixels: PixelSamples, frozen: ProjectedView | None) -> ProjectedView:

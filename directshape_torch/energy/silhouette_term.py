@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -24,6 +25,7 @@ from directshape_torch.residuals.silhouette import (
     silhouette_residual,
 )
 from directshape_torch.residuals.state_chain import sdf_state_jacobian
+from directshape_torch.shape.raycast import ObjectRays
 from directshape_torch.shape.shape_prior import BoundShape
 from directshape_torch.solver.normal_equations import Segments
 from directshape_torch.solver.problem import Stage
@@ -107,7 +109,10 @@ class SilhouetteTerm:
         """Residuals and their hand-derived Jacobian from one pass."""
         view = self.view(projected)
         form = self._rows_product if self.config.form == "product" else self._rows_closest_approach
-        residual, J = form(projected.shape, view)
+        return self._crossing_rows(view, *form(projected.shape, view))
+
+    def _crossing_rows(self, view: ProjectedView, residual: Tensor, J: Tensor) -> tuple[ResidualRows, Tensor]:
+        """Residuals (P,) and Jacobian (P, D) with those of the rays that miss the bounds."""
         crosses = view.march.crosses_bounds
         residual = torch.where(crosses, residual, self._residual_of_a_miss())
         J = torch.where(crosses[:, None], J, torch.zeros_like(J))
@@ -143,15 +148,8 @@ class SilhouetteTerm:
             at = shape.value_and_derivatives(points, view.rays.object_index)
             residual, J_residual_sdf = self._by_sdf(at.value)
             return residual, J_residual_sdf[:, None] * sdf_state_jacobian(points, at)
-        residual, J_residual_sdf = self._by_sdf(view.closest_sdf)
-        # The projection of half of the rays is certain, and what does not depend on the state needs no lookup.
-        unclear = (J_residual_sdf != 0) | residual.isnan()
-        rows = (view.march.crosses_bounds & unclear).nonzero()[:, 0]
-        rays = view.rays.select(rows)
-        points = rays.at(view.closest_depth.index_select(0, rows))
-        at = shape.value_and_derivatives(points, rays.object_index)
-        J = J_residual_sdf.index_select(0, rows)[:, None] * sdf_state_jacobian(points, at)
-        return residual, J.new_zeros(len(residual), J.shape[1]).index_copy(0, rows, J)
+        (rows,) = _closest_approach_of_sides([self], shape, [view])
+        return rows
 
     def _by_sdf(self, closest_sdf: Tensor) -> tuple[Tensor, Tensor]:
         return residual_derivative_closest_approach(closest_sdf, self.zeta, self.config.saturation, self.foreground)
@@ -174,6 +172,45 @@ class SilhouetteTerm:
             rows = rows.index_add(0, index, J)
         assert rows is not None
         return residual, rows
+
+
+def linearise_sides(terms: Sequence[SilhouetteTerm], projected: ProjectedState) -> list[TermLinearisation]:
+    """`linearise` with Fisher information of terms of one configuration, all their rays together, as constants.
+
+    For the form "closest_approach" alone.
+    """
+    views = [term.view(projected) for term in terms]
+    rows = _closest_approach_of_sides(terms, projected.shape, views)
+    return [
+        term.accumulate(*term._crossing_rows(view, *of_side), with_fisher=True)
+        for term, view, of_side in zip(terms, views, rows, strict=True)
+    ]
+
+
+def _closest_approach_of_sides(
+    terms: Sequence[SilhouetteTerm], shape: BoundShape, views: Sequence[ProjectedView]
+) -> list[tuple[Tensor, Tensor]]:
+    """Residuals (P,) and Jacobian (P, D) of each side at the closest approach that its view knows, constants."""
+
+    def of_sides(parts: Iterable[Tensor]) -> Tensor:
+        return torch.cat(list(parts))
+
+    residual, J_residual_sdf = residual_derivative_closest_approach(
+        of_sides(view.closest_sdf for view in views),
+        of_sides(term.zeta for term in terms),
+        terms[0].config.saturation,
+        of_sides(term.foreground for term in terms),
+    )
+    # The projection of half of the rays is certain, and what does not depend on the state needs no lookup.
+    unclear = (J_residual_sdf != 0) | residual.isnan()
+    rows = (of_sides(view.march.crosses_bounds for view in views) & unclear).nonzero()[:, 0]
+    rays = ObjectRays.joined([view.rays for view in views]).select(rows)
+    points = rays.at(of_sides(view.closest_depth for view in views).index_select(0, rows))
+    at = shape.value_and_derivatives(points, rays.object_index)
+    J = J_residual_sdf.index_select(0, rows)[:, None] * sdf_state_jacobian(points, at)
+    J = J.new_zeros(len(residual), J.shape[1]).index_copy(0, rows, J)
+    lengths = [len(term.zeta) for term in terms]
+    return list(zip(residual.split_with_sizes(lengths), J.split_with_sizes(lengths), strict=True))
 
 
 def silhouette_term(

@@ -83,6 +83,12 @@ def scaled(part: TermLinearisation, factor: Tensor | None) -> TermLinearisation:
     return TermLinearisation(factor * part.cost, factor[:, None] * part.gradient, *matrices)
 
 
+def weighted(parts: Sequence[TermLinearisation], weights: Tensor | None) -> list[TermLinearisation]:
+    """Parts whose cars have factors (B, T), a column for each part; None for 1."""
+    columns = [None] * len(parts) if weights is None else weights.to(torch.float64).unbind(dim=1)
+    return [scaled(part, factor) for part, factor in zip(parts, columns, strict=True)]
+
+
 def total_of(parts: Sequence[Linearisation | TermLinearisation]) -> Linearisation:
     """What the solver sees of the terms of an energy."""
     if len(parts) == 1:

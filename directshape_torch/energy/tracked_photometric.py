@@ -13,7 +13,7 @@ from directshape_torch.energy.fixed_rows import FixedRows
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.tracking.blocks import BlockParts, Blocks, PackedBlocks
-from directshape_torch.tracking.field import BlockField
+from directshape_torch.tracking.field import BlockField, block_field
 from directshape_torch.tracking.photometric import (
     Hits,
     PhotometricRows,
@@ -29,6 +29,9 @@ from directshape_torch.tracking.photometric import (
     surface_under,
 )
 from directshape_torch.tracking.rays import BlockRays
+
+# Beyond every object that is ever seen.
+_FAR_M = 1e4
 
 
 class FixedSurface(NamedTuple):
@@ -81,6 +84,13 @@ class TrackedPhotometric:
             linearise_photometric(field, self.rows, self.settings, self._of_blocks(T_obj_cam), self.hits)
         )
 
+    def at_state(self, term: PhotometricTerm, projected: ProjectedState) -> BlockParts:
+        """What the blocks of all objects of a term add at any state, with the hits of that very state."""
+        field, T_obj_cam = block_field(projected.shape), self._of_blocks(projected.state.T_obj_cam)
+        hits = _hits(term, projected, PackedBlocks.of_rows(term.pixel_set.segments))
+        sums = linearise_photometric(field, self.rows, self.settings, T_obj_cam, hits)
+        return BlockParts(sums.cost, sums.products)
+
     def fixed_depths(self, field: BlockField, T_obj_cam: Tensor) -> FixedSurface:
         """The surface at a state, with the set of its usable pixels."""
         surface = surface_under(field, self.rows, self.settings, self._of_blocks(T_obj_cam), self.hits)
@@ -112,7 +122,7 @@ class TrackedPhotometric:
     def of_objects(self, keep: Tensor, numbers: Sequence[int]) -> TrackedPhotometric:
         """Those of the objects where `keep` (B,) holds: `numbers` of them, as the host knows them."""
         blocks, kept = self.blocks.of_objects(keep, numbers)
-        rows, hits = self.rows.select(kept, blocks.owner), Hits(*(x[:, kept] for x in self.hits))
+        rows, hits = self.rows.select(kept, blocks.owner), Hits(*(x.index_select(1, kept) for x in self.hits))
         return TrackedPhotometric(blocks, rows, self.settings, self.weight[kept], hits)
 
     def _of_blocks(self, T_obj_cam: Tensor) -> Tensor:
@@ -168,6 +178,7 @@ def _hidden(term: PhotometricTerm, owner: Tensor) -> tuple[Tensor, Tensor, Tenso
 
 def _hits(term: PhotometricTerm, projected: ProjectedState, packed: PackedBlocks) -> Hits:
     rays, root = projected.left.surface(term.pixel_set.pixel_index)
-    points = rays.at(root.depth)
+    # A pixel that has no surface at this state starts where none is near.
+    points = rays.at(torch.where(root.found, root.depth, _FAR_M))
     normal = projected.left.surface_gradient(term.pixel_set.pixel_index, root)
     return Hits(*(x[packed.rows].movedim(-1, 0).contiguous() for x in (points, normal)))

@@ -6,7 +6,7 @@ linearisation; only the signed distances along the ray carry derivatives.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -29,6 +29,12 @@ class ObjectRays:
     origin_obj: Tensor  # (P, 3) metres
     direction_obj: Tensor  # (P, 3) per metre of depth
     object_index: Tensor  # (P,)
+
+    @classmethod
+    def joined(cls, parts: Sequence[ObjectRays]) -> ObjectRays:
+        """Rays of the same objects, those of the parts one after the other."""
+        fields = ((part.origin_obj, part.direction_obj, part.object_index) for part in parts)
+        return cls(*(torch.cat(of_parts) for of_parts in zip(*fields, strict=True)))
 
     def at(self, depth: Tensor) -> Tensor:
         """Points (P, 3) at depths (P,)."""

@@ -33,7 +33,19 @@ _FOR_SPEED = "a threshold that only saves work: what it leaves out is below the 
 _VALUE_UNUSED = "carried along with the derivatives, and the Jacobian does not depend on it"
 _THRESHOLD = "self.zeta[:, None] * torch.exp(torch.as_tensor(_NEGLIGIBLE_LOG_WEIGHT, dtype=self.zeta.dtype))"
 
+_IN_ANOTHER_ORDER = "a sum in another order"
+
 EQUIVALENTS: tuple[Equivalent, ...] = (
+    Equivalent(
+        "EndBlocks.linearise",
+        "(self._photometric(projected), self._priors(projected), self._by_terms(projected))",
+        None,
+        _IN_ANOTHER_ORDER,
+    ),
+    Equivalent("EndLinearisation.plus", "[self.fisher_seen, other.fisher_seen]", None, _IN_ANOTHER_ORDER),
+    Equivalent(
+        "EndLinearisation.plus", "[self.photometric_gradient, other.photometric_gradient]", None, _IN_ANOTHER_ORDER
+    ),
     Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),

@@ -23,20 +23,24 @@ _FOLLOWING = tuple(
 TARGETS: dict[str, Target] = {
     "silhouette_term": Target(
         "directshape_torch/energy/silhouette_term.py",
-        tuple(
-            f"SilhouetteTerm.{name}"
-            for name in (
-                "at_stage",
-                "pixel_residual",
-                "residual_at",
-                "_rows",
-                "_rows_closest_approach",
-                "_by_sdf",
-                "_rows_product",
-                "accumulate",
-                "weight",
-                "_residual_of_a_miss",
-            )
+        (
+            "_closest_approach_of_sides",
+            *(
+                f"SilhouetteTerm.{name}"
+                for name in (
+                    "at_stage",
+                    "pixel_residual",
+                    "residual_at",
+                    "_rows",
+                    "_crossing_rows",
+                    "_rows_closest_approach",
+                    "_by_sdf",
+                    "_rows_product",
+                    "accumulate",
+                    "weight",
+                    "_residual_of_a_miss",
+                )
+            ),
         ),
         ("tests/energy/test_silhouette_sums.py", *_ROWS, "tests/energy/test_constant_sets.py"),
     ),
@@ -51,11 +55,22 @@ TARGETS: dict[str, Target] = {
                 "_depth_and_residual",
                 "_norm_and_weight",
                 "_linearisation",
+                "fisher_factor",
                 "weight",
                 "_weighted_cost",
             )
         ),
         ("tests/energy/test_photometric_sums.py", *_ROWS, "tests/energy/test_constant_sets.py"),
+    ),
+    "end_blocks": Target(
+        "directshape_torch/energy/end_blocks.py",
+        ("EndBlocks.of", "EndBlocks.linearise", "EndBlocks._photometric", "EndBlocks._priors", "EndBlocks._by_terms"),
+        ("tests/energy/test_end_linearisation.py",),
+    ),
+    "end_linearisation": Target(
+        "directshape_torch/energy/end_linearisation.py",
+        ("EndLinearisation.of_parts", "EndLinearisation.plus", "_sum"),
+        ("tests/energy/test_end_linearisation.py", "tests/energy/test_point_cloud_term.py"),
     ),
     "tracking_blocks": Target(
         "directshape_torch/tracking/blocks.py",
