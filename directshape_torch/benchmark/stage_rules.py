@@ -96,7 +96,7 @@ RULES = (
     Rule(r"outcome", r"assemble|nothing", "bookkeeping"),
     Rule(_OUTCOME, _ANY, "outcome", encloses=True),
     Rule(r"refiner|admission|result|status|backward|checks|config.*|scene", _ANY, "bookkeeping"),
-    Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms|stage_unknowns|unchanged)", _ANY, "bookkeeping"),
+    Rule(r"solver\..*|energy\.(car_.*|term|method|.*_terms|stage_unknowns|unchanged|end_.*)", _ANY, "bookkeeping"),
     Rule(r"geometry\..*|image\..*|shape\..*|tracking\.(blocks|field|rays)", _ANY, None),
     Rule(
         r"residuals\.(robust|state_chain)|compil.*|device_constants|full_precision|car_rows|.*_(lookup|mode)",
