@@ -42,12 +42,12 @@ def stage_pixels(term: PhotometricTerm) -> PixelSet:
     return term.fixed
 
 
-def seen_surface(term: PhotometricTerm, projected: ProjectedState, rows: Tensor | slice) -> SeenSurface:
+def seen_surface(term: PhotometricTerm, projected: ProjectedState, rows: Tensor) -> SeenSurface:
     """The surface of a state under some rows (R,) of the term's pixel set."""
     return projected.left.seen_surface(stage_pixels(term).pixel_index[rows], term.config.min_ray_cosine)
 
 
-def match(term: PhotometricTerm, rows: Tensor | slice, seen: SeenSurface, offsets_px: Tensor) -> Match:
+def match(term: PhotometricTerm, rows: Tensor, seen: SeenSurface, offsets_px: Tensor) -> Match:
     """Some rows (R,) of the pixel set, whose surfaces stand at the given depths, at offsets (n,)."""
     fixed, config = stage_pixels(term), term.config
     found = _residuals(term, fixed, rows, seen.depth, offsets_px)
@@ -89,7 +89,7 @@ def agreement(term: PhotometricTerm, projected: ProjectedState) -> tuple[Tensor,
 
 
 def _residuals(
-    term: PhotometricTerm, fixed: PixelSet, rows: Tensor | slice, depth: Tensor, offsets_px: Tensor
+    term: PhotometricTerm, fixed: PixelSet, rows: Tensor, depth: Tensor, offsets_px: Tensor
 ) -> DisparityResiduals:
     images, frame = fixed.images, term.cars.frame_index[fixed.object_index[rows]]
     right = (images.right, images.sizes, images.scale, frame)

@@ -7,11 +7,11 @@ is half of a warm start. Compiled ahead of its first call, a function is stored 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from directshape_torch.compilation.inputs import with_varying_sizes
+from directshape_torch.compilation.inputs import constants_of, global_settings, with_varying_sizes
 
 if TYPE_CHECKING:
     from torch._dynamo.aot_compile import AOTCompiledFunction
@@ -89,6 +89,34 @@ class CompiledForm:
 
     def __call__(self, values: Sequence[object]) -> Any:
         return self._function.fn(*values)
+
+
+class LatestForm(NamedTuple):
+    """The form that a function's latest call took: most calls are like the one before.
+
+    What a form checks of the tensors that it reads is all that their variant and their kind would say, and takes less
+    time than those.
+    """
+
+    form: CompiledForm
+    forms: Mapping[tuple[object, ...], Sequence[CompiledForm]]  # of which it is one
+    settings: tuple[object, ...]
+    constants: list[object]
+
+    @classmethod
+    def of(
+        cls,
+        form: CompiledForm,
+        forms: Mapping[tuple[object, ...], Sequence[CompiledForm]],
+        values: Sequence[object],
+    ) -> LatestForm:
+        """For a form of a function that was called with these arguments."""
+        return cls(form, forms, global_settings(), constants_of(values))
+
+    def fits(self, values: Sequence[object]) -> bool:
+        """Whether it holds for these arguments, under the present settings."""
+        same = self.constants == constants_of(values) and self.settings == global_settings()
+        return same and self.form.fits(values)
 
 
 def _of_arguments(guards: Sequence[GuardFilterEntry]) -> list[bool]:

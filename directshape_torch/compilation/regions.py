@@ -16,16 +16,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, NamedTuple, ParamSpec, TypeAlias, TypeVar
+from typing import Any, Generic, Literal, ParamSpec, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor
 
-from directshape_torch.compilation.form import CompiledForm
+from directshape_torch.compilation.form import CompiledForm, LatestForm
 from directshape_torch.compilation.inputs import (
-    constants_of,
     distinct,
-    global_settings,
     is_normal,
     is_unusual_call,
     normal,
@@ -188,24 +186,6 @@ def num_forms() -> int:
     return _process.forms
 
 
-class _Latest(NamedTuple):
-    """The form that a function's latest call took: most calls are like the one before.
-
-    What a form checks of the tensors that it reads is all that their variant and their kind would say, and takes less
-    time than those.
-    """
-
-    form: CompiledForm
-    forms: Mapping[tuple[object, ...], list[CompiledForm]]  # of which it is one
-    settings: tuple[object, ...]
-    constants: list[object]
-
-    def fits(self, values: tuple[object, ...]) -> bool:
-        """Whether it holds for these arguments, under the present settings."""
-        same = self.constants == constants_of(values) and self.settings == global_settings()
-        return same and self.form.fits(values)
-
-
 class Compilable(Generic[_P, _R]):
     """A pure function of tensors in two forms, plain and compiled; see `compilable`."""
 
@@ -215,7 +195,7 @@ class Compilable(Generic[_P, _R]):
         self._varying = varying_dimensions(function, sizes)
         # By variant. What is compiled may assume more of the sizes than we ask for; then there are several.
         self._forms: dict[tuple[object, ...], list[CompiledForm]] = {}
-        self._latest: _Latest | None = None
+        self._latest: LatestForm | None = None
         self._not_stored: set[tuple[tuple[object, ...], int]] = set()
         functools.update_wrapper(self, function)
 
@@ -261,7 +241,7 @@ class Compilable(Generic[_P, _R]):
             form = self._fitting(variant, values) or self._new_form(variant, values, region)
             if form is None:
                 return None
-            self._latest = _Latest(form, self._forms, global_settings(), constants_of(values))
+            self._latest = LatestForm.of(form, self._forms, values)
             result: _R = form(values)
             return result
 

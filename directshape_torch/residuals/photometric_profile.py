@@ -33,8 +33,8 @@ class WarpLines(NamedTuple):
     along_baseline: Tensor  # (3, 1, P) what a unit of inverse depth adds
     per_offset: Tensor  # (P,) inverse depth of a pixel of disparity
 
-    def select(self, chosen: Tensor | slice) -> WarpLines:
-        """Those of some of the pixels: rows (R,), or a slice."""
+    def select(self, chosen: Tensor) -> WarpLines:
+        """Those of some of the pixels, rows (R,)."""
         return WarpLines(*(x[..., chosen] for x in self))
 
 

@@ -16,8 +16,9 @@ from torch import Tensor
 from torch._dynamo.utils import counters
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from directshape_torch.compilation.form import LatestForm
 from directshape_torch.compilation.machine import compiler_problem
-from directshape_torch.compilation.regions import _Latest, compilable, compiling
+from directshape_torch.compilation.regions import compilable, compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 
@@ -97,14 +98,14 @@ def test_a_form_that_another_thread_takes_meanwhile_is_not_the_one_that_was_chec
         function(x, 3.0, none)
         other = function._latest
         function(x, 2.0, none)
-        fits = _Latest.fits
+        fits = LatestForm.fits
 
-        def and_then_comes_another(latest: _Latest, values: tuple[object, ...]) -> bool:
+        def and_then_comes_another(latest: LatestForm, values: tuple[object, ...]) -> bool:
             found = fits(latest, values)
             function._latest = other
             return found
 
-        monkeypatch.setattr(_Latest, "fits", and_then_comes_another)
+        monkeypatch.setattr(LatestForm, "fits", and_then_comes_another)
         assert function(x, 2.0, none).tolist() == [[2.0] * 3] * 4
 
 

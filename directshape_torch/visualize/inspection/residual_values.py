@@ -14,7 +14,7 @@ from directshape_torch.energy.car_state import CarState
 from directshape_torch.energy.photometric_term import PhotometricTerm
 from directshape_torch.energy.silhouette_term import SilhouetteTerm
 from directshape_torch.observation.occlusion import Side
-from directshape_torch.photometric_match import match, seen_surface, stage_pixels
+from directshape_torch.photometric_match import stage_pixels
 from directshape_torch.refinement_trace import RefinementTrace
 
 
@@ -59,13 +59,11 @@ def photometric_residuals(trace: RefinementTrace, car: int, number: int) -> Pixe
     projected = problem.project(_state(trace, car, number))
     for term in problem.terms:
         if isinstance(term, PhotometricTerm):
-            fixed, everything = stage_pixels(term), slice(None)
-            seen = seen_surface(term, projected, everything)
-            found = match(term, everything, seen, seen.depth.new_zeros(1))
+            fixed, (usable, residual) = stage_pixels(term), term.values(projected)
             weight = fixed.neighbour_weight
-            mean = (found.residual[0] * weight).sum(dim=1) / weight.sum(dim=1).clamp_min(1)
+            mean = (residual * weight).sum(dim=1) / weight.sum(dim=1).clamp_min(1)
             uv = term.pixels.uv[fixed.pixel_index]
-            return PixelResiduals(_array(uv), _array(mean), np.asarray(~found.usable[0].cpu()))
+            return PixelResiduals(_array(uv), _array(mean), np.asarray(~usable.cpu()))
     return _NOTHING
 
 
