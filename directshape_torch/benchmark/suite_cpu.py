@@ -16,6 +16,7 @@ from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_in
 from directshape_torch.benchmark.workloads import Scene, load_scenes
 from directshape_torch.benchmark.yardstick import Yardstick
 from directshape_torch.compilation.machine import compiler_problem
+from directshape_torch.evaluation.bootstrap import Estimate
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
@@ -76,7 +77,9 @@ def _scene_rows(scene: Scene, sides: dict[str, _Side], settings: SuiteSettings) 
         calls: dict[str, Callable[[], object]] = {name: partial(side.refine, loaded) for name, side in sides.items()}
         times.append(time_interleaved({**calls, _YARDSTICK: yardstick}, repetitions))
     cars = [len(loaded.detections) for loaded in scene.frames]
+    overlaps = {name: mean_bev_iou(scene, side.results) for name, side in sides.items()}
     rows = [row for name, side in sides.items() for row in _side_rows(scene, name, side, times, cars)]
+    rows += _overlap_rows(scene, overlaps)
     return rows + _ratio_rows(scene, times) + _yardstick_rows(f"{scene.name}, ", sides, times)
 
 
@@ -111,18 +114,28 @@ def _side_rows(scene: Scene, name: str, side: _Side, times: list[InterleavedTime
     key = side.preset, side.mode
     ms_per_frame = [1000 * frame.spread(name).median for frame in times]
     ms_per_car = [ms / count for ms, count in zip(ms_per_frame, cars, strict=True)]
-    rows = [
+    return [
         _time_row(f"{scene.name}, {name}, per car", ms_per_car, _GOALS_MS_PER_CAR.get(key)),
         _time_row(f"{scene.name}, {name}, per frame", ms_per_frame, _GOALS_MS_PER_FRAME.get(key)),
     ]
-    overlap = mean_bev_iou(scene, side.results)
-    if overlap is not None:
+
+
+def _overlap_rows(scene: Scene, overlaps: dict[str, tuple[Estimate, Estimate] | None]) -> list[Row]:
+    """How good the timed results are, and whether compiled code gives as good ones."""
+    rows: list[Row] = []
+    for name, overlap in overlaps.items():
+        if overlap is None:  # no label counts
+            continue
         before, after = overlap
         note = f"interval over cars; input {before.value:.3f}; of the results that were timed"
-        what = f"{scene.name}, {name}, bird's-eye IoU"
-        rows.append(
-            Row(_SUITE, what, after.value, "", "accuracy", after.low, after.high, len(cars), "higher", note=note)
-        )
+        what, count = f"{scene.name}, {name}, bird's-eye IoU", len(scene.frames)
+        rows.append(Row(_SUITE, what, after.value, "", "accuracy", after.low, after.high, count, "higher", note=note))
+    for preset in _PRESETS:
+        plain, compiled = overlaps.get(f"{preset} eager"), overlaps.get(f"{preset} compiled")
+        if plain is not None and compiled is not None:
+            what = f"{scene.name}, {preset} compiled over {preset} eager, bird's-eye IoU"
+            ratio = compiled[1].value / plain[1].value
+            rows.append(Row(_SUITE, what, ratio, "", "ratio", count=len(scene.frames), better="higher"))
     return rows
 
 
