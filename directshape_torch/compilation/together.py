@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 from directshape_torch.compilation import regions
+from directshape_torch.compilation.compilable import MAX_FORMS, Asked
 from directshape_torch.compilation.helpers import compiled_by_helpers, num_helpers
-from directshape_torch.compilation.regions import Asked, Region
+from directshape_torch.compilation.regions import Region
 from directshape_torch.compilation.request import CompileRequest
 from directshape_torch.compilation.store import can_keep
 
@@ -63,7 +64,7 @@ def _is_there(asked: Asked, request: CompileRequest) -> bool:
 
 
 def _is_for_helpers(asked: Asked, request: CompileRequest) -> bool:
-    return request.number < regions.MAX_FORMS and can_keep(asked[0].plain) and request.is_for_helpers()
+    return request.number < MAX_FORMS and can_keep(asked[0].plain) and request.is_for_helpers()
 
 
 def _compile_one(asked: Asked, request: CompileRequest, region: Region) -> None:

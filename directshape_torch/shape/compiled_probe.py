@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.compilation.regions import compilable
+from directshape_torch.compilation.compilable import compilable
 from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.compiled_march import RayRows
 from directshape_torch.shape.grid_cells import GridField

@@ -16,9 +16,10 @@ from torch import Tensor
 from torch._dynamo.utils import counters
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from directshape_torch.compilation.compilable import compilable
 from directshape_torch.compilation.form import LatestForm
 from directshape_torch.compilation.machine import compiler_problem
-from directshape_torch.compilation.regions import compilable, compiling
+from directshape_torch.compilation.regions import compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 

@@ -14,13 +14,12 @@ from helpers.compiled_lookup import PlainForm, nearest_inputs, nearest_values, n
 from torch import Tensor
 
 from directshape_torch.compilation import regions
+from directshape_torch.compilation.compilable import Compilable, compilable
 from directshape_torch.compilation.form import CompiledForm
 from directshape_torch.compilation.regions import (
     CARS_WORTH_COMPILING,
     CARS_WORTH_LOADING,
-    Compilable,
     cars_ahead,
-    compilable,
     compiling,
 )
 from directshape_torch.compilation.together import compiled_together
@@ -121,10 +120,11 @@ class TestFailure:
 NO_FOLDER = """
 import logging, torch
 from directshape_torch.compilation import regions
+from directshape_torch.compilation.compilable import compilable
 from directshape_torch.errors import CompilationError
 logging.basicConfig()
 regions._process.cars = {cars}
-doubled = regions.compilable(sizes={{"x": 0}})(lambda x: 2 * x)
+doubled = compilable(sizes={{"x": 0}})(lambda x: 2 * x)
 for _ in range(2):
     with regions.compiling("auto", 1):
         assert doubled(torch.ones(3)).tolist() == [2, 2, 2]

@@ -26,7 +26,8 @@ from helpers.compiled_lookup import (
 )
 from torch._inductor.runtime import cache_dir_utils
 
-from directshape_torch.compilation import helpers, regions, together
+from directshape_torch.compilation import compilable as compilable_module
+from directshape_torch.compilation import helpers, together
 from directshape_torch.compilation.form import CompiledForm
 from directshape_torch.compilation.helpers import compiled_by_helpers, num_helpers
 from directshape_torch.compilation.inputs import global_settings, varying_dimensions
@@ -281,7 +282,7 @@ class TestTogether:
 
             def __exit__(self, *_: object) -> None:
                 if helper_works:
-                    monkeypatch.setattr(regions, "load", lambda function, *_: PlainForm(function))
+                    monkeypatch.setattr(compilable_module, "load", lambda function, *_: PlainForm(function))
 
         def compile_here(_: CompileRequest, function: object) -> PlainForm:
             made.append(function)

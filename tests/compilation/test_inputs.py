@@ -11,8 +11,9 @@ import torch
 from helpers.compiled_lookup import nearest_inputs, nearest_values, trace_only
 from torch._dynamo.utils import counters
 
+from directshape_torch.compilation.compilable import compilable
 from directshape_torch.compilation.inputs import variant_of
-from directshape_torch.compilation.regions import compilable, compiling
+from directshape_torch.compilation.regions import compiling
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 

@@ -9,13 +9,13 @@ import torch
 from helpers.compiled_lookup import PlainForm, compile_nothing, needs_compiler
 from torch import Tensor
 
+from directshape_torch.compilation import compilable as compilable_module
 from directshape_torch.compilation import regions
+from directshape_torch.compilation.compilable import Compilable, compilable
 from directshape_torch.compilation.regions import (
     CARS_WORTH_COMPILING,
     CARS_WORTH_LOADING,
-    Compilable,
     cars_ahead,
-    compilable,
     compiling,
 )
 from directshape_torch.compilation.request import CompileRequest
@@ -66,7 +66,7 @@ class TestForms:
             asked.append(number)
             return EvenForm(plain, number) if number < 2 else None
 
-        monkeypatch.setattr(regions, "load", load)
+        monkeypatch.setattr(compilable_module, "load", load)
         with cars_ahead(CARS_WORTH_LOADING), compiling("auto", 1):
             for length in (3, 2, 5):
                 function(torch.ones(length), torch.ones(length))
@@ -74,7 +74,7 @@ class TestForms:
 
     def test_the_disk_is_asked_once_where_nothing_is_compiled(self, function, monkeypatch) -> None:
         asked = []
-        monkeypatch.setattr(regions, "load", lambda *arguments: asked.append(arguments))
+        monkeypatch.setattr(compilable_module, "load", lambda *arguments: asked.append(arguments))
         with cars_ahead(CARS_WORTH_COMPILING - 1), compiling("auto", 1):
             for _ in range(3):
                 function(torch.ones(2), torch.ones(2))

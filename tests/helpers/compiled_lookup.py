@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 from torch._dynamo.utils import counters
 
+from directshape_torch.compilation import compilable as compilable_module
 from directshape_torch.compilation import regions, request
+from directshape_torch.compilation.compilable import Compilable, compilable
 from directshape_torch.compilation.form import CompiledForm
 from directshape_torch.compilation.inputs import with_varying_sizes
-from directshape_torch.compilation.regions import Compilable, compilable
 from directshape_torch.compilation.request import CompileRequest
 
 SIZES = {"points": 0, "grid": 0, "car": 0}
@@ -50,7 +51,7 @@ def new_nearest() -> Nearest:
 
 def without_disk(monkeypatch: pytest.MonkeyPatch, stored: bool = False) -> None:
     """Nothing is looked up in the compiler's folder, nor kept there; or everything is there, in its plain form."""
-    monkeypatch.setattr(regions, "load", lambda function, *_: PlainForm(function) if stored else None)
+    monkeypatch.setattr(compilable_module, "load", lambda function, *_: PlainForm(function) if stored else None)
     monkeypatch.setattr(request, "store", lambda *_: None)
 
 
