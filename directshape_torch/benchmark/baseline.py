@@ -51,7 +51,11 @@ class Expected:
 
 def make_baseline(rows: Iterable[Row]) -> dict[str, Expected]:
     """What later runs are held to: the comparable rows by key."""
-    return {r.key: Expected(r.value, r.kind, r.better, _TOLERANCES[r.kind]) for r in rows if r.kind in COMPARABLE}
+    return {r.key: Expected(r.value, r.kind, r.better, _tolerance(r)) for r in rows if r.kind in COMPARABLE}
+
+
+def _tolerance(row: Row) -> float:
+    return _TOLERANCES[row.kind] if row.tolerance is None else row.tolerance
 
 
 @dataclass(frozen=True)

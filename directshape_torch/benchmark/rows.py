@@ -46,6 +46,7 @@ class Row:
         better: "lower" or "higher".
         goal: what it should be, or None.
         note: what must be known to read it.
+        tolerance: by which a baseline lets it become worse; None: as of its kind.
     """
 
     suite: str
@@ -59,6 +60,7 @@ class Row:
     better: Literal["lower", "higher"] = "lower"
     goal: Goal | None = None
     note: str = ""
+    tolerance: float | None = None
 
     @property
     def key(self) -> str:

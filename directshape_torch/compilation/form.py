@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 # arithmetic. Code that asks for the number of threads serves every setting of the user with one entry on disk. What the
 # processor says of its vector units is believed: trying each of them with the compiler takes seconds of the first start
 # and one of later ones, and a compiler that reads PyTorch's headers at all (C++20) knows them. Precompiled
-# headers would cost a first start what they save it. No result takes the place of an argument: PyTorch 2.13 lets it
-# take that of a part of a `torch.stack` too, and then gives the whole stack to another result while the first is read.
+# headers would cost a first start what they save it. No operation writes over its operand: PyTorch 2.13 lets one
+# write over a part of a `torch.stack` too, and then gives the whole stack to another while what was written is read.
 _OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
     "inplace_buffers": False,
     "assert_indirect_indexing": False,

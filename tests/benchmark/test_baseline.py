@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -51,6 +52,14 @@ def test_the_limit_by_hand(expected: Expected, passes: float, fails: float) -> N
     assert expected.allows(passes)
     assert not expected.allows(fails)
     assert not expected.allows(float("nan"))
+
+
+def test_a_row_may_be_held_more_closely_than_its_kind() -> None:
+    baseline = make_baseline([row("a", 1.0, better="higher"), replace(row("b", 1.0, better="higher"), tolerance=0.01)])
+
+    found = compared([row("a", 0.97, better="higher"), row("b", 0.97, better="higher")], baseline)
+
+    assert found.regressions == ("kernels: b: 0.97, at least 0.99 allowed (baseline 1)",)
 
 
 def test_a_better_figure_is_no_regression() -> None:

@@ -18,6 +18,7 @@ from directshape_torch.benchmark.suite_profile import run_profile
 from directshape_torch.benchmark.timing import Repetitions
 from directshape_torch.benchmark.workloads import demo_scene, first_cars
 from directshape_torch.errors import CompilationError
+from directshape_torch.evaluation.bootstrap import Estimate
 
 _ONE_ITERATION = ["stages=[{max_iterations: 1}]"]
 SMALLEST = SuiteSettings(quick=True, repetitions=Repetitions(warm_up=0, rounds=1))
@@ -46,6 +47,20 @@ def test_speed_and_accuracy_of_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert alone.kind == together.kind == "ratio"
     assert alone.value > 0
     assert together.value > 0
+
+
+def test_compiled_overlaps_are_held_to_the_plain_ones() -> None:
+    before = Estimate(0.5, 0.4, 0.6)
+    found = {"default eager": 0.8, "default compiled": 0.6, "fast eager": 0.0, "fast compiled": 0.0}
+    overlaps = {name: (before, Estimate(value, None, None)) for name, value in found.items()}
+
+    rows = suite_cpu._overlap_rows(demo_scene(), {**overlaps, "other eager": None})
+
+    ratios = [row for row in rows if row.kind == "ratio"]
+    assert [row.name for row in ratios] == ["demo, default compiled over default eager, bird's-eye IoU"]
+    assert ratios[0].value == pytest.approx(0.75)
+    assert ratios[0].tolerance == 0.015
+    assert len(rows) - len(ratios) == 4
 
 
 def test_what_compiling_costs_is_the_first_calls_less_the_second(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,31 +16,42 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from directshape_torch.benchmark.workloads import demo_scene, with_cars
-from directshape_torch.compilation.regions import Compilable
+from directshape_torch.compilation.compilable import Compilable
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
-# Two steps, so that the second one follows what the first has found.
+# Two iterations, so that the second one follows what the first has found.
 FEW_STEPS = ("compile=on", "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 2}]")
-FUNCTIONS = {"sample_grids", "probe_grids", "silhouette._of_grids", "photometric._of_grids"}
 
-# Of the typical size of an output. Rounding takes a pixel over a threshold now and then, and with it what is summed
-# over its block.
-TOLERANCE, MAY_DIFFER = 1e-3, 0.05
+# For each output the axes of its components, which are quantities of their own.
+COMPONENT_AXES: dict[str, list[tuple[int, ...]]] = {
+    "sample_grids": [(0,), (0,), (), (), ()],
+    "probe_grids": [(0,), (0,)],
+    "silhouette._of_grids": [(), (1, 2), (0,)],
+    "photometric._of_grids": [(), (1, 2), (0,), (0,)],
+}
+
+# Of the mean size of a component, and metres or whatever its unit is. Rounding takes a pixel over a threshold now and
+# then, and with it what is summed over its block; which ends of a bracket are kept is a matter of rounding for every
+# fifth ray that has converged. An error of the compiler concerns all of a component, or nearly.
+TOLERANCE, FLOOR = 1e-3, 1e-4
+MAY_DIFFER, FLAGS_MAY_DIFFER = 0.4, 0.005
 
 
-@pytest.fixture(params=[1, 2])
-def _threads(request: pytest.FixtureRequest) -> Iterator[None]:
+@pytest.fixture
+def _threads(threads: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
+    torch.set_num_threads(threads)
     yield
     torch.set_num_threads(before)
 
 
+# Where 40 cars hide each other, what hides a pixel is looked up in several words: another compilation.
 @needs_compiler
+@pytest.mark.parametrize(("threads", "num_cars"), [(1, 5), (2, 5), (2, 40)])
 @pytest.mark.usefixtures("_threads")
-def test_compiled_functions_compute_what_they_compute_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
-    shares: dict[str, list[float]] = {}
+def test_compiled_functions_compute_what_they_compute_plainly(num_cars: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong: dict[str, set[str]] = {}
     compiled_form = Compilable.compiled
 
     def compare(function: Compilable[..., Any], *args: object, **kwargs: object) -> object:
@@ -48,14 +59,12 @@ def test_compiled_functions_compute_what_they_compute_plainly(monkeypatch: pytes
         if found is not None:
             with torch.no_grad():
                 expected = function.plain(*args, **kwargs)
-            pairs = zip(tree_leaves(found), tree_leaves(expected), strict=True)
-            shares.setdefault(name_of(function), []).extend(share_that_differs(*pair) for pair in pairs)
+            wrong.setdefault(name_of(function), set()).update(differences(name_of(function), found, expected))
         return found
 
     monkeypatch.setattr(Compilable, "compiled", compare)
-    DirectShapeRefiner(config=load_config(None, FEW_STEPS))(*with_cars(demo_scene().frames, 5))
-    assert shares.keys() == FUNCTIONS
-    assert {name: max(of_outputs) for name, of_outputs in shares.items() if max(of_outputs) > MAY_DIFFER} == {}
+    DirectShapeRefiner(config=load_config(None, FEW_STEPS))(*with_cars(demo_scene().frames, num_cars))
+    assert wrong == {name: set() for name in COMPONENT_AXES}
 
 
 def name_of(function: Compilable[..., Any]) -> str:
@@ -63,12 +72,42 @@ def name_of(function: Compilable[..., Any]) -> str:
     return f"{module}.{name}" if name == "_of_grids" else name
 
 
-def share_that_differs(found: Tensor, expected: Tensor) -> float:
-    """Of the elements of an output; NaN and infinities have to be the same."""
-    assert found.shape == expected.shape
-    assert found.dtype == expected.dtype
-    found, expected = found.double(), expected.double()
-    finite = expected[expected.isfinite()]
-    atol = TOLERANCE * finite.abs().mean().item() if len(finite) else 0.0
-    same = torch.isclose(found, expected, rtol=TOLERANCE, atol=atol, equal_nan=True)
-    return 1.0 - same.double().mean().item()
+def differences(name: str, found: object, expected: object) -> Iterator[str]:
+    """The components of all outputs that are not the same."""
+    outputs = zip(COMPONENT_AXES[name], tree_leaves(found), tree_leaves(expected), strict=True)
+    for number, (axes, mine, theirs) in enumerate(outputs):
+        assert mine.shape == theirs.shape
+        assert mine.dtype == theirs.dtype
+        shares = share_that_differs(by_component(mine, axes), by_component(theirs, axes))
+        allowed = FLAGS_MAY_DIFFER if mine.dtype == torch.bool else MAY_DIFFER
+        places = (shares > allowed).nonzero()[:, 0].tolist()
+        yield from (f"output {number}, component {place}: {shares[place]:.0%} differ" for place in places)
+
+
+def by_component(output: Tensor, axes: tuple[int, ...]) -> Tensor:
+    """(components, elements of each) in double precision."""
+    count = torch.Size([output.shape[axis] for axis in axes]).numel()
+    return output.movedim(axes, tuple(range(len(axes)))).reshape(count, -1).double()
+
+
+def share_that_differs(found: Tensor, expected: Tensor) -> Tensor:
+    """Of the elements of each component; what is not finite has to be the same."""
+    finite = expected.isfinite()
+    size = torch.where(finite, expected, 0.0).abs().sum(dim=1) / finite.sum(dim=1).clamp_min(1)
+    near = (found - expected).abs() <= TOLERANCE * (size[:, None] + expected.abs()) + FLOOR
+    same = near | (found == expected) | (found.isnan() & expected.isnan())
+    return 1 - same.double().mean(dim=1)
+
+
+def test_what_is_wrong_is_seen_component_by_component() -> None:
+    products = torch.randn(75, 15, 14, generator=torch.Generator().manual_seed(0)).double()
+    products[:, :14] *= 1000
+    cost, points = torch.ones(75), torch.randn(3, 75, 64)
+    right = cost, products, points
+    assert list(differences("silhouette._of_grids", right, right)) == []
+    no_gradient, overwritten = products.clone(), points.clone()
+    no_gradient[:, 14] = 0
+    overwritten[2] = overwritten[0]
+    assert len(list(differences("silhouette._of_grids", (cost, no_gradient, points), right))) == 14
+    assert len(list(differences("silhouette._of_grids", (cost, products, overwritten), right))) == 1
+    assert len(list(differences("silhouette._of_grids", (cost * torch.nan, products, points), right))) == 1
