@@ -1,113 +1,115 @@
-"""Settings from and to YAML: files, `key=value` overrides, nested mappings."""
+"""Settings from and to YAML: files, `key=value` overrides, nested mappings. What is allowed follows `config`."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
-import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, TypeVar
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import RefinerConfig, Settings, type_hints
 from directshape_torch.errors import ConfigError
 
 BUNDLED_CONFIGS = ("default", "paper", "fast")
 """Names of the settings that come with the package, for `load_config`."""
 
 _CONFIG_FOLDER = Path(__file__).parent / "assets" / "configs"
-_ConfigT = TypeVar("_ConfigT")
+_KINDS = {float: "a number", int: "a whole number", bool: "true or false"}
+_GroupT = TypeVar("_GroupT", bound=Settings)
 
 
-def config_from_mapping(cls: type[_ConfigT], mapping: Mapping[str, Any], where: str = "") -> _ConfigT:
-    """A configuration dataclass from nested mappings; missing keys keep their defaults.
+def config_from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str = "") -> _GroupT:
+    """A group of settings from nested mappings; missing keys keep their defaults.
+
+    Args:
+        cls: such as `RefinerConfig`.
+        mapping: keys and values, as they come from YAML or JSON.
+        where: what stands before the keys in errors, such as "refiner.".
 
     Raises:
-        ConfigError: an unknown key (naming the nearest one) or a value of the wrong kind.
+        ConfigError: an unknown key (naming the nearest one), or a value of the wrong kind or out of range.
 
     Example:
         >>> config_from_mapping(RefinerConfig, {"silhouette": {"weight": 6}}).silhouette.weight
         6.0
     """
-    return _from_mapping(cls, mapping, where, _Root(cls, where))
+    return _from_mapping(cls, mapping, where, {f"{where}{path}": path.split(".")[-1] for path in _leaves(cls)})
 
 
-class _Root(NamedTuple):
-    """The whole configuration that a key is looked for in, and what stands before its keys."""
-
-    cls: type[Any]
-    where: str
-
-
-def _from_mapping(cls: type[_ConfigT], mapping: Mapping[str, Any], where: str, root: _Root) -> _ConfigT:
+def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, known: Mapping[str, str]) -> _GroupT:
+    """The group whose keys follow `where`; `known`: names of all settings by their paths."""
     if not isinstance(mapping, Mapping):
-        raise ConfigError(f"{where or 'configuration'}: expected keys and values, got {mapping!r}")
-    hints = typing.get_type_hints(cls)
+        raise ConfigError(f"{where.rstrip('.') or 'configuration'}: expected keys and values, got {mapping!r}")
+    hints = type_hints(cls)
     for key in mapping:
         if key not in hints:
-            nearest = _nearest_key(str(key), list(hints), where, root)
+            nearest = _nearest_key(str(key), {f"{where}{name}": name for name in hints}, known)
             raise ConfigError(f"unknown key {where}{key!s}; the nearest known one is {nearest}")
-    return cls(**{key: _convert(hints[key], value, f"{where}{key}", root) for key, value in mapping.items()})
+    values = {key: _convert(hints[key], value, f"{where}{key}", known) for key, value in mapping.items()}
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}{error}") from error
 
 
-def _nearest_key(key: str, known: Sequence[str], where: str, root: _Root) -> str:
+def _nearest_key(key: str, here: Mapping[str, str], known: Mapping[str, str]) -> str:
     """The nearest key of the same group, or one of another group whose own name is nearer still."""
-    here = difflib.get_close_matches(key, known, n=1, cutoff=0.0)[0]
-    paths = {f"{where}{here}": here} | {f"{root.where}{path}": path.split(".")[-1] for path in _leaves(root.cls)}
+    names = dict(here) | {path: name for path, name in known.items() if path not in here}
     # Of equally near ones the first, which is of the same group.
-    return max(paths, key=lambda path: difflib.SequenceMatcher(None, paths[path], key).ratio())
+    return max(names, key=lambda path: difflib.SequenceMatcher(None, names[path], key).ratio())
 
 
 def _leaves(cls: type[Any]) -> Iterator[str]:
-    """Dotted paths of all settings of a configuration; those of a list's entries as if there were one entry."""
-    for name, hint in typing.get_type_hints(cls).items():
-        kinds = [kind for kind in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(kind)]
-        if kinds:
-            yield from (f"{name}.{leaf}" for leaf in _leaves(typing.cast(type[Any], kinds[0])))
-        else:
-            yield name
+    """Dotted paths of all settings; those of a list's entries as if there were one entry."""
+    for name, hint in type_hints(cls).items():
+        kind = next((kind for kind in (hint, *typing.get_args(hint)) if _is_group(kind)), None)
+        yield from [name] if kind is None else (f"{name}.{leaf}" for leaf in _leaves(kind))
 
 
-def _convert(hint: Any, value: Any, where: str, root: _Root) -> Any:
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        return _from_mapping(hint, value, f"{where}.", root)
+def _is_group(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, Settings)
+
+
+def _convert(hint: Any, value: Any, where: str, known: Mapping[str, str]) -> Any:
+    """A value as its type has it; limits and words are the group's own matter."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if _is_group(hint):
+        return _from_mapping(hint, value, f"{where}.", known)
     if origin is tuple:
-        if isinstance(value, (str, Mapping)) or not isinstance(value, Sequence):
-            raise ConfigError(f"{where}: expected a list, got {value!r}")
-        kinds = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
-        if len(kinds) != len(value):
-            raise ConfigError(f"{where}: expected {len(kinds)} entries, got {value!r}")
-        return tuple(
-            _convert(kind, item, f"{where}[{i}]", root) for i, (kind, item) in enumerate(zip(kinds, value, strict=True))
-        )
+        return tuple(_convert(*entry, known) for entry in _entries(arguments, value, where))
     if origin is Literal:
-        if isinstance(value, bool) and {"on", "off"} <= set(arguments):
-            # YAML 1.1 reads the words on and off as truth values.
-            return "on" if value else "off"
-        if value not in arguments:
-            raise ConfigError(f"{where}: expected one of {', '.join(map(str, arguments))}, got {value!r}")
-        return value
+        # YAML 1.1 reads the words on and off as truth values.
+        is_switch = isinstance(value, bool) and {"on", "off"} <= set(arguments)
+        return ("off", "on")[value] if is_switch else value
     return _convert_scalar(hint, value, where)
 
 
-def _convert_scalar(hint: Any, value: Any, where: str) -> Any:
+def _entries(arguments: Sequence[Any], value: Any, where: str) -> list[tuple[Any, Any, str]]:
+    """Type, value and name of each entry of a list."""
+    if isinstance(value, (str, Mapping)) or not isinstance(value, Sequence):
+        raise ConfigError(f"{where}: expected a list, got {value!r}")
+    kinds = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
+    if len(kinds) != len(value):
+        raise ConfigError(f"{where}: expected {len(kinds)} entries, got {value!r}")
+    return [(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(kinds, value, strict=True))]
+
+
+def _convert_scalar(hint: type[Any], value: Any, where: str) -> Any:
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     if hint is float and isinstance(value, str):
         # YAML 1.1 reads 1e7 (no point) as text.
-        try:
+        with contextlib.suppress(ValueError):
             return float(value)
-        except ValueError as error:
-            raise ConfigError(f"{where}: expected a number, got {value!r}") from error
     if hint is float and is_number:
         return float(value)
     if hint is int and is_number and float(value).is_integer():
         return int(value)
-    if hint in (bool, str) and isinstance(value, hint):
+    if hint is bool and isinstance(value, bool):
         return value
-    name = hint.__name__ if isinstance(hint, (type, types.GenericAlias)) else str(hint)
-    raise ConfigError(f"{where}: expected {name}, got {value!r}")
+    raise ConfigError(f"{where}: expected {_KINDS[hint]}, got {value!r}")
 
 
 def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> RefinerConfig:
@@ -119,7 +121,7 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         overrides: for example `["silhouette.weight=6", "solver.max_code=2.5"]`.
 
     Raises:
-        ConfigError: unreadable file, unknown key, wrong kind of value.
+        ConfigError: unreadable file, unknown key, a value of the wrong kind or out of range; names file and overrides.
 
     Example:
         >>> load_config(None, ["solver.max_code=2.5"]).solver.max_code
@@ -127,39 +129,46 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         >>> load_config("paper").silhouette.form
         'product'
     """
+    mapping = {} if path is None else _read(path)
+    for override in overrides:
+        _override(mapping, override)
+    sources = ([] if path is None else [str(path)]) + [f"--set {override}" for override in overrides]
+    try:
+        return config_from_mapping(RefinerConfig, mapping)
+    except ConfigError as error:
+        raise ConfigError(f"{' '.join(sources)}: {error}") from error
+
+
+def _read(path: Path | str) -> dict[str, Any]:
     import yaml
 
-    mapping: dict[str, Any] = {}
-    if path is not None:
-        try:
-            mapping = yaml.safe_load(_config_file(path).read_text(encoding="utf-8")) or {}
-        except (OSError, yaml.YAMLError) as error:
-            names = f"bundled ones are {', '.join(BUNDLED_CONFIGS)}"
-            raise ConfigError(f"{path}: cannot be read as a YAML configuration: {error}; {names}") from error
+    file = _CONFIG_FOLDER / f"{path}.yaml" if str(path) in BUNDLED_CONFIGS else Path(path)
+    try:
+        mapping = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        names = f"bundled ones are {', '.join(BUNDLED_CONFIGS)}"
+        raise ConfigError(f"{path}: cannot be read as a YAML configuration: {error}; {names}") from error
+    if not isinstance(mapping, dict):
+        raise ConfigError(f"{path}: expected keys and values, got {mapping!r}")
+    return mapping
+
+
+def _override(mapping: dict[str, Any], override: str) -> None:
+    """Apply `key.sub=value` to nested keys."""
+    import yaml
+
+    path, equals, text = override.partition("=")
+    if not equals:
+        raise ConfigError(f"--set {override}: expected key=value")
+    *groups, key = path.strip().split(".")
+    for group in groups:
+        mapping = mapping.setdefault(group, {})
         if not isinstance(mapping, dict):
-            raise ConfigError(f"{path}: expected keys and values, got {mapping!r}")
-    for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals:
-            raise ConfigError(f"--set {override}: expected key=value")
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--set {override}: the value is not YAML") from error
-        _set_nested(mapping, key.strip().split("."), value, override)
-    return config_from_mapping(RefinerConfig, mapping)
-
-
-def _config_file(path: Path | str) -> Path:
-    return _CONFIG_FOLDER / f"{path}.yaml" if str(path) in BUNDLED_CONFIGS else Path(path)
-
-
-def _set_nested(mapping: dict[str, Any], keys: Sequence[str], value: Any, override: str) -> None:
-    for key in keys[:-1]:
-        mapping = mapping.setdefault(key, {})
-        if not isinstance(mapping, dict):
-            raise ConfigError(f"--set {override}: {key} holds no keys of its own")
-    mapping[keys[-1]] = value
+            raise ConfigError(f"--set {override}: {group} holds no keys of its own")
+    try:
+        mapping[key] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {override}: the value is not YAML") from error
 
 
 def config_to_mapping(config: Any) -> Any:

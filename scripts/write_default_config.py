@@ -1,28 +1,28 @@
-"""Writes `configs/default.yaml` from the defaults in `directshape_torch/config.py`, each key with its description.
+"""Writes `configs/default.yaml` from `directshape_torch/config.py`: each key with its description, limits and default.
 
     python scripts/write_default_config.py
 
-Run it after changing a default; a test compares the two.
+Run it after changing a setting; a test compares the two.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import re
 import textwrap
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import RefinerConfig, Settings, limits_in_words
 from directshape_torch.config_files import config_to_mapping
 
 TARGET = Path(__file__).parent.parent / "directshape_torch" / "assets" / "configs" / "default.yaml"
 HEADER = """\
 # The default settings: the best we know. They are also what the program uses without --config.
 # Written by scripts/write_default_config.py from directshape_torch/config.py; a file may hold any subset of the keys.
+# Brackets: the numbers that are allowed.
 """
 
 
@@ -35,53 +35,42 @@ def main() -> None:
 def default_yaml() -> str:
     """The content of the file."""
     config = RefinerConfig()
-    sections = [_section(field.name, getattr(config, field.name)) for field in dataclasses.fields(config)]
-    return HEADER + "".join(f"\n{section}" for section in sections)
+    return HEADER + "".join(f"\n{_section(field, getattr(config, field.name))}" for field in dataclasses.fields(config))
 
 
-def _section(name: str, part: Any) -> str:
-    if isinstance(part, str):
-        return _comment(_descriptions(RefinerConfig)[name], "") + yaml.safe_dump({name: part})
-    if not dataclasses.is_dataclass(part):
-        stages = "".join(
-            f"  - {yaml.safe_dump(config_to_mapping(s), default_flow_style=True, width=200)}" for s in part
+def _section(field: dataclasses.Field[Any], part: Any) -> str:
+    if isinstance(part, Settings):
+        return _title(part, field.name) + "".join(
+            _setting(f, getattr(part, f.name), "  ") for f in dataclasses.fields(part)
         )
-        described = _descriptions(type(part[0])).items()
-        return _comment(_first_line(type(part[0])), "") + f"{name}:\n" + _comments(dict(described)) + stages
-    descriptions = _descriptions(type(part))
-    lines = [_comment(_first_line(type(part)), "") + f"{name}:\n"]
-    for field in dataclasses.fields(part):
-        lines.append(_comment(descriptions.pop(field.name, ""), "  "))
-        value = config_to_mapping(getattr(part, field.name))
-        lines.append(
-            "  " + yaml.safe_dump({field.name: value}, default_flow_style=None if isinstance(value, list) else False)
-        )
-    return "".join(lines)
+    if isinstance(part, tuple):
+        keys = "".join(_comment(f"{f.name}: {_description(f)}", "  ") for f in dataclasses.fields(part[0]))
+        return _title(part[0], field.name) + keys + "".join(f"  - {_entry(stage)}" for stage in part)
+    return _setting(field, part, "")
 
 
-def _comments(descriptions: dict[str, str]) -> str:
-    return "".join(_comment(f"{name}: {text}", "  ") for name, text in descriptions.items())
+def _title(part: Settings, name: str) -> str:
+    return _comment((type(part).__doc__ or "").splitlines()[0], "") + f"{name}:\n"
+
+
+def _entry(stage: Settings) -> str:
+    return yaml.safe_dump(config_to_mapping(stage), default_flow_style=True, width=200, sort_keys=False)
+
+
+def _setting(field: dataclasses.Field[Any], value: Any, indent: str) -> str:
+    in_line = None if isinstance(value, tuple) else False
+    line = yaml.safe_dump({field.name: config_to_mapping(value)}, default_flow_style=in_line)
+    return _comment(_description(field), indent) + indent + line
+
+
+def _description(field: dataclasses.Field[Any]) -> str:
+    limits = limits_in_words(field.metadata["limits"])
+    return field.metadata["description"] + (f" [{limits}]" if limits else "")
 
 
 def _comment(text: str, indent: str) -> str:
     prefix = f"{indent}# "
-    return textwrap.fill(text, 118, initial_indent=prefix, subsequent_indent=prefix) + "\n" if text else ""
-
-
-def _first_line(cls: type) -> str:
-    return (cls.__doc__ or "").strip().splitlines()[0]
-
-
-def _descriptions(cls: type) -> dict[str, str]:
-    """The entries of a docstring's `Attributes:`; those for several names stand at the first."""
-    text = (cls.__doc__ or "").partition("Attributes:")[2]
-    entries = re.findall(r"^        (\w[\w, ]*): (.*(?:\n            .*)*)", text, flags=re.MULTILINE)
-    described = {}
-    for names, description in entries:
-        first, *others = re.split(r", *", names)
-        words = " ".join(description.split())
-        described[first] = f"(with {', '.join(others)}) {words}" if others else words
-    return described
+    return textwrap.fill(text, 118, initial_indent=prefix, subsequent_indent=prefix) + "\n"
 
 
 if __name__ == "__main__":

@@ -10,21 +10,16 @@ from typing import Any
 import pytest
 
 from directshape_torch.config import (
-    AcceptanceConfig,
     BackwardConfig,
-    PhotometricConfig,
-    PointCloudConfig,
-    PriorConfig,
     RefinerConfig,
-    RigConfig,
     SamplingConfig,
     SearchConfig,
+    Settings,
     SilhouetteConfig,
     SolverConfig,
     StageConfig,
 )
 from directshape_torch.config_files import config_from_mapping, config_to_mapping, load_config
-from directshape_torch.config_ranges import _RANGES
 from directshape_torch.errors import ConfigError, DirectShapeError
 
 
@@ -52,16 +47,16 @@ def test_an_unknown_key_names_the_nearest(mapping: dict[str, Any], nearest: str)
 @pytest.mark.parametrize(
     ("mapping", "text"),
     [
-        ({"silhouette": 3}, "silhouette.: expected keys and values, got 3"),
+        ({"silhouette": 3}, "silhouette: expected keys and values, got 3"),
         ({"silhouette": {"weight": "heavy"}}, "silhouette.weight: expected a number, got 'heavy'"),
-        ({"silhouette": {"weight": True}}, "silhouette.weight: expected float, got True"),
-        ({"silhouette": {"samples_per_ray": 3.5}}, "silhouette.samples_per_ray: expected int, got 3.5"),
+        ({"silhouette": {"weight": True}}, "silhouette.weight: expected a number, got True"),
+        ({"silhouette": {"samples_per_ray": 3.5}}, "silhouette.samples_per_ray: expected a whole number, got 3.5"),
         ({"silhouette": {"form": "sum"}}, "silhouette.form: expected one of closest_approach, product, got 'sum'"),
-        ({"photometric": {"truncated": 1}}, "photometric.truncated: expected bool, got 1"),
+        ({"photometric": {"truncated": 1}}, "photometric.truncated: expected true or false, got 1"),
         ({"stages": {"a": 1}}, "stages: expected a list, got {'a': 1}"),
         ({"priors": {"dimensions_sigma_m": [0.1, 0.2]}}, "priors.dimensions_sigma_m: expected 3 entries"),
         ({"search": {"yaw_offsets_deg": ["x"]}}, "search.yaw_offsets_deg[0]: expected a number"),
-        ({"silhouette": {"weight": None}}, "silhouette.weight: expected float, got None"),
+        ({"silhouette": {"weight": None}}, "silhouette.weight: expected a number, got None"),
     ],
 )
 def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) -> None:
@@ -74,25 +69,34 @@ def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) 
     ("override", "text"),
     [
         ("stages=[]", "stages: expected at least one stage"),
-        ("stages=[{contour_width_px: 0}]", "stages[0].contour_width_px: expected a number above 0, got 0.0"),
-        ("silhouette.samples_per_ray=0", "silhouette.samples_per_ray: expected a number of at least 1"),
+        ("stages=[{contour_width_px: 0}]", "stages[0].contour_width_px: expected a finite number, above 0, got 0.0"),
+        (
+            "silhouette.samples_per_ray=0",
+            "silhouette.samples_per_ray: expected a finite number, at least 1 and at most 4096, got 0",
+        ),
         ("silhouette.probability_floor=0.5", "silhouette.probability_floor: expected"),
-        ("silhouette.weight=-1", "silhouette.weight: expected a number of at least 0, got -1.0"),
-        ("photometric.huber_grey_levels=.nan", "photometric.huber_grey_levels: expected a number above 0, got nan"),
+        ("silhouette.weight=-1", "silhouette.weight: expected a finite number, at least 0, got -1.0"),
+        (
+            "photometric.huber_grey_levels=.nan",
+            "photometric.huber_grey_levels: expected a finite number, above 0, got nan",
+        ),
         (
             "photometric.contrast_floor_grey_levels=1e-30",  # nothing, squared in single precision
-            "photometric.contrast_floor_grey_levels: expected a number of at least 0.001, got 1e-30",
+            "photometric.contrast_floor_grey_levels: expected a finite number, at least 0.001, got 1e-30",
         ),
-        ("solver.max_code=.inf", "solver.max_code: expected a number above 0, got inf"),
-        ("priors.dimensions_sigma_m=[0.1, 0, 0.1]", "priors.dimensions_sigma_m: expected a number above 0"),
-        ("sampling.max_pixels=50", "sampling.max_pixels: expected at least sampling.min_pixels = 400, got 50"),
+        ("solver.max_code=.inf", "solver.max_code: expected a finite number, above 0, got inf"),
+        (
+            "priors.dimensions_sigma_m=[0.1, 0, 0.1]",
+            "priors.dimensions_sigma_m: expected a finite number, above 0, got (0.1, 0.0, 0.1)",
+        ),
+        ("sampling.max_pixels=50", "sampling.max_pixels: expected a finite number, at least min_pixels = 400, got 50"),
         (
             "point_cloud.max_height_m=0",
-            "point_cloud.max_height_m: expected at least point_cloud.min_height_m = 0.1, got",
+            "point_cloud.max_height_m: expected a finite number, at least min_height_m = 0.1 and at most 100, got 0.0",
         ),
-        ("point_cloud.huber_m=0", "point_cloud.huber_m: expected a number above 0, got 0.0"),
+        ("point_cloud.huber_m=0", "point_cloud.huber_m: expected a finite number, above 0, got 0.0"),
         ("method=geometry", "method: expected one of direct, geometric, combined, got 'geometry'"),
-        ("sampling.density=1.5", "sampling.density: expected a number above 0 and at most 1, got 1.5"),
+        ("sampling.density=1.5", "sampling.density: expected a finite number, above 0 and at most 1, got 1.5"),
     ],
 )
 def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
@@ -109,41 +113,51 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
             "method: expected one of direct, geometric, combined, got 'geometry'",
         ),  # type: ignore[arg-type]
         (lambda: RefinerConfig(compile=True), "compile: expected one of auto, on, off, got True"),  # type: ignore[arg-type]
+        (lambda: RefinerConfig(stages=()), "stages: expected at least one stage, got none"),
+        (lambda: SilhouetteConfig(form="sum"), "form: expected one of closest_approach, product, got 'sum'"),  # type: ignore[arg-type]
         (
-            lambda: RefinerConfig(silhouette=SilhouetteConfig(form="sum")),  # type: ignore[arg-type]
-            "silhouette.form: expected one of closest_approach, product, got 'sum'",
+            lambda: BackwardConfig(mode=None),  # type: ignore[arg-type]
+            "mode: expected one of none, unroll, implicit, implicit_gauss_newton, got None",
+        ),
+        (lambda: StageConfig(0.5, 0, 3, unknowns="all"), "unknowns: expected one of both, pose, shape, got 'all'"),  # type: ignore[arg-type]
+        (
+            lambda: SamplingConfig(mode=["dense"]),  # type: ignore[arg-type]
+            "mode: expected one of adaptive, round_one, uniform, dense, got ['dense']",
+        ),
+        (lambda: SamplingConfig(density="5 %"), "density: expected a finite number, above 0 and at most 1, got '5 %'"),  # type: ignore[arg-type]
+        (
+            lambda: SolverConfig(min_damping=10, max_damping=1),
+            "max_damping: expected a finite number, above 0 and at least min_damping = 10, got 1",
         ),
         (
-            lambda: RefinerConfig(backward=BackwardConfig(mode=None)),  # type: ignore[arg-type]
-            "backward.mode: expected one of none, unroll, implicit, implicit_gauss_newton, got None",
-        ),
-        (
-            lambda: RefinerConfig(stages=(StageConfig(0.5, 0, 3), StageConfig(0.5, 0, 3, unknowns="all"))),  # type: ignore[arg-type]
-            "stages[1].unknowns: expected one of both, pose, shape, got 'all'",
-        ),
-        (
-            lambda: dataclasses.replace(RefinerConfig(), sampling=SamplingConfig(mode=["dense"])),  # type: ignore[arg-type]
-            "sampling.mode: expected one of adaptive, round_one, uniform, dense, got ['dense']",
+            lambda: dataclasses.replace(SearchConfig(), yaw_offsets_deg=(0.0, 400.0)),
+            "yaw_offsets_deg: expected a finite number, at least -360 and at most 360, got (0.0, 400.0)",
         ),
     ],
 )
-def test_words_of_settings_made_in_python_are_checked(make: Callable[[], object], text: str) -> None:
+def test_groups_made_in_python_are_checked_too(make: Callable[[], object], text: str) -> None:
     with pytest.raises(ConfigError) as error:
         make()
     assert str(error.value) == text
 
 
-def test_every_number_has_a_range() -> None:
-    groups = {
-        "solver": SolverConfig, "silhouette": SilhouetteConfig, "photometric": PhotometricConfig,
-        "priors": PriorConfig, "sampling": SamplingConfig, "search": SearchConfig, "point_cloud": PointCloudConfig,
-        "rig": RigConfig, "acceptance": AcceptanceConfig, "backward": BackwardConfig,
-    }  # fmt: skip
-    for group, kind in groups.items():
-        for field in dataclasses.fields(kind):
-            default = getattr(kind(), field.name)
-            if isinstance(default, (int, float, tuple)) and not isinstance(default, bool):
-                assert f"{group}.{field.name}" in _RANGES
+def test_every_setting_is_described_and_every_number_has_limits() -> None:
+    config = RefinerConfig()
+    groups = [x for x in vars(config).values() if isinstance(x, Settings)] + [config.stages[0]]
+    assert len(groups) == 11
+    settings = [(group, field) for group in groups for field in dataclasses.fields(group)]
+    assert len(settings) > 80
+    for group, field in settings:
+        default = getattr(group, field.name)
+        assert field.metadata["description"]
+        if isinstance(default, (int, float, tuple)) and not isinstance(default, bool):
+            assert field.metadata["limits"], field.name
+
+
+def test_implicit_gradients_need_a_last_stage_at_rest() -> None:
+    text = "^stages\\[-1\\].unknowns: backward.mode implicit needs both, got pose$"
+    with pytest.raises(ConfigError, match=text):
+        RefinerConfig(stages=(StageConfig(unknowns="pose"),), backward=BackwardConfig(mode="implicit"))
 
 
 def test_round_trip() -> None:
@@ -196,3 +210,26 @@ def test_unreadable_files_and_overrides(tmp_path: Path, content: str, overrides:
 def test_a_missing_file_is_an_error_of_this_package(tmp_path: Path) -> None:
     with pytest.raises(DirectShapeError, match=r"none\.yaml: cannot be read"):
         load_config(tmp_path / "none.yaml")
+
+
+def test_errors_name_file_and_overrides(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("stages: [{unknowns: pose}, {unknowns: all}]\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as error:
+        load_config(path)
+    assert str(error.value) == f"{path}: stages[1].unknowns: expected one of both, pose, shape, got 'all'"
+    with pytest.raises(ConfigError) as error:
+        load_config("fast", ["sampling.density=0.1", "sampling.max_pixels=100"])
+    assert str(error.value) == (
+        "fast --set sampling.density=0.1 --set sampling.max_pixels=100: "
+        "sampling.max_pixels: expected a finite number, at least min_pixels = 200, got 100"
+    )
+    with pytest.raises(ConfigError, match=r"^refiner\.solver\.max_code: expected a finite number, above 0, got 0\.0$"):
+        config_from_mapping(RefinerConfig, {"solver": {"max_code": 0}}, "refiner.")
+
+
+def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "picture.yaml"
+    path.write_bytes(b"\xff\xd8\xff\xe0")
+    with pytest.raises(ConfigError, match=r"picture\.yaml: cannot be read as a YAML configuration"):
+        load_config(path)
