@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import RefinerConfig, StageConfig, Unknowns
 from directshape_torch.energy.autograd_jacobian import rows_by_autograd
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.end_blocks import EndBlocks
@@ -21,7 +21,7 @@ from directshape_torch.energy.tracked_problem import TrackedProblem
 from directshape_torch.energy.unchanged import Origin
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.problem import Linearisation, Stage, StageProblem, Unknowns
+from directshape_torch.solver.problem import Linearisation, StageProblem
 
 # Projections kept: of the input, of the present stage's first state, of the end.
 _REMEMBERED = 3
@@ -60,10 +60,10 @@ class CarProblem:
         self._costs: list[tuple[Origin, Tensor]] = []  # of the present stage
         self._end_blocks: EndBlocks | None = None  # of the present stage
 
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[StageConfig]:
         return method_stages(self.config)
 
-    def begin_stage(self, stage: Stage, state: CarState) -> StageProblem[CarState]:
+    def begin_stage(self, stage: StageConfig, state: CarState) -> StageProblem[CarState]:
         self.unknowns = stage.unknowns
         self._costs, self._end_blocks = [], None
         projected = self.project(state)
@@ -78,7 +78,7 @@ class CarProblem:
         marched = self._of_terms(others) if others else None
         return TrackedProblem(self.prior, energy, marched, self.config.solver, self.unknowns)
 
-    def _follows_a_wider(self, stage: Stage) -> bool:
+    def _follows_a_wider(self, stage: StageConfig) -> bool:
         stages = self.stages()
         earlier = stages[: stages.index(stage)] if stage in stages else []
         return any(other.contour_width_px > stage.contour_width_px for other in earlier)

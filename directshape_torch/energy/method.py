@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.direct_terms import direct_terms
 from directshape_torch.energy.geometric_terms import combined_terms, geometric_terms
@@ -11,7 +11,6 @@ from directshape_torch.errors import ConfigError
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.problem import Stage
 from directshape_torch.stereo_matching.car_points import PointSamples
 
 # Those of "point_cloud" hold for the methods with points, the first two for the others.
@@ -46,7 +45,7 @@ def method_terms(
     return terms
 
 
-def method_stages(config: RefinerConfig) -> list[Stage]:
+def method_stages(config: RefinerConfig) -> list[StageConfig]:
     """The stages of `config.method`: rounds of its own for "geometric", else those of the configuration.
 
     Example:
@@ -56,11 +55,11 @@ def method_stages(config: RefinerConfig) -> list[Stage]:
         ['pose', 'shape', 'pose', 'shape']
     """
     if config.method != "geometric":
-        return [Stage(**vars(stage)) for stage in config.stages]
+        return list(config.stages)
     # Contour and pyramid level mean nothing to a point cloud: the last stage's, for whoever draws or measures.
     last, cloud = config.stages[-1], config.point_cloud
     pose_stage, shape_stage, joint_stage = (
-        Stage(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns=unknowns)
+        StageConfig(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns=unknowns)
         for unknowns in ("pose", "shape", "both")
     )
     return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]

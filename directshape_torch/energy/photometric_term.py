@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.config import PhotometricConfig
+from directshape_torch.config import PhotometricConfig, StageConfig
 from directshape_torch.device_constants import made_once
 from directshape_torch.energy.brightness import matched_brightness
 from directshape_torch.energy.car_batch import CarBatch
@@ -36,7 +36,6 @@ from directshape_torch.residuals.photometric_patch import PatchForm, patch_deriv
 from directshape_torch.residuals.photometric_profile import residuals_on_lines, warp_lines
 from directshape_torch.shape.raycast import attached_depth
 from directshape_torch.solver.normal_equations import Segments
-from directshape_torch.solver.problem import Stage
 
 _CENTRE = DSO_PATTERN.index((0, 0))
 
@@ -80,7 +79,7 @@ class PhotometricTerm:
     def name(self) -> str:
         return "photometric"
 
-    def at_stage(self, stage: Stage, projected: ProjectedState) -> PhotometricTerm:
+    def at_stage(self, stage: StageConfig, projected: ProjectedState) -> PhotometricTerm:
         images = self.pyramid[stage.image_level]
         rows = torch.arange(len(self.pixels), device=self.pixels.uv.device)
         candidates = self._surface(projected, rows).on_surface

@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from directshape_torch.config import PointCloudConfig
+from directshape_torch.config import PointCloudConfig, StageConfig
 from directshape_torch.energy.projected_state import ProjectedState
 from directshape_torch.energy.term import ResidualRows, TermLinearisation
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.point_cloud import point_cloud_distance, point_cloud_residual
 from directshape_torch.solver.normal_equations import Segments
-from directshape_torch.solver.problem import Stage
 from directshape_torch.stereo_matching.car_points import PointSamples
 
 
@@ -29,7 +28,7 @@ class PointCloudTerm:
     def name(self) -> str:
         return "point_cloud"
 
-    def at_stage(self, stage: Stage, projected: ProjectedState) -> PointCloudTerm:
+    def at_stage(self, stage: StageConfig, projected: ProjectedState) -> PointCloudTerm:
         return self
 
     def cost(self, projected: ProjectedState) -> Tensor:

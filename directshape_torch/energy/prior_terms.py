@@ -10,7 +10,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from directshape_torch.config import PriorConfig, RefinerConfig
+from directshape_torch.config import PriorConfig, RefinerConfig, StageConfig
 from directshape_torch.device_constants import constant_like
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_state import CarState
@@ -26,7 +26,6 @@ from directshape_torch.residuals.priors import (
     tilt_prior_normal,
 )
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.problem import Stage
 
 
 class AtState(Protocol):
@@ -104,7 +103,7 @@ class PriorTerm:
     cars: CarBatch
     residual_of: Callable[[CarBatch, ProjectedState], PriorResidual]
 
-    def at_stage(self, stage: Stage, projected: ProjectedState) -> PriorTerm:
+    def at_stage(self, stage: StageConfig, projected: ProjectedState) -> PriorTerm:
         return self
 
     def cost(self, projected: ProjectedState) -> Tensor:

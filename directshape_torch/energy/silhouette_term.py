@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from directshape_torch.config import SilhouetteConfig
+from directshape_torch.config import SilhouetteConfig, StageConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
 from directshape_torch.energy.term import ResidualRows, TermLinearisation
@@ -28,7 +28,6 @@ from directshape_torch.residuals.state_chain import sdf_state_jacobian
 from directshape_torch.shape.raycast import ObjectRays
 from directshape_torch.shape.shape_prior import BoundShape
 from directshape_torch.solver.normal_equations import Segments
-from directshape_torch.solver.problem import Stage
 
 # Samples of the product form whose derivative is below exp(-46) = 1e-20 of zeta do not change a float64 sum.
 _NEGLIGIBLE_LOG_WEIGHT = -46.0
@@ -50,7 +49,7 @@ class SilhouetteTerm:
     def name(self) -> str:
         return f"silhouette_{self.side}"
 
-    def at_stage(self, stage: Stage, projected: ProjectedState) -> SilhouetteTerm:
+    def at_stage(self, stage: StageConfig, projected: ProjectedState) -> SilhouetteTerm:
         zeta = self.cars.focal_over_depth / stage.contour_width_px
         zeta = zeta.clamp(self.config.min_zeta_per_m, self.config.max_zeta_per_m)
         return replace(self, zeta=zeta[self.pixels.object_index])

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.config import SolverConfig
+from directshape_torch.config import SolverConfig, Unknowns
 from directshape_torch.device_constants import constant_like
-from directshape_torch.solver.problem import Linearisation, Unknowns
+from directshape_torch.solver.problem import Linearisation
 
 
 def moving_unknowns(unknowns: Unknowns, code: Tensor) -> Tensor:

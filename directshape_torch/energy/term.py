@@ -8,8 +8,9 @@ from typing import NamedTuple, Protocol, Self
 import torch
 from torch import Tensor
 
+from directshape_torch.config import StageConfig
 from directshape_torch.energy.projected_state import ProjectedState
-from directshape_torch.solver.problem import Linearisation, Stage
+from directshape_torch.solver.problem import Linearisation
 
 
 class TermLinearisation(NamedTuple):
@@ -43,7 +44,7 @@ class Term(Protocol):
     @property
     def name(self) -> str: ...
 
-    def at_stage(self, stage: Stage, projected: ProjectedState) -> Self:
+    def at_stage(self, stage: StageConfig, projected: ProjectedState) -> Self:
         """The term with its pixel set, counts and zeta fixed at a state, for the length of a stage."""
         ...
 

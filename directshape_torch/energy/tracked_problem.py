@@ -9,7 +9,7 @@ from typing import Protocol, Self
 
 from torch import Tensor
 
-from directshape_torch.config import SolverConfig
+from directshape_torch.config import SolverConfig, Unknowns
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.energy.stage_unknowns import step_limits, without_held
 from directshape_torch.energy.term import TermLinearisation, total_of
@@ -18,7 +18,7 @@ from directshape_torch.gradient_mode import nothing_is_differentiated
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_grid import GridMemory
 from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
-from directshape_torch.solver.problem import Linearisation, Unknowns
+from directshape_torch.solver.problem import Linearisation
 
 
 class MarchedTerms(Protocol):

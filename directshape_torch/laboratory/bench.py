@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig
+from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState, retract
@@ -21,7 +21,6 @@ from directshape_torch.observation.packing import Observation, PixelSamples, pac
 from directshape_torch.residuals.photometric import surface_slope
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.raycast import ObjectRays, Root
-from directshape_torch.solver.problem import Stage
 
 TERM_NAMES = (
     "silhouette_left", "silhouette_right", "silhouette_left_product", "silhouette_right_product", "photometric",
@@ -111,8 +110,7 @@ class Bench:
         )
         observation = pack_pixels(scene.frame, drawn.detections, sampling)
         cars = CarBatch.from_scene(scene.frame, drawn.detections)
-        stage_config = config.stages[regime.stage]
-        stage = Stage(stage_config.contour_width_px, stage_config.image_level, stage_config.max_iterations)
+        stage = config.stages[regime.stage]
         observation = _choose(observation, regime, prior, drawn.state, cars, stage, config, pixels_per_car, generator)
         other_forms = replace(
             config,
@@ -169,7 +167,7 @@ def _choose(
     prior: PCAShapePrior,
     state: CarState,
     cars: CarBatch,
-    stage: Stage,
+    stage: StageConfig,
     config: RefinerConfig,
     pixels_per_car: int,
     generator: torch.Generator,

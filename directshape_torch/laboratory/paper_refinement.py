@@ -22,7 +22,6 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.residuals.photometric import DSO_PATTERN
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.solver.problem import Stage
 from directshape_torch.status import Status
 
 CONTROL = "damped, control"
@@ -41,7 +40,7 @@ class PaperDepthTerm:
     def name(self) -> str:
         return self.exact.name
 
-    def at_stage(self, stage: Stage, projected: ProjectedState) -> PaperDepthTerm:
+    def at_stage(self, stage: StageConfig, projected: ProjectedState) -> PaperDepthTerm:
         return PaperDepthTerm(self.exact.at_stage(stage, projected))
 
     def of_objects(self, keep: Tensor) -> PaperDepthTerm:

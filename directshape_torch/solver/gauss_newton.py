@@ -8,12 +8,11 @@ from typing import Generic
 import torch
 from torch import Tensor
 
-from directshape_torch.config import SolverConfig
+from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.solver.damped_solve import step_lengths
 from directshape_torch.solver.iteration import RUNNING, Outcome, begin, has_failed, iterate
 from directshape_torch.solver.problem import (
     Problem,
-    Stage,
     StageProblem,
     StateT,
     put_rows,
@@ -166,7 +165,7 @@ def minimise(
 
 def _run_stage(
     part: StageProblem[StateT],
-    stage: Stage,
+    stage: StageConfig,
     state: StateT,
     ended: Tensor,
     unfailed: _Unfailed,

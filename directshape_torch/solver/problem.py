@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-Unknowns = Literal["both", "pose", "shape"]
-"""The unknowns that a stage moves."""
+from directshape_torch.config import StageConfig
 
 
 class Linearisation(NamedTuple):
@@ -19,25 +17,6 @@ class Linearisation(NamedTuple):
     cost: Tensor  # (B,)
     gradient: Tensor  # (B, D)
     hessian: Tensor  # (B, D, D)
-
-
-@dataclass(frozen=True)
-class Stage:
-    """A part of a minimisation during which pixel sets, counts and zeta are fixed, so that costs are comparable.
-
-    Attributes:
-        contour_width_px: softness of the projected contour.
-        image_level: pyramid level of the photometric term, 0 is full resolution.
-        max_iterations: Gauss-Newton iterations at most.
-        unknowns: which of them move; the others are constants of the stage, a matter of the problem alone.
-        over_relaxation: factor of steps (`step_lengths`).
-    """
-
-    contour_width_px: float
-    image_level: int
-    max_iterations: int
-    unknowns: Unknowns = "both"
-    over_relaxation: float = 1.0
 
 
 StateT = TypeVar("StateT", bound=tuple[Tensor, ...])
@@ -73,9 +52,9 @@ class StageProblem(Protocol[StateT]):
 class Problem(Protocol[StateT]):
     """B problems that share nothing but the batch."""
 
-    def stages(self) -> Sequence[Stage]: ...
+    def stages(self) -> Sequence[StageConfig]: ...
 
-    def begin_stage(self, stage: Stage, state: StateT) -> StageProblem[StateT]:
+    def begin_stage(self, stage: StageConfig, state: StateT) -> StageProblem[StateT]:
         """Fix everything that must not change while costs are compared; what the stage's iterations work on."""
         ...
 

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.solver.problem import Linearisation, Stage
+from directshape_torch.config import StageConfig
+from directshape_torch.solver.problem import Linearisation
 
 
 class Vector(NamedTuple):
@@ -25,20 +26,20 @@ class ResidualProblem:
         residual: Callable[[Tensor, Tensor], Tensor],
         identity: Tensor,
         num_unknowns: int,
-        stages: Sequence[Stage],
+        stages: Sequence[StageConfig],
         limit: float = 1e6,
     ) -> None:
         self.residual, self.identity, self.limit = residual, identity, limit
         self.num_unknowns, self._stages = num_unknowns, list(stages)
-        self.begun: list[Stage] = []
+        self.begun: list[StageConfig] = []
         self.compactions: list[int] = []
         self.evaluated: list[Tensor] = []
         self.followed: list[Tensor] = []
 
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[StageConfig]:
         return self._stages
 
-    def begin_stage(self, stage: Stage, state: Vector) -> ResidualProblem:
+    def begin_stage(self, stage: StageConfig, state: Vector) -> ResidualProblem:
         self.begun.append(stage)
         return self
 
@@ -76,7 +77,9 @@ class ResidualProblem:
         return part
 
 
-def linear_problem(num_problems: int, num_unknowns: int, stages: Sequence[Stage]) -> tuple[ResidualProblem, Tensor]:
+def linear_problem(
+    num_problems: int, num_unknowns: int, stages: Sequence[StageConfig]
+) -> tuple[ResidualProblem, Tensor]:
     """`r = A_i x - b_i` with its least-squares solution (B, D)."""
     generator = torch.Generator().manual_seed(12)
     A = torch.randn(num_problems, 2 * num_unknowns, num_unknowns, generator=generator, dtype=torch.float64)

@@ -10,10 +10,10 @@ import torch
 from helpers.quadratics import Vector
 from torch import Tensor
 
-from directshape_torch.config import SolverConfig
+from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.solver.differentiate import NotStationaryWarning, implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.solver.problem import Linearisation, Stage
+from directshape_torch.solver.problem import Linearisation
 
 EXACT = SolverConfig(
     cost_tolerance=0.0,
@@ -21,7 +21,7 @@ EXACT = SolverConfig(
     initial_damping=1e-3,
     max_step_translation_m=10.0,
 )
-STAGES = [Stage(2.0, 1, 30), Stage(1.0, 0, 60)]
+STAGES = [StageConfig(2.0, 1, 30), StageConfig(1.0, 0, 60)]
 
 
 class Curved:
@@ -30,13 +30,13 @@ class Curved:
     The residuals of the first stage are scaled: it has another minimum than the last one.
     """
 
-    def __init__(self, theta: Tensor, stages: list[Stage] = STAGES, bound: float = torch.inf) -> None:
+    def __init__(self, theta: Tensor, stages: list[StageConfig] = STAGES, bound: float = torch.inf) -> None:
         self.theta, self._stages, self.bound, self.scale = theta, stages, bound, 1.0
 
-    def stages(self) -> list[Stage]:
+    def stages(self) -> list[StageConfig]:
         return self._stages
 
-    def begin_stage(self, stage: Stage, state: Vector) -> Curved:
+    def begin_stage(self, stage: StageConfig, state: Vector) -> Curved:
         self.scale = stage.contour_width_px
         return self
 
@@ -134,7 +134,7 @@ def test_unrolled_gradient_by_differences_of_the_whole_minimisation(over_relaxat
     config = replace(EXACT, initial_damping=0.0, accept_every_step=True)
 
     def few(theta: Tensor, start: Tensor) -> Tensor:
-        stages = [Stage(2.0, 1, n, over_relaxation=over_relaxation) for n in (1, 2)]
+        stages = [StageConfig(2.0, 1, n, over_relaxation=over_relaxation) for n in (1, 2)]
         problem = Curved(theta, stages)
         minimum = _minimum(problem, start, config)
         assert minimum.iterations.tolist() == [3, 3, 3]
@@ -187,7 +187,7 @@ def test_only_the_wanted_problems_and_each_by_itself() -> None:
 
 def test_no_gradient_away_from_a_stationary_point() -> None:
     theta = _theta().requires_grad_()
-    problem = Curved(theta, [Stage(1.0, 0, 1)])
+    problem = Curved(theta, [StageConfig(1.0, 0, 1)])
     minimum = _minimum(problem, START)
     with pytest.warns(NotStationaryWarning, match="problems 0, 1, 2"):
         state = implicit_state(problem, minimum, torch.arange(3), exact=True, max_remaining_step=1e-6)
@@ -221,7 +221,7 @@ def test_an_unknown_at_its_bound_is_a_constant() -> None:
 
 
 def test_no_iterations_at_all() -> None:
-    problem = Curved(_theta(), [Stage(1.0, 0, 0)])
+    problem = Curved(_theta(), [StageConfig(1.0, 0, 0)])
     start = START.clone().requires_grad_()
     minimum = _minimum(problem, start)
     state = unrolled_state(problem, Vector(start), minimum, torch.arange(3), 5)

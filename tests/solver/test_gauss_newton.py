@@ -10,12 +10,11 @@ import torch
 from helpers.quadratics import ResidualProblem, Vector, linear_problem
 from torch import Tensor
 
-from directshape_torch.config import SolverConfig
+from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.solver.gauss_newton import minimise
-from directshape_torch.solver.problem import Stage
 from directshape_torch.status import Status
 
-ONE_STAGE = [Stage(1.0, 0, 30)]
+ONE_STAGE = [StageConfig(1.0, 0, 30)]
 DAMPED = SolverConfig()
 PURE = SolverConfig(initial_damping=0.0, accept_every_step=True)
 
@@ -28,7 +27,7 @@ def start(count: int, unknowns: int = 3, value: float = 0.0) -> Vector:
     return Vector(torch.full((count, unknowns), value, dtype=torch.float64))
 
 
-def rosenbrock(count: int, stages: list[Stage] = ONE_STAGE, limit: float = 1.0) -> ResidualProblem:
+def rosenbrock(count: int, stages: list[StageConfig] = ONE_STAGE, limit: float = 1.0) -> ResidualProblem:
     """A curved valley of a width of its own for each problem; minimum at (1, 1), cost 0."""
 
     def residual(x: Tensor, identity: Tensor) -> Tensor:
@@ -66,20 +65,20 @@ def test_the_cost_never_rises_unless_every_step_is_accepted() -> None:
 def test_accepting_every_step_goes_uphill_but_returns_the_best_state() -> None:
     """Gauss-Newton on the valley jumps uphill first: the history rises, the result is the best state seen."""
     free = replace(PURE, step_tolerance=0.0)
-    problem = rosenbrock(1, [Stage(1.0, 0, 3)], limit=1e6)
+    problem = rosenbrock(1, [StageConfig(1.0, 0, 3)], limit=1e6)
     result = minimise(problem, start(1, 2, -1.0), free)
     history = torch.cat([problem.cost(start(1, 2, -1.0)), result.cost_history[0]])
     # By hand: the first step leads to (1, -3), cost 72 after 20; the second to the minimum (1, 1).
     torch.testing.assert_close(history[:3], torch.tensor([20.0, 72.0, 0.0], dtype=torch.float64))
     torch.testing.assert_close(result.state.x, torch.ones(1, 2, dtype=torch.float64))
-    one = minimise(rosenbrock(1, [Stage(1.0, 0, 1)], limit=1e6), start(1, 2, -1.0), free)
+    one = minimise(rosenbrock(1, [StageConfig(1.0, 0, 1)], limit=1e6), start(1, 2, -1.0), free)
     torch.testing.assert_close(one.cost_history[0, 0], history[1])
     assert (one.state.x == -1.0).all()
 
 
 def test_the_best_state_on_the_way_is_returned() -> None:
     """Gauss-Newton on atan(x) from 3 with steps of at most 4.5: -1.5 by hand, then 1.69, then -2.32: it diverges."""
-    problem = ResidualProblem(lambda x, _: torch.atan(x), torch.arange(1), 1, [Stage(1.0, 0, 3)], limit=4.5)
+    problem = ResidualProblem(lambda x, _: torch.atan(x), torch.arange(1), 1, [StageConfig(1.0, 0, 3)], limit=4.5)
     result = minimise(problem, start(1, 1, 3.0), replace(PURE, step_tolerance=0.0))
     assert result.cost_history[0, 1] > result.cost_history[0, 0]
     assert float(result.state.x) == -1.5
@@ -118,7 +117,7 @@ def test_finished_problems_are_evaluated_no_more() -> None:
 @pytest.mark.parametrize("config", [DAMPED, PURE], ids=["damped", "pure"])
 def test_costs_are_logged_while_a_problem_takes_part_and_no_longer(config: SolverConfig, block: int) -> None:
     """Blocks of one iteration have nothing to leave out: the costs are the same for blocks of any length."""
-    problem = rosenbrock(6, [Stage(2.0, 1, 20), Stage(1.0, 0, 20)])
+    problem = rosenbrock(6, [StageConfig(2.0, 1, 20), StageConfig(1.0, 0, 20)])
     uneven = Vector(torch.linspace(-1.3, 1.0, 6, dtype=torch.float64)[:, None].repeat(1, 2))
     result = minimise(problem, uneven, replace(config, block_iterations=block), record=True)
     took_part = result.cost_history.isfinite()
@@ -168,7 +167,7 @@ def test_a_broken_problem_keeps_its_input_and_touches_no_other(kind: str, config
     assert (result.status[[0, 2]] == healthy.status[[0, 2]]).all()
 
 
-TWO_STAGES = [Stage(2.0, 1, 30), Stage(1.0, 0, 30)]
+TWO_STAGES = [StageConfig(2.0, 1, 30), StageConfig(1.0, 0, 30)]
 
 
 @pytest.mark.parametrize("block", [1, 4])
@@ -180,7 +179,7 @@ def test_what_failed_is_not_evaluated_in_the_next_stage(kind: str, block: int) -
     evaluated_before: list[int] = []
 
     class Counted(ResidualProblem):
-        def begin_stage(self, stage: Stage, state: Vector) -> ResidualProblem:
+        def begin_stage(self, stage: StageConfig, state: Vector) -> ResidualProblem:
             evaluated_before.append(len(self.evaluated))
             return super().begin_stage(stage, state)
 
@@ -213,7 +212,7 @@ def test_stages_of_problems_that_have_all_failed_evaluate_nothing() -> None:
 def test_what_failed_unseen_by_the_host_is_told_from_what_it_saw() -> None:
     """A stage without iterations is not read: its failures are only known at the end of the next block."""
     problem = _poisoned("nan at the input")
-    problem._stages = [Stage(2.0, 1, 0), *TWO_STAGES]
+    problem._stages = [StageConfig(2.0, 1, 0), *TWO_STAGES]
     result = minimise(problem, start(3, 2, -1.3), PURE)
     healthy = minimise(rosenbrock(3, TWO_STAGES), start(3, 2, -1.3), PURE)
     assert status_of(result.status)[1] is Status.non_finite
@@ -252,28 +251,28 @@ def test_a_result_worse_than_the_input_is_rejected() -> None:
             return -super().cost(state) if len(self.begun) == 2 else super().cost(state)
 
     base, _ = linear_problem(2, 2, [])
-    problem = Deceitful(base.residual, base.identity, 2, [Stage(2.0, 1, 5), Stage(1.0, 0, 0)])
+    problem = Deceitful(base.residual, base.identity, 2, [StageConfig(2.0, 1, 5), StageConfig(1.0, 0, 0)])
     result = minimise(problem, start(2, 2), DAMPED)
     assert status_of(result.status) == [Status.rejected_worse] * 2
     assert (result.state.x == 0).all()
 
 
 def test_running_out_of_iterations_says_so() -> None:
-    result = minimise(rosenbrock(2, [Stage(1.0, 0, 2)]), start(2, 2, -1.3), DAMPED)
+    result = minimise(rosenbrock(2, [StageConfig(1.0, 0, 2)]), start(2, 2, -1.3), DAMPED)
     assert status_of(result.status) == [Status.max_iterations] * 2
     assert result.iterations.tolist() == [2, 2]
     assert result.cost_history.shape == (2, 2)
 
 
 def test_stages_begin_in_order_with_fresh_damping() -> None:
-    problem = rosenbrock(2, [Stage(2.0, 1, 3), Stage(1.0, 0, 4)])
+    problem = rosenbrock(2, [StageConfig(2.0, 1, 3), StageConfig(1.0, 0, 4)])
     result = minimise(problem, start(2, 2, -1.3), replace(DAMPED, cost_tolerance=0.0, step_tolerance=0.0))
     assert [s.image_level for s in problem.begun] == [1, 0]
     assert result.iterations.tolist() == [7, 7]
 
 
 def test_steps_stay_in_the_trust_region() -> None:
-    problem = rosenbrock(1, [Stage(1.0, 0, 6)], limit=0.05)
+    problem = rosenbrock(1, [StageConfig(1.0, 0, 6)], limit=0.05)
     minimise(problem, start(1, 2, -1.3), DAMPED)
     moved = torch.stack([x[0] for x in problem.evaluated]).diff(dim=0).abs()
     assert moved.max() <= 0.1 + 1e-12  # a refused candidate is followed by one from the old state
@@ -292,7 +291,7 @@ def test_problems_follow_the_steps_that_were_taken() -> None:
 
 
 def test_the_end_is_known_whatever_the_status() -> None:
-    problem, solution = linear_problem(2, 3, [Stage(1.0, 0, 0)])
+    problem, solution = linear_problem(2, 3, [StageConfig(1.0, 0, 0)])
     result = minimise(problem, Vector(solution), DAMPED, start(2))
     assert status_of(result.status) == [Status.rejected_worse] * 2
     assert (result.end.x == 0).all()
@@ -300,10 +299,10 @@ def test_the_end_is_known_whatever_the_status() -> None:
 
 
 def test_a_start_of_its_own_is_compared_with_the_input() -> None:
-    problem, solution = linear_problem(2, 3, [Stage(1.0, 0, 0)])
+    problem, solution = linear_problem(2, 3, [StageConfig(1.0, 0, 0)])
     better = minimise(problem, start(2), DAMPED, Vector(solution))
     assert (better.state.x == solution).all()
-    problem, _ = linear_problem(2, 3, [Stage(1.0, 0, 0)])
+    problem, _ = linear_problem(2, 3, [StageConfig(1.0, 0, 0)])
     worse = minimise(problem, Vector(solution), DAMPED, start(2))
     assert status_of(worse.status) == [Status.rejected_worse] * 2
     assert (worse.state.x == solution).all()

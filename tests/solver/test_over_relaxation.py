@@ -11,13 +11,13 @@ import torch
 from helpers.quadratics import ResidualProblem, Vector, linear_problem
 from torch import Tensor
 
-from directshape_torch.config import SolverConfig
+from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.config_files import load_config
 from directshape_torch.energy.method import method_stages
 from directshape_torch.errors import ConfigError
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import minimise
-from directshape_torch.solver.problem import Linearisation, Stage
+from directshape_torch.solver.problem import Linearisation
 
 DAMPED = SolverConfig()
 PURE = SolverConfig(initial_damping=0.0, accept_every_step=True, cost_tolerance=0.0, step_tolerance=0.0)
@@ -27,7 +27,7 @@ FACTOR = 1.6
 class GeometricMedians(ResidualProblem):
     """The points with the least sum of distances to others, by reweighting: the matrix lacks what the weights do."""
 
-    def __init__(self, points: Tensor, identity: Tensor, stages: Sequence[Stage]) -> None:
+    def __init__(self, points: Tensor, identity: Tensor, stages: Sequence[StageConfig]) -> None:
         super().__init__(lambda x, _: x, identity, 2, stages)
         self.points = points
 
@@ -52,7 +52,7 @@ def zeros(count: int, unknowns: int) -> Vector:
 
 
 def test_on_a_quadratic_energy_what_is_left_shrinks_by_the_factor_less_one() -> None:
-    problem, solution = linear_problem(3, 3, [Stage(1.0, 0, 4, over_relaxation=FACTOR)])
+    problem, solution = linear_problem(3, 3, [StageConfig(1.0, 0, 4, over_relaxation=FACTOR)])
     result = minimise(problem, zeros(3, 3), PURE, record=True)
     states = torch.stack([iteration.state.x for iteration in result.trajectory])
     powers = (1 - FACTOR) ** torch.arange(4, dtype=torch.float64)
@@ -64,7 +64,9 @@ def test_reweighted_problems_settle_in_fewer_iterations_at_the_same_minimum() ->
     config = replace(DAMPED, cost_tolerance=1e-12, min_damping=0.0, step_tolerance=0.0)
     plain, longer = (
         minimise(
-            GeometricMedians(points, torch.arange(8), [Stage(1.0, 0, 300, over_relaxation=factor)]), zeros(8, 2), config
+            GeometricMedians(points, torch.arange(8), [StageConfig(1.0, 0, 300, over_relaxation=factor)]),
+            zeros(8, 2),
+            config,
         )
         for factor in (1.0, FACTOR)
     )
@@ -76,7 +78,7 @@ def test_reweighted_problems_settle_in_fewer_iterations_at_the_same_minimum() ->
 @pytest.mark.parametrize("solver", [{}, {"initial_damping": 1.0}, {"initial_damping": 1e-9}], ids=str)
 def test_what_was_refused_is_tried_again_plain(solver: dict[str, float]) -> None:
     # From 3 a Gauss-Newton step on the arcus tangent leads to -9.5, where the cost is higher.
-    stages = [Stage(1.0, 0, 25, over_relaxation=FACTOR)]
+    stages = [StageConfig(1.0, 0, 25, over_relaxation=FACTOR)]
     problem = ResidualProblem(lambda x, _: torch.atan(x), torch.arange(1), 1, stages)
     config = replace(DAMPED, cost_tolerance=0.0, step_tolerance=0.0, **solver)
     trajectory = minimise(problem, Vector(torch.full((1, 1), 3.0, dtype=torch.float64)), config, record=True).trajectory
@@ -94,7 +96,7 @@ def test_what_was_refused_is_tried_again_plain(solver: dict[str, float]) -> None
 class Bent(ResidualProblem):
     """A distance to 1 whose matrix is too small by a factor, so that plain steps are so many times too long."""
 
-    def __init__(self, factor: float, stages: Sequence[Stage]) -> None:
+    def __init__(self, factor: float, stages: Sequence[StageConfig]) -> None:
         super().__init__(
             lambda x, _: torch.cat([x - 1, torch.full_like(x, 9.0)], dim=1), torch.arange(1), 1, stages, 8.0
         )
@@ -107,14 +109,14 @@ class Bent(ResidualProblem):
 
 def test_undamped_steps_that_are_refused_are_plain_ones_next() -> None:
     """Steps of 1.3 times 1.6 end higher than they began, and no damping is there to shorten them."""
-    problem = Bent(1.3, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    problem = Bent(1.3, [StageConfig(1.0, 0, 20, over_relaxation=FACTOR)])
     result = minimise(problem, zeros(1, 1), replace(DAMPED, initial_damping=0.0, cost_tolerance=1e-6))
     torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=1e-2)
 
 
 def test_a_long_step_to_the_other_side_is_not_taken_for_the_end() -> None:
     """Steps of a little less than 2 in all: the cost hardly falls, and the minimum is in the middle."""
-    problem = Bent(1.2499, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    problem = Bent(1.2499, [StageConfig(1.0, 0, 20, over_relaxation=FACTOR)])
     result = minimise(problem, zeros(1, 1), replace(DAMPED, initial_damping=1e-9, min_damping=1e-9))
     assert float(result.cost_history[0, 0]) > 40.999  # of 41
     torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=0.1)
@@ -122,7 +124,7 @@ def test_a_long_step_to_the_other_side_is_not_taken_for_the_end() -> None:
 
 
 def test_two_steps_in_a_row_that_change_next_to_nothing_are_the_end() -> None:
-    problem = Bent(2.5, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    problem = Bent(2.5, [StageConfig(1.0, 0, 20, over_relaxation=FACTOR)])
     near = Vector(torch.full((1, 1), 1.0001, dtype=torch.float64))
     result = minimise(problem, near, replace(DAMPED, step_tolerance=0.0))
     assert (result.status.tolist(), result.iterations.tolist()) == ([0], [2])
@@ -130,7 +132,7 @@ def test_two_steps_in_a_row_that_change_next_to_nothing_are_the_end() -> None:
 
 def test_two_steps_in_a_row_that_overshoot_are_not() -> None:
     problem = ResidualProblem(
-        lambda x, _: torch.atan(x), torch.arange(1), 1, [Stage(1.0, 0, 30, over_relaxation=FACTOR)], 20.0
+        lambda x, _: torch.atan(x), torch.arange(1), 1, [StageConfig(1.0, 0, 30, over_relaxation=FACTOR)], 20.0
     )
     start = Vector(torch.full((1, 1), 4.0, dtype=torch.float64))
     result = minimise(problem, start, DAMPED, record=True)
@@ -141,7 +143,7 @@ def test_two_steps_in_a_row_that_overshoot_are_not() -> None:
 
 def test_a_mirror_image_of_the_start_is_not_the_end() -> None:
     """The longer step is refused for a large rise, the plain one for a rise of a hundredth, but promises much more."""
-    problem = Bent(2.02, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    problem = Bent(2.02, [StageConfig(1.0, 0, 20, over_relaxation=FACTOR)])
     result = minimise(problem, zeros(1, 1), replace(DAMPED, initial_damping=1e-6, min_damping=1e-6))
     torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=0.1)
 
@@ -160,13 +162,13 @@ def test_a_candidate_that_is_not_finite_is_not_the_end() -> None:
         def compact(self, keep: Tensor, numbers: Sequence[int]) -> Broken:
             return self
 
-    problem = Broken(1.5, [Stage(1.0, 0, 30, over_relaxation=FACTOR)])
+    problem = Broken(1.5, [StageConfig(1.0, 0, 30, over_relaxation=FACTOR)])
     result = minimise(problem, zeros(1, 1), DAMPED)
     assert 0.5 < float(result.state.x) < 1.2
 
 
 def test_uphill_steps_that_are_taken_are_followed_by_plain_ones() -> None:
-    problem = Bent(1.3, [Stage(1.0, 0, 20, over_relaxation=FACTOR)])
+    problem = Bent(1.3, [StageConfig(1.0, 0, 20, over_relaxation=FACTOR)])
     config = replace(DAMPED, initial_damping=0.0, accept_every_step=True, cost_tolerance=1e-6)
     result = minimise(problem, zeros(1, 1), config)
     torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=1e-2)
@@ -177,7 +179,7 @@ def test_compaction_changes_nothing(block: int) -> None:
     points = torch.randn(8, 9, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     reference, result = (
         minimise(
-            GeometricMedians(points, torch.arange(8), [Stage(1.0, 0, 60, over_relaxation=FACTOR)]),
+            GeometricMedians(points, torch.arange(8), [StageConfig(1.0, 0, 60, over_relaxation=FACTOR)]),
             zeros(8, 2),
             replace(DAMPED, block_iterations=length, cost_tolerance=1e-6, step_tolerance=0.0),
         )

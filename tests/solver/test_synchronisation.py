@@ -13,12 +13,12 @@ from helpers.quadratics import Vector
 from torch import Tensor
 
 from directshape_torch.benchmark.synchronisations import count_synchronisations
-from directshape_torch.config import SolverConfig
+from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.solver import gauss_newton
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.iteration import begin, iterate
-from directshape_torch.solver.problem import Linearisation, Stage
+from directshape_torch.solver.problem import Linearisation
 
 DAMPED = SolverConfig(cost_tolerance=1e-12)
 PURE = SolverConfig(initial_damping=0.0, accept_every_step=True)
@@ -33,10 +33,10 @@ class Valleys:
         self.limits = torch.ones(2, dtype=torch.float64, device=steep.device)
         self.compactions: list[int] = []
 
-    def stages(self) -> list[Stage]:
-        return [Stage(1.0, 0, self.iterations)] * self.num_stages
+    def stages(self) -> list[StageConfig]:
+        return [StageConfig(1.0, 0, self.iterations)] * self.num_stages
 
-    def begin_stage(self, stage: Stage, state: Vector) -> Valleys:
+    def begin_stage(self, stage: StageConfig, state: Vector) -> Valleys:
         """Nothing is fixed."""
         return self
 
