@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import groupby
 from typing import NamedTuple
 
@@ -16,7 +17,6 @@ from directshape_torch.observation.occlusion import OcclusionCrops, Side
 from directshape_torch.observation.pixel_sampling import candidate_pixels
 from directshape_torch.observation.portions import pixels_at_once, portions
 from directshape_torch.observation.regions import RegionPixels
-from directshape_torch.observation.sampling_settings import SamplingSettings
 from directshape_torch.observation.small_cells import CellPixels
 from directshape_torch.observation.strongest_pixels import strongest_pixels
 from directshape_torch.scene import Detections, FrameBatch
@@ -57,10 +57,10 @@ def chosen_pixels(
     )
 
 
-def sampling_settings(config: SamplingConfig, side: Side) -> SamplingSettings:
-    """The part of the configuration that chooses pixels within a region of an image."""
+def sampling_settings(config: SamplingConfig, side: Side) -> SamplingConfig:
+    """The configuration with the mode of that image."""
     mode = config.mode if side == "left" or config.mode_right == "as_left" else config.mode_right
-    return SamplingSettings(mode, config.density, config.min_pixels, config.max_pixels)
+    return replace(config, mode=mode)
 
 
 def _in_mode(
@@ -68,7 +68,7 @@ def _in_mode(
     detections: Detections,
     regions: Tensor,  # (2 B, 4)
     hidden: OcclusionCrops | None,
-    settings: SamplingSettings,
+    settings: SamplingConfig,
 ) -> tuple[ChosenPixels, ChosenPixels]:
     """Those of both images in one mode."""
     if settings.mode == "uniform":
@@ -85,7 +85,7 @@ def _in_mode(
     for part in portions(amounts, pixels_at_once(regions.device)) or [slice(0, 0)]:
         cars = [n for run in runs[part] for n in run]
         of_images = [ImageRegion(side, frame[n], boxes[side * count + n]) for side in (0, 1) for n in cars]
-        cells = gradient_cells(images, sizes, of_images, settings)
+        cells = gradient_cells(images, sizes, of_images)
         begin, end = (cars[0], cars[-1] + 1) if cars else (0, 0)
         both = torch.cat([number[begin:end], number[count + begin : count + end]])
         visible = _visible(cells, regions[both], both, images[0].shape[3], hidden, settings)
@@ -102,7 +102,7 @@ def _even_pixels(
     detections: Detections,
     regions: Tensor,  # (2 B, 4)
     hidden: OcclusionCrops | None,
-    settings: SamplingSettings,
+    settings: SamplingConfig,
 ) -> tuple[ChosenPixels, ChosenPixels]:
     """Those of the mode that looks at no other pixels than it chooses."""
     count, found = len(detections), even_pixels(regions, settings)
@@ -126,7 +126,7 @@ def _visible(
     number: Tensor,  # (R,) of each region among all of them
     image_width: int,
     hidden: OcclusionCrops | None,
-    settings: SamplingSettings,
+    settings: SamplingConfig,
 ) -> ChosenPixels:
     """The chosen pixels of some regions that no instance hides."""
     found = _candidates(regions, cells, image_width, settings)
@@ -144,7 +144,7 @@ def _unhidden(found: CellPixels, object_index: Tensor, hidden: OcclusionCrops | 
     return object_index.index_select(0, kept), uv.index_select(0, kept), kept
 
 
-def _candidates(regions: Tensor, cells: GradientCells, image_width: int, settings: SamplingSettings) -> CellPixels:
+def _candidates(regions: Tensor, cells: GradientCells, image_width: int, settings: SamplingConfig) -> CellPixels:
     if settings.mode in ("adaptive", "round_one"):
         return strongest_pixels(cells, regions, image_width, settings)
     # The mode "dense" does not look at the image.

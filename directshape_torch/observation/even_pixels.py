@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
+from directshape_torch.config import SamplingConfig
 from directshape_torch.observation.small_cells import CellPixels, small_cell_side
 
 # Pixels: what rounding makes of distances that are equal.
@@ -20,7 +20,7 @@ _ROUNDING_PX = 1e-6
 
 def even_pixels(
     regions: Tensor,  # (B, 4)
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    settings: SamplingConfig,
 ) -> CellPixels:
     """The pixel nearest to the middle of each small cell; of those that differ by rounding the first, row-major.
 
@@ -29,7 +29,7 @@ def even_pixels(
         settings: density; its mode is not asked for.
 
     Example:
-        >>> chosen = even_pixels(torch.tensor([[5, 2, 11, 6]]), SamplingSettings("uniform", min_pixels=6, max_pixels=6))
+        >>> chosen = even_pixels(torch.tensor([[5, 2, 11, 6]]), SamplingConfig(min_pixels=6, max_pixels=6))
         >>> chosen.u.tolist(), chosen.v.tolist()
         ([5, 7, 9, 5, 7, 9], [2, 2, 2, 4, 4, 4])
     """

@@ -12,10 +12,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.image.frame_parts import gradient_magnitude_of_part
-from directshape_torch.observation.gradient_thresholds import smoothed_thresholds
+from directshape_torch.observation.gradient_thresholds import THRESHOLD_CELL_PX, smoothed_thresholds
 from directshape_torch.observation.lower_median import lower_medians
 from directshape_torch.observation.portions import pixels_at_once
-from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 
 Box = tuple[int, int, int, int]
 
@@ -87,7 +86,8 @@ def gradient_cells(
     images: Sequence[Tensor],
     sizes: Sequence[Sequence[int]],
     regions: Sequence[ImageRegion],
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    *,
+    cell_px: int = THRESHOLD_CELL_PX,
 ) -> GradientCells:
     """Gradient magnitudes and thresholds of the cells that regions touch, and of those around them.
 
@@ -95,9 +95,9 @@ def gradient_cells(
         images: S stacks (F, 3, H, W), RGB in [0, 1], such as left and right.
         sizes: F pairs (height, width) without padding, the same for all stacks.
         regions: B regions within their frames; empty ones touch nothing.
-        settings: the side of the cells and the offset of the thresholds.
+        cell_px: side of the cells.
     """
-    side, device = settings.threshold_cell_px, images[0].device
+    side, device = cell_px, images[0].device
     parts = _parts(regions, sizes, side)
     count = max((part.end for part in parts.values()), default=0)
     magnitude = torch.empty(count, side, side, dtype=images[0].dtype, device=device)
@@ -108,7 +108,7 @@ def gradient_cells(
     of_regions = [parts.get((region.stack, region.frame), nothing) for region in regions]
     rows = [(p.first - p.cells[1] * p.shape[1] - p.cells[0], p.shape[1]) for p in of_regions]
     first, columns = torch.tensor(rows, dtype=torch.long, device=device).view(-1, 2).unbind(1)
-    return GradientCells(magnitude, _thresholds(medians, list(parts.values()), settings), first, columns, side)
+    return GradientCells(magnitude, _thresholds(medians, list(parts.values())), first, columns, side)
 
 
 def _parts(regions: Sequence[ImageRegion], sizes: Sequence[Sequence[int]], side: int) -> dict[tuple[int, int], _Part]:
@@ -156,7 +156,7 @@ def _write_cells(cells: Tensor, image: Tensor, size_hw: Sequence[int], part: _Pa
         by_place[first:end].copy_(magnitude.view(end - first, side, columns, side).transpose(1, 2))
 
 
-def _thresholds(medians: Tensor, parts: Sequence[_Part], settings: SamplingSettings) -> Tensor:
+def _thresholds(medians: Tensor, parts: Sequence[_Part]) -> Tensor:
     """Thresholds (C,) from the medians (C,) of the cells."""
     if not parts:
         return medians
@@ -165,5 +165,5 @@ def _thresholds(medians: Tensor, parts: Sequence[_Part], settings: SamplingSetti
     places = [grid[:rows, :columns] for grid, (rows, columns) in zip(grids, shapes, strict=True)]
     for part, place in zip(parts, places, strict=True):
         place.copy_(medians[part.first : part.end].view(part.shape))
-    smoothed = smoothed_thresholds(grids, settings)
+    smoothed = smoothed_thresholds(grids)
     return torch.cat([grid[:rows, :columns].flatten() for grid, (rows, columns) in zip(smoothed, shapes, strict=True)])

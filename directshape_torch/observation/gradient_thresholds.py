@@ -12,14 +12,19 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
+
+THRESHOLD_CELL_PX = 32
+"""Side of the cells that have one threshold each."""
+
+_THRESHOLD_OFFSET_GREY = 7.0
 
 
 def cell_thresholds(
     magnitude: Tensor,  # (F, H, W)
     sizes: Tensor,  # (F, 2)
     needed: Tensor | None = None,  # (F, rows, columns)
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    *,
+    cell_px: int = THRESHOLD_CELL_PX,
 ) -> Tensor:
     """Round 1: threshold of the gradient magnitude in each cell, the 3x3-smoothed median plus an offset.
 
@@ -28,6 +33,7 @@ def cell_thresholds(
         sizes: (F, 2) integer (height, width) without padding; the padding does not count.
         needed: (F, rows, columns) bool, the cells whose threshold is wanted; None: all. Elsewhere the value means
             nothing.
+        cell_px: side of the cells.
 
     Returns:
         (F, rows, columns) thresholds, rows = ceil(H / cell). At the image border the mean is over the cells there are.
@@ -38,13 +44,13 @@ def cell_thresholds(
     if magnitude.ndim != 3:
         raise InputError("magnitude", "shape (F, H, W)", f"{tuple(magnitude.shape)}", "use gradient_magnitude")
     num_frames, height, width = magnitude.shape
-    rows, columns = (-(-length // settings.threshold_cell_px) for length in (height, width))
+    rows, columns = (-(-length // cell_px) for length in (height, width))
     wanted = torch.ones(num_frames, rows, columns, dtype=torch.bool, device=magnitude.device)
     if needed is not None:
         wanted = with_neighbours(needed)
     medians = magnitude.new_full((num_frames, rows, columns), torch.nan)
-    medians[wanted] = _cell_medians(magnitude, sizes, wanted, settings.threshold_cell_px)
-    return smoothed_thresholds(medians, settings)
+    medians[wanted] = _cell_medians(magnitude, sizes, wanted, cell_px)
+    return smoothed_thresholds(medians)
 
 
 def with_neighbours(
@@ -56,17 +62,17 @@ def with_neighbours(
 
 def smoothed_thresholds(
     medians: Tensor,  # (F, rows, columns)
-    settings: SamplingSettings = DEFAULT_SETTINGS,
 ) -> Tensor:
     """Thresholds (F, rows, columns) from the medians of the cells, NaN for those without."""
-    return _mean_of_neighbours(medians) + settings.threshold_offset_grey
+    return _mean_of_neighbours(medians) + _THRESHOLD_OFFSET_GREY
 
 
 def cells_of_regions(
     regions: Tensor,  # (B, 4)
     frame_index: Tensor,  # (B,)
     image_shape: Sequence[int],  # F, H, W
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    *,
+    cell_px: int = THRESHOLD_CELL_PX,
 ) -> Tensor:
     """The threshold cells that any region touches, (F, rows, columns) bool: `needed` of `cell_thresholds`.
 
@@ -75,7 +81,7 @@ def cells_of_regions(
         [[[1, 1, 0], [0, 0, 0]]]
     """
     num_frames, height, width = image_shape
-    side = settings.threshold_cell_px
+    side = cell_px
     row = torch.arange(-(-height // side), device=regions.device)
     column = torch.arange(-(-width // side), device=regions.device)
     u0, v0, u1, v1 = regions[:, :, None].unbind(1)

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.config import SamplingConfig
 from directshape_torch.errors import InputError
 from directshape_torch.observation.even_pixels import even_pixels
-from directshape_torch.observation.gradient_thresholds import cell_thresholds, cells_of_regions
+from directshape_torch.observation.gradient_thresholds import THRESHOLD_CELL_PX, cell_thresholds, cells_of_regions
 from directshape_torch.observation.regions import RegionPixels
-from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 from directshape_torch.observation.small_cells import small_cell_side
 
 _INT32_MIN, _INT64_MIN = torch.iinfo(torch.int32).min, torch.iinfo(torch.int64).min
@@ -43,7 +43,9 @@ def select_pixels(
     sizes: Tensor,  # (F, 2)
     frame_index: Tensor,  # (B,)
     regions: Tensor,  # (B, 4)
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    settings: SamplingConfig,
+    *,
+    cell_px: int = THRESHOLD_CELL_PX,
 ) -> PixelSelection:
     """Both rounds for one side: thresholds where the cars are, then the pixels of every car.
 
@@ -53,6 +55,7 @@ def select_pixels(
         frame_index: (B,) integer frame of each region.
         regions: (B, 4) integer (u0, v0, u1, v1), half open, from `region_boxes`; may be empty.
         settings: density and mode.
+        cell_px: side of the cells of the first round.
 
     Returns:
         The selected pixels, sorted by object. Hidden ones are not yet removed: see `occlusion.hidden_pixels`.
@@ -62,13 +65,14 @@ def select_pixels(
 
     Example:
         >>> ramp = 20.0 * torch.arange(40.0).repeat(1, 40, 1)
-        >>> chosen = select_pixels(ramp, torch.tensor([[40, 40]]), torch.tensor([0]), torch.tensor([[5, 5, 25, 25]]))
+        >>> frame, region = torch.tensor([0]), torch.tensor([[5, 5, 25, 25]])
+        >>> chosen = select_pixels(ramp, torch.tensor([[40, 40]]), frame, region, SamplingConfig(min_pixels=100))
         >>> chosen.uv.shape
         torch.Size([100, 2])
     """
-    needed = cells_of_regions(regions, frame_index, magnitude.shape, settings)
-    thresholds = cell_thresholds(magnitude, sizes, needed, settings)
-    return sample_pixels(magnitude, thresholds, regions, frame_index, settings)
+    needed = cells_of_regions(regions, frame_index, magnitude.shape, cell_px=cell_px)
+    thresholds = cell_thresholds(magnitude, sizes, needed, cell_px=cell_px)
+    return sample_pixels(magnitude, thresholds, regions, frame_index, settings, cell_px=cell_px)
 
 
 def sample_pixels(
@@ -76,7 +80,9 @@ def sample_pixels(
     thresholds: Tensor,  # (F, rows, columns)
     regions: Tensor,  # (B, 4)
     frame_index: Tensor,  # (B,)
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    settings: SamplingConfig,
+    *,
+    cell_px: int = THRESHOLD_CELL_PX,
 ) -> PixelSelection:
     """Round 2: at most one pixel in each small cell of every region.
 
@@ -90,6 +96,8 @@ def sample_pixels(
         thresholds: (F, rows, columns) from `cell_thresholds`.
         regions: (B, 4) integer (u0, v0, u1, v1), half open, from `region_boxes`; may be empty.
         frame_index: (B,) integer frame of each region.
+        settings: density and mode.
+        cell_px: side of the cells of the thresholds.
 
     Returns:
         The selected pixels, sorted by object.
@@ -102,7 +110,7 @@ def sample_pixels(
         >>> magnitude[0, 7, 9] = 50.0
         >>> region, frame = torch.tensor([[5, 5, 15, 15]]), torch.tensor([0])
         >>> thresholds = cell_thresholds(magnitude, torch.tensor([[40, 40]]))
-        >>> chosen = sample_pixels(magnitude, thresholds, region, frame, SamplingSettings(min_pixels=1))
+        >>> chosen = sample_pixels(magnitude, thresholds, region, frame, SamplingConfig(min_pixels=1))
         >>> chosen.uv[chosen.above_threshold]
         tensor([[9, 7]])
     """
@@ -111,8 +119,8 @@ def sample_pixels(
     frame, u, v = frame_index[pixels.object_index], pixels.u, pixels.v
     strength = magnitude[frame, v, u]
     above = strength.detach().float() > thresholds.float()[
-        frame, torch.div(v, settings.threshold_cell_px, rounding_mode="floor"),
-        torch.div(u, settings.threshold_cell_px, rounding_mode="floor"),
+        frame, torch.div(v, cell_px, rounding_mode="floor"),
+        torch.div(u, cell_px, rounding_mode="floor"),
     ]  # fmt: skip
     candidates = candidate_pixels(pixels, regions, strength, above, settings)
     chosen = candidates.pixel[candidates.exists]
@@ -132,7 +140,7 @@ def candidate_pixels(
     regions: Tensor,  # (B, 4)
     magnitude: Tensor,  # (A,)
     above_threshold: Tensor,  # (A,)
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    settings: SamplingConfig,
 ) -> Candidates:
     """The pixel of every small cell, see `sample_pixels`; not yet brought together, so that others may leave first.
 

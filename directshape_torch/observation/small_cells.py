@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from directshape_torch.observation.sampling_settings import SamplingSettings
+from directshape_torch.config import SamplingConfig
 
 
 class CellPixels(NamedTuple):
@@ -20,7 +20,7 @@ class CellPixels(NamedTuple):
 
 def small_cell_side(
     regions: Tensor,  # (B, 4)
-    settings: SamplingSettings,
+    settings: SamplingConfig,
 ) -> Tensor:
     """Side of the cells of each region, (B,) float64, pixels; at least one pixel."""
     areas = ((regions[:, 3] - regions[:, 1]) * (regions[:, 2] - regions[:, 0])).double()

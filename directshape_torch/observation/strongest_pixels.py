@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.config import SamplingConfig
 from directshape_torch.observation.gradient_cells import GradientCells
-from directshape_torch.observation.sampling_settings import DEFAULT_SETTINGS, SamplingSettings
 from directshape_torch.observation.small_cells import CellPixels, small_cell_side
 
 _INT32_MIN, _INT64_MIN = torch.iinfo(torch.int32).min, torch.iinfo(torch.int64).min
@@ -22,7 +22,7 @@ def strongest_pixels(
     cells: GradientCells,
     regions: Tensor,  # (B, 4)
     image_width: int,
-    settings: SamplingSettings = DEFAULT_SETTINGS,
+    settings: SamplingConfig,
 ) -> CellPixels:
     """What `candidate_pixels` finds in the modes "adaptive" and "round_one".
 
@@ -78,7 +78,7 @@ class _SmallCells(NamedTuple):
     height: int  # of all regions together, pixels
 
     @classmethod
-    def of(cls, regions: Tensor, settings: SamplingSettings) -> _SmallCells:
+    def of(cls, regions: Tensor, settings: SamplingConfig) -> _SmallCells:
         side = small_cell_side(regions, settings)
         widths, heights = (regions[:, 2:] - regions[:, :2]).unbind(1)
         rows, columns = ((length / side).ceil().long() for length in (heights, widths))

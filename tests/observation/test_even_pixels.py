@@ -7,14 +7,14 @@ import torch
 from helpers.host_traffic import host_traffic
 from torch import Tensor
 
+from directshape_torch.config import SamplingConfig
 from directshape_torch.observation.even_pixels import even_pixels
 from directshape_torch.observation.pixel_sampling import candidate_pixels
 from directshape_torch.observation.regions import RegionPixels, region_pixels
-from directshape_torch.observation.sampling_settings import SamplingSettings
 from directshape_torch.observation.small_cells import small_cell_side
 
 
-def by_pixels(regions: Tensor, settings: SamplingSettings) -> tuple[Tensor, Tensor]:
+def by_pixels(regions: Tensor, settings: SamplingConfig) -> tuple[Tensor, Tensor]:
     """Of all pixels of each cell the nearest one to its middle, one cell after the other."""
     index, uv = [], []
     for number, (region, side) in enumerate(zip(regions.tolist(), small_cell_side(regions, settings), strict=True)):
@@ -34,7 +34,7 @@ def by_pixels(regions: Tensor, settings: SamplingSettings) -> tuple[Tensor, Tens
     return torch.tensor(index, dtype=torch.long), pixels
 
 
-def by_lines(regions: Tensor, settings: SamplingSettings) -> tuple[Tensor, Tensor]:
+def by_lines(regions: Tensor, settings: SamplingConfig) -> tuple[Tensor, Tensor]:
     found = even_pixels(regions, settings)
     return found.object_index[found.exists], torch.stack([found.u, found.v], dim=1)[found.exists]
 
@@ -55,7 +55,7 @@ def test_random_regions(longest: int, times: int) -> None:
         regions = random_regions(generator, longest)
         density = 0.01 + 0.5 * float(torch.rand((), generator=generator))
         least, more = torch.randint(1, 300, (2,), generator=generator).tolist()
-        settings = SamplingSettings("uniform", density, least, least + more)
+        settings = SamplingConfig(density=density, min_pixels=least, max_pixels=least + more)
         for found, expected in zip(by_lines(regions, settings), by_pixels(regions, settings), strict=True):
             assert torch.equal(found, expected)
 
@@ -65,7 +65,7 @@ def test_random_regions(longest: int, times: int) -> None:
 def test_borders_and_middles_on_pixels(side: int, size: tuple[int, int]) -> None:
     """Cells of whole pixels: every border lies between two of them, and every second middle on one."""
     u, v = size
-    settings = SamplingSettings("uniform", 1 / side**2, 1)
+    settings = SamplingConfig(density=1 / side**2, min_pixels=1)
     regions = torch.tensor([[3, 5, 3 + u, 5 + v], [0, 0, 0, 0], [9, 9, 9 + v, 9 + u]])
     for found, expected in zip(by_lines(regions, settings), by_pixels(regions, settings), strict=True):
         assert torch.equal(found, expected)
@@ -73,14 +73,15 @@ def test_borders_and_middles_on_pixels(side: int, size: tuple[int, int]) -> None
 
 def test_middles_that_are_nearly_between_two_pixels() -> None:
     """Of large cells: both pixels are equally near to the seventh digit, whole columns of them."""
-    regions, settings = torch.tensor([[0, 0, 866, 274], [0, 0, 401, 209]]), SamplingSettings("uniform", 0.05, 200, 200)
+    regions = torch.tensor([[0, 0, 866, 274], [0, 0, 401, 209]])
+    settings = SamplingConfig(min_pixels=200, max_pixels=200)
     for found, expected in zip(by_lines(regions, settings), by_pixels(regions, settings), strict=True):
         assert torch.equal(found, expected)
 
 
 def test_the_selection_by_pixels_takes_the_same() -> None:
     regions = torch.tensor([[3, 5, 90, 40], [0, 0, 0, 0], [7, 7, 9, 60], [0, 0, 866, 274]])
-    settings = SamplingSettings("uniform", 0.05, 100, 200)
+    settings = SamplingConfig(mode="uniform", min_pixels=100, max_pixels=200)
     pixels = RegionPixels.of(regions)
     unseen = torch.zeros(len(pixels))
     candidates = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
@@ -90,7 +91,7 @@ def test_the_selection_by_pixels_takes_the_same() -> None:
 
 
 def test_no_regions() -> None:
-    index, uv = by_lines(torch.zeros(0, 4, dtype=torch.long), SamplingSettings("uniform"))
+    index, uv = by_lines(torch.zeros(0, 4, dtype=torch.long), SamplingConfig())
     assert index.shape == (0,)
     assert uv.shape == (0, 2)
 
@@ -98,6 +99,6 @@ def test_no_regions() -> None:
 def test_the_host_waits_for_two_numbers_alone() -> None:
     """They are read with `tolist`, of which nothing is seen here; and the work does not grow with the pixels."""
     small, large = (torch.tensor([[0, 0, length, length]]) for length in (50, 2000))
-    settings = SamplingSettings("uniform", min_pixels=100, max_pixels=100)
+    settings = SamplingConfig(min_pixels=100, max_pixels=100)
     assert host_traffic(lambda: even_pixels(small, settings)).found == []
     assert len(even_pixels(small, settings).u) == len(even_pixels(large, settings).u) == 100

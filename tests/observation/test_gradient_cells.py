@@ -9,7 +9,6 @@ from torch import Tensor
 from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
 from directshape_torch.observation.gradient_cells import Box, ImageRegion, gradient_cells
 from directshape_torch.observation.gradient_thresholds import cell_thresholds
-from directshape_torch.observation.sampling_settings import SamplingSettings
 
 SIZES = [[90, 130], [61, 97]]
 
@@ -28,7 +27,6 @@ def pixels_of(box: Box) -> Tensor:
 
 @pytest.mark.parametrize("side", [8, 32, 50])
 def test_magnitudes_and_thresholds_are_those_of_the_frames(side: int) -> None:
-    settings = SamplingSettings(threshold_cell_px=side)
     stacks = (images(0), images(1))
     regions = [
         ImageRegion(0, 0, (3, 5, 40, 30)),
@@ -37,25 +35,25 @@ def test_magnitudes_and_thresholds_are_those_of_the_frames(side: int) -> None:
         ImageRegion(0, 1, (0, 0, 0, 0)),  # nothing
         ImageRegion(1, 0, (64, 32, 65, 33)),
     ]
-    cells = gradient_cells(stacks, SIZES, regions, settings)
+    cells = gradient_cells(stacks, SIZES, regions, cell_px=side)
     for number, region in enumerate(regions):
         whole = gradient_magnitude(image_gradient(grey_levels(stacks[region.stack]), torch.tensor(SIZES)))
         uv = pixels_of(region.box)
         index = torch.full((len(uv),), number)
         assert torch.equal(cells.magnitude_at(index, uv), whole[region.frame, uv[:, 1], uv[:, 0]])
-        thresholds = cell_thresholds(whole, torch.tensor(SIZES), settings=settings)[region.frame]
+        thresholds = cell_thresholds(whole, torch.tensor(SIZES), cell_px=side)[region.frame]
         column, row = (uv // side).unbind(1)
         got = cells.thresholds[cells.first[number] + row * cells.columns[number] + column]
         assert torch.equal(got, thresholds[row, column])
 
 
 def test_only_cells_around_regions_are_made() -> None:
-    cells = gradient_cells((images(0),), SIZES, [ImageRegion(0, 0, (70, 40, 75, 44))], SamplingSettings())
+    cells = gradient_cells((images(0),), SIZES, [ImageRegion(0, 0, (70, 40, 75, 44))])
     # The region lies in cell (1, 2), whose neighbours are rows 0 to 2 and columns 1 to 3.
     assert cells.magnitude.shape == (9, 32, 32)
 
 
 def test_no_regions() -> None:
-    cells = gradient_cells((images(0),), SIZES, [], SamplingSettings())
+    cells = gradient_cells((images(0),), SIZES, [])
     assert cells.magnitude.shape == (0, 32, 32)
     assert cells.thresholds.shape == (0,)

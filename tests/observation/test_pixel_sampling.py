@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -10,10 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from directshape_torch.config import SamplingConfig
 from directshape_torch.errors import InputError
 from directshape_torch.observation.gradient_thresholds import cell_thresholds, cells_of_regions
 from directshape_torch.observation.pixel_sampling import sample_pixels, select_pixels
-from directshape_torch.observation.sampling_settings import SamplingMode, SamplingSettings
+
+# What `slow_sampling` takes.
+SAMPLING = SamplingConfig(min_pixels=100, max_pixels=3000)
 
 
 def slow_thresholds(magnitude: Tensor, height: int, width: int, side: int = 32) -> dict[tuple[int, int], float]:
@@ -62,7 +67,7 @@ def test_both_rounds_equal_the_slow_reference() -> None:
     magnitude = random_magnitude(0, (2, height, width))
     regions = torch.tensor([[10, 5, 90, 70], [0, 0, 130, 90], [100, 60, 105, 65], [33, 31, 34, 80]])
     frame_index = torch.tensor([0, 1, 1, 0])
-    chosen = select_pixels(magnitude, torch.tensor([[height, width]] * 2), frame_index, regions)
+    chosen = select_pixels(magnitude, torch.tensor([[height, width]] * 2), frame_index, regions, SAMPLING)
     for number, (region, frame) in enumerate(zip(regions.tolist(), frame_index.tolist(), strict=True)):
         expected = slow_sampling(magnitude[frame], slow_thresholds(magnitude[frame], height, width), region)
         of_region = chosen.object_index == number
@@ -80,7 +85,7 @@ def test_both_rounds_equal_the_slow_reference() -> None:
 def test_at_most_one_pixel_a_cell_and_none_missing(seed: int, u0: int, v0: int, w: int, h: int) -> None:
     magnitude = random_magnitude(seed, (1, 64, 80))
     region = [u0, v0, u0 + w, v0 + h]
-    chosen = select_pixels(magnitude, torch.tensor([[64, 80]]), torch.tensor([0]), torch.tensor([region]))
+    chosen = select_pixels(magnitude, torch.tensor([[64, 80]]), torch.tensor([0]), torch.tensor([region]), SAMPLING)
     expected = slow_sampling(magnitude[0], slow_thresholds(magnitude[0], 64, 80), region)
     assert {tuple(pixel) for pixel in chosen.uv.tolist()} == {(u, v) for u, v, _ in expected}
     # n = 100 cells are wanted of a region below 2000 pixels, plus the cut ones at two borders; narrow ones have fewer.
@@ -97,7 +102,7 @@ def test_strongest_wins_and_ties_go_to_the_first() -> None:
         torch.tensor([[64, 64]]),
         torch.tensor([0]),
         torch.tensor([[0, 0, 20, 20]]),
-        SamplingSettings(min_pixels=4, density=0.01),
+        SamplingConfig(min_pixels=4, density=0.01),
     )
     assert chosen.uv.tolist() == [[6, 5], [10, 0], [0, 10], [18, 15]]
     assert chosen.above_threshold.tolist() == [False, False, False, True]
@@ -108,7 +113,7 @@ def test_above_its_own_threshold_beats_stronger_below() -> None:
     magnitude = torch.zeros(1, 32, 64)
     magnitude[0, 4, 30], magnitude[0, 4, 34] = 12.0, 9.0
     thresholds = torch.tensor([[[20.0, 8.0]]])
-    settings_one = SamplingSettings(min_pixels=1, max_pixels=1)
+    settings_one = SamplingConfig(min_pixels=1, max_pixels=1)
     chosen = sample_pixels(magnitude, thresholds, torch.tensor([[28, 0, 36, 8]]), torch.tensor([0]), settings_one)
     assert chosen.uv.tolist() == [[34, 4]]
     assert chosen.above_threshold.tolist() == [True]
@@ -146,21 +151,22 @@ def test_a_nan_image_still_gives_pixels_and_touches_no_other_frame() -> None:
     magnitude = random_magnitude(3, (2, 64, 64))
     spoiled = magnitude.clone()
     spoiled[0] = torch.nan
-    arguments = torch.tensor([[64, 64]] * 2), torch.tensor([0, 1]), torch.tensor([[0, 0, 50, 50]] * 2)
+    arguments = torch.tensor([[64, 64]] * 2), torch.tensor([0, 1]), torch.tensor([[0, 0, 50, 50]] * 2), SAMPLING
     clean, got = select_pixels(magnitude, *arguments), select_pixels(spoiled, *arguments)
     assert torch.equal(got.uv[got.object_index == 1], clean.uv[clean.object_index == 1])
     assert not got.above_threshold[got.object_index == 0].any()
 
 
 @pytest.mark.parametrize("mode", ["adaptive", "round_one", "uniform", "dense"])
-def test_modes_batch_equals_loop_and_sorted(mode: SamplingMode) -> None:
+def test_modes_batch_equals_loop_and_sorted(mode: Any) -> None:
+    sampling = replace(SAMPLING, mode=mode)
     magnitude, sizes = random_magnitude(4, (2, 96, 128)), torch.tensor([[96, 128]] * 2)
     regions = torch.tensor([[5, 5, 60, 50], [0, 0, 0, 0], [70, 10, 120, 90], [60, 60, 64, 65]])
     frame_index = torch.tensor([1, 0, 0, 1])
-    chosen = select_pixels(magnitude, sizes, frame_index, regions, SamplingSettings(mode=mode))
+    chosen = select_pixels(magnitude, sizes, frame_index, regions, sampling)
     assert (chosen.object_index.diff() >= 0).all()
     for number in range(4):
-        alone = select_pixels(magnitude, sizes, frame_index[[number]], regions[[number]], SamplingSettings(mode=mode))
+        alone = select_pixels(magnitude, sizes, frame_index[[number]], regions[[number]], sampling)
         assert torch.equal(chosen.uv[chosen.object_index == number], alone.uv)
     count = int((chosen.object_index == 3).sum())
     assert count == 20 if mode != "round_one" else count < 20  # 4 x 5 pixels: all there are
@@ -170,7 +176,7 @@ def test_modes_batch_equals_loop_and_sorted(mode: SamplingMode) -> None:
 
 
 def test_uniform_takes_the_middle_of_each_cell() -> None:
-    settings_9 = SamplingSettings(mode="uniform", min_pixels=9, density=0.001)
+    settings_9 = SamplingConfig(mode="uniform", min_pixels=9, density=0.001)
     magnitude = random_magnitude(5, (1, 32, 32))
     chosen = select_pixels(
         magnitude, torch.tensor([[32, 32]]), torch.tensor([0]), torch.tensor([[1, 2, 16, 17]]), settings_9
@@ -182,14 +188,16 @@ def test_uniform_takes_the_middle_of_each_cell() -> None:
 @pytest.mark.parametrize("num_frames", [0, 2])
 def test_no_objects(num_frames: int) -> None:
     magnitude, none = torch.zeros(num_frames, 40, 50), torch.zeros(0, dtype=torch.long)
-    chosen = select_pixels(magnitude, torch.tensor([[40, 50]] * num_frames).reshape(-1, 2), none, none.reshape(0, 4))
+    chosen = select_pixels(
+        magnitude, torch.tensor([[40, 50]] * num_frames).reshape(-1, 2), none, none.reshape(0, 4), SAMPLING
+    )
     assert chosen.uv.shape == (0, 2)
     assert chosen.object_index.shape == chosen.above_threshold.shape == (0,)
 
 
 def test_float64_selects_the_same_pixels() -> None:
     magnitude, sizes = random_magnitude(6, (1, 64, 64)), torch.tensor([[64, 64]])
-    arguments = sizes, torch.tensor([0]), torch.tensor([[3, 3, 60, 60]])
+    arguments = sizes, torch.tensor([0]), torch.tensor([[3, 3, 60, 60]]), SAMPLING
     assert torch.equal(select_pixels(magnitude, *arguments).uv, select_pixels(magnitude.double(), *arguments).uv)
 
 
@@ -197,16 +205,10 @@ def test_wrong_input_is_named() -> None:
     zeros = torch.zeros(1, 40, 40)
     index, sizes = torch.tensor([0]), torch.tensor([[40, 40]])
     with pytest.raises(InputError, match=r"regions: expected integer .* use region_boxes"):
-        sample_pixels(zeros, torch.zeros(1, 2, 2), torch.zeros(1, 4), index)
+        sample_pixels(zeros, torch.zeros(1, 2, 2), torch.zeros(1, 4), index, SAMPLING)
     with pytest.raises(InputError, match=r"frame_index: expected shape \(1,\)"):
-        sample_pixels(zeros, torch.zeros(1, 2, 2), torch.zeros(1, 4).long(), torch.tensor([0, 0]))
+        sample_pixels(zeros, torch.zeros(1, 2, 2), torch.zeros(1, 4).long(), torch.tensor([0, 0]), SAMPLING)
     with pytest.raises(InputError, match=r"thresholds: expected shape \(1, rows, columns\)"):
-        sample_pixels(zeros, torch.zeros(2, 2), torch.zeros(1, 4).long(), index)
+        sample_pixels(zeros, torch.zeros(2, 2), torch.zeros(1, 4).long(), index, SAMPLING)
     with pytest.raises(InputError, match="magnitude: expected shape"):
         cell_thresholds(zeros[None], sizes)
-    with pytest.raises(InputError, match="density: expected a share"):
-        SamplingSettings(density=5.0)
-    with pytest.raises(InputError, match="mode: expected 'adaptive'"):
-        SamplingSettings(mode="gaussian")
-    with pytest.raises(InputError, match=r"min_pixels: expected 1\.\.max_pixels"):
-        SamplingSettings(min_pixels=10, max_pixels=5)
