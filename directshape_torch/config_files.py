@@ -17,7 +17,7 @@ BUNDLED_CONFIGS = ("default", "paper", "fast")
 """Names of the settings that come with the package, for `load_config`."""
 
 _CONFIG_FOLDER = Path(__file__).parent / "assets" / "configs"
-_KINDS = {float: "a number", int: "a whole number", bool: "true or false"}
+_KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 _GroupT = TypeVar("_GroupT", bound=Settings)
 
 
@@ -107,7 +107,7 @@ def _convert_scalar(hint: type[Any], value: Any, where: str) -> Any:
         return float(value)
     if hint is int and is_number and float(value).is_integer():
         return int(value)
-    if hint is bool and isinstance(value, bool):
+    if hint in (bool, str) and isinstance(value, hint):
         return value
     raise ConfigError(f"{where}: expected {_KINDS[hint]}, got {value!r}")
 
