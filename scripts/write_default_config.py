@@ -19,6 +19,7 @@ from directshape_torch.config import RefinerConfig, Settings, limits_in_words
 from directshape_torch.config_files import config_to_mapping
 
 TARGET = Path(__file__).parent.parent / "directshape_torch" / "assets" / "configs" / "default.yaml"
+_UNBROKEN = "\N{NO-BREAK SPACE}"
 HEADER = """\
 # The default settings: the best we know. They are also what the program uses without --config.
 # Written by scripts/write_default_config.py from directshape_torch/config.py; a file may hold any subset of the keys.
@@ -64,13 +65,14 @@ def _setting(field: dataclasses.Field[Any], value: Any, indent: str) -> str:
 
 
 def _description(field: dataclasses.Field[Any]) -> str:
-    limits = limits_in_words(field.metadata["limits"])
+    # Brackets stay on one line.
+    limits = limits_in_words(field.metadata["limits"]).replace(" ", _UNBROKEN)
     return field.metadata["description"] + (f" [{limits}]" if limits else "")
 
 
 def _comment(text: str, indent: str) -> str:
     prefix = f"{indent}# "
-    return textwrap.fill(text, 118, initial_indent=prefix, subsequent_indent=prefix) + "\n"
+    return textwrap.fill(text, 118, initial_indent=prefix, subsequent_indent=prefix).replace(_UNBROKEN, " ") + "\n"
 
 
 if __name__ == "__main__":
