@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.observation.gradient_cells import ImageRegion, gradient_cells
 from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.observation.sampling_settings import SamplingMode, SamplingSettings
@@ -18,7 +18,7 @@ FRAMES = [0, 1, 0, 0, 1, 1]
 
 
 def check(images: Tensor, settings: SamplingSettings) -> None:
-    magnitude = gradient_magnitude(image_gradient(grey_levels(images), SIZES))
+    magnitude = gradient_magnitude(images, SIZES)
     regions = torch.tensor(REGIONS)
     expected = select_pixels(magnitude, SIZES, torch.tensor(FRAMES), regions, settings)
     places = [
