@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import torch
+from kornia.geometry import camera as kornia_camera
 from torch import Tensor
 
 from directshape_torch.checks import (
@@ -25,10 +26,14 @@ from directshape_torch.checks import (
 )
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.se3 import from_rotation_translation
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
 _DARKEST = -0.5
+# Of rectified cameras: 1e-4 radians move a pixel by 0.07 at a focal length of 700, and KITTI's stand askew by 0.5 %.
+_LARGEST_TURN = 1e-4
+_LARGEST_OFFSET = 0.05  # of the baseline
 
 
 class _TensorRecord:
@@ -122,6 +127,50 @@ class StereoCamera(_TensorRecord):
         T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
         T_right_cam[:, :3, 3] = t_right - t_left
         return cls(K_left.clone(), K_right.clone(), T_right_cam, t_left, disparity_field)
+
+    @classmethod
+    def from_kornia(
+        cls,
+        left: kornia_camera.PinholeCamera | kornia_camera.StereoCamera,
+        right: kornia_camera.PinholeCamera | None = None,
+        disparity_field: DisparityField | None = None,
+    ) -> StereoCamera:
+        """From a rectified pair of kornia's `PinholeCamera`, or from its `StereoCamera`, of F frames each.
+
+        Pixels and axes are the same there: centres at integers, x right, y down, z forward. Extrinsics (world to
+        camera) and projections are taken to be in metres. Of a pair, `T_right_cam` is kept and the world is not: `ref`
+        is the left camera itself. The height and width of the images belong to `FrameBatch.sizes`. Dtype, device and
+        gradients are kept.
+
+        Args:
+            left: of the left images: a `StereoCamera`, which has both, or intrinsics and extrinsics (F, 4, 4).
+            right: likewise of the right images; None beside a `StereoCamera`.
+            disparity_field: residual disparity of the rig (measured minus true), or None.
+
+        Raises:
+            InputError: other types, a pair whose batch, image size, dtype or device differ, a rotation that is none,
+                cameras that are not rectified (turned by more than 1e-4 radians, or displaced by more than 5 % of the
+                baseline in height or depth), or a right camera that is not to the right of the left one.
+
+        Example:
+            >>> K, T_right_cam = torch.eye(4)[None], torch.eye(4)[None].clone()
+            >>> K[0, 0, 0] = K[0, 1, 1] = 700.0
+            >>> T_right_cam[0, 0, 3] = -0.54
+            >>> height, width = torch.tensor([375]), torch.tensor([1242])
+            >>> left = kornia_camera.PinholeCamera(K, torch.eye(4)[None], height, width)
+            >>> right = kornia_camera.PinholeCamera(K, T_right_cam, height, width)
+            >>> StereoCamera.from_kornia(left, right).baseline
+            tensor([0.5400])
+        """
+        if isinstance(left, kornia_camera.StereoCamera):
+            if right is not None:
+                raise InputError("right", "None beside kornia's StereoCamera, which has both", type(right).__name__)
+            return cls.from_projections(left.rectified_left_camera, left.rectified_right_camera, disparity_field)
+        pair = _pinhole("left", left), _pinhole("right", right)
+        _check_alike(*pair)
+        T_right_cam = _between_rectified(*pair)
+        K_left, K_right = (camera.intrinsics[:, :3, :3].clone() for camera in pair)
+        return cls(K_left, K_right, T_right_cam, torch.zeros_like(T_right_cam[:, :3, 3]), disparity_field)
 
     @property
     def num_frames(self) -> int:
@@ -356,6 +405,45 @@ def _translation(
     except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
         cure = "give the projections of the rectified cameras (KITTI: P2 and P3)"
         raise InputError(name, "intrinsics K = P[:, :3] that can be inverted", "a singular K", cure) from error
+
+
+def _pinhole(name: str, camera: object) -> kornia_camera.PinholeCamera:
+    if not isinstance(camera, kornia_camera.PinholeCamera):
+        expected = "kornia's PinholeCamera" + (" beside the left one" if name == "right" else " or StereoCamera")
+        raise InputError(name, expected, type(camera).__name__, "for matrices there is from_projections")
+    check_shape(f"{name}.intrinsics", camera.intrinsics, ("F", 4, 4), "give one camera a frame")
+    check_shape(f"{name}.rt_matrix", camera.rt_matrix, (len(camera.intrinsics), 3, 4), "give one camera a frame")
+    if camera.intrinsics.dtype not in (torch.float32, torch.float64):
+        raise InputError(name, "float32 or float64", str(camera.intrinsics.dtype), "convert its matrices")
+    check_rotation(name, camera.rt_matrix)
+    return camera
+
+
+def _check_alike(left: kornia_camera.PinholeCamera, right: kornia_camera.PinholeCamera) -> None:
+    for what, of in (
+        ("frames", lambda camera: camera.batch_size),
+        ("dtype", lambda camera: camera.intrinsics.dtype),
+        ("device", lambda camera: camera.device()),
+        ("(height, width)", lambda camera: torch.stack([camera.height, camera.width], dim=1).tolist()),
+    ):
+        if of(left) != of(right):
+            cure = "give both cameras of every frame, of images rectified to one size"
+            raise InputError("right", f"the {what} of the left camera: {of(left)}", f"{of(right)}", cure)
+
+
+def _between_rectified(left: kornia_camera.PinholeCamera, right: kornia_camera.PinholeCamera) -> Tensor:
+    """`T_right_cam` (F, 4, 4), in float64 on the way: their world may be far away."""
+    R = right.rotation_matrix.double() @ left.rotation_matrix.double().mT
+    t = (right.translation_vector.double() - R @ left.translation_vector.double())[..., 0]
+    turn = (R - torch.eye(3).to(R)).detach().abs().amax(dim=(1, 2))
+    offset = t.detach()[:, 1:].abs().amax(dim=1)
+    askew = (turn > _LARGEST_TURN) | (offset > _LARGEST_OFFSET * t.detach()[:, 0].abs())
+    if askew.any():
+        row = int(askew.int().argmax())
+        got = f"a turn by {turn[row]:.2g} and a translation by {[round(x, 4) for x in t[row].tolist()]} m in row {row}"
+        cure = "rectify the images, and give the cameras of the rectified ones (cv2.stereoRectify)"
+        raise InputError("right", "a rectified pair: parallel cameras, side by side", got, cure)
+    return from_rotation_translation(R, t).to(right.intrinsics.dtype)
 
 
 def _check_brightness(name: str, images: Tensor) -> None:

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 from helpers.synthetic_scene import cached_street
+from kornia.geometry import camera as kornia_camera
+from kornia.geometry.camera.pinhole import PinholeCamerasList
 
 from directshape_torch.checks import check_shape
 from directshape_torch.errors import (
@@ -20,6 +22,8 @@ from directshape_torch.errors import (
     MissingDependencyError,
     ResumeError,
 )
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.pinhole import project
 from directshape_torch.scene import GroundPlane, Occluders, StereoCamera
 from directshape_torch.status import Status
 
@@ -250,6 +254,93 @@ def test_projections_share_a_dtype() -> None:
     for wrong in (torch.int64, torch.float16):
         with pytest.raises(InputError, match=rf"P_left: expected float32 or float64, got {wrong}; convert it"):
             StereoCamera.from_projections(P_left.to(wrong), P_right)
+
+
+def pinhole(
+    T_cam_world: torch.Tensor,  # (F, 4, 4)
+    size_hw: tuple[int, int] = (375, 1242),
+) -> kornia_camera.PinholeCamera:
+    K = torch.diag_embed(T_cam_world.new_tensor([721.5, 719.0, 1.0, 1.0])).repeat(len(T_cam_world), 1, 1)
+    K[:, 0, 2], K[:, 1, 2] = 609.6, 172.9
+    height, width = (K.new_full((len(K),), side) for side in size_hw)
+    return kornia_camera.PinholeCamera(K, T_cam_world, height, width)
+
+
+def beside(T_cam_world: torch.Tensor, *shift: float) -> torch.Tensor:
+    """The left camera moved along its own axes, its own transform kept."""
+    T_right_cam = torch.eye(4).to(T_cam_world)
+    T_right_cam[:3, 3] = -T_cam_world.new_tensor(shift)
+    return T_right_cam @ T_cam_world
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_kornias_pinhole_pair(dtype: torch.dtype) -> None:
+    """Cameras somewhere in a world, the right one 2.7 mm off vertically: points appear where kornia has them."""
+    twist = torch.tensor([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [300.0, -2.0, 500.0, 0.3, -1.0, 0.2]], dtype=dtype)
+    T_cam_world = se3.exp(twist)
+    left, right = pinhole(T_cam_world), pinhole(beside(T_cam_world, 0.54, 0.0027, 0.0))
+    rig = StereoCamera.from_kornia(left, right)
+    assert rig.K_left.dtype == rig.T_right_cam.dtype == rig.t_cam_ref.dtype == dtype
+    assert rig.num_frames == 2
+    atol = 1e-4 if dtype == torch.float32 else 1e-12  # a float32 world of 600 m has steps of 0.06 mm
+    torch.testing.assert_close(rig.baseline, torch.full((2,), 0.54, dtype=dtype), atol=atol, rtol=0)
+    assert not rig.t_cam_ref.any()
+    point_cam = torch.tensor([2.0, 1.0, 15.0], dtype=dtype).expand(2, 1, 3)
+    point_world = se3.transform(se3.inverse(T_cam_world)[:, None], point_cam)
+    expected = right.project(point_world)
+    seen = project(se3.transform(rig.T_right_cam[:, None], point_cam), rig.K_right[:, None])
+    torch.testing.assert_close(seen, expected, atol=1e3 * atol, rtol=0)
+
+    left.scale_(0.5)  # in place, but of its own matrices
+    assert (rig.K_left[:, 0, 0] == rig.K_right[:, 0, 0]).all()
+
+
+def test_kornias_stereo_camera() -> None:
+    P_left = pinhole(torch.eye(4, dtype=torch.float64)[None]).intrinsics[:, :3]
+    P_right = P_left.clone()
+    P_right[:, 0, 3] = -0.54 * P_left[:, 0, 0]
+    theirs = kornia_camera.StereoCamera(P_left, P_right)
+    rig = StereoCamera.from_kornia(theirs)
+    torch.testing.assert_close(rig.baseline, theirs.tx)
+    assert torch.equal(rig.K_right, P_left[..., :3])
+    assert not rig.t_cam_ref.any()
+    with pytest.raises(InputError, match=r"right: expected None beside kornia's StereoCamera"):
+        StereoCamera.from_kornia(theirs, pinhole(torch.eye(4)[None]))
+
+
+def test_gradients_reach_kornias_cameras() -> None:
+    T_left = torch.eye(4, dtype=torch.float64)[None]
+    T_right = beside(T_left, 0.54, 0.0, 0.0).requires_grad_()
+    StereoCamera.from_kornia(pinhole(T_left), pinhole(T_right)).baseline.sum().backward()
+    assert T_right.grad is not None
+    assert T_right.grad[0, 0, 3] == -1
+
+
+def test_kornias_pair_is_checked() -> None:
+    T_left = torch.eye(4).repeat(2, 1, 1)
+    T_right = beside(T_left, 0.54, 0.0, 0.0)
+    left, right = pinhole(T_left), pinhole(T_right)
+    turned = se3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 1e-3, 0.0])) @ T_right
+    for wrong, message in (
+        (None, r"right: expected kornia's PinholeCamera beside the left one, got NoneType; for matrices"),
+        (pinhole(T_right[:1]), r"right: expected the frames of the left camera: 2, got 1; give both cameras"),
+        (pinhole(T_right, (370, 1242)), r"the \(height, width\) of the left .*375.* got .*370.*; give both"),
+        (pinhole(T_right.double()), r"the dtype of the left camera: torch.float32, got torch.float64; give both"),
+        (pinhole(turned), r"right: expected a rectified pair: .* got a turn by 0\.001 .* in row 0; rectify the images"),
+        (pinhole(beside(T_left, 0.54, 0.1, 0.0)), r"a rectified pair: .* \[-0\.54, -0\.1, 0\.0\] m in row 0; rectify"),
+        (pinhole(beside(T_left, -0.54, 0.0, 0.0)), r"T_right_cam: .* got baseline -0\.5400 m; swap the two cameras"),
+        (pinhole(2 * T_left), r"right: expected rotations R with .* leave scale out"),
+        (pinhole(T_left + torch.nan), r"T_right_cam: expected finite numbers, got NaN or infinity"),
+    ):
+        with pytest.raises(InputError, match=message):
+            StereoCamera.from_kornia(left, wrong)
+    for wrong, message in (
+        (T_left, r"left: expected kornia's PinholeCamera or StereoCamera, got Tensor; for matrices there is"),
+        (PinholeCamerasList([left]), r"left.intrinsics: expected shape \(F, 4, 4\), got \(2, 1, 4, 4\); give one"),
+        (pinhole(T_left.half()), r"left: expected float32 or float64, got torch.float16; convert"),
+    ):
+        with pytest.raises(InputError, match=message):
+            StereoCamera.from_kornia(wrong, right)  # type: ignore[arg-type]
 
 
 def test_moving_to_a_dtype_keeps_integers_and_masks() -> None:

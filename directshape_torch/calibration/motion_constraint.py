@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
+from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from directshape_torch.calibration.disparity_observations import DisparityObservations
@@ -27,7 +28,7 @@ from directshape_torch.calibration.motion_tracks import TrackedFeatures
 from directshape_torch.calibration.road_constraint import disparity_slope
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.se3 import exp, hat
+from directshape_torch.geometry.se3 import exp
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.points import depth_from_disparity, disparity_of_depth
 
@@ -105,7 +106,9 @@ class MotionConstraint:
         # The point times its inverse depth: finite however far it is.
         later = rays_from_pixels(tracks.uv_left, calibration[0]) @ R.T + inverse_depth[:, None] * t
         J_uv_later = _projection_jacobian(later, calibration[0])
-        J_later_twist = torch.cat([inverse_depth[:, None, None] * torch.eye(3, dtype=later.dtype), -hat(later)], dim=2)
+        J_later_twist = torch.cat(
+            [inverse_depth[:, None, None] * torch.eye(3, dtype=later.dtype), -So3.hat(later)], dim=2
+        )
         residual_uv = (project(later, calibration[0]) - tracks.uv_later) / _TRACK_SIGMA_PX
         residual = torch.cat([((disparity + bias - tracks.disparity) / PATCH_SIGMA_PX)[:, None], residual_uv], dim=1)
         slope = disparity_slope(tracks.uv_left, inverse_depth, *calibration)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.image.gradients import grey_of_channels, length_2d
+from directshape_torch.image.gradients import grey_levels, length_2d
 from directshape_torch.table_lookup import take
 
 
@@ -14,7 +14,7 @@ def gradient_magnitude_of_part(
     size_hw: tuple[int, int],
     part: tuple[int, int, int, int],
 ) -> Tensor:
-    """`gradient_magnitude` of one part of a frame, the same numbers as in the whole; differentiable by the image.
+    """Length of the image gradient in one part of a frame, by central differences; differentiable by the image.
 
     Args:
         image: (3, H, W), RGB in [0, 1], padded at the right and bottom.
@@ -32,12 +32,31 @@ def gradient_magnitude_of_part(
     (u0, v0, u1, v1), (height, width) = part, size_hw
     # One pixel more on each side, as far as there is one.
     left, top, right, bottom = int(u0 > 0), int(v0 > 0), int(u1 < width), int(v1 < height)
-    grey = grey_of_channels(*image[:, v0 - top : v1 + bottom, u0 - left : u1 + right])
+    grey = grey_levels(image[:, v0 - top : v1 + bottom, u0 - left : u1 + right])
     if not left or not top or not right or not bottom:
         missing = (1 - left, 1 - right, 1 - top, 1 - bottom)
         grey = torch.nn.functional.pad(grey[None], missing, mode="replicate")[0]
     d_u, d_v = grey[1:-1, 2:] - grey[1:-1, :-2], grey[2:, 1:-1] - grey[:-2, 1:-1]
     return length_2d(d_u, d_v).mul_(0.5)
+
+
+def gradient_magnitude(
+    images: Tensor,  # (F, 3, H, W)
+    sizes: Tensor,  # (F, 2)
+) -> Tensor:
+    """`gradient_magnitude_of_part` of whole frames (F, H, W), 0 in their padding: for figures.
+
+    Example:
+        >>> ramp = torch.arange(4.0).expand(1, 3, 2, 4) / 255
+        >>> gradient_magnitude(ramp, torch.tensor([[1, 4]]))
+        tensor([[[0.5000, 1.0000, 1.0000, 0.5000],
+                 [0.0000, 0.0000, 0.0000, 0.0000]]])
+    """
+    magnitude = torch.zeros_like(images[:, 0])
+    for frame, (height, width) in enumerate(sizes.tolist()):
+        whole = gradient_magnitude_of_part(images[frame], (height, width), (0, 0, width, height))
+        magnitude[frame, :height, :width] = whole
+    return magnitude
 
 
 def gradient_magnitude_at(
@@ -46,7 +65,7 @@ def gradient_magnitude_at(
     frame_index: Tensor,  # (P,)
     uv: Tensor,  # (P, 2)
 ) -> Tensor:
-    """`gradient_magnitude` at single pixels, the same numbers as in whole frames; differentiable by the images.
+    """`gradient_magnitude_of_part` at single pixels, the same numbers; differentiable by the images.
 
     Args:
         images: (F, 3, H, W), RGB in [0, 1], padded at the right and bottom.
@@ -74,5 +93,5 @@ def gradient_magnitude_at(
     else:
         # Without a copy of whole frames that lie in memory in another order.
         values = images[frame_index, channel, places_v, places_u]
-    right, left, below, above = grey_of_channels(*values.unbind(0)).unbind(0)
+    right, left, below, above = grey_levels(values).unbind(0)
     return length_2d(right - left, below - above).mul_(0.5)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import torch
+from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from directshape_torch.energy.photometric_term import PhotometricTerm
@@ -40,7 +41,7 @@ _SERIES_TERMS = 60
 
 def exponential(bench: Bench) -> Experiment:
     """`exp(xi)` (12 numbers) at the twists of the states; `d exp = hat(J_l d xi) exp`, J_l by its power series."""
-    twist = se3.log(bench.state.T_obj_cam)
+    twist = se3.to_kornia(bench.state.T_obj_cam).log()
     T = se3.exp(twist)
     generated = se3.generators(twist.dtype) @ T[:, None]
     J = torch.einsum("bgij,bgk->bijk", generated, left_jacobian(twist))
@@ -59,7 +60,7 @@ def left_jacobian(twist: Tensor) -> Tensor:
         >>> left_jacobian(torch.zeros(6)).diagonal()
         tensor([1., 1., 1., 1., 1., 1.])
     """
-    v, omega = se3.hat(twist[..., :3]), se3.hat(twist[..., 3:])
+    v, omega = So3.hat(twist[..., :3]), So3.hat(twist[..., 3:])
     ad = torch.cat([torch.cat([omega, v], dim=-1), torch.cat([torch.zeros_like(v), omega], dim=-1)], dim=-2)
     power = torch.eye(6, dtype=twist.dtype, device=twist.device).expand_as(ad)
     total = power
@@ -74,7 +75,7 @@ def transform(bench: Bench) -> Experiment:
     points_cam, points_obj, car = _points(bench)
     T = bench.state.T_obj_cam[car]
     identity = torch.eye(3, dtype=points_obj.dtype).expand(len(points_obj), 3, 3)
-    J = torch.cat([identity, -se3.hat(points_obj)], dim=-1)
+    J = torch.cat([identity, -So3.hat(points_obj)], dim=-1)
     at = points_obj.new_zeros(len(points_obj), 6)
     return factor_experiment("transform", lambda d: se3.transform(se3.exp(d) @ T, points_cam), at, J)
 

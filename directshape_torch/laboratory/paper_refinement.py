@@ -150,7 +150,7 @@ def _refine(
 def _compare(name: str, first: _Refined, second: _Refined) -> PaperRefinement:
     exact, paper = first.minimum, second.minimum
     costs = first.cost, second.cost
-    difference = se3.log(paper.state.T_obj_cam @ se3.inverse(exact.state.T_obj_cam))
+    difference = se3.to_kornia(paper.state.T_obj_cam @ se3.inverse(exact.state.T_obj_cam)).log()
     metres, degrees = difference[:, :3].norm(dim=1), torch.rad2deg(difference[:, 3:].norm(dim=1))
     converged = [int((m.status == Status.converged.code).sum()) for m in (exact, paper)]
     return PaperRefinement(

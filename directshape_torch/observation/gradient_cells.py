@@ -1,6 +1,7 @@
 """Gradient magnitudes and thresholds where cars are: in each image the threshold cells around its regions.
 
-What `image_gradient` and `cell_thresholds` find in whole frames, number for number, at a cost that follows the cars.
+What `gradient_magnitude` and `cell_thresholds` find in whole frames, number for number, at a cost that follows the
+cars.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.pixel_sampling import select_pixels
@@ -36,7 +36,7 @@ def observation_sheet(
     """
     config = SamplingConfig() if config is None else config
     left, _ = car_regions(frames, detections, config)
-    magnitude = gradient_magnitude(image_gradient(grey_levels(frames.images_left), frames.sizes))
+    magnitude = gradient_magnitude(frames.images_left, frames.sizes)
     chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, left, sampling_settings(config, "left"))
     order = config.occlusion_order
     panels = [

@@ -23,7 +23,6 @@ class Equivalent:
 
 
 _OF_ZERO = "the negative of zero is zero"
-_EITHER_SIGN = "a quaternion and its negative are the same rotation, and so3_log turns it to w >= 0"
 _BRANCH_NOT_TAKEN = "a stand-in where the other branch is taken: neither its value nor its derivative gets anywhere"
 _SQUARED = "the floor of the contrast enters as a square"
 _FLAG = "a flag, whose truth a sign leaves alone"
@@ -46,7 +45,6 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent(
         "EndLinearisation.plus", "[self.photometric_gradient, other.photometric_gradient]", None, _IN_ANOTHER_ORDER
     ),
-    Equivalent("hat", "zero", "(-zero)", _OF_ZERO),
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
     Equivalent("viewing_axes", "zero", "(-zero)", _OF_ZERO),
@@ -139,21 +137,6 @@ EQUIVALENTS: tuple[Equivalent, ...] = (
         _ROW_IN_PAIRS,
     ),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
-    Equivalent(
-        "_quaternion",
-        "row / row.norm(dim=-1, keepdim=True)",
-        "(-(row / row.norm(dim=-1, keepdim=True)))",
-        _EITHER_SIGN,
-    ),
-    *(
-        Equivalent("_quaternion", row, f"(-{row})", _EITHER_SIGN)
-        for row in (
-            "torch.stack([four_squared[..., 0], a, b, c], dim=-1)",
-            "torch.stack([a, four_squared[..., 1], d, e], dim=-1)",
-            "torch.stack([b, d, four_squared[..., 2], f], dim=-1)",
-            "torch.stack([c, e, f, four_squared[..., 3]], dim=-1)",
-        )
-    ),
     Equivalent(
         "project",
         "K @ points_cam[..., None]",

@@ -16,6 +16,7 @@ import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT, begun_problem
 from helpers.synthetic_scene import cached_street, disturbed
+from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from directshape_torch.energy.car_state import CarState, retract
@@ -288,7 +289,7 @@ def test_22_jacobians_are_out_in() -> None:
     gradient, X = vector(0.1, -0.6, 0.7), vector(1.0, -0.8, 0.4)
     at = SdfDerivatives(vector(0.0), gradient[None], torch.zeros(1, 2).double())
     J_sdf_point = gradient[None]
-    J_point_state = torch.cat([torch.eye(3).double(), -se3.hat(X)], dim=1)  # of v + omega x X
+    J_point_state = torch.cat([torch.eye(3).double(), -So3.hat(X)], dim=1)  # of v + omega x X
     J_sdf_state = sdf_state_jacobian(X[None], at)
     torch.testing.assert_close(J_sdf_state[:, :6], J_sdf_point @ J_point_state)
     assert J_sdf_state.shape == (1, 8)

@@ -1,26 +1,60 @@
-"""Parts of frames against the same pixels of whole frames."""
+"""Parts of frames against kornia's gradients of whole frames, and against hand-derived numbers."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from kornia.filters import spatial_gradient
+from torch import Tensor
 
-from directshape_torch.image.frame_parts import gradient_magnitude_at, gradient_magnitude_of_part
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.image.frame_parts import (
+    gradient_magnitude,
+    gradient_magnitude_at,
+    gradient_magnitude_of_part,
+)
+from directshape_torch.image.gradients import grey_levels, length_2d
 
 # Of a frame of 41 x 33 pixels: inside, along each edge, in corners, single pixels, all of it.
 PARTS = [(5, 6, 20, 31), (0, 6, 4, 9), (30, 2, 33, 8), (3, 0, 9, 2), (3, 40, 9, 41), (0, 0, 1, 1), (32, 40, 33, 41),
          (0, 0, 33, 41)]  # fmt: skip
 
 
+def by_kornia(
+    image: Tensor,  # (3, H, W)
+    size_hw: tuple[int, int],
+) -> Tensor:
+    """Of one frame without its padding, (height, width)."""
+    height, width = size_hw
+    grey = grey_levels(image[None, :, :height, :width])
+    return length_2d(*spatial_gradient(grey[None], mode="diff")[0, 0])
+
+
+def test_numbers_by_hand() -> None:
+    """d/du = 3, 4, 1 by the replicated border, and d/dv = 5."""
+    grey = torch.tensor([[0.0, 6.0, 8.0], [10.0, 16.0, 18.0]], dtype=torch.float64)
+    magnitude = gradient_magnitude_of_part((grey / 255).expand(3, 2, 3), (2, 3), (0, 0, 3, 2))
+    expected = torch.tensor([34.0, 41.0, 26.0], dtype=torch.float64).sqrt().expand(2, 3)
+    torch.testing.assert_close(magnitude, expected)
+
+
+def test_whole_frames_have_nothing_in_their_padding() -> None:
+    images = torch.rand(3, 3, 7, 9, generator=torch.Generator().manual_seed(2))
+    sizes = [(4, 5), (7, 9), (1, 1)]
+    magnitude = gradient_magnitude(images, torch.tensor(sizes))
+    for image, size, got in zip(images, sizes, magnitude, strict=True):
+        expected = by_kornia(image, size)
+        assert torch.equal(got[: size[0], : size[1]], expected)
+        assert float(got.sum()) == pytest.approx(float(expected.sum()), rel=1e-6)
+    assert gradient_magnitude(images[:0], torch.zeros(0, 2)).shape == (0, 7, 9)
+
+
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gradients_of_a_part_are_those_of_the_frame(part: tuple[int, int, int, int], dtype: torch.dtype) -> None:
     images = torch.rand(1, 3, 50, 70, generator=torch.Generator().manual_seed(0), dtype=dtype)
-    whole = gradient_magnitude(image_gradient(grey_levels(images), torch.tensor([[41, 33]])))
     u0, v0, u1, v1 = part
     got = gradient_magnitude_of_part(images[0], (41, 33), part)
-    assert torch.equal(got, whole[0, v0:v1, u0:u1])
+    assert torch.equal(got, by_kornia(images[0], (41, 33))[v0:v1, u0:u1])
 
 
 def test_a_frame_of_one_pixel_is_flat() -> None:
@@ -43,13 +77,12 @@ def test_where_an_image_is_flat_the_derivative_is_zero() -> None:
 def test_gradients_at_pixels_are_those_of_the_frames(dtype: torch.dtype) -> None:
     images = torch.rand(2, 3, 50, 70, generator=torch.Generator().manual_seed(0), dtype=dtype)
     sizes = torch.tensor([[41, 33], [50, 70]])
-    whole = gradient_magnitude(image_gradient(grey_levels(images), sizes))
     for frame, (height, width) in enumerate(sizes.tolist()):
         v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         uv = torch.stack([u, v], dim=-1).reshape(-1, 2)
         for given in (images, images.contiguous(memory_format=torch.channels_last)):
             got = gradient_magnitude_at(given, sizes, torch.full((len(uv),), frame), uv)
-            assert torch.equal(got.view(height, width), whole[frame, :height, :width])
+            assert torch.equal(got.view(height, width), by_kornia(images[frame], (height, width)))
 
 
 def test_derivatives_at_pixels_by_the_images_are_exact() -> None:

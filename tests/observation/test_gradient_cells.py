@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.observation.gradient_cells import Box, ImageRegion, gradient_cells
 from directshape_torch.observation.gradient_thresholds import cell_thresholds
 
@@ -37,7 +37,7 @@ def test_magnitudes_and_thresholds_are_those_of_the_frames(side: int) -> None:
     ]
     cells = gradient_cells(stacks, SIZES, regions, cell_px=side)
     for number, region in enumerate(regions):
-        whole = gradient_magnitude(image_gradient(grey_levels(stacks[region.stack]), torch.tensor(SIZES)))
+        whole = gradient_magnitude(stacks[region.stack], torch.tensor(SIZES))
         uv = pixels_of(region.box)
         index = torch.full((len(uv),), number)
         assert torch.equal(cells.magnitude_at(index, uv), whole[region.frame, uv[:, 1], uv[:, 0]])

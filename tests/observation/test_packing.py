@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.occlusion import Side, hidden_pixels
@@ -29,7 +29,7 @@ def whole_frame_side(frames: FrameBatch, d: Detections, side: Side, regions: Ten
     images, masks = (
         (frames.images_left, d.mask_left) if side == "left" else (frames.images_right, d.mask_right)
     )  # fmt: skip
-    magnitude = gradient_magnitude(image_gradient(grey_levels(images), frames.sizes))
+    magnitude = gradient_magnitude(images, frames.sizes)
     chosen = select_pixels(magnitude, frames.sizes, d.frame_index, regions, sampling_settings(config, side))
     object_index, uv = chosen.object_index, chosen.uv
     if config.occlusion:
@@ -174,7 +174,7 @@ def test_gradients_reach_images_and_masks() -> None:
     seen = pack_pixels(replace(frames, images_left=attached), replace(detections, mask_right=mask), SamplingConfig())
     (seen.left.gradient_magnitude.sum() + seen.right.foreground.sum()).backward()
     reference = frames.images_left.clone().requires_grad_()
-    magnitude = gradient_magnitude(image_gradient(grey_levels(reference), frames.sizes))
+    magnitude = gradient_magnitude(reference, frames.sizes)
     u, v = seen.left.uv.long().unbind(-1)
     magnitude[detections.frame_index[seen.left.object_index], v, u].sum().backward()
     torch.testing.assert_close(attached.grad, reference.grad)

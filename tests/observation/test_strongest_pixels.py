@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.observation.gradient_cells import ImageRegion, gradient_cells
 from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.observation.strongest_pixels import strongest_pixels
@@ -20,7 +20,7 @@ FRAMES = [0, 1, 0, 0, 1, 1]
 
 
 def check(images: Tensor, settings: SamplingConfig, cell_px: int = 32) -> None:
-    magnitude = gradient_magnitude(image_gradient(grey_levels(images), SIZES))
+    magnitude = gradient_magnitude(images, SIZES)
     regions = torch.tensor(REGIONS)
     expected = select_pixels(magnitude, SIZES, torch.tensor(FRAMES), regions, settings, cell_px=cell_px)
     places = [

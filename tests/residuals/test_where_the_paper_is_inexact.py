@@ -6,6 +6,7 @@ import pytest
 import torch
 from helpers.derivatives import central_differences, relative_error
 from helpers.ellipsoids import Ellipsoid, ellipsoid_prior
+from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 from directshape_torch.geometry import se3
@@ -73,7 +74,7 @@ def test_derivative_by_the_twist_is_not_that_by_the_increment() -> None:
     assert relative_error(by_twist(xi), by_increment(xi)) > 0.1
     # What the generators give is the increment's.
     X = se3.transform(se3.exp(xi), point)
-    torch.testing.assert_close(by_increment(xi), torch.cat([torch.eye(3).double(), -se3.hat(X)], dim=1))
+    torch.testing.assert_close(by_increment(xi), torch.cat([torch.eye(3).double(), -So3.hat(X)], dim=1))
 
 
 def test_the_mean_of_the_shapes_depends_on_the_point_too() -> None:

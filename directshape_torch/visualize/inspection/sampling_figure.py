@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.admission import without_empty_masks
-from directshape_torch.image.gradients import gradient_magnitude, grey_levels, image_gradient
+from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.figure_files import new_figure
 from directshape_torch.io.instance_masks import SIDES
@@ -59,7 +59,7 @@ def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
     frames, detections = view.loaded.frame, without_empty_masks(view.loaded.detections)
     left, right = car_regions(frames, detections, config)
     images, regions = (frames.images_left, left) if side == "left" else (frames.images_right, right)
-    magnitude = gradient_magnitude(image_gradient(grey_levels(images), frames.sizes))
+    magnitude = gradient_magnitude(images, frames.sizes)
     chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config, side))
     mine = chosen.object_index == view.car
     uv, above = chosen.uv[mine], chosen.above_threshold[mine]
