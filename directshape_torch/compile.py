@@ -13,7 +13,8 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, ParamSpec, TypeVar
@@ -31,13 +32,6 @@ CompileMode = Literal["auto", "on", "off"]
 # in the two modes differ by the former with an empty TORCHINDUCTOR_CACHE_DIR, `again_s` by the latter.
 CARS_WORTH_COMPILING = 3000
 
-
-def _count(guards: Sequence[object]) -> list[bool]:
-    """Told of what a new form assumes: all of it is checked before each call."""
-    _process.forms += 1
-    return [True] * len(guards)
-
-
 # Nothing in place: PyTorch 2.13 lets an operation write over a part of a `torch.stack` too, and then gives the whole
 # stack to another while what was written is read. Indices are right by construction, and a check of each costs a
 # multiple of the arithmetic. Code that asks for the number of threads serves every setting of the user. What the
@@ -49,7 +43,6 @@ _OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
     "cpp.dynamic_threads": True,
     "cpp.vec_isa_ok": True,
     "cpp_cache_precompile_headers": False,
-    "guard_filter_fn": _count,
 }
 # Forms of one function, for other settings, fixed sizes or dtypes, before it is dropped.
 _MOST_FORMS = 64
@@ -108,13 +101,11 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
     with _process.lock:
         _process.cars += num_cars if mode != "off" else 0
     job = _job.get()
-    wanted = mode == "on" or (mode == "auto" and (_process.cars if job is None else job) >= CARS_WORTH_COMPILING)
-    token = _mode.set(mode if wanted and not _process.forked and _can_compile(mode) else "off")
+    is_worth_it = mode == "on" or (mode == "auto" and (_process.cars if job is None else job) >= CARS_WORTH_COMPILING)
+    token = _mode.set(mode if is_worth_it and not _process.forked and _can_compile(mode) else "off")
+    gradients = torch.is_grad_enabled()
     try:
-        with ExitStack() as stack:
-            if torch.is_inference_mode_enabled():
-                stack.enter_context(torch.inference_mode(False))
-                stack.enter_context(torch.no_grad())
+        with torch.inference_mode(False), torch.set_grad_enabled(gradients):
             yield
     finally:
         _mode.reset(token)
@@ -139,18 +130,18 @@ def will_compile(*tensors: Tensor) -> bool:
     """Whether a marked function that is called here with tensors like these takes its compiled form.
 
     It does not with gradients on, in forward mode, inside `torch.func`, in float64, for subclasses of tensors, under
-    autocast, and in the user's own `torch.compile`.
+    autocast, under a mode that sees every operation (`FlopCounterMode`), and in the user's own `torch.compile`.
     """
     # First of all: the user's own compilation traces the plain form.
     if torch.compiler.is_compiling() or _mode.get() == "off" or not nothing_is_differentiated():
         return False
-    # PyTorch refuses to compile under a mode that sees every operation (`FlopCounterMode`), and has no public word for
-    # whether there is one.
-    if torch._C._len_torch_dispatch_stack() > 0:
-        return False
-    return all(
-        is_plain(x) and x.dtype != torch.float64 and not torch.is_autocast_enabled(x.device.type) for x in tensors
-    )
+    # PyTorch refuses to compile under such a mode, and has no public word for whether there is one.
+    return torch._C._len_torch_dispatch_stack() == 0 and all(map(_is_fit, tensors))
+
+
+def _is_fit(tensor: Tensor) -> bool:
+    is_single = is_plain(tensor) and tensor.dtype != torch.float64
+    return is_single and not torch.is_autocast_enabled(tensor.device.type)
 
 
 def num_forms() -> int:
@@ -172,15 +163,14 @@ def compiler_problem() -> str | None:
         >>> problem is None or isinstance(problem, str)
         True
     """
-    before = num_forms()
+    traced: list[int] = []
     try:
-        with _process.lock, _quiet(), torch.no_grad():
-            torch.compile(lambda x: x + 1, fullgraph=True, dynamic=False, options={**_OPTIONS})(torch.ones(2))
+        # In a thread of its own, which has none of the caller's modes.
+        with _process.lock, warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(1) as thread:
+            thread.submit(lambda: _compiled(lambda x: x + 1, traced.append)(torch.ones(2))).result()
     except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no compiler
         return _first_line(error)
-    # The trial itself is no function of the package's.
-    is_switched_off, _process.forms = _process.forms == before, before
-    return "PyTorch's compiler is switched off" if is_switched_off else None
+    return None if traced else "PyTorch's compiler is switched off"
 
 
 def _can_compile(mode: CompileMode) -> bool:
@@ -250,14 +240,12 @@ class Compilable(Generic[_P, _R]):
 
     def _run(self, values: Sequence[object]) -> _R:
         with torch.no_grad():
-            if self._compiled is not None and self._has_worked:
+            if self._has_worked and self._compiled is not None:
                 return self._compiled(*values)
-            # Threads that call at once share the first compilation.
-            with _process.lock, _quiet():
-                # A copy of the options: they are taken out one by one.
-                self._compiled = self._compiled or torch.compile(  # type: ignore[call-overload]
-                    self.plain, fullgraph=True, dynamic=False, options={**_OPTIONS}, recompile_limit=_MOST_FORMS
-                )
+            # Threads that call at once share the first compilation. PyTorch's own deprecations, where its caller has
+            # made errors of warnings, are no reason not to compile.
+            with _process.lock, warnings.catch_warnings(action="ignore"):
+                self._compiled = self._compiled or _compiled(self.plain, _count)
                 result = self._compiled(*values)
             self._has_worked = True
             return result
@@ -281,28 +269,37 @@ class _StaysPlainError(Exception):
 
 def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
     """An argument as compiled code takes it: contiguous, without gradient, with its varying size marked."""
-    # `dynamic=True` instead of marks would have every size vary, which takes three times as long to compile; nothing
-    # else has a public name.
+    # `dynamic=True` in place of marks has every size vary, which takes three times as long to compile. The guide to
+    # dynamic shapes names this function; there is none outside of `torch._dynamo`.
     from torch._dynamo import mark_dynamic
 
-    if isinstance(value, Tensor):
-        if not will_compile(value) or (name in sizes and value.shape[sizes[name]] < 2):
-            raise _StaysPlainError
-        value = (value.clone() if value.is_inference() else value.detach()).contiguous()
-        if name in sizes:
-            mark_dynamic(value, sizes[name])
-    elif isinstance(value, tuple) and hasattr(value, "_fields"):
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*(_prepared(part, field, sizes) for field, part in zip(value._fields, value, strict=True)))
+    if not isinstance(value, Tensor):
+        return value
+    if not _is_fit(value) or (name in sizes and value.shape[sizes[name]] < 2):
+        raise _StaysPlainError
+    # A tensor object of its own, for the mark must not stay on the caller's.
+    value = (value.clone() if value.is_inference() else value.detach()).contiguous()
+    if name in sizes:
+        mark_dynamic(value, sizes[name])
     return value
+
+
+def _compiled(function: Callable[_P, _R], on_compilation: Callable[[int], None]) -> Callable[_P, _R]:
+    """By `torch.compile`, which is told to check all that a form assumes, and tells how many assumptions that are."""
+
+    def keep_all(guards: Sequence[object]) -> list[bool]:
+        on_compilation(len(guards))
+        return [True] * len(guards)
+
+    options = _OPTIONS | {"guard_filter_fn": keep_all}
+    return torch.compile(function, fullgraph=True, dynamic=False, options=options, recompile_limit=_MOST_FORMS)  # type: ignore[call-overload, no-any-return]
+
+
+def _count(_: int) -> None:
+    _process.forms += 1
 
 
 def _first_line(error: BaseException) -> str:
     return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    # PyTorch's own deprecations, where its caller has made errors of warnings, are no reason not to compile.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
