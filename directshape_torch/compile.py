@@ -269,20 +269,17 @@ class _StaysPlainError(Exception):
 
 def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
     """An argument as compiled code takes it: contiguous, without gradient, with its varying size marked."""
-    # `dynamic=True` in place of marks has every size vary, which takes three times as long to compile. The guide to
-    # dynamic shapes names this function; there is none outside of `torch._dynamo`.
-    from torch._dynamo import mark_dynamic
-
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*(_prepared(part, field, sizes) for field, part in zip(value._fields, value, strict=True)))
     if not isinstance(value, Tensor):
         return value
     if not _is_fit(value) or (name in sizes and value.shape[sizes[name]] < 2):
         raise _StaysPlainError
-    # A tensor object of its own, for the mark must not stay on the caller's.
+    # A tensor object of its own, for the mark must not stay on the caller's. `dynamic=True` in place of marks has every
+    # size vary, which takes three times as long to compile; PyTorch's guide to dynamic shapes names no other function.
     value = (value.clone() if value.is_inference() else value.detach()).contiguous()
     if name in sizes:
-        mark_dynamic(value, sizes[name])
+        torch._dynamo.mark_dynamic(value, sizes[name])
     return value
 
 
