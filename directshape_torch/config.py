@@ -286,8 +286,8 @@ class RefinerConfig:
     Attributes:
         method: terms of the energy: "direct" (images), "geometric" (the rival's: point cloud) or "combined" (both).
         compile: compile the hot functions: "on", "off", or "auto" where there is a C++ compiler and the job, or the
-            process so far if nobody knows, has at least 3000 cars. Results differ in the last digits, so a choice makes runs repeatable to
-            the bit, whatever came before them.
+            process so far if nobody knows, has at least 3000 cars. Results differ in the last digits, so a choice
+            makes runs repeatable to the bit, whatever came before them.
     """
 
     method: Literal["direct", "geometric", "combined"] = "direct"
