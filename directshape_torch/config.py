@@ -386,9 +386,9 @@ class RefinerConfig(Settings):
     )
     compile: Literal["auto", "on", "off"] = setting(
         "auto",
-        'compile the hot functions: "on", "off", or "auto" where there is a C++ compiler and the cars so far, or known '
-        "to be ahead, make up for it. Results differ in the last digits, so a choice makes runs repeatable to the bit, "
-        "whatever came before them",
+        'compile the hot functions: "on", "off", or "auto" where there is a C++ compiler and the job, or the process '
+        "so far if nobody knows, has at least 3000 cars. Results differ in the last digits, so a choice makes runs "
+        "repeatable to the bit, whatever came before them",
     )
     stages: tuple[StageConfig, ...] = (
         StageConfig(contour_width_px=2.0, image_level=1, max_iterations=6, over_relaxation=1.6),

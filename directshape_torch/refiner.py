@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from directshape_torch.admission import check_fit, check_no_tangents, refusals, without_empty_masks
 from directshape_torch.backward import attached_state
-from directshape_torch.compilation.regions import compiling
-from directshape_torch.compilation.together import compiled_together
+from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.energy.car_batch import CarBatch
 from directshape_torch.energy.car_problem import CarProblem
@@ -108,7 +107,7 @@ class DirectShapeRefiner(nn.Module):
             full_precision(frames.images_left.device.type),
             compiling(self.config.compile, len(detections)),
         ):
-            return compiled_together(lambda: self._refine(frames, detections, term_weights))
+            return self._refine(frames, detections, term_weights)
 
     def _refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-
 import hypothesis
 import pytest
 import torch
 
-from directshape_torch.compilation import regions
+from directshape_torch import compile as compile_module
 
 # Fixtures that several files share.
 pytest_plugins = ("helpers.compiled_lookup", "helpers.run_fixtures")
@@ -28,4 +26,4 @@ def _seed() -> None:
 @pytest.fixture(autouse=True)
 def _fresh_count_of_cars(monkeypatch: pytest.MonkeyPatch) -> None:
     """The setting `compile: auto` counts the cars of a process: without this a test would change form in the middle."""
-    monkeypatch.setattr(regions, "_process", regions._Process(threading.RLock()))
+    monkeypatch.setattr(compile_module, "_process", compile_module._Process())

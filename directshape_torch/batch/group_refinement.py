@@ -16,7 +16,7 @@ from directshape_torch.batch.frame_outputs import failed_entry, frame_entry, wri
 from directshape_torch.batch.journal import FrameRecord, Journal
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.timing import CallTiming, RunTimings, peak_device_memory_mb, peak_memory_mb
-from directshape_torch.compilation.regions import cars_ahead
+from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.run_manifest import hash_files

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from directshape_torch.compilation.regions import num_forms
+from directshape_torch.compile import num_forms
 from directshape_torch.io.atomic_files import write_json
 
 TIMINGS_SCHEMA_VERSION = 1

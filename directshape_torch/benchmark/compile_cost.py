@@ -17,7 +17,7 @@ from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.errors import DirectShapeError
 
 _SUITE = "cpu"
-_COLD_GOAL_S, _WARM_DISK_GOAL_S = 40.0, 5.0
+_COLD_GOAL_S, _WARM_DISK_GOAL_S = 70.0, 8.0
 
 
 def compile_rows(settings: SuiteSettings) -> list[Row]:

@@ -20,7 +20,7 @@ import torch
 from directshape_torch.batch.timing import peak_memory_mb
 from directshape_torch.benchmark.presets import make_refiner
 from directshape_torch.benchmark.workloads import first_scene, with_cars
-from directshape_torch.compilation.regions import num_forms
+from directshape_torch.compile import num_forms
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.benchmark.peers_energy import CarEnergy
-from directshape_torch.compilation.regions import compiling
+from directshape_torch.compile import compiling
 from directshape_torch.config import SolverConfig
 from directshape_torch.energy.car_problem import CarProblem
 from directshape_torch.energy.car_state import CarState

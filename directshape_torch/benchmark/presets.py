@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from directshape_torch.compilation.machine import compiler_problem
+from directshape_torch.compile import compiler_problem
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 

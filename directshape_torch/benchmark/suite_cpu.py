@@ -15,7 +15,7 @@ from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import Scene, load_scenes
 from directshape_torch.benchmark.yardstick import Yardstick
-from directshape_torch.compilation.machine import compiler_problem
+from directshape_torch.compile import compiler_problem
 from directshape_torch.evaluation.bootstrap import Estimate
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame

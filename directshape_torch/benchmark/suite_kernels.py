@@ -15,8 +15,7 @@ from directshape_torch.benchmark.rows import Goal, Kind, Row, SuiteResult
 from directshape_torch.benchmark.settings import SuiteSettings
 from directshape_torch.benchmark.timing import InterleavedTimes, Spread, time_interleaved
 from directshape_torch.benchmark.workloads import demo_scene, first_cars
-from directshape_torch.compilation.compilable import compilable
-from directshape_torch.compilation.regions import CompileMode, compiling
+from directshape_torch.compile import CompileMode, compilable, compiling
 from directshape_torch.energy.car_state import CarState
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.compilation.compilable import compilable
+from directshape_torch.compile import compilable
 from directshape_torch.geometry.rays import ray_box_interval
 from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.grid_lookup import value_at

@@ -10,28 +10,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.compilation.compilable import compilable
+from directshape_torch.compile import compilable
 from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.compiled_march import RayRows
 from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.grid_lookup import derivatives_at
 
 
-def compiled_entry(field: GridField, rows: RayRows, bracket: Bracket, num_probes: int) -> tuple[Tensor, Tensor] | None:
-    """Where P rays enter grids: best depth (P,) of their bracket after so many probes, and the gradient (P, 3) there.
-
-    None where nothing is compiled.
-    """
+def compiled_entry(field: GridField, rows: RayRows, bracket: Bracket, num_probes: int) -> tuple[Tensor, Tensor]:
+    """Where P rays enter grids: best depth (P,) of their bracket after so many probes; the gradient (P, 3) there."""
     parts = rows.in_rows(torch.stack([part for part in bracket if part.is_floating_point()]))
     for _ in range(num_probes):
-        probed = probe_grids.compiled(*field, rows.rays_obj, rows.object_index, parts)
-        if probed is None:
-            return None
-        parts = probed.bracket
+        parts = probe_grids(*field, rows.rays_obj, rows.object_index, parts).bracket
     best = _bracket(parts).best
     # What would be probed next is the best itself, for its gradient.
-    at_best = probe_grids.compiled(*field, rows.rays_obj, rows.object_index, torch.cat([best[None], parts[1:]]))
-    return None if at_best is None else (rows.packed(best), rows.packed(at_best.gradient).mT)
+    at_best = probe_grids(*field, rows.rays_obj, rows.object_index, torch.cat([best[None], parts[1:]]))
+    return rows.packed(best), rows.packed(at_best.gradient).mT
 
 
 class Probed(NamedTuple):

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.compile import will_compile
 from directshape_torch.gradient_mode import as_constant, nothing_is_differentiated
 from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.compiled_march import RayRows, interval, neighbours, sample_grids, vertex_offset
-from directshape_torch.shape.compiled_probe import compiled_entry, probe_grids
+from directshape_torch.shape.compiled_probe import compiled_entry
 from directshape_torch.shape.grid_lookup import value_at
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import BoundShape
@@ -73,12 +74,11 @@ class Root(NamedTuple):
 @as_constant
 def march(shape: BoundShape, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> RayMarch:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
-    if type(shape) is GridShape and sample_grids.may_be_compiled(rays.origin_obj):
+    if type(shape) is GridShape and will_compile(rays.origin_obj):
         rows = RayRows.of(*_fields(rays))
-        sampled = sample_grids.compiled(*shape.field, rows.rays_obj, rows.object_index, bounds_obj, num_samples)
-        if sampled is not None:
-            depths, sdf, *of_rays = (rows.packed(x) for x in sampled)
-            return RayMarch(depths.mT, sdf.mT, *of_rays)
+        sampled = sample_grids(*shape.field, rows.rays_obj, rows.object_index, bounds_obj, num_samples)
+        depths, sdf, *of_rays = (rows.packed(x) for x in sampled)
+        return RayMarch(depths.mT, sdf.mT, *of_rays)
     near, far, crosses_bounds = interval(rays.origin_obj, rays.direction_obj, bounds_obj)
     share = (torch.arange(num_samples, dtype=near.dtype, device=near.device) + 0.5) / num_samples
     depths = near[:, None] + (far - near)[:, None] * share
@@ -210,10 +210,8 @@ def _first_bracket(
 
 def _entry(shape: BoundShape, rays: ObjectRays, bracket: Bracket, num_iterations: int) -> tuple[Tensor, Tensor | None]:
     """Depth (Q,) at which rays enter a shape, and the gradient (Q, 3) there where it costs next to nothing."""
-    if type(shape) is GridShape and probe_grids.may_be_compiled(rays.origin_obj):
-        entry = compiled_entry(shape.field, RayRows.of(*_fields(rays)), bracket, num_iterations)
-        if entry is not None:
-            return entry
+    if type(shape) is GridShape and will_compile(rays.origin_obj):
+        return compiled_entry(shape.field, RayRows.of(*_fields(rays)), bracket, num_iterations)
     return _false_position(shape, rays, bracket, num_iterations), None
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.compilation.compilable import compilable
+from directshape_torch.compile import compilable
 from directshape_torch.geometry.short_axes import all_along
 from directshape_torch.image.interpolate import bilinear_patch
 from directshape_torch.residuals import robust

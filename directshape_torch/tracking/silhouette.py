@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.compilation.compilable import compilable
+from directshape_torch.compile import compilable
 from directshape_torch.geometry.short_axes import length
 from directshape_torch.residuals import robust
 from directshape_torch.residuals.silhouette import (

@@ -14,9 +14,9 @@ from helpers.kitti_folder import CODE, FRAMES, PEDESTRIAN
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine
 
+from directshape_torch import compile as compile_module
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import expected_cars, refine_dataset
-from directshape_torch.compilation import regions
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_labels import read_objects
@@ -132,12 +132,11 @@ def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
     assert expected_cars(dataset(kitti_copy), FRAMES[:1] * 400) == 800
     (kitti_copy / "detections" / "data" / "000002.txt").write_text("damaged")
     assert expected_cars(dataset(kitti_copy), FRAMES) == 2 * (len(FRAMES) - 1)
-    counts = []
+    counts: list[int | None] = []
 
     class Watched(DirectShapeRefiner):
         def forward(self, *args: Any, **kwargs: Any) -> RefinementResult:
-            job = regions._job.get()
-            counts.append(None if job is None else job.cars_ahead)
+            counts.append(compile_module._job.get())
             return super().forward(*args, **kwargs)
 
     monkeypatch.setattr("directshape_torch.batch.refine_dataset.expected_cars", lambda *_: 5000)
@@ -146,7 +145,7 @@ def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
     refine_dataset(dataset(kitti_copy), watched, tmp_path)
     # The same for every call: neither the calls before nor an interruption change what is compiled.
     assert counts == [5000, 5000]
-    assert regions._job.get() is None
+    assert compile_module._job.get() is None
 
 
 def test_options_are_checked() -> None:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from helpers.compiled_lookup import needs_compiler
 from helpers.ellipsoids import ellipsoid_prior
 from torch import Tensor
 
-from directshape_torch.compilation.regions import compiling
+from directshape_torch.compile import compiling
 from directshape_torch.shape import raycast
 from directshape_torch.shape.compiled_march import ROW, RayRows, sample_grids
-from directshape_torch.shape.compiled_probe import Probed, probe_grids
+from directshape_torch.shape.compiled_probe import probe_grids
 from directshape_torch.shape.raycast import ObjectRays, RayMarch, Root
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import SdfDerivatives
@@ -88,9 +86,7 @@ def assert_gradients(shape: GridShape, rays: ObjectRays, root: Root, exactly: bo
 
 
 def in_rows_but_plainly(monkeypatch: pytest.MonkeyPatch) -> None:
-    for function in (sample_grids, probe_grids):
-        monkeypatch.setattr(function, "may_be_compiled", lambda _: True)
-        monkeypatch.setattr(function, "compiled", function.plain)
+    monkeypatch.setattr(raycast, "will_compile", lambda _: True)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
@@ -117,27 +113,6 @@ def test_a_ray_that_is_inside_from_the_start_enters_nowhere(monkeypatch: pytest.
     root = raycast.first_crossing(shape, rays, marched._replace(sdf=inside), depth, closest_sdf=sdf)
     assert not root.found[ray]
     assert_gradients(shape, rays, root, exactly=True)
-
-
-@pytest.mark.parametrize("last_call", [0, 3, 8])
-def test_a_search_that_is_not_compiled_to_its_end_goes_the_general_path(
-    monkeypatch: pytest.MonkeyPatch, last_call: int
-) -> None:
-    calls = 0
-
-    def some_calls(*arguments: Any) -> Probed | None:
-        nonlocal calls
-        calls += 1
-        return probe_grids.plain(*arguments) if calls <= last_call else None
-
-    monkeypatch.setattr(probe_grids, "may_be_compiled", lambda _: True)
-    monkeypatch.setattr(probe_grids, "compiled", some_calls)
-    shape, rays, bounds = scene(60, torch.float64)
-    *_, root = cast(shape, rays, bounds)
-    *_, expected = cast(AnyShape(shape), rays, bounds)
-    assert calls == last_call + 1
-    assert root.gradient is None
-    torch.testing.assert_close(root.depth[root.found], expected.depth[root.found], rtol=0, atol=1e-12)
 
 
 def test_parts_of_the_rays_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,7 +165,7 @@ def test_compiled_rays_are_the_plain_ones_for_any_number_of_them() -> None:
             compiled = cast(shape, rays, bounds)
         assert_same(compiled, cast(shape, rays, bounds), 1e-4)
         assert_gradients(shape, rays, compiled[3], exactly=False)
-    assert sample_grids.num_variants == probe_grids.num_variants == 1
+    assert sample_grids._problem is probe_grids._problem is None
 
 
 @pytest.mark.parametrize(("count", "expected"), [(0, 2), (1, 2), (2 * ROW, 2), (2 * ROW + 1, 3)])

@@ -6,7 +6,7 @@ than the real functions with real arguments tells whether their code is right.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from directshape_torch.benchmark.workloads import demo_scene, with_cars
-from directshape_torch.compilation.compilable import Compilable
+from directshape_torch.compile import Compilable
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
@@ -52,17 +52,16 @@ def _threads(threads: int) -> Iterator[None]:
 @pytest.mark.usefixtures("_threads")
 def test_compiled_functions_compute_what_they_compute_plainly(num_cars: int, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong: dict[str, set[str]] = {}
-    compiled_form = Compilable.compiled
+    run_compiled = Compilable._run
 
-    def compare(function: Compilable[..., Any], *args: object, **kwargs: object) -> object:
-        found = compiled_form(function, *args, **kwargs)
-        if found is not None:
-            with torch.no_grad():
-                expected = function.plain(*args, **kwargs)
-            wrong.setdefault(name_of(function), set()).update(differences(name_of(function), found, expected))
+    def compare(function: Compilable[..., Any], values: Sequence[Any]) -> object:
+        found = run_compiled(function, values)
+        with torch.no_grad():
+            expected = function.plain(*values)
+        wrong.setdefault(name_of(function), set()).update(differences(name_of(function), found, expected))
         return found
 
-    monkeypatch.setattr(Compilable, "compiled", compare)
+    monkeypatch.setattr(Compilable, "_run", compare)
     DirectShapeRefiner(config=load_config(None, FEW_STEPS))(*with_cars(demo_scene().frames, num_cars))
     assert wrong == {name: set() for name in COMPONENT_AXES}
 

@@ -1,1 +1,0 @@
-"""Hot functions in compiled form: when they are compiled, by whom, and where they are kept."""

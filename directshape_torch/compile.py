@@ -1,0 +1,302 @@
+"""Hot tensor functions, marked `@compilable(sizes={...})`, and where `torch.compile` is put to work on them.
+
+A marked function is called like any other. It is compiled inside a `compiling` region alone, which the refiner opens
+around its work by the setting `compile: auto | on | off`; what was compiled lies in PyTorch's own cache on disk.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import logging
+import os
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any, Generic, Literal, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import CompilationError
+from directshape_torch.gradient_mode import is_plain, nothing_is_differentiated
+
+CompileMode = Literal["auto", "on", "off"]
+
+# A cold start takes as long as compiled code saves with so many cars, in frames by themselves: `first_s` of
+#     python -m directshape_torch.benchmark.compile_probe --threads 1 --mode compiled|eager
+# in the two modes differ by the former with an empty TORCHINDUCTOR_CACHE_DIR, `again_s` by the latter.
+CARS_WORTH_COMPILING = 3000
+
+# Nothing in place: PyTorch 2.13 lets an operation write over a part of a `torch.stack` too, and then gives the whole
+# stack to another while what was written is read. Indices are right by construction, and a check of each costs a
+# multiple of the arithmetic. Code that asks for the number of threads serves every setting of the user. What the
+# processor says of its vector units is believed (trying them takes seconds), and headers cost more than they save.
+_OPTIONS: dict[str, str | int | bool | Callable[..., Any]] = {
+    "inplace_buffers": False,
+    "assert_indirect_indexing": False,
+    "size_asserts": False,
+    "cpp.dynamic_threads": True,
+    "cpp.vec_isa_ok": True,
+    "cpp_cache_precompile_headers": False,
+}
+# Forms of one function, for other settings, fixed sizes or dtypes, before it is dropped.
+_MOST_FORMS = 64
+
+_logger = logging.getLogger(__name__)
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+@dataclass
+class _Process:
+    """What this process has done so far."""
+
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    cars: int = 0
+    forms: int = 0
+    said_why_not: bool = False
+    forked: bool = False
+
+
+_process = _Process()
+_job: ContextVar[int | None] = ContextVar("directshape_torch_job", default=None)
+_mode: ContextVar[CompileMode] = ContextVar("directshape_torch_compiling", default="off")
+
+
+def _in_child() -> None:
+    # The threads of OpenMP do not survive a fork, and the parent may have held the lock.
+    _process.forked, _process.lock = True, threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_in_child)
+
+
+@contextmanager
+def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
+    """Region in which marked functions may be compiled, for the refinement of some cars.
+
+    "on" compiles always, "off" never, and "auto" where the job has at least `CARS_WORTH_COMPILING` cars: those that
+    `cars_ahead` tells of, or else those of the process so far. Without a working compiler "auto" stays plain and says
+    so once in the log. Forked processes stay plain. Inference mode becomes `no_grad` inside: its tensors would be one
+    more compilation of everything.
+
+    Args:
+        mode: the setting.
+        num_cars: of this call.
+
+    Raises:
+        CompilationError: in mode "on" where there is no working C++ compiler.
+
+    Example:
+        >>> with compiling("auto", num_cars=1):
+        ...     will_compile(torch.ones(2))  # one car is not worth it
+        False
+    """
+    with _process.lock:
+        _process.cars += num_cars if mode != "off" else 0
+    job = _job.get()
+    is_worth_it = mode == "on" or (mode == "auto" and (_process.cars if job is None else job) >= CARS_WORTH_COMPILING)
+    token = _mode.set(mode if is_worth_it and not _process.forked and _can_compile(mode) else "off")
+    gradients = torch.is_grad_enabled()
+    try:
+        with torch.inference_mode(False), torch.set_grad_enabled(gradients):
+            yield
+    finally:
+        _mode.reset(token)
+
+
+@contextmanager
+def cars_ahead(num_cars: int) -> Iterator[None]:
+    """Tell the `compiling` regions inside how many cars their job has in all, at least roughly.
+
+    Example:
+        >>> with cars_ahead(5000), compiling("off", num_cars=7):
+        ...     pass
+    """
+    token = _job.set(num_cars)
+    try:
+        yield
+    finally:
+        _job.reset(token)
+
+
+def will_compile(*tensors: Tensor) -> bool:
+    """Whether a marked function that is called here with tensors like these takes its compiled form.
+
+    It does not with gradients on, in forward mode, inside `torch.func`, in float64, for subclasses of tensors, under
+    autocast, under a mode that sees every operation (`FlopCounterMode`), and in the user's own `torch.compile`.
+    """
+    # First of all: the user's own compilation traces the plain form.
+    if torch.compiler.is_compiling() or _mode.get() == "off" or not nothing_is_differentiated():
+        return False
+    # PyTorch refuses to compile under such a mode, and has no public word for whether there is one.
+    return torch._C._len_torch_dispatch_stack() == 0 and all(map(_is_fit, tensors))
+
+
+def _is_fit(tensor: Tensor) -> bool:
+    is_single = is_plain(tensor) and tensor.dtype != torch.float64
+    return is_single and not torch.is_autocast_enabled(tensor.device.type)
+
+
+def num_forms() -> int:
+    """How many forms of functions this process has compiled, or loaded from the disk.
+
+    Example:
+        >>> num_forms()
+        0
+    """
+    return _process.forms
+
+
+@functools.cache
+def compiler_problem() -> str | None:
+    """Why nothing can be compiled here, or None if it can; tried once with a function of one line.
+
+    Example:
+        >>> problem = compiler_problem()
+        >>> problem is None or isinstance(problem, str)
+        True
+    """
+    traced: list[int] = []
+    try:
+        # In a thread of its own, which has none of the caller's modes.
+        with _process.lock, warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(1) as thread:
+            thread.submit(lambda: _compiled(lambda x: x + 1, traced.append)(torch.ones(2))).result()
+    except Exception as error:  # PyTorch's compiler can raise anything, and whatever it is there is no compiler
+        return _first_line(error)
+    return None if traced else "PyTorch's compiler is switched off"
+
+
+def _can_compile(mode: CompileMode) -> bool:
+    problem = compiler_problem()
+    if problem is not None and mode == "on":
+        raise CompilationError(f"compile: on needs a compiler that works, but {problem}; set compile to auto or off")
+    if problem is not None and not _process.said_why_not:
+        _process.said_why_not = True
+        _logger.warning("compile: auto goes on without compiling, several times slower: %s", problem)
+    return problem is None
+
+
+def compilable(sizes: Mapping[str, int]) -> Callable[[Callable[_P, _R]], Compilable[_P, _R]]:
+    """Mark a pure function of tensors, named tuples of them, numbers and strings for compilation.
+
+    Inside a `compiling` region it is compiled once for all values of the named sizes, and once more for each
+    combination of other sizes, dtypes, devices, numbers and strings. Calls that cannot be compiled (`will_compile`),
+    and those with a named size below 2, of which PyTorch would make a case of its own, take the plain form. A compiled
+    form that fails where the plain one does not is dropped for the rest of the process; the log says so in one line.
+
+    Args:
+        sizes: dimensions whose sizes vary from call to call, by the names of arguments, or of fields of named tuples.
+
+    Raises:
+        CompilationError: by the marked function, in mode "on", where its first compilation fails.
+
+    Example:
+        >>> @compilable(sizes={"points": 0})
+        ... def distances(points: torch.Tensor) -> torch.Tensor:
+        ...     return points.norm(dim=-1)
+        >>> distances(torch.tensor([[3.0, 4.0]]))
+        tensor([5.])
+    """
+    return functools.partial(Compilable, sizes)
+
+
+class Compilable(Generic[_P, _R]):
+    """A pure function in two forms, plain and compiled; see `compilable`."""
+
+    def __init__(self, sizes: Mapping[str, int], function: Callable[_P, _R]) -> None:
+        self.plain = function
+        self._sizes, self._signature = sizes, inspect.signature(function)
+        self._compiled: Callable[..., _R] | None = None
+        self._has_worked = False
+        self._problem: str | None = None
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if not will_compile():
+            return self.plain(*args, **kwargs)
+        if self._problem is not None:
+            self._refuse_if_on()
+            return self.plain(*args, **kwargs)
+        values = self._signature.bind(*args, **kwargs).args if kwargs else args
+        try:
+            named = zip(self._signature.parameters, values, strict=False)
+            prepared = [_prepared(value, name, self._sizes) for name, value in named]
+        except _StaysPlainError:
+            return self.plain(*args, **kwargs)
+        try:
+            return self._run(prepared)
+        except Exception as error:  # PyTorch's compiler can raise anything
+            # First of all: what is wrong with the arguments is raised here, and is no matter of the compiler's.
+            result = self.plain(*args, **kwargs)
+            self._drop(error)
+            return result
+
+    def _run(self, values: Sequence[object]) -> _R:
+        with torch.no_grad():
+            if self._has_worked and self._compiled is not None:
+                return self._compiled(*values)
+            # Threads that call at once share the first compilation. PyTorch's own deprecations, where its caller has
+            # made errors of warnings, are no reason not to compile.
+            with _process.lock, warnings.catch_warnings(action="ignore"):
+                self._compiled = self._compiled or _compiled(self.plain, _count)
+                result = self._compiled(*values)
+            self._has_worked = True
+            return result
+
+    def _drop(self, error: Exception) -> None:
+        name, reason = self.plain.__qualname__, _first_line(error)
+        with _process.lock:
+            is_known, self._problem = self._problem is not None, f"{name} could not be compiled: {reason}"
+        self._refuse_if_on()
+        if not is_known:
+            _logger.warning("%s goes on without its compiled form, several times slower: %s", name, reason)
+
+    def _refuse_if_on(self) -> None:
+        if _mode.get() == "on" and not self._has_worked:
+            raise CompilationError(f"{self._problem}; set compile to auto or off")
+
+
+class _StaysPlainError(Exception):
+    """These arguments have no compiled form."""
+
+
+def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
+    """An argument as compiled code takes it: contiguous, without gradient, with its varying size marked."""
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*(_prepared(part, field, sizes) for field, part in zip(value._fields, value, strict=True)))
+    if not isinstance(value, Tensor):
+        return value
+    if not _is_fit(value) or (name in sizes and value.shape[sizes[name]] < 2):
+        raise _StaysPlainError
+    # A tensor object of its own, for the mark must not stay on the caller's. `dynamic=True` in place of marks has every
+    # size vary, which takes three times as long to compile; PyTorch's guide to dynamic shapes names no other function.
+    value = (value.clone() if value.is_inference() else value.detach()).contiguous()
+    if name in sizes:
+        torch._dynamo.mark_dynamic(value, sizes[name])
+    return value
+
+
+def _compiled(function: Callable[_P, _R], on_compilation: Callable[[int], None]) -> Callable[_P, _R]:
+    """By `torch.compile`, which is told to check all that a form assumes, and tells how many assumptions that are."""
+
+    def keep_all(guards: Sequence[object]) -> list[bool]:
+        on_compilation(len(guards))
+        return [True] * len(guards)
+
+    options = _OPTIONS | {"guard_filter_fn": keep_all}
+    return torch.compile(function, fullgraph=True, dynamic=False, options=options, recompile_limit=_MOST_FORMS)  # type: ignore[call-overload, no-any-return]
+
+
+def _count(_: int) -> None:
+    _process.forms += 1
+
+
+def _first_line(error: BaseException) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
