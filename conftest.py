@@ -1,15 +1,9 @@
-"""What tests and doctests share: a folder of their own for compiled code, and what is left out."""
+"""What tests and doctests share: a folder of their own for compiled code."""
 
 import atexit
 import os
 import shutil
 import tempfile
-from importlib.util import find_spec
-
-# Doctests of modules that need a library that only the benchmark's `peers` suite asks for.
-collect_ignore = [
-    f"directshape_torch/benchmark/peers_{library}.py" for library in ("pypose", "theseus") if find_spec(library) is None
-]
 
 # Before anything is compiled: tests must neither find nor leave anything in the user's cache. Processes that a session
 # starts share the folder.

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from directshape_torch.compile import compiler_problem
+# The one place that knows where the compiler is.
+from directshape_torch.compile import compiler_problem, num_forms
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
+__all__ = ["MODES", "available_modes", "compiler_problem", "make_refiner", "num_forms", "unavailable_modes"]
+
 MODES = {"eager": "off", "compiled": "on"}
 """Value of the setting `compile` by the name of a mode."""
+ENDLESS = ("solver.cost_tolerance=0", "solver.step_tolerance=0", "solver.accept_every_step=true")
+"""Settings with which no car settles, so that every car takes part in every iteration."""
 
 
 def available_modes() -> tuple[str, ...]:

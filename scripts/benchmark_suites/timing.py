@@ -33,17 +33,16 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, quartiles and least of a sample.
+    """Median and quartiles of a sample.
 
     Example:
         >>> Spread.of([3.0, 1.0, 2.0, 4.0, 5.0])
-        Spread(median=3.0, low=2.0, high=4.0, least=1.0, count=5)
+        Spread(median=3.0, low=2.0, high=4.0, count=5)
     """
 
     median: float
     low: float
     high: float
-    least: float
     count: int
 
     @classmethod
@@ -51,11 +50,11 @@ class Spread:
         """Of a sample of one number or more; the quartiles of one number are the number."""
         quarters = statistics.quantiles(sample, n=4, method="inclusive") if len(sample) > 1 else [sample[0]] * 3
         low, median, high = quarters
-        return cls(median, low, high, min(sample), len(sample))
+        return cls(median, low, high, len(sample))
 
     def scaled(self, factor: float) -> Spread:
         """The spread of the sample times a positive factor."""
-        return Spread(factor * self.median, factor * self.low, factor * self.high, factor * self.least, self.count)
+        return Spread(factor * self.median, factor * self.low, factor * self.high, self.count)
 
 
 @dataclass(frozen=True)
@@ -115,14 +114,14 @@ def time_interleaved(
 
 
 def _seconds_of(call: Callable[[], object], device: torch.device | None, clock: Clock) -> float:
-    wait_for(device)
+    _wait_for(device)
     start = clock()
     call()
-    wait_for(device)
+    _wait_for(device)
     return clock() - start
 
 
-def wait_for(device: torch.device | None) -> None:
+def _wait_for(device: torch.device | None) -> None:
     """Wait until a graphics card has done what it was told; nothing on a CPU."""
     if device is not None and device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -7,17 +7,14 @@ from functools import partial
 
 import torch
 
-from directshape_torch.benchmark.memory import peak_tensor_bytes
-from directshape_torch.benchmark.presets import available_modes, make_refiner
-from directshape_torch.benchmark.rows import Goal, Row, SuiteResult
-from directshape_torch.benchmark.settings import SuiteSettings
-from directshape_torch.benchmark.synchronisations import count_synchronisations
-from directshape_torch.benchmark.timing import Repetitions, Spread, time_interleaved
-from directshape_torch.benchmark.workloads import Scene, load_scenes
+from benchmark_suites.figures import Row, SuiteResult, SuiteSettings
+from benchmark_suites.measures import count_synchronisations, peak_tensor_bytes
+from benchmark_suites.refiners import ENDLESS, available_modes, make_refiner
+from benchmark_suites.timing import time_interleaved
+from benchmark_suites.workloads import Scene, load_scenes
 from directshape_torch.errors import CompilationError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 
 _SUITE = "gpu"
@@ -36,7 +33,9 @@ def run_gpu(settings: SuiteSettings) -> SuiteResult:
     """One frame and a batch of 64, or a note that there is no graphics card."""
     if not torch.cuda.is_available():
         return SuiteResult(_SUITE, (), notes=("not measured: PyTorch finds no CUDA device",))
-    return measure_device(torch.device("cuda"), load_scenes(settings.data_root, settings.max_frames), settings)
+    return measure_device(
+        torch.device("cuda"), load_scenes(settings.data_root, 1 if settings.quick else None), settings
+    )
 
 
 def measure_device(device: torch.device, scenes: Sequence[Scene], settings: SuiteSettings) -> SuiteResult:
@@ -54,45 +53,30 @@ def measure_device(device: torch.device, scenes: Sequence[Scene], settings: Suit
             notes.append(f"{mode}: not measured, {error}")
     for scene in scenes:
         settings.progress(f"gpu: {scene.name}, against the CPU")
-        rows += _agreement_rows(scene, device)
-    return SuiteResult(_SUITE, tuple(rows), notes=tuple(notes))
+        rows.append(_agreement_row(scene, device))
+    return SuiteResult(_SUITE, tuple(rows), tuple(notes))
 
 
 def _batch_rows(scene: Scene, mode: str, device: torch.device, settings: SuiteSettings) -> list[Row]:
-    """Times of one frame alone and of many in one call, memory, and how long the card was at work."""
+    """Times of one frame alone and of many in one call, and memory."""
     refiner = make_refiner("default", mode).to(device)
     many = _QUICK_BATCH_FRAMES if settings.quick else _BATCH_FRAMES
     batch = _on_device(*collate([scene.frames[k % len(scene.frames)] for k in range(many)]), device)
     single = _on_device(*collate(scene.frames[:1]), device)
     calls = {"single": partial(refiner, *single), "batch": partial(refiner, *batch)}
     times = time_interleaved(calls, settings.repetitions, device)
-    cars = len(batch[1])
+    cars, alone, together = len(batch[1]), times.spread("single"), times.spread("batch")
     peak = peak_tensor_bytes(calls["batch"], device) / _MEGABYTE
-    name = f"{scene.name}, default {mode}"
-    busy = 100 * _busy_share(calls["batch"], device)
+    name, where = f"{scene.name}, default {mode}", f"{many} frames in a call"
     return [
-        _time_row(f"{name}, one frame", times.spread("single").scaled(1e3)),
-        _time_row(f"{name}, {many} frames in a batch, per frame", times.spread("batch").scaled(1e3 / many)),
-        _time_row(f"{name}, {many} frames in a batch, per car", times.spread("batch").scaled(1e3 / cars)),
-        Row(_SUITE, f"{name}, {many} frames in a batch, peak memory per car", peak / cars, "MB", "memory"),
-        Row(_SUITE, f"{name}, {many} frames in a batch, card at work", busy, "%", "rate", better="higher",
-            note="time of its kernels over that of the call"),
-    ]  # fmt: skip
+        Row.of(_SUITE, f"{name}, per frame", alone.scaled(1e3), "ms", "time"),
+        Row.of(_SUITE, f"{name}, {where}, per frame", together.scaled(1e3 / many), "ms", "time"),
+        Row.of(_SUITE, f"{name}, {where}, per car", together.scaled(1e3 / cars), "ms", "time"),
+        Row(_SUITE, f"{name}, {where}, peak memory per car", peak / cars, "MB", "memory"),
+    ]
 
 
-def _busy_share(call: partial[RefinementResult], device: torch.device) -> float:
-    """Time in which kernels ran over the time of the call."""
-    from torch.profiler import ProfilerActivity, profile
-
-    seconds = time_interleaved({"call": call}, Repetitions(warm_up=0, rounds=3), device).spread("call").median
-    with profile(activities=[ProfilerActivity.CUDA]) as recorded:
-        call()
-        torch.cuda.synchronize(device)
-    kernels_us = sum(e.self_device_time_total for e in recorded.key_averages() if e.device_type.name == "CUDA")
-    return float(kernels_us) * 1e-6 / seconds
-
-
-def _agreement_rows(scene: Scene, device: torch.device) -> list[Row]:
+def _agreement_row(scene: Scene, device: torch.device) -> Row:
     """The same frames on both devices."""
     refiner = make_refiner("default", "eager")
     frames, detections = collate(scene.frames)
@@ -100,12 +84,9 @@ def _agreement_rows(scene: Scene, device: torch.device) -> list[Row]:
     found = refiner.to(device)(*_on_device(frames, detections, device)).T_cam_obj.cpu()
     distance_m = (found[:, :3, 3] - expected.T_cam_obj[:, :3, 3]).norm(dim=-1)
     same = float((distance_m < _SAME_CENTRE_M).double().mean())
-    return [
-        Row(_SUITE, f"{scene.name}, cars with the CPU's result", same, "", "ratio", count=len(distance_m),
-            better="higher", goal=Goal("at least", _SAME_SHARE)),
-        Row(_SUITE, f"{scene.name}, difference of centres, median", 1e3 * float(distance_m.median()), "mm",
-            "accuracy", count=len(distance_m)),
-    ]  # fmt: skip
+    note = f"difference of centres, median: {1e3 * float(distance_m.median()):.3g} mm"
+    return Row(_SUITE, f"{scene.name}, cars with the CPU's result", same, "", "ratio", count=len(distance_m),
+               better="higher", goal=_SAME_SHARE, note=note)  # fmt: skip
 
 
 def _synchronisation_rows(mode: str, device: torch.device, scene: Scene, settings: SuiteSettings) -> list[Row]:
@@ -116,25 +97,20 @@ def _synchronisation_rows(mode: str, device: torch.device, scene: Scene, setting
         refiner = _of_blocks(mode, blocks).to(device)
         for _ in range(1 + settings.repetitions.warm_up):
             refiner(*inputs)
-        found.append(count_synchronisations(partial(refiner, *inputs)).total)
+        found.append(count_synchronisations(partial(refiner, *inputs)).total())
     a_block = (found[1] - found[0]) / (_MANY_BLOCKS - _FEW_BLOCKS)
     note = f"{_BLOCK} iterations in a block, no car finished"
     whole = f"a call of {_MANY_BLOCKS} blocks, synchronisations in all, {mode}"
     return [
-        Row(_SUITE, f"synchronisations a block, {mode}", a_block, "", "count", goal=Goal("at most", 1), note=note),
-        Row(_SUITE, whole, float(found[1]), "", "count"),
+        Row(_SUITE, f"synchronisations a block, {mode}", a_block, "", "count", goal=1, note=note),
+        Row(_SUITE, whole, found[1], "", "count"),
     ]
 
 
 def _of_blocks(mode: str, blocks: int) -> DirectShapeRefiner:
     stage = f"stages=[{{contour_width_px: 0.5, image_level: 0, max_iterations: {blocks * _BLOCK}}}]"
-    never = ["solver.cost_tolerance=0", "solver.step_tolerance=0", "solver.accept_every_step=true"]
-    return make_refiner("default", mode, [stage, f"solver.block_iterations={_BLOCK}", *never])
+    return make_refiner("default", mode, [stage, f"solver.block_iterations={_BLOCK}", *ENDLESS])
 
 
 def _on_device(frames: FrameBatch, detections: Detections, device: torch.device) -> tuple[FrameBatch, Detections]:
     return frames.to(device), detections.to(device)
-
-
-def _time_row(name: str, ms: Spread) -> Row:
-    return Row(_SUITE, name, ms.median, "ms", "time", ms.low, ms.high, ms.count)

@@ -8,13 +8,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from directshape_torch.benchmark.rows import COMPARABLE, Kind, Row, SuiteResult
+from benchmark_suites.figures import Kind, Row, SuiteResult
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.atomic_files import write_json
 
-SCHEMA_VERSION = 1
+_SCHEMA_VERSION = 1
 
-# Ratios wander by a quarter on a busy machine, slopes less and on an absolute scale; counts do not at all.
+# Ratios wander by a quarter on a busy machine, slopes less and on an absolute scale; counts do not at all. Other kinds
+# are of one machine, and in no baseline.
 _TOLERANCES: dict[Kind, float] = {"ratio": 0.3, "slope": 0.2, "count": 0.0}
 
 
@@ -26,7 +27,7 @@ class Expected:
         value: it had.
         kind: "ratio", "slope" or "count".
         better: "lower" or "higher".
-        tolerance: by which it may be worse: a share of the value of a ratio, else absolute.
+        tolerance: by which it may be worse: absolute for a slope, else a share of the value.
     """
 
     value: float
@@ -42,7 +43,7 @@ class Expected:
             >>> Expected(4.0, "ratio", "higher", 0.25).limit, Expected(2.0, "slope", "lower", 0.5).limit
             (3.0, 2.5)
         """
-        allowed = self.tolerance * abs(self.value) if self.kind == "ratio" else self.tolerance
+        allowed = self.tolerance if self.kind == "slope" else self.tolerance * abs(self.value)
         return self.value + allowed if self.better == "lower" else self.value - allowed
 
     def allows(self, value: float) -> bool:
@@ -51,7 +52,7 @@ class Expected:
 
 def make_baseline(rows: Iterable[Row]) -> dict[str, Expected]:
     """What later runs are held to: the comparable rows by key."""
-    return {r.key: Expected(r.value, r.kind, r.better, _tolerance(r)) for r in rows if r.kind in COMPARABLE}
+    return {r.key: Expected(r.value, r.kind, r.better, _tolerance(r)) for r in rows if r.kind in _TOLERANCES}
 
 
 def _tolerance(row: Row) -> float:
@@ -103,7 +104,7 @@ def compare(suites: Iterable[SuiteResult], baseline: dict[str, Expected]) -> Com
 def write_baseline(path: Path | str, baseline: dict[str, Expected]) -> None:
     """Write a baseline; rows of suites that did not run are to be among what is given."""
     rows = {key: asdict(expected) for key, expected in baseline.items()}
-    write_json(path, {"schema_version": SCHEMA_VERSION, "rows": rows})
+    write_json(path, {"schema_version": _SCHEMA_VERSION, "rows": rows})
 
 
 def read_baseline(path: Path | str) -> dict[str, Expected]:
@@ -114,8 +115,8 @@ def read_baseline(path: Path | str) -> dict[str, Expected]:
     """
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
-        if content["schema_version"] != SCHEMA_VERSION:
-            raise ValueError(f"not of schema version {SCHEMA_VERSION}")
+        if content["schema_version"] != _SCHEMA_VERSION:
+            raise ValueError(f"not of schema version {_SCHEMA_VERSION}")
         return {key: Expected(**row) for key, row in content["rows"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         cure = "make one with scripts/benchmark.py --write-baseline"

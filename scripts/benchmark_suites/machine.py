@@ -25,8 +25,7 @@ class Machine:
         system: operating system and its version.
         python, torch, directshape_torch: versions.
         compiler: first line of the C++ compiler's `--version`, or None where there is none.
-        gpu: name of the first graphics card, or None.
-        cuda: version that PyTorch was built with, or None.
+        gpu: name of the first graphics card and CUDA's version, or None.
         load: mean number of processes that wanted to run in the minute before, or None where the system does not tell.
     """
 
@@ -39,12 +38,25 @@ class Machine:
     directshape_torch: str
     compiler: str | None
     gpu: str | None
-    cuda: str | None
     load: float | None
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether more wants to run than our own threads, of which there are as many as cores at most."""
+        return self.load is not None and self.load >= self.cores + 0.5
+
+    def __str__(self) -> str:
+        load = "" if self.load is None else f", load {self.load:g}"
+        versions = [f"Python {self.python}", f"PyTorch {self.torch}", self.compiler or "no C++ compiler"]
+        return (
+            f"{self.processor}, {self.cores} cores, {self.threads} threads of PyTorch{load}\n"
+            f"{', '.join([*versions, self.gpu or 'no graphics card'])}"
+        )
 
 
 def describe_machine() -> Machine:
     """The machine of this process, now."""
+    gpu = f"{torch.cuda.get_device_name(0)}, CUDA {torch.version.cuda}" if torch.cuda.is_available() else None
     return Machine(
         processor=_processor(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
@@ -53,14 +65,13 @@ def describe_machine() -> Machine:
         python=platform.python_version(),
         torch=torch.__version__,
         directshape_torch=package_version(),
-        compiler=compiler(),
-        gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else None,
-        cuda=torch.version.cuda,
+        compiler=_compiler(),
+        gpu=gpu,
         load=round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
     )
 
 
-def compiler() -> str | None:
+def _compiler() -> str | None:
     """Version line of the C++ compiler that `torch.compile` would call, or None."""
     for name in (os.environ.get("CXX"), "g++", "clang++", "c++"):
         path = shutil.which(name) if name else None
@@ -73,8 +84,6 @@ def compiler() -> str | None:
 def _processor() -> str:
     """Linux hides the model's name from `platform`."""
     listing = Path("/proc/cpuinfo")
-    if listing.is_file():
-        for line in listing.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or "unknown"
+    lines = listing.read_text(encoding="utf-8").splitlines() if listing.is_file() else []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or "unknown")

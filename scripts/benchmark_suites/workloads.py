@@ -1,13 +1,10 @@
-"""What is refined: scenes with labels, and calls of any number of cars and any frame size made from one frame."""
+"""What is refined: scenes with labels, and calls of any number of cars made from one frame."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-import torch
-from torch import Tensor
 
 import directshape_torch
 from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
@@ -132,42 +129,3 @@ def _rows(detections: Detections, rows: slice) -> Detections:
     kept = {name: getattr(detections, name)[rows] for name in (*names, "has_mask_left", "has_mask_right")}
     sigma = None if detections.pose_sigma is None else detections.pose_sigma[rows]
     return replace(detections, pose_sigma=sigma, **kept)
-
-
-def enlarged(loaded: LoadedFrame, factor: int) -> LoadedFrame:
-    """The same frame in images of `factor` times the height: below the picture it is repeated upside down and again.
-
-    Cars, masks and calibration stay, so all that grows is the part of the images where no car is.
-    """
-    frame, detections = loaded.frame, loaded.detections
-    sizes = frame.sizes * torch.tensor([factor, 1])
-    frame = replace(
-        frame,
-        images_left=_repeated(frame.images_left, factor),
-        images_right=_repeated(frame.images_right, factor),
-        sizes=sizes,
-        camera=replace(frame.camera, disparity_field=None),
-        disparity=None,
-    )
-    detections = replace(
-        detections,
-        mask_left=_with_empty_rows(detections.mask_left, factor),
-        mask_right=_with_empty_rows(detections.mask_right, factor),
-    )
-    if detections.occluders is not None:
-        occluders = replace(
-            detections.occluders,
-            mask_left=_with_empty_rows(detections.occluders.mask_left, factor),
-            mask_right=_with_empty_rows(detections.occluders.mask_right, factor),
-        )
-        detections = replace(detections, occluders=occluders)
-    return replace(loaded, frame=frame, detections=detections)
-
-
-def _repeated(images: Tensor, factor: int) -> Tensor:
-    return torch.cat([images if k % 2 == 0 else images.flip(-2) for k in range(factor)], dim=-2)
-
-
-def _with_empty_rows(masks: Tensor, factor: int) -> Tensor:
-    empty = masks.new_zeros(*masks.shape[:-2], (factor - 1) * masks.shape[-2], masks.shape[-1])
-    return torch.cat([masks, empty], dim=-2)

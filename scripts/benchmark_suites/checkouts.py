@@ -1,0 +1,139 @@
+"""`--against CHECKOUT`: how many times as long as another version do we take, and how many operations more?
+
+Each version has a process of its own, and the two are asked in turn: what else the machine does slows down both. Eager,
+and with nothing that a version of this project could lack: frames, presets, the refiner.
+
+    PYTHONPATH=CHECKOUT:scripts python -m benchmark_suites.checkouts
+
+is one such process: it says which scenes it has, then answers each line `PRESET SCENE FIRST COUNT`, a call of so many
+frames, with its seconds, or its operations where the line ends in `operations`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmark_suites.figures import Row, SuiteResult, SuiteSettings
+from benchmark_suites.measures import count_operations
+from benchmark_suites.timing import Spread
+from benchmark_suites.workloads import load_scenes
+from directshape_torch import DirectShapeRefiner, load_config
+from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.io.frame_collation import collate
+
+_SUITE = "against"
+_SINGLE_FRAMES, _BATCH_FRAMES = 3, 8
+_ROUNDS = 11
+
+
+def run_against(checkout: Path, settings: SuiteSettings) -> SuiteResult:
+    """Ratios of time and operations, here over there, for frames by themselves and 8 in a call.
+
+    Raises:
+        InputError: the folder holds no version of this package.
+        DirectShapeError: a version failed.
+    """
+    if not (checkout / "directshape_torch" / "__init__.py").is_file():
+        raise InputError("--against", "a checkout of this project", str(checkout))
+    here = Path(__file__).resolve().parents[2]
+    rounds, rows = 1 if settings.quick else _ROUNDS, []
+    with _version(here, settings) as ours, _version(checkout.resolve(), settings) as theirs:
+        scenes = ours.answer()
+        theirs.answer()
+        for number, (scene, count) in enumerate(scenes):
+            calls = {f"{scene}, one frame in a call": [(f, 1) for f in range(min(count, _SINGLE_FRAMES))]}
+            if not settings.quick:
+                calls[f"{scene}, {_BATCH_FRAMES} frames in a call"] = [(0, _BATCH_FRAMES)]
+            for preset in ("default",) if settings.quick else ("default", "fast"):
+                for what, frames in calls.items():
+                    settings.progress(f"against {checkout}: {what}, {preset}")
+                    asked = [f"{preset} {number} {first} {size}" for first, size in frames]
+                    ratios = [ratio for line in asked for ratio in _ratios(ours, theirs, line, rounds)]
+                    rows.append(Row.of(_SUITE, f"{what}, {preset}, time", Spread.of(ratios), "", "ratio"))
+                    found = [[v.ask(f"{line} operations") for line in asked] for v in (ours, theirs)]
+                    note = f"{' '.join(map(str, found[0]))} over {' '.join(map(str, found[1]))}"
+                    ratio = Spread.of([a / b for a, b in zip(*found, strict=True)])
+                    rows.append(Row.of(_SUITE, f"{what}, {preset}, operations", ratio, "", "ratio", note=note))
+    return SuiteResult(_SUITE, tuple(rows), (f"this version over {checkout}, eager, by the ratios within the rounds",))
+
+
+def _ratios(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterator[float]:
+    """Of the seconds of calls in turn, in reversed order in every second round, after one that does not count."""
+    for number in range(rounds + 1):
+        order = (ours, theirs) if number % 2 else (theirs, ours)
+        seconds = {version: version.ask(line) for version in order}
+        if number:
+            yield seconds[ours] / seconds[theirs]
+
+
+class _Version:
+    """The process of one version."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def ask(self, line: str) -> Any:
+        """What it answers to a line."""
+        assert self._process.stdin is not None
+        print(line, file=self._process.stdin, flush=True)
+        return self.answer()
+
+    def answer(self) -> Any:
+        """What it says next."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise DirectShapeError(f"the process of {self._process.args!r} has ended; its errors are above")
+        return json.loads(line)
+
+
+@contextmanager
+def _version(root: Path, settings: SuiteSettings) -> Iterator[_Version]:
+    scripts = Path(__file__).resolve().parents[1]
+    command = [sys.executable, "-m", "benchmark_suites.checkouts", "--threads", str(torch.get_num_threads())]
+    command += ["--data", str(settings.data_root.resolve())] if settings.data_root else []
+    # In the root, for the folder in which a module is started comes first in its path.
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(root), str(scripts)))}
+    with subprocess.Popen(
+        command, cwd=root, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        yield _Version(process)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """One version: answer until there are no more lines."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, metavar="ROOT")
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args(arguments)
+    torch.set_num_threads(args.threads)
+    scenes = load_scenes(args.data, _BATCH_FRAMES)
+    refiner = cache(lambda preset: DirectShapeRefiner(config=load_config(preset, ["compile=off"])))
+    print(json.dumps([(scene.name, len(scene.frames)) for scene in scenes]), flush=True)
+    for line in sys.stdin:
+        preset, number, first, count, *operations = line.split()
+        frames = scenes[int(number)].frames
+        inputs = collate([frames[n % len(frames)] for n in range(int(first), int(first) + int(count))])
+        refine = refiner(preset)
+        if operations:
+            print(count_operations(lambda: refine(*inputs)), flush=True)  # noqa: B023
+            continue
+        start = time.perf_counter()
+        refine(*inputs)
+        print(time.perf_counter() - start, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""`--profile`: where the time and the operations of one eager call go, without a line of it in the measured code.
+
+Python tells a hook of every function that begins and ends. The time between two events, and the operations in it,
+belong to the innermost running function of `PARTS`; all others are helpers of whoever called them. Parts are exclusive
+and add up to the whole, so a lookup counts where it is asked for; but what judges the result counts as a whole.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from types import CodeType, FrameType
+from typing import Any
+
+from benchmark_suites.figures import Row, SuiteResult, SuiteSettings
+from benchmark_suites.measures import OperationCount
+from benchmark_suites.refiners import make_refiner
+from benchmark_suites.timing import Spread
+from benchmark_suites.workloads import demo_scene
+from directshape_torch import depth
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.outcome import outcome_of
+from directshape_torch.problem import CarIterations, CarProblem, CarStage
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.iteration import iterate
+from directshape_torch.terms import cars, term
+from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.priors import PriorTerm
+from directshape_torch.terms.silhouette import Silhouettes
+
+_SUITE = "profile"
+_REST = "everything else"
+_OUTCOME = "outcome: covariance, quality, profile, trust"
+# Of the functions themselves, so that one that goes takes its line with it.
+PARTS: dict[str, tuple[Any, ...]] = {
+    "observation: regions, occlusion, pixels": (DirectShapeRefiner._observe, CarProblem.of_scene),
+    "marched rays and first hits": (CarProblem.look,),
+    "tracked rays": (depth.tracked_closest, depth.tracked_depth),
+    "beginning of stages": (CarProblem.begin, CarStage.start),
+    "grids of the cars": (PCAShapePrior.bind,),
+    "silhouettes": (Silhouettes.linear,),
+    "photometric": (Photometric.linear,),
+    "priors": (PriorTerm.linear,),
+    "sums over pixels and cars": (term.part_of, term.summed),
+    "solve and step": (damped_step, cars.retract),
+    "iterations, the rest": (iterate, CarIterations.choose, CarIterations.of_problems),
+    "figures at the end": (CarStage.figures,),
+    _OUTCOME: (outcome_of,),
+}
+
+
+def run_profile(settings: SuiteSettings) -> SuiteResult:
+    """Median over a few calls of the milliseconds of each part, and its operations."""
+    frames, detections = collate(demo_scene().frames)
+    call = partial(make_refiner("default", "eager"), frames, detections)
+    settings.progress("profile: one eager refinement, by part")
+    for _ in range(settings.repetitions.warm_up):
+        call()
+    times = [profile_parts(call, time.perf_counter) for _ in range(1 if settings.quick else 5)]
+    with OperationCount() as count:
+        operations = profile_parts(call, lambda: count.total)
+    whole = Spread.of([sum(each.values()) for each in times])
+    rows = []
+    for part in (*PARTS, _REST):
+        spread = Spread.of([1e3 * each[part] for each in times])
+        note = f"{spread.median / whole.median / 10:.1f} %, {operations[part]:.0f} operations"
+        rows.append(Row.of(_SUITE, part, spread, "ms", "time", note=note))
+    rows.append(Row.of(_SUITE, "whole call", whole.scaled(1e3), "ms", "time", note=f"{count.total} operations"))
+    notes = f"default preset, eager, the bundled frame with {len(detections)} cars; exclusive, with the hook's own cost"
+    return SuiteResult(_SUITE, tuple(rows), (notes,))
+
+
+def profile_parts(call: Callable[[], object], reading: Callable[[], float]) -> Counter[str]:
+    """Run `call` once in this thread and say by how much a reading rises in each of `PARTS`, and in the rest.
+
+    Args:
+        call: eager code; of compiled code only the call as a whole is seen.
+        reading: of a clock or a counter.
+    """
+    recorder = _Recorder(reading)
+    previous = sys.getprofile()
+    sys.setprofile(recorder.event)
+    try:
+        call()
+    finally:
+        sys.setprofile(previous)
+    return recorder.risen
+
+
+class _Recorder:
+    """Stack of the parts of the running functions."""
+
+    def __init__(self, reading: Callable[[], float]) -> None:
+        self.risen: Counter[str] = Counter()
+        self._parts = {_code(function): part for part, functions in PARTS.items() for function in functions}
+        self._stack, self._reading, self._last = [_REST], reading, reading()
+
+    def event(self, frame: FrameType, event: str, argument: Any) -> None:
+        if event not in ("call", "return"):
+            return
+        self.risen[self._stack[-1]] += self._reading() - self._last  # type: ignore[assignment]
+        if event == "call":
+            caller = self._stack[-1]
+            self._stack.append(caller if caller == _OUTCOME else self._parts.get(frame.f_code, caller))
+        elif len(self._stack) > 1:  # functions that were running before the hook was set return too
+            self._stack.pop()
+        self._last = self._reading()
+
+
+def _code(function: Any) -> CodeType:
+    """The code of a function, a method, or whatever they wrap."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    assert isinstance(code, CodeType), function
+    return code
