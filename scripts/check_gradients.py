@@ -1,13 +1,16 @@
 """The Jacobian laboratory: every derivative of the energy three ways, in named regimes, with real image content.
 
-Every term (both silhouettes in both forms, photometric in two, shape, height, tilt in both forms, dimensions, pose) and
-every factor of the chain has its hand-derived Jacobian compared with autograd and with central differences (Richardson
-extrapolation over a sweep of steps). Entries whose difference stencil contains a kink of the function are excluded by
-a stated rule and counted. Exit code 1 when a bound is broken: analytic against autograd 1e-9, against numeric 1e-6,
-relative to the norm of the row, float64; less than 2 percent excluded in the typical regime.
+Every term (silhouettes and photometric in both forms, points, all priors) and the factors of the chain have their
+hand-derived Jacobian compared with autograd and with central differences (Richardson extrapolation over a sweep of
+steps); the gradients of the terms have their derivatives by autograd compared with differences. Entries that
+differences cannot judge, as their own estimate of error says, are excluded and counted. A term of one's own,
+`--term module:factory`, is examined as the built-in ones are, and its shapes are checked. Exit code 1 when a bound is
+broken: analytic against autograd 1e-9, against numeric 1e-6, relative to the norm of the row, float64; less than 2
+percent excluded in the typical regime.
 
     python scripts/check_gradients.py --out gradients
-    python scripts/check_gradients.py --term photometric ray_depth --regime typical near_3m --states 12
+    python scripts/check_gradients.py --term photometric surface_depth --regime typical near_3m --states 12
+    python scripts/check_gradients.py --term my_terms:upright --regime typical
     python scripts/check_gradients.py --data KITTI --frame 000107 --out gradients_kitti
 
 What the columns mean: docs/gradients.md.
@@ -24,54 +27,43 @@ import torch
 from command_line import run_command
 
 from directshape_torch.errors import InputError
-from directshape_torch.laboratory.bench import Bench
-from directshape_torch.laboratory.paper_depth import PaperDepthError, paper_depth_errors
-from directshape_torch.laboratory.paper_refinement import paper_refinements
+from directshape_torch.laboratory.own_term import load_factory
 from directshape_torch.laboratory.regimes import regimes_named
-from directshape_torch.laboratory.report import LaboratoryReport, console_table, summary, write_report
+from directshape_torch.laboratory.report import console_table, summary, write_report
 from directshape_torch.laboratory.scenes import load_scene
-from directshape_torch.laboratory.second_derivatives import SecondDerivativeCheck, second_derivatives
-from directshape_torch.laboratory.study import StudyPlan, run_study, subjects_named
+from directshape_torch.laboratory.study import SUBJECT_NAMES, StudyPlan, run_study, subjects_named
 from directshape_torch.shape.pca_prior import PCAShapePrior
-
-DTYPES = ("float64", "float32")
-_REFINED_CARS = 24
 
 
 def run(args: argparse.Namespace) -> int:
     """Examine, print, write; returns the exit code.
 
     Raises:
-        DirectShapeError: unknown names, a data set that cannot be read.
+        DirectShapeError: unknown names, a term of wrong shapes, a data set that cannot be read.
     """
     if args.states < 1:
         raise InputError("--states", "at least 1", f"{args.states}")
+    names = SUBJECT_NAMES if args.term is None else args.term
     plan = StudyPlan(
-        subjects=subjects_named(args.term),
+        subjects=subjects_named([name for name in names if ":" not in name]),
+        own_terms=tuple(load_factory(name) for name in names if ":" in name),
         regimes=tuple(regimes_named(args.regime)),
         num_states=args.states,
-        dtypes=tuple(args.dtype),
         seed=args.seed,
         pixels_per_car=args.pixels,
+        second=args.second,
+        steps=args.steps,
     )
     scene = load_scene(args.data, args.frame, args.detections, args.masks)
     prior = (PCAShapePrior.load_bundled() if args.prior is None else PCAShapePrior.load(args.prior)).double()
     study = run_study(scene, prior, plan, report=lambda line: print(line, file=sys.stderr))
-    second: list[SecondDerivativeCheck] = []
-    paper: list[PaperDepthError] = []
-    for regime in plan.regimes if args.second or args.paper_depth else ():
-        bench = Bench.build(scene, prior, regime, plan.num_states, plan.seed, plan.pixels_per_car)
-        second += second_derivatives(bench) if args.second else []
-        paper += paper_depth_errors(bench) if args.paper_depth else []
-    refinements = paper_refinements(scene, prior, _REFINED_CARS, plan.seed) if args.paper_depth else []
-    report = LaboratoryReport(scene.source, plan, study, second, paper, refinements)
     print(console_table(study.comparisons))
     if args.out is None:
-        print(summary(report))
+        print(summary(scene.source, plan, study))
     else:
-        write_report(args.out, report)
+        write_report(args.out, scene.source, plan, study)
         print(f"summary  {args.out / 'summary.md'}")
-    broken = report.broken_bounds()
+    broken = study.broken_bounds()
     for sentence in broken:
         print(f"BROKEN   {sentence}")
     return 1 if broken else 0
@@ -82,9 +74,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--states", type=int, default=6, metavar="N", help="states in each regime (default 6)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="for CSV files, plots and summary.md")
-    parser.add_argument("--term", nargs="+", metavar="NAME", help="terms and factors; default all")
+    parser.add_argument(
+        "--term", nargs="+", metavar="NAME", help="terms and factors, default all; module:factory for one of your own"
+    )
     parser.add_argument("--regime", nargs="+", metavar="NAME", help="default all")
-    parser.add_argument("--dtype", nargs="+", choices=DTYPES, default=list(DTYPES), help="default both")
     parser.add_argument("--data", type=Path, metavar="ROOT", help="KITTI's layout; default the bundled demo frame")
     parser.add_argument("--frame", metavar="ID", help="frame of --data; default the one with most masked cars")
     parser.add_argument("--detections", type=Path, metavar="DIR", help="default the first folder in ROOT/detections")
@@ -94,8 +87,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pixels", type=int, default=64, metavar="N", help="pixels per car and side (default 64)")
     parser.add_argument("--second", action=argparse.BooleanOptionalAction, default=True, help="second derivatives too")
     parser.add_argument(
-        "--paper-depth", action=argparse.BooleanOptionalAction, default=True,
-        help="measure the paper's approximate depth derivative too",
+        "--steps", action=argparse.BooleanOptionalAction, default=True,
+        help="measure what float32 and the paper's depth derivative do to a step too",
     )  # fmt: skip
     torch.set_num_threads(1)  # the operations are small, and threads would spin
     return run_command(parser, run, arguments)

@@ -1,52 +1,42 @@
-"""The states of a regime with everything that is examined at them: pixels, terms of all forms, precise projections."""
+"""The states of a regime with everything that is examined at them: pixels, all terms, where rows look."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig, StageConfig
-from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.car_problem import CarProblem
-from directshape_torch.energy.car_state import CarState, retract
-from directshape_torch.energy.direct_terms import direct_terms
-from directshape_torch.energy.projected_state import ProjectedState, ProjectedView
-from directshape_torch.energy.term import Term
+from directshape_torch.config import RefinerConfig
+from directshape_torch.depth import closest_of_march, first_hits, march
 from directshape_torch.geometry import se3
+from directshape_torch.geometry.short_axes import length
+from directshape_torch.laboratory.own_term import checked_term
 from directshape_torch.laboratory.regimes import Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
+from directshape_torch.numerics.table_lookup import occurrences
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
-from directshape_torch.residuals.photometric import surface_slope
+from directshape_torch.problem import CarProblem, CarStage, TermFactory
+from directshape_torch.rows import Rays, Rows
+from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.raycast import ObjectRays, Root
+from directshape_torch.stereo_matching.car_points import PointSamples
+from directshape_torch.terms.cars import CarBatch, CarState, retract
+from directshape_torch.terms.silhouette import contour_zeta
+from directshape_torch.terms.term import Linear, Sight, Term
 
 TERM_NAMES = (
-    "silhouette_left", "silhouette_right", "silhouette_left_product", "silhouette_right_product", "photometric",
-    "photometric_normalised", "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
+    "silhouettes", "silhouettes_product", "photometric", "photometric_normalised", "point_cloud",
+    "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
 )  # fmt: skip
 
-# Brackets shrink superlinearly: more iterations than float64 can use; Newton's steps from there are quadratic.
-ROOT_ITERATIONS = 20
-_NEWTON_STEPS = 5
+# Each look begins where the last one ended: tracked depths converge to the last digit.
+_LOOKS = 3
 _CELLS_TO_CHOOSE_FROM = 3000
 _CONTOUR = 3.0
 _GRAZING_COSINE = 0.3
-
-
-class _RememberedView(ProjectedView):
-    """A view that finds each set of surface roots once: hundreds of displaced states start from them."""
-
-    def __init__(self, view: ProjectedView) -> None:
-        self.__dict__.update(view.__dict__)
-        self._found: dict[int, tuple[Tensor, tuple[ObjectRays, Root]]] = {}
-
-    def surface(self, rows: Tensor) -> tuple[ObjectRays, Root]:
-        # The rows are kept beside what was found, so that no other tensor can take over their identity.
-        if id(rows) not in self._found:
-            self._found[id(rows)] = rows, super().surface(rows)
-        return self._found[id(rows)][1]
+_POINT_NOISE_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -55,38 +45,37 @@ class Bench:
 
     Attributes:
         regime: they were drawn from.
-        problem: of these cars, its terms those of the default settings and the pose prior, the regime's stage begun.
+        stage: of the problem with the default settings, a pose prior, points and the user's own terms, begun.
         terms: by the laboratory's names, in all forms, the paper's among them.
         state: of the B cars.
-        projected: at that state, with roots as precise as the dtype allows.
-        cars: constants of the cars.
+        sight: what the rays see of it.
+        rows: residuals and factors of each term at that state.
     """
 
     regime: Regime
-    problem: CarProblem
-    terms: dict[str, Term]
+    stage: CarStage
+    terms: Mapping[str, Term]
     state: CarState
-    projected: ProjectedState
-    cars: CarBatch
+    sight: Sight
+    rows: Mapping[str, Linear]
+
+    @property
+    def problem(self) -> CarProblem:
+        return self.stage.problem
 
     @property
     def num_unknowns(self) -> int:
         return 6 + self.state.code.shape[1]
 
     @property
-    def pixels_per_car(self) -> Tensor:
-        """Pixels (B,) of both images."""
-        sides = (self.problem.left, self.problem.right)
-        count = torch.stack([torch.bincount(s.object_index, minlength=len(self.state.code)) for s in sides])
-        return count.sum(dim=0)
+    def rays_per_car(self) -> Tensor:
+        """Rays (B,) of both images."""
+        masks, count = self.problem.masks, torch.zeros_like(self.state.code[:, 0])
+        return count.index_add(0, masks.rays.owner, masks.filled.sum(dim=1))
 
     def moved(self, delta: Tensor) -> CarState:
         """All cars moved by one tangent vector (D,)."""
         return retract(self.state, delta.expand(len(self.state.code), self.num_unknowns))
-
-    def project(self, state: CarState) -> ProjectedState:
-        """The projection of another state; sample depths, closest approaches and hits stay, surfaces are followed."""
-        return self.problem.project(state, frozen=self.projected, root_iterations=_NEWTON_STEPS)
 
     @classmethod
     def build(
@@ -97,48 +86,49 @@ class Bench:
         num_states: int,
         seed: int = 0,
         pixels_per_car: int = 64,
-        config: RefinerConfig | None = None,
+        own_terms: Sequence[TermFactory] = (),
     ) -> Bench:
         """Draw states and choose their pixels."""
-        config = _with_pose_prior(RefinerConfig() if config is None else config)
+        config = _settings(regime, pixels_per_car)
         generator = seeded(seed, regime)
         drawn = regime.draw(scene, prior, num_states, generator)
-        cells = pixels_per_car if regime.pixels == "sampled" else _CELLS_TO_CHOOSE_FROM
-        # Gradients of the image choose the pixels on both sides: there the residuals are not flat.
-        sampling = replace(
-            config.sampling, mode_right="as_left", min_pixels=cells, max_pixels=cells, occlusion=regime.occlusion
-        )
-        observation = pack_pixels(scene.frame, drawn.detections, sampling)
-        cars = CarBatch.from_scene(scene.frame, drawn.detections)
-        stage = config.stages[regime.stage]
-        observation = _choose(observation, regime, prior, drawn.state, cars, stage, config, pixels_per_car, generator)
+        frame, detections = scene.frame, drawn.detections
+        cars = CarBatch.from_scene(frame, detections)
+        observation = pack_pixels(frame, detections, config.sampling)
+        if regime.pixels != "sampled":
+            observation = _chosen(observation, regime, prior, drawn.state, cars, config, pixels_per_car, generator)
+        points = _points(observation.left, drawn.state, generator)
         other_forms = replace(
             config,
             silhouette=replace(config.silhouette, form="product"),
             photometric=replace(config.photometric, patch="normalised", brightness="affine"),
             priors=replace(config.priors, tilt_form="cosine"),
         )
-        problem, other = (
-            CarProblem(
-                prior,
-                direct_terms(c, prior, scene.frame, drawn.detections, cars, observation),
-                observation.left,
-                observation.right,
-                c,
-            )
-            for c in (config, other_forms)
-        )
         # Pixel sets are fixed where a refinement would begin, so that rows get lost on the way to the state.
-        start = CarState(se3.inverse(drawn.detections.T_cam_obj), drawn.state.code)
-        for p in (problem, other):
-            p.begin_stage(stage, start)
-        projected = problem.project(drawn.state, root_iterations=ROOT_ITERATIONS)
-        projected.left, projected.right = _RememberedView(projected.left), _RememberedView(projected.right)
-        return cls(regime, problem, _named(problem, other), drawn.state, projected, cars)
+        start = CarState(se3.inverse(detections.T_cam_obj), drawn.state.code)
+        stages = []
+        for c in (config, other_forms):
+            problem = CarProblem.of_scene(c, prior, frame, detections, cars, observation, points, own_terms)
+            stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
+        terms = _named(*stages)
+        sight = stages[0].problem.look(drawn.state)
+        rows = {name: rows_at(checked_term(term, sight), sight) for name, term in terms.items()}
+        return cls(regime, stages[0], terms, drawn.state, sight, rows)
 
 
-def _with_pose_prior(config: RefinerConfig) -> RefinerConfig:
-    """With a stereo detector's standard deviations: without any that prior would not be there to be examined."""
+@torch.no_grad()
+def rows_at(term: Term, sight: Sight) -> Linear:
+    """The rows of a term at a state, its depths as precise as the dtype allows."""
+    at = term.linear(sight.field, sight.state, term.where(sight))
+    for _ in range(_LOOKS):
+        at = term.linear(sight.field, sight.state, at.where)
+    return at
+
+
+def _settings(regime: Regime, pixels_per_car: int) -> RefinerConfig:
+    """The default ones with every prior and few pixels."""
+    config = RefinerConfig(method="combined")
+    # A stereo detector's standard deviations: without any that prior would not be there to be examined.
     priors = replace(
         config.priors,
         pose_sigma_along_share=0.02,
@@ -146,65 +136,79 @@ def _with_pose_prior(config: RefinerConfig) -> RefinerConfig:
         pose_sigma_vertical_m=0.05,
         pose_sigma_yaw_deg=4.0,
     )
-    return replace(config, priors=priors)
+    cells = pixels_per_car if regime.pixels == "sampled" else _CELLS_TO_CHOOSE_FROM
+    # Gradients of the image choose the pixels on both sides: there the residuals are not flat.
+    sampling = replace(
+        config.sampling, mode_right="as_left", min_pixels=cells, max_pixels=cells, occlusion=regime.occlusion
+    )
+    cloud = replace(config.point_cloud, min_points=1)
+    return replace(config, priors=priors, sampling=sampling, point_cloud=cloud)
 
 
-def _named(problem: CarProblem, other_forms: CarProblem) -> dict[str, Term]:
-    by_name = {("tilt_normal" if t.name == "tilt" else t.name): t for t in problem.terms}
-    for term in other_forms.terms:
-        if term.name.startswith("silhouette"):
-            by_name[f"{term.name}_product"] = term
-        elif term.name == "photometric":
-            by_name["photometric_normalised"] = term
-        elif term.name == "tilt":
-            by_name["tilt_cosine"] = term
-    return {name: by_name[name] for name in TERM_NAMES}
+def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:
+    """The terms of a stage and the other forms of three of them; those of a user under their own names."""
+    plain, other = (
+        {"silhouettes" if len(t.names) > 1 else t.names[0]: t for t in s.terms} for s in (stage, other_forms)
+    )
+    plain |= {"tilt_normal": plain.pop("tilt"), "tilt_cosine": other["tilt"]}
+    plain |= {"silhouettes_product": other["silhouettes"], "photometric_normalised": other["photometric"]}
+    return {name: plain.pop(name) for name in TERM_NAMES} | plain
 
 
-def _choose(
+def _points(pixels: PixelSamples, state: CarState, generator: torch.Generator) -> PointSamples:
+    """A point beside the middle of its car, on the ray of each left pixel."""
+    car = pixels.object_index
+    depth = se3.inverse(state.T_obj_cam)[car, 2, 3]
+    noise = torch.randn(len(car), 3, generator=generator, dtype=torch.float64)
+    points = pixels.origin_cam + depth[:, None] * pixels.ray_cam + _POINT_NOISE_M * noise
+    return PointSamples(car, points, occurrences(car, len(state.code)))
+
+
+def _chosen(
     observation: Observation,
     regime: Regime,
     prior: PCAShapePrior,
     state: CarState,
     cars: CarBatch,
-    stage: StageConfig,
     config: RefinerConfig,
     pixels_per_car: int,
     generator: torch.Generator,
 ) -> Observation:
     """The pixels that a regime is about, at most so many per car and side."""
-    if regime.pixels == "sampled":
-        return observation
-    projected = ProjectedState(
-        prior, state, observation.left, observation.right, config.silhouette.samples_per_ray, root_iterations=20
-    )
+    field, bounds = field_of(prior.bind(state.code)), prior.bounds_obj
+    zeta = contour_zeta(cars, config.silhouette, config.stages[regime.stage])
     chosen = []
-    for view, pixels in ((projected.left, observation.left), (projected.right, observation.right)):
-        points = view.rays.at(view.closest_depth)
-        sdf = projected.shape.value(points, pixels.object_index)
-        rays, root = view.surface(torch.arange(len(pixels)))
-        surface = rays.at(root.depth)
+    for pixels in (observation.left, observation.right):
+        rows = Rows.of_sorted(pixels.object_index, len(cars))
+        owner = rows.blocks.owner
+        rays = Rays.of_rows(rows, pixels.origin_cam, pixels.ray_cam).in_objects(state.T_obj_cam)
+        marched = march(field, owner, rays, bounds, config.silhouette.samples_per_ray)
+        closest = closest_of_march(field, owner, rays, bounds, marched)
+        hits = first_hits(field, owner, rays, marched, closest)
         if regime.pixels == "contour":
-            zeta = (cars.focal_over_depth / stage.contour_width_px)[pixels.object_index]
-            wanted = (zeta * sdf).abs() < _CONTOUR
+            sdf = field.value(closest.points_obj, owner, constant=True)
+            wanted = (zeta[owner][:, None] * sdf).abs() < _CONTOUR
         elif regime.pixels == "grazing":
-            gradient = projected.shape.value_and_derivatives(surface, pixels.object_index).gradient
-            wanted = root.found & surface_slope(gradient, rays.direction_obj, _GRAZING_COSINE)[1]
+            slope = (hits.normal_obj * rays.direction_obj).sum(0).abs()
+            steepest = length(hits.normal_obj, dim=0) * length(rays.direction_obj, dim=0)
+            wanted = hits.found & (slope <= _GRAZING_COSINE * steepest)
         else:
-            wanted = _near_border(prior, points) | (root.found & _near_border(prior, surface))
-        chosen.append(_at_most(pixels, wanted & view.march.crosses_bounds, pixels_per_car, generator))
+            wanted = near_border(prior, closest.points_obj) | (hits.found & near_border(prior, hits.points_obj))
+        wanted = (wanted & closest.crosses).flatten()[rows.places]
+        chosen.append(_at_most(pixels, wanted, pixels_per_car, generator))
     return replace(observation, left=chosen[0], right=chosen[1])
 
 
-def _near_border(prior: PCAShapePrior, points_obj: Tensor) -> Tensor:
-    lower, upper = prior.bounds_obj
-    return torch.minimum(points_obj - lower, upper - points_obj).amin(dim=-1) < prior.spacing_m
+def near_border(prior: PCAShapePrior, points_obj: Tensor) -> Tensor:
+    """Which points (3, ...) lie within a cell of the border of a prior's grid."""
+    lower, upper = (corner.view(3, *[1] * (points_obj.ndim - 1)) for corner in prior.bounds_obj)
+    return torch.minimum(points_obj - lower, upper - points_obj).amin(dim=0) < prior.spacing_m
 
 
 def _at_most(pixels: PixelSamples, wanted: Tensor, count: int, generator: torch.Generator) -> PixelSamples:
-    """Some of the wanted pixels of each object, drawn at random, in their order."""
+    """Some of the wanted pixels of each car, drawn at random, in their order."""
     keep = torch.zeros_like(wanted)
-    for car in range(int(pixels.object_index.max()) + 1 if len(pixels) else 0):
+    for car in set(pixels.object_index.tolist()):
         rows = (wanted & (pixels.object_index == car)).nonzero()[:, 0]
         keep[rows[torch.randperm(len(rows), generator=generator)[:count]]] = True
     return pixels.select(keep.nonzero()[:, 0])

@@ -1,4 +1,4 @@
-"""Three Jacobians against one another: relative errors of entries, exclusions by rule, bounds."""
+"""Three Jacobians against one another: relative errors of entries, exclusions and their reasons, bounds."""
 
 from __future__ import annotations
 
@@ -8,16 +8,20 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from directshape_torch.laboratory.differences import STEPS, UNRESOLVED, DifferenceSweep, choose, sweep
-from directshape_torch.laboratory.subjects import Experiment, Subject
+from directshape_torch.laboratory.differences import KINK, STEPS, DifferenceSweep, choose, sweep
+from directshape_torch.laboratory.experiments import Experiment, Subject
 
 PAIRS = ("analytic-autograd", "analytic-numeric", "autograd-numeric")
 BOUNDS: Mapping[str, float] = {"analytic-autograd": 1e-9, "analytic-numeric": 1e-6, "autograd-numeric": 1e-6}
 """Largest permitted error of an entry in float64, relative to the norm of its row."""
 MAX_EXCLUDED_SHARE_TYPICAL = 0.02
+MAX_VALUE_ERROR = 1e-9
+"""Of the two ways in which a term computes its residuals, relative."""
 
-# Differences must be able to resolve a quarter of the bound that they are to decide.
+# Differences must reach a quarter of the bound that they are to decide.
 _RESOLUTION_SHARE = 0.25
+# A derivative's estimated error, as a share of the derivative, that only a kink explains.
+_KINK_SHARE = 0.1
 # A row is compared relative to its norm, but rows shorter than a millionth of the longest of their regime (a ray deep
 # inside the mask, a neighbour on a white wall) relative to that millionth: rounding of their parts is all they are.
 FLAT_SHARE = 1e-6
@@ -49,13 +53,13 @@ class Comparison:
     Attributes:
         name: of the factor or term.
         regime: of the state.
-        entries: of usable rows, rows times unknowns.
+        entries: rows times unknowns.
         compared: entries that differences could judge.
-        excluded: by rule, the entries that they could not.
-        skipped_rows: rows that the residual's own skip rules make constant.
-        zero_rows: usable rows whose Jacobian is exactly zero.
-        flat_rows: further usable rows so short that they are compared with `FLAT_SHARE` of the longest.
+        excluded: by reason, the entries that they could not.
+        zero_rows: rows whose Jacobian is exactly zero, also by a skip rule of the residual.
+        flat_rows: further rows so short that they are compared with `FLAT_SHARE` of the longest.
         errors: for each pair.
+        value_error: see `Subject`.
         curve: of the numeric differences; None where there is nothing to draw.
     """
 
@@ -64,10 +68,10 @@ class Comparison:
     entries: int
     compared: int
     excluded: Mapping[str, int]
-    skipped_rows: int
     zero_rows: int
     flat_rows: int
     errors: Mapping[str, PairError]
+    value_error: float = 0.0
     curve: StepCurve | None = field(repr=False, default=None)
 
     @property
@@ -78,7 +82,7 @@ class Comparison:
         """One sentence for each bound that does not hold.
 
         Example:
-            >>> bad = Comparison("warp", "typical", 2, 2, {}, 0, 0, 0, {"analytic-numeric": PairError(0.5, 0.5)})
+            >>> bad = Comparison("warp", "typical", 2, 2, {}, 0, 0, {"analytic-numeric": PairError(0.5, 0.5)})
             >>> bad.broken_bounds()
             ['warp, typical: analytic-numeric error 5.0e-01 above 1e-06']
         """
@@ -87,6 +91,8 @@ class Comparison:
             for pair, error in self.errors.items()
             if not error.maximum <= BOUNDS[pair]
         ]
+        if not self.value_error <= MAX_VALUE_ERROR:
+            broken.append(f"{self.name}, {self.regime}: residual and linear give values {self.value_error:.1e} apart")
         if self.regime == "typical" and self.excluded_share >= MAX_EXCLUDED_SHARE_TYPICAL:
             broken.append(f"{self.name}, typical: {100 * self.excluded_share:.1f} percent of the entries excluded")
         return broken
@@ -99,17 +105,16 @@ def compare(experiment: Experiment, regime: str) -> list[Comparison]:
 
 
 def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Comparison:
-    usable = subject.usable
     norm = subject.norm
-    moving = usable & (norm != 0)  # NaN among them: its errors are NaN and break the bounds
+    moving = norm != 0  # NaN among them: its errors are NaN and break the bounds
     finite = norm[moving & norm.isfinite()]
     longest = finite.max() if len(finite) else norm.new_ones(())
     scale = norm.clamp_min(float(FLAT_SHARE * longest))
     choice = choose(found, _RESOLUTION_SHARE * BOUNDS["analytic-numeric"] * scale)
     numeric = choice.derivative
-    # Everything that no rule excludes is judged: a difference that is no number breaks its bound.
+    # Everything that has no reason to be excluded is judged: a difference that is no number breaks its bound.
     judged = moving[:, None] & ~torch.stack(list(choice.excluded.values())).any(dim=0)
-    excluded = {rule: int((e & moving[:, None]).sum()) for rule, e in choice.excluded.items()}
+    excluded = {reason: int((e & moving[:, None]).sum()) for reason, e in choice.excluded.items()}
     difference = {
         "analytic-autograd": (subject.analytic - subject.autograd).abs(),
         "analytic-numeric": (subject.analytic - numeric).abs(),
@@ -119,40 +124,36 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
         pair: (d / scale[:, None])[moving[:, None].expand_as(d) if pair == "analytic-autograd" else judged]
         for pair, d in difference.items()
     }
-    constant = usable & (norm == 0)
-    constant_errors, constant_excluded = _rows_that_should_be_constant(found, constant)
+    constant_errors, kinks = _rows_that_should_be_constant(found, ~moving)
     pairs = {p: e if p == "analytic-autograd" else torch.cat([e, constant_errors]) for p, e in pairs.items()}
-    excluded = {rule: n + constant_excluded.get(rule, 0) for rule, n in excluded.items()}
+    excluded[KINK] += kinks
     return Comparison(
         name=subject.name,
         regime=regime,
-        entries=int(usable.sum()) * subject.analytic.shape[1],
+        entries=subject.analytic.numel(),
         compared=int(judged.sum()) + len(constant_errors),
-        excluded={rule: n for rule, n in excluded.items() if n},
-        skipped_rows=int((~usable).sum()),
-        zero_rows=int(constant.sum()),
+        excluded={reason: n for reason, n in excluded.items() if n},
+        zero_rows=int((~moving).sum()),
         flat_rows=int((moving & (norm < scale)).sum()),
         errors={pair: _pair_error(e) for pair, e in pairs.items()},
+        value_error=subject.value_error,
         curve=_curve(subject, found, moving, scale[:, None]),
     )
 
 
-def _rows_that_should_be_constant(found: DifferenceSweep, constant: Tensor) -> tuple[Tensor, dict[str, int]]:
+def _rows_that_should_be_constant(found: DifferenceSweep, constant: Tensor) -> tuple[Tensor, int]:
     """Rows whose Jacobians are zero have no norm to compare with: their differences must be rounding alone.
 
     Judged at the smallest stencil, where a kink is least likely; an entry beyond four times its rounding is an
     infinite relative error.
 
     Returns:
-        The errors of the entries without a kink there, and the number of the others by rule.
+        The errors of the entries without a kink there, and the number of the others.
     """
-    judged = constant[:, None].expand_as(found.extrapolated[-1])
-    excluded = {}
-    for rule, crossed in found.crossed.items():
-        excluded[rule] = int((judged & crossed[-1]).sum())
-        judged = judged & ~crossed[-1]
-    still = found.extrapolated[-1].abs() <= 4 * found.rounding[-1]
-    return torch.where(still, 0.0, torch.inf)[judged].to(found.value.dtype), excluded
+    derivative, error, rounding = (x[-1][constant] for x in (found.extrapolated, found.error, found.rounding))
+    still = derivative.abs() <= 4 * rounding
+    kink = ~still & (error - rounding > _KINK_SHARE * derivative.abs())
+    return torch.where(still, 0.0, torch.inf)[~kink].to(derivative.dtype), int(kink.sum())
 
 
 def _pair_error(error: Tensor) -> PairError:
@@ -188,6 +189,3 @@ def _curve(subject: Subject, found: DifferenceSweep, moving: Tensor, scale: Tens
         STEPS[2:],
         tuple(quantile(e, 0.5) for e in extrapolated),
     )
-
-
-__all__ = ["BOUNDS", "PAIRS", "UNRESOLVED", "Comparison", "PairError", "StepCurve", "compare", "quantile"]

@@ -1,8 +1,7 @@
-"""Every factor of the chain by itself, at the very values that it takes at the states of a regime.
+"""Factors of the chain by themselves, at the very values that they take at the states of a regime.
 
-The hand-derived Jacobians are those that the package uses (lookups, warp, projections, depth), or the closed forms of
-the derivations where the package never forms them (exponential, transform, pinhole projection). At the end of the chain
-stand the rows as the iterations evaluate them, with rays that are followed (`tracked_rows`).
+The hand-derived Jacobians are those that the package uses, or the closed forms of the derivations where the package
+never forms them (exponential, transform).
 """
 
 from __future__ import annotations
@@ -13,29 +12,21 @@ import torch
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from directshape_torch.energy.photometric_term import PhotometricTerm
-from directshape_torch.energy.silhouette_term import SilhouetteTerm
+from directshape_torch.depth import surface_depth
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.pinhole import project
-from directshape_torch.geometry.stereo import warp_to_right
-from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.laboratory import kinks
 from directshape_torch.laboratory.bench import Bench
-from directshape_torch.laboratory.subjects import Experiment, factor_experiment
-from directshape_torch.laboratory.surface_depth import ray_depth_experiment
-from directshape_torch.laboratory.tracked_rows import tracked_photometric, tracked_silhouettes
-from directshape_torch.residuals import robust
-from directshape_torch.residuals.silhouette import (
-    project_closest_approach,
-    project_product,
-    residual_derivative_closest_approach,
-    residual_derivative_product,
-    silhouette_residual,
-)
-from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.laboratory.experiments import Experiment, factor_experiment
+from directshape_torch.shape.field import field_of
+from directshape_torch.terms import robust
+from directshape_torch.terms.photometric import Comparison, Photometric, Surface, compared
+from directshape_torch.terms.point_cloud import PointCloud
+from directshape_torch.terms.silhouette import Silhouettes, closest_approach_residual
+from directshape_torch.terms.silhouette_product import Samples, SilhouetteProducts, product_residual
+from directshape_torch.terms.term import Linear
 
 # Each point of the trilinear lookup binds a grid of its own.
 _MAX_GRIDS = 40
+_MAX_PIXELS = 160
 _SERIES_TERMS = 60
 
 
@@ -71,149 +62,124 @@ def left_jacobian(twist: Tensor) -> Tensor:
 
 
 def transform(bench: Bench) -> Experiment:
-    """A camera point in the object frame, by the tangent of the state: `J_point_state = [I, -hat(X)]`."""
-    points_cam, points_obj, car = _points(bench)
-    T = bench.state.T_obj_cam[car]
+    """A point fixed in the camera, in the object frame, by the tangent of the state: `J_point_state = [I, -hat(X)]`."""
+    points_obj, _ = _points(bench)
     identity = torch.eye(3, dtype=points_obj.dtype).expand(len(points_obj), 3, 3)
     J = torch.cat([identity, -So3.hat(points_obj)], dim=-1)
     at = points_obj.new_zeros(len(points_obj), 6)
-    return factor_experiment("transform", lambda d: se3.transform(se3.exp(d) @ T, points_cam), at, J)
-
-
-def projection(bench: Bench) -> Experiment:
-    """Pinhole projection of a camera point: `J_pixel_point = (K_01 - [u, v] K_2) / z`."""
-    points_cam, _, car = _points(bench)
-    K = bench.cars.K_left[car]
-    z = (K @ points_cam[..., None])[:, 2:]
-    J = (K[:, :2] - project(points_cam, K)[..., None] * K[:, 2:]) / z
-    return factor_experiment("projection", lambda x: project(x, K), points_cam, J)
-
-
-def warp(bench: Bench) -> Experiment:
-    """Left pixels of the surface into the right image, by depth: `J_pixel_depth` of the package."""
-    view, pixels = bench.projected.left, bench.problem.left
-    car = pixels.object_index
-    K, T = bench.cars.K_right[car], bench.cars.T_right_cam[car]
-    depth = view.closest_depth[:, None]
-
-    def to_right(d: Tensor) -> Tensor:
-        return warp_to_right(pixels.ray_cam, d[:, 0], K, T, pixels.bias_px, pixels.vertical_px).uv_right
-
-    J = warp_to_right(pixels.ray_cam, depth[:, 0], K, T).J_pixel_depth[..., None]
-    return factor_experiment("warp", to_right, depth, J)
-
-
-def bilinear_lookup(bench: Bench) -> Experiment:
-    """Grey levels of the right image where the neighbourhoods land, by pixel."""
-    term = bench.terms["photometric"]
-    assert isinstance(term, PhotometricTerm)
-    assert term.fixed is not None
-    images, car = term.fixed.images, term.fixed.object_index
-    _, root = bench.projected.left.surface(term.fixed.pixel_index)
-    uv = kinks.photometric_pixels_right(term, root.depth)
-    frame = term.cars.frame_index[car].repeat_interleave(uv.shape[1])
-    uv = uv.flatten(0, 1)
-
-    def lookup(x: Tensor) -> Tensor:
-        return bilinear_with_gradient(images.right, frame, x, images.sizes)[0][:, None]
-
-    def branches(x: Tensor) -> Mapping[str, Tensor]:
-        return {kinks.BILINEAR: kinks.bilinear_cell(x, images.sizes[frame])}
-
-    J = bilinear_with_gradient(images.right, frame, uv, images.sizes)[1][:, None]
-    return factor_experiment("bilinear_lookup", lookup, uv, J, branches)
+    return factor_experiment("transform", lambda d: se3.transform(se3.exp(d), points_obj), at, J)
 
 
 def trilinear_lookup(bench: Bench) -> Experiment:
     """Signed distance at an object point, by the point and the code."""
-    _, points_obj, car = _points(bench)
-    chosen = torch.linspace(0, max(len(car) - 1, 0), min(len(car), _MAX_GRIDS)).round().long()
-    points, code = points_obj[chosen], bench.state.code[car[chosen]]
-    prior, own = bench.problem.prior, torch.arange(len(chosen))
-    assert isinstance(prior, PCAShapePrior)
+    points_obj, car = _points(bench)
+    chosen = _evenly(len(car), _MAX_GRIDS)
+    at, own = torch.cat([points_obj, bench.state.code[car]], dim=1)[chosen], torch.arange(len(chosen))
 
     def value(x: Tensor) -> Tensor:
-        return prior.bind(x[:, 3:]).value(x[:, :3], own)[:, None]
+        return bench.problem.prior.bind(x[:, 3:]).value(x[:, :3], own)[:, None]
 
-    at = prior.bind(code).value_and_derivatives(points, own)
-    J = torch.cat([at.gradient, at.J_value_code], dim=-1)[:, None]
-
-    def branches(x: Tensor) -> Mapping[str, Tensor]:
-        return {kinks.TRILINEAR: kinks.trilinear_cell(prior, x[:, :3])}
-
-    return factor_experiment("trilinear_lookup", value, torch.cat([points, code], dim=-1), J, branches)
+    lookup = bench.problem.prior.bind(at[:, 3:]).value_and_derivatives(at[:, :3], own)
+    J = torch.cat([lookup.gradient, lookup.J_value_code], dim=-1)[:, None]
+    return factor_experiment("trilinear_lookup", value, at, J)
 
 
 def pi_closest(bench: Bench) -> Experiment:
     """Projection by closest approach and its residual, by the least signed distance."""
-    term, sdf = _silhouette(bench, "silhouette_left")
-    zeta, saturation, foreground = term.zeta, term.config.saturation, term.foreground
-
-    def residual(x: Tensor) -> Tensor:
-        return silhouette_residual(project_closest_approach(x[:, 0], zeta, saturation), foreground)[:, None]
-
-    def branches(x: Tensor) -> Mapping[str, Tensor]:
-        return {kinks.SATURATION: ((zeta * x[:, 0]).abs() >= saturation).long()}
-
-    J = residual_derivative_closest_approach(sdf, zeta, saturation, foreground)[1]
-    return factor_experiment("pi_closest", residual, sdf[:, None], J[:, None, None], branches)
+    term, closest = bench.terms["silhouettes"], bench.sight.closest
+    assert isinstance(term, Silhouettes)
+    seen = (term.rows.filled > 0) & closest.crosses
+    at = bench.sight.field.value(closest.points_obj, term.rows.rays.owner, constant=True)[seen]
+    fixed = term.zeta.expand_as(seen)[seen], term.config.saturation, term.rows.foreground[seen]
+    J = closest_approach_residual(at, *fixed)[1][:, None, None]
+    return factor_experiment(
+        "pi_closest", lambda x: closest_approach_residual(x[:, 0], *fixed)[0][:, None], at[:, None], J
+    )
 
 
 def pi_product(bench: Bench) -> Experiment:
     """The paper's product and its residual, by the signed distances of all samples of a ray."""
-    term, _ = _silhouette(bench, "silhouette_left_product")
-    sdf, zeta, foreground = bench.projected.left.march.sdf, term.zeta, term.foreground
+    term, where = bench.terms["silhouettes_product"], bench.rows["silhouettes_product"].where
+    assert isinstance(term, SilhouetteProducts)
+    assert isinstance(where, Samples)
+    points = term.rows.rays.in_objects(bench.state.T_obj_cam).at(where.depths)
+    seen = (term.rows.filled > 0) & where.crosses
+    at = bench.sight.field.value(points, term.rows.rays.owner, constant=True)[:, seen]
+    fixed = term.zeta.expand_as(seen)[seen], term.rows.foreground[seen]
+    J = product_residual(at, *fixed)[1].mT[:, None]
+    return factor_experiment("pi_product", lambda x: product_residual(x.mT, *fixed)[0][:, None], at.mT, J)
 
-    def residual(x: Tensor) -> Tensor:
-        return silhouette_residual(project_product(x, zeta), foreground)[:, None]
 
-    return factor_experiment(
-        "pi_product", residual, sdf, residual_derivative_product(sdf, zeta, foreground)[1][:, None]
-    )
+def depth_of_surface(bench: Bench) -> Experiment:
+    """Depth of the surface under the pixels of the photometric term, by the tangent of the state.
+
+    The function is that of the two Newton steps which differentiate it, from the depth at the state.
+    """
+    term, at, where = _photometric(bench)
+    rays = term.pixel_set.rows.rays
+    usable = where.on_surface & term.pixel_set.filled
+    chosen = usable.flatten().nonzero()[:, 0][_evenly(int(usable.sum()), _MAX_PIXELS)]
+
+    def depth(delta: Tensor) -> Tensor:
+        moved = bench.moved(delta[0])
+        field, in_objects = field_of(bench.problem.prior.bind(moved.code)), rays.in_objects(moved.T_obj_cam)
+        return surface_depth(field, rays.owner, in_objects, where.depth, usable).flatten()[None, chosen]
+
+    zero = bench.state.code.new_zeros(1, bench.num_unknowns)
+    return factor_experiment("surface_depth", depth, zero, at.J_inner_state.flatten(0, 1)[None, chosen], block=1)
+
+
+def comparison_of_images(bench: Bench) -> Experiment:
+    """Right minus left grey levels of neighbourhoods, by the one depth of their pixel: warp and bilinear lookup."""
+    term, _, where = _photometric(bench)
+    usable = where.usable & term.pixel_set.filled
+
+    def at_depths(x: Tensor) -> Comparison:
+        depth = torch.ones_like(where.depth).masked_scatter(usable, x)
+        return compared(term.pixel_set.rows, term.config, depth)
+
+    at = where.depth[usable]
+    J = at_depths(at).J_residual_depth[usable][..., None]
+    return factor_experiment("compared", lambda x: at_depths(x[:, 0]).residual[usable], at[:, None], J, block=1)
 
 
 def robust_norm(bench: Bench) -> Experiment:
     """Huber's norm of the photometric residuals."""
-    term = bench.terms["photometric"]
-    assert isinstance(term, PhotometricTerm)
-    corner = term.config.huber_grey_levels
-    residual = term.residuals(bench.projected).value.detach()[:, None]
-
-    def branches(x: Tensor) -> Mapping[str, Tensor]:
-        return {kinks.HUBER: (x[:, 0].abs() > corner).long()}
-
+    term, at, _ = _photometric(bench)
+    residual, corner = at.residual[term.row_weight > 0][:, None], term.config.huber_grey_levels
     J = robust.huber(residual, corner).gradient_weight[..., None]
-    return factor_experiment("robust_norm", lambda x: robust.huber(x, corner).rho, residual, J, branches)
+    return factor_experiment("robust_norm", lambda x: robust.huber(x, corner).rho, residual, J)
 
 
-def _points(bench: Bench) -> tuple[Tensor, Tensor, Tensor]:
-    """Points of closest approach of the left rays, camera and object frame (P, 3), and their cars (P,)."""
-    view, pixels = bench.projected.left, bench.problem.left
-    depth = view.closest_depth
-    return pixels.origin_cam + depth[:, None] * pixels.ray_cam, view.rays.at(depth), pixels.object_index
+def _points(bench: Bench) -> tuple[Tensor, Tensor]:
+    """The points (P, 3) of the point cloud, object frame, and their cars (P,)."""
+    term = bench.terms["point_cloud"]
+    assert isinstance(term, PointCloud)
+    points = term.points_cam.in_objects(bench.state.T_obj_cam).at(torch.ones_like(term.filled))
+    owner = term.blocks.owner[:, None].expand_as(term.filled)
+    return points[:, term.filled > 0].mT, owner[term.filled > 0]
 
 
-def _silhouette(bench: Bench, name: str) -> tuple[SilhouetteTerm, Tensor]:
-    term = bench.terms[name]
-    assert isinstance(term, SilhouetteTerm)
-    _, points, car = _points(bench)
-    return term, bench.projected.shape.value(points, car)
+def _photometric(bench: Bench) -> tuple[Photometric, Linear, Surface]:
+    term, at = bench.terms["photometric"], bench.rows["photometric"]
+    assert isinstance(term, Photometric)
+    assert isinstance(at.where, Surface)
+    return term, at, at.where
+
+
+def _evenly(count: int, most: int) -> Tensor:
+    """At most so many of the numbers below a count, evenly chosen."""
+    return torch.linspace(0, max(count - 1, 0), min(count, most)).round().long()
 
 
 FACTORS: Mapping[str, Callable[[Bench], Experiment]] = {
     "exp": exponential,
     "transform": transform,
-    "projection": projection,
-    "warp": warp,
-    "bilinear_lookup": bilinear_lookup,
     "trilinear_lookup": trilinear_lookup,
     "pi_closest": pi_closest,
     "pi_product": pi_product,
-    "ray_depth": ray_depth_experiment,
+    "surface_depth": depth_of_surface,
+    "compared": comparison_of_images,
     "robust_norm": robust_norm,
-    "tracked_silhouettes": tracked_silhouettes,
-    "tracked_photometric": tracked_photometric,
 }
 """By name; each is built from a bench."""
-
-__all__ = ["FACTORS", "left_jacobian"]

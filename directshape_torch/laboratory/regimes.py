@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig, RefinerConfig
-from directshape_torch.energy.car_state import CarState, retract
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
@@ -20,6 +19,7 @@ from directshape_torch.laboratory.scenes import LaboratoryScene, place_cars, sel
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.terms.cars import CarState, retract
 
 Pixels = Literal["sampled", "contour", "grazing", "grid_border"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,13 +12,9 @@ from typing import Any
 
 from directshape_torch.io.atomic_files import write_bytes, write_text
 from directshape_torch.laboratory.comparison import BOUNDS, PAIRS, Comparison
-from directshape_torch.laboratory.paper_depth import PAPER, PaperDepthError
-from directshape_torch.laboratory.paper_refinement import PaperRefinement
 from directshape_torch.laboratory.plots import v_curves_png
 from directshape_torch.laboratory.regimes import REGIMES
-from directshape_torch.laboratory.second_derivatives import SecondDerivativeCheck
-from directshape_torch.laboratory.single_precision import ALL_TERMS, PrecisionLoss
-from directshape_torch.laboratory.skip_rules import SkipCost
+from directshape_torch.laboratory.step_errors import ALL_TERMS, PAPER, StepError
 from directshape_torch.laboratory.study import StudyPlan, StudyResult
 
 
@@ -29,14 +24,14 @@ def console_table(comparisons: Sequence[Comparison]) -> str:
     Columns: entries compared; for each pair the maximum and the 99.9th percentile of the relative error; exclusions.
     """
     lines = [
-        f"{'subject':26}{'regime':19}{'compared':>9}  "
+        f"{'subject':36}{'regime':19}{'compared':>9}  "
         + "".join(f"{_short(pair):>20}" for pair in PAIRS)
-        + "  excluded by rule",
-        f"{'':26}{'':19}{'':>9}  " + f"{'max / 99.9 %':>20}" * len(PAIRS),
+        + "  excluded",
+        f"{'':36}{'':19}{'':>9}  " + f"{'max / 99.9 %':>20}" * len(PAIRS),
     ]
     for c in comparisons:
         errors = "".join(f"{c.errors[p].maximum:9.1e} / {c.errors[p].percentile_999:8.1e}" for p in PAIRS)
-        lines.append(f"{c.name:26}{c.regime:19}{c.compared:9d}  {errors}  {_exclusions(c)}")
+        lines.append(f"{c.name:36}{c.regime:19}{c.compared:9d}  {errors}  {_exclusions(c)}")
     return "\n".join(lines)
 
 
@@ -50,13 +45,13 @@ def _exclusions(c: Comparison) -> str:
 
 
 def comparisons_csv(comparisons: Sequence[Comparison]) -> str:
-    """All comparisons, one line each; exclusions by rule in columns of their own."""
+    """All comparisons, one line each; exclusions by reason in columns of their own."""
     rules = sorted({rule for c in comparisons for rule in c.excluded})
     rows = []
     for c in comparisons:
         row: dict[str, Any] = {
             "subject": c.name, "regime": c.regime, "entries": c.entries, "compared": c.compared,
-            "skipped_rows": c.skipped_rows, "zero_rows": c.zero_rows, "flat_rows": c.flat_rows,
+            "zero_rows": c.zero_rows, "flat_rows": c.flat_rows, "value_error": f"{c.value_error:.1e}",
         }  # fmt: skip
         for pair in PAIRS:
             row[f"{pair} max"] = f"{c.errors[pair].maximum:.3e}"
@@ -85,50 +80,25 @@ def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
     return text.getvalue()
 
 
-@dataclasses.dataclass(frozen=True)
-class LaboratoryReport:
-    """Everything that one run found."""
-
-    source: str
-    plan: StudyPlan
-    study: StudyResult
-    second: Sequence[SecondDerivativeCheck] = ()
-    paper: Sequence[PaperDepthError] = ()
-    refinements: Sequence[PaperRefinement] = ()
-
-    def broken_bounds(self) -> list[str]:
-        """One sentence for each bound that does not hold."""
-        return self.study.broken_bounds() + [s for check in self.second for s in check.broken_bounds()]
-
-
-def write_report(out: Path, report: LaboratoryReport) -> None:
+def write_report(out: Path, source: str, plan: StudyPlan, study: StudyResult) -> None:
     """CSV files, one plot for each subject and `summary.md`."""
-    study = report.study
-    tables = {
-        "jacobians.csv": comparisons_csv(study.comparisons),
-        "float32.csv": records_csv(study.losses),
-        "skip_rules.csv": records_csv(study.skips),
-        "second_derivatives.csv": records_csv(report.second),
-        "paper_depth.csv": records_csv(report.paper),
-        "paper_refinements.csv": records_csv(report.refinements),
-    }
+    tables = {"jacobians.csv": comparisons_csv(study.comparisons), "steps.csv": records_csv(study.steps)}
     for name, text in tables.items():
         if text:
             write_text(out / name, text)
     for name in dict.fromkeys(c.name for c in study.comparisons):
         picture = v_curves_png(name, [c for c in study.comparisons if c.name == name])
         if picture is not None:
-            write_bytes(out / f"{name}.png", picture)
-    write_text(out / "summary.md", summary(report))
+            write_bytes(out / f"{name.replace(' ', '_')}.png", picture)
+    write_text(out / "summary.md", summary(source, plan, study))
 
 
-def summary(report: LaboratoryReport) -> str:
-    """One page: verdict, the worst of each subject, exclusions, float32, skip rules, second derivatives, the paper."""
-    plan, study = report.plan, report.study
-    broken = report.broken_bounds()
+def summary(source: str, plan: StudyPlan, study: StudyResult) -> str:
+    """One page: verdict, the worst of each subject, exclusions, what inexact Jacobians do to a step."""
+    broken = study.broken_bounds()
     parts = [
         "# Jacobians three ways",
-        f"Images: {report.source}. {plan.num_states} states in each of {len(plan.regimes)} regimes, seed {plan.seed}. "
+        f"Images: {source}. {plan.num_states} states in each of {len(plan.regimes)} regimes, seed {plan.seed}. "
         "Errors are relative to the norm of the row. Bounds in float64: "
         + ", ".join(f"{pair} {BOUNDS[pair]:.0e}" for pair in PAIRS)
         + ".",
@@ -138,12 +108,8 @@ def summary(report: LaboratoryReport) -> str:
         parts.append(f"{regime}: {count} of {plan.num_states} states see no valid pixel; only their priors count.")
     sections = {
         "Largest errors over all regimes, float64": _worst_table(study.comparisons),
-        "Entries excluded because the function has a kink within the stencil": _exclusion_table(study.comparisons),
-        "float32: the first Gauss-Newton step moves by": _float32_table(study.losses),
-        "What the skip rules take": _skip_table(study.skips),
-        "Second derivatives": _second_table(report.second),
-        "The paper's depth derivative, -1 / cos(theta), against the exact one": _paper_table(report.paper),
-        "Whole refinements with the paper's depth derivative": _refinement_table(report.refinements),
+        "Entries that differences cannot judge": _exclusion_table(study.comparisons),
+        "What inexact Jacobians do to the first Gauss-Newton step": _step_table(study.steps),
     }
     parts += [f"## {title}\n\n{table}" for title, table in sections.items() if table]
     return "\n\n".join(parts) + "\n"
@@ -177,82 +143,22 @@ def _exclusion_table(comparisons: Sequence[Comparison]) -> str:
         entries = sum(c.entries for c in own)
         share = 100 * counts.total() / max(entries, 1)
         worst = max(own, key=lambda c: c.excluded_share)
-        rules = ", ".join(f"{rule} {count}" for rule, count in counts.most_common())
+        reasons = ", ".join(f"{reason} {count}" for reason, count in counts.most_common())
         most = f"{worst.name} {100 * worst.excluded_share:.2f} %"
-        rows.append([regime, REGIMES[regime].explanation, entries, f"{share:.2f} %", most, rules or "none"])
-    return _table(["regime", "states", "entries", "excluded", "most in", "by rule"], rows)
+        rows.append([regime, REGIMES[regime].explanation, entries, f"{share:.2f} %", most, reasons or "none"])
+    return _table(["regime", "states", "entries", "excluded", "most in", "why"], rows)
 
 
-def _float32_table(losses: Sequence[PrecisionLoss]) -> str:
+def _step_table(steps: Sequence[StepError]) -> str:
     rows = [
-        [x.regime, f"{x.analytic_median:.0e}", f"{x.analytic_999:.0e}", f"{100 * x.step_share_median:.1g} %",
-         f"{100 * x.step_share:.1g} %", f"{1000 * x.step_m:.2g} mm", f"{x.step_deg:.1g} deg"]
-        for x in losses if x.name == ALL_TERMS
-    ]  # fmt: skip
-    header = ["regime", "row error, median", "99.9 %", "of the trust region, median", "largest", "", ""]
-    note = "\n\nThe same when only one term is in float32: float32.csv."
-    return _table(header, rows) + note if rows else ""
-
-
-def _skip_table(skips: Sequence[SkipCost]) -> str:
-    rows = []
-    for rule, term in dict.fromkeys((s.rule, s.term) for s in skips):
-        own = [s for s in skips if (s.rule, s.term) == (rule, term)]
-        total, skipped = sum(s.rows for s in own), sum(s.skipped for s in own)
-        shares = [s.gradient_share for s in own if not math.isnan(s.gradient_share)]
-        medians = [s.gradient_share_median for s in own if not math.isnan(s.gradient_share_median)]
-        steps = [s.step_share for s in own if not math.isnan(s.step_share)]
-        rows.append([
-            rule, term, f"{skipped} of {total} ({100 * skipped / max(total, 1):.1f} %)",
-            _percent(sorted(medians)[len(medians) // 2]) if medians else "not defined",
-            _percent(max(shares)) if shares else "", _percent(max(steps)) if steps else "",
-        ])  # fmt: skip
-    header = ["rule", "term", "rows", "gradient removed, median", "largest", "step, of the trust region, largest"]
-    return _table(header, rows)
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
-
-
-def _second_table(checks: Sequence[SecondDerivativeCheck]) -> str:
-    """The worst regime of each; all are in the CSV file."""
-    rows = []
-    for name in dict.fromkeys(c.name for c in checks):
-        own = [c for c in checks if c.name == name]
-        worst = max(own, key=lambda c: c.maximum)
-        entries, excluded = sum(c.compared for c in own), sum(c.excluded for c in own)
-        rows.append([name, entries, f"{worst.maximum:.1e}", worst.regime, excluded])
-    header = ["second derivative", "entries", "largest error", "in", "excluded (cell borders)"]
-    return _table(header, rows)
-
-
-def _paper_table(errors: Sequence[PaperDepthError]) -> str:
-    rows = [
-        [e.variant, e.regime, e.rays, f"{100 * e.row_error_median:.1f} %", f"{100 * e.row_error_95:.0f} %",
-         f"{100 * e.gradient_error_median:.1f} %", f"{e.turned_deg_median:.2g} / {e.turned_deg:.2g} deg",
-         f"{100 * e.step_m_median:.2g} / {100 * e.step_m:.2g} cm",
-         f"{e.step_deg_median:.2g} / {e.step_deg:.2g} deg"]
-        for e in errors if e.variant == PAPER or e.regime == errors[0].regime
+        [s.cause, s.term, s.regime, s.rows, f"{s.row_error_median:.1g}", f"{s.row_error_999:.1g}",
+         f"{s.turned_deg_median:.2g} / {s.turned_deg:.2g} deg",
+         f"{100 * s.step_share_median:.1g} / {100 * s.step_share:.1g} %", f"{100 * s.step_m:.2g} cm",
+         f"{s.step_deg:.2g} deg"]
+        for s in steps if s.cause == PAPER or s.term == ALL_TERMS
     ]  # fmt: skip
     header = [
-        "what is approximated", "regime", "rays", "row error, median", "95 %", "gradient error, median",
-        "step turns by (median / max)", "step moves by", "and turns the car by",
+        "cause", "term", "regime", "rows", "row error, median", "99.9 %", "step turns by, median / max",
+        "moves by, of the trust region", "at most", "and",
     ]  # fmt: skip
-    return _table(header, rows) + "\n\nBoth parts in every regime: paper_depth.csv." if rows else ""
-
-
-def _refinement_table(refinements: Sequence[PaperRefinement]) -> str:
-    rows = [
-        [r.solver, r.cars, f"{r.converged_exact} / {r.converged_paper}",
-         f"{r.iterations_exact:.1f} / {r.iterations_paper:.1f}", f"{r.cost_higher} / {r.cost_lower}",
-         f"{100 * r.apart_m_median:.2g} / {100 * r.apart_m:.2g} cm",
-         f"{r.apart_deg_median:.2g} / {r.apart_deg:.2g} deg"]
-        for r in refinements
-    ]  # fmt: skip
-    header = [
-        "solver", "cars", "converged, exact / paper's", "iterations, exact / paper's",
-        "final cost higher / lower with the latter", "final poses apart by (median / max)", "and",
-    ]  # fmt: skip
-    note = "\n\nThe control has the exact derivative both times, the second time with twice the initial damping."
-    return _table(header, rows) + note if rows else ""
+    return _table(header, rows) + "\n\nTerm by term, and the parts of the paper's: steps.csv." if rows else ""

@@ -8,15 +8,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from directshape_torch.depth import march
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.rows import Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.raycast import ObjectRays, march
 
 DEMO_FOLDER = Path(__file__).parents[1] / "assets" / "demo"
 
@@ -155,11 +157,10 @@ def _hits(
     uv = uv.to(code.dtype)
     if side == "left":
         direction = rays_from_pixels(uv, camera.K_left[0])
-        origin = torch.zeros_like(direction)
+        centre = torch.zeros_like(direction)
     else:
-        rays = right_rays(uv, camera.K_right[0], camera.T_right_cam[0])
-        origin, direction = rays.origin_cam, rays.direction_cam
-    R, t = T_obj_cam[:3, :3], T_obj_cam[:3, 3]
-    object_rays = ObjectRays(origin @ R.T + t, direction @ R.T, torch.zeros(len(uv), dtype=torch.long))
-    marched = march(prior.bind(code[None]), object_rays, prior.bounds_obj, _MASK_SAMPLES_PER_RAY)
-    return marched.crosses_bounds & (marched.sdf < 0).any(dim=1)
+        centre, direction = right_rays(uv, camera.K_right[0], camera.T_right_cam[0])
+    rows = Rows.of_sorted(torch.zeros(len(uv), dtype=torch.long), 1)
+    rays = Rays.of_rows(rows, centre, direction).in_objects(T_obj_cam[None])
+    marched = march(field_of(prior.bind(code[None])), rows.blocks.owner, rays, prior.bounds_obj, _MASK_SAMPLES_PER_RAY)
+    return (marched.crosses & (marched.sdf < 0).any(dim=0)).flatten()[rows.places]

@@ -9,12 +9,12 @@ import torch
 
 from directshape_torch.laboratory.bench import TERM_NAMES, Bench
 from directshape_torch.laboratory.comparison import Comparison, compare
+from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, gradient_experiment, term_experiment
 from directshape_torch.laboratory.factors import FACTORS
 from directshape_torch.laboratory.regimes import Regime, checked_name, regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene
-from directshape_torch.laboratory.single_precision import PrecisionLoss, precision_loss
-from directshape_torch.laboratory.skip_rules import SkipCost, skip_costs
-from directshape_torch.laboratory.term_experiment import term_experiment
+from directshape_torch.laboratory.step_errors import StepError, paper_depth_errors, single_precision_errors
+from directshape_torch.problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 SUBJECT_NAMES = (*FACTORS, *TERM_NAMES)
@@ -26,32 +26,36 @@ class StudyPlan:
 
     Attributes:
         subjects: factors and terms by name.
+        own_terms: make further terms, which are examined as the others.
         regimes: by name.
         num_states: per regime.
-        dtypes: "float64" compares the three Jacobians, "float32" measures what single precision costs.
         seed: of the draws.
         pixels_per_car: at most, on each side.
+        second: examine the derivatives of the terms' gradients too.
+        steps: measure what float32 and the paper's depth derivative do to a step.
     """
 
     subjects: tuple[str, ...] = SUBJECT_NAMES
+    own_terms: tuple[TermFactory, ...] = ()
     regimes: tuple[Regime, ...] = field(default_factory=lambda: tuple(regimes_named(None)))
     num_states: int = 6
-    dtypes: tuple[str, ...] = ("float64", "float32")
     seed: int = 0
     pixels_per_car: int = 64
+    second: bool = True
+    steps: bool = True
 
 
-def subjects_named(names: Sequence[str] | None) -> tuple[str, ...]:
-    """The factors and terms of these names, all where None.
+def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
+    """The factors and terms of these names.
 
     Raises:
         InputError: an unknown name; lists the names.
 
     Example:
-        >>> subjects_named(["warp"])
-        ('warp',)
+        >>> subjects_named(["transform"])
+        ('transform',)
     """
-    return tuple(checked_name("term", name, list(SUBJECT_NAMES)) for name in names or SUBJECT_NAMES)
+    return tuple(checked_name("term", name, list(SUBJECT_NAMES)) for name in names)
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,12 @@ class StudyResult:
 
     Attributes:
         comparisons: one for each subject and regime.
-        losses: of single precision, one for each term and regime, and "all terms".
-        skips: what the skip rules take, for each rule and regime.
+        steps: what inexact Jacobians do, for each regime.
         states_without_pixels: how many states of each regime saw no pixel at all.
     """
 
     comparisons: tuple[Comparison, ...]
-    losses: tuple[PrecisionLoss, ...]
-    skips: tuple[SkipCost, ...]
+    steps: tuple[StepError, ...]
     states_without_pixels: dict[str, int]
 
     def broken_bounds(self) -> list[str]:
@@ -83,31 +85,32 @@ def run_study(
 ) -> StudyResult:
     """Examine everything that a plan names; `report` hears one line for each regime."""
     comparisons: list[Comparison] = []
-    losses: list[PrecisionLoss] = []
-    skips: list[SkipCost] = []
+    steps: list[StepError] = []
     without: dict[str, int] = {}
     for regime in plan.regimes:
-        bench = Bench.build(scene, prior, regime, plan.num_states, plan.seed, plan.pixels_per_car)
-        empty = int((bench.pixels_per_car == 0).sum())
+        bench = Bench.build(scene, prior, regime, plan.num_states, plan.seed, plan.pixels_per_car, plan.own_terms)
+        empty = int((bench.rays_per_car == 0).sum())
         if empty:
             without[regime.name] = empty
             report(f"{regime.name}: {empty} of {plan.num_states} states see no valid pixel; only their priors count")
-        found = compare_subjects(bench, plan.subjects) if "float64" in plan.dtypes else []
+        own = [name for name in bench.terms if name not in TERM_NAMES]
+        found = compare_subjects(bench, [*plan.subjects, *own], plan.second)
         comparisons += found
-        if "float32" in plan.dtypes:
-            terms = [name for name in plan.subjects if name in TERM_NAMES]
-            losses += precision_loss(bench, terms)
-        skips += skip_costs(bench)
+        if plan.steps:
+            steps += [*single_precision_errors(bench), *paper_depth_errors(bench)]
         report(f"{regime.name}: {_in_a_line(found)}")
-    return StudyResult(tuple(comparisons), tuple(losses), tuple(skips), without)
+    return StudyResult(tuple(comparisons), tuple(steps), without)
 
 
-def compare_subjects(bench: Bench, names: Sequence[str]) -> list[Comparison]:
-    """The three Jacobians of the named factors and terms at the states of a bench."""
-    with torch.no_grad():
-        found = [c for name in names if name in FACTORS for c in compare(FACTORS[name](bench), bench.regime.name)]
-        terms = [name for name in names if name in TERM_NAMES]
-        return found + (compare(term_experiment(bench, terms), bench.regime.name) if terms else [])
+@torch.no_grad()
+def compare_subjects(bench: Bench, names: Sequence[str], second: bool = False) -> list[Comparison]:
+    """The three Jacobians of the named factors and terms at the states of a bench, and those of their gradients."""
+    terms = [name for name in names if name in bench.terms]
+    experiments = [FACTORS[name](bench) for name in names if name in FACTORS]
+    experiments += [term_experiment(bench, terms)] if terms else []
+    twice = [name for name in terms if name not in AT_FIXED_DEPTHS]
+    experiments += [gradient_experiment(bench, twice)] if second and twice else []
+    return [c for experiment in experiments for c in compare(experiment, bench.regime.name)]
 
 
 def _in_a_line(found: Sequence[Comparison]) -> str:

@@ -2,13 +2,198 @@
 
 from __future__ import annotations
 
-from jacobian_mutants import targets_energy, targets_geometry_and_shape, targets_residuals
-from jacobian_mutants.target import Target
+from dataclasses import dataclass
 
-__all__ = ["TARGETS", "Target"]
+
+@dataclass(frozen=True)
+class Target:
+    """Functions of one file (`Class.method` for methods) and the tests named for them, the quickest first."""
+
+    path: str
+    functions: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+_SE3_TESTS = tuple(
+    f"tests/geometry/test_se3_{name}.py"
+    for name in ("generators", "group", "exp_log", "series", "references", "gradients")
+)
+_LABORATORY = "tests/laboratory/test_three_ways.py"
+_SUMS = (f"{_LABORATORY}::test_sums_are_those_of_single_residuals",)
+_JACOBIANS = (
+    f"{_LABORATORY}::test_linear_is_the_derivative_of_residual_in_every_regime",
+    f"{_LABORATORY}::test_terms_against_differences",
+)
+_GRADIENTS = (*_JACOBIANS, f"{_LABORATORY}::test_gradients_can_be_differentiated")
+_FACTORS = (f"{_LABORATORY}::test_factors",)
 
 TARGETS: dict[str, Target] = {
-    **targets_geometry_and_shape.TARGETS,
-    **targets_residuals.TARGETS,
-    **targets_energy.TARGETS,
+    "silhouettes": Target(
+        "directshape_torch/terms/silhouette.py",
+        (
+            "Silhouettes.linear",
+            "Silhouettes.residual",
+            "Silhouettes._of_distance",
+            "closest_approach_residual",
+            "sdf_state_jacobian",
+        ),
+        _JACOBIANS,
+    ),
+    "silhouette_products": Target(
+        "directshape_torch/terms/silhouette_product.py",
+        ("SilhouetteProducts.linear", "SilhouetteProducts.residual", "product_residual"),
+        _JACOBIANS,
+    ),
+    "photometric": Target(
+        "directshape_torch/terms/photometric.py",
+        ("Photometric.linear", "Photometric.residual", "compared", "_warped"),
+        _GRADIENTS,
+    ),
+    "photometric_patch": Target(
+        "directshape_torch/terms/photometric_patch.py",
+        ("patch_derivative",),
+        _JACOBIANS,
+    ),
+    "point_cloud": Target(
+        "directshape_torch/terms/point_cloud.py",
+        ("PointCloud.linear", "PointCloud.residual", "PointCloud._points_obj"),
+        _JACOBIANS,
+    ),
+    "priors": Target(
+        "directshape_torch/terms/priors.py",
+        (
+            "PriorTerm.linear",
+            "shape_prior",
+            "height_prior",
+            "tilt_prior_normal",
+            "tilt_prior_cosine",
+            "_by_rotation",
+            "dimensions_prior",
+            "pose_prior",
+        ),
+        _JACOBIANS,
+    ),
+    "robust": Target(
+        "directshape_torch/terms/robust.py",
+        ("quadratic", "huber", "truncated_huber", "identity"),
+        ("tests/terms/test_robust.py",),
+    ),
+    "depth": Target(
+        "directshape_torch/depth.py",
+        ("along_face", "attached_closest_depth", "surface_depth"),
+        _GRADIENTS,
+    ),
+    "ray_minimum": Target(
+        "directshape_torch/shape/ray_minimum.py",
+        ("minimum_in_grids", "curvature_in_grids", "_cells_along", "_derivatives_along", "_first_root"),
+        (f"{_LABORATORY}::test_rays_are_closest_where_they_are_said_to_be", *_GRADIENTS),
+    ),
+    "sums": Target("directshape_torch/rows.py", ("CarSums.of", "CarSums.sum"), _SUMS),
+    "term_sums": Target(
+        "directshape_torch/terms/term.py",
+        ("part_of", "part_of_rows", "_block_costs", "weighted_products", "summed", "by_autograd"),
+        _SUMS,
+    ),
+    "stage_sums": Target(
+        "directshape_torch/problem.py",
+        ("CarStage.figures", "CarIterations.evaluated", "_Layout.of"),
+        _SUMS,
+    ),
+    "se3_exp": Target(
+        "directshape_torch/geometry/se3.py",
+        ("generators", "_higher_exp_coefficients", "exp", "from_rotation_translation"),
+        _SE3_TESTS,
+    ),
+    "se3_group": Target(
+        "directshape_torch/geometry/se3.py", ("inverse", "transform", "from_kornia", "to_kornia"), _SE3_TESTS
+    ),
+    "retract": Target("directshape_torch/terms/cars.py", ("retract",), _JACOBIANS),
+    "pinhole": Target(
+        "directshape_torch/geometry/pinhole.py", ("rays_from_pixels", "project"), ("tests/geometry/test_pinhole.py",)
+    ),
+    "stereo_warp": Target(
+        "directshape_torch/geometry/stereo.py",
+        ("warp_to_right", "_shifted", "right_rays"),
+        ("tests/geometry/test_stereo.py",),
+    ),
+    "bilinear": Target(
+        "directshape_torch/image/interpolate.py",
+        ("bilinear_with_gradient", "_cell"),
+        ("tests/image/test_interpolate.py",),
+    ),
+    "sdf_grid": Target(
+        "directshape_torch/shape/sdf_grid.py",
+        (
+            "GridShape.__init__",
+            "GridShape.value",
+            "GridShape.value_and_derivatives",
+            "GridShape.gradient",
+        ),
+        ("tests/shape/test_sdf_grid.py", "tests/shape/test_pca_prior.py"),
+    ),
+    "grid_lookup": Target(
+        "directshape_torch/shape/grid_lookup.py",
+        (
+            "value_at",
+            "derivatives_at",
+            "gradient_at",
+            "_value_and_gradient",
+            "_corner_values",
+            "_ends",
+            "_difference",
+            "_interpolated_basis",
+            "_summed_basis",
+            "_along",
+        ),
+        ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_many_lookups.py"),
+    ),
+    "grid_cells": Target(
+        "directshape_torch/shape/grid_cells.py",
+        ("GridField.num_nodes", "GridField.corners", "Cells.distance", "cells_at", "_safe_norm"),
+        (
+            "tests/shape/test_grid_lookup.py",
+            "tests/shape/test_sdf_grid.py",
+            "tests/shape/test_many_lookups.py",
+            "tests/shape/test_traced_lookup.py",
+        ),
+    ),
+    "traced_lookup": Target(
+        "directshape_torch/shape/traced_lookup.py",
+        ("traced_value_at", "traced_derivatives_at", "_entries", "_interpolated", "_along", "_moved", "_differences"),
+        ("tests/shape/test_traced_lookup.py",),
+    ),
+    "short_axes": Target(
+        "directshape_torch/geometry/short_axes.py",
+        ("length", "all_along", "cross"),
+        ("tests/geometry/test_short_axes.py",),
+    ),
+    "bracket": Target(
+        "directshape_torch/shape/bracket.py",
+        ("Bracket.between", "Bracket.probed", "_line_zero"),
+        ("tests/shape/test_bracket.py",),
+    ),
+    "neural_prior": Target(
+        "directshape_torch/shape/neural_prior.py",
+        (
+            "CodedLinear.shift",
+            "NeuralShapePrior.dimensions_and_derivative",
+            "NeuralShape._value",
+            "NeuralShape._value_and_derivatives",
+            "NeuralShape._split",
+            "NeuralShape._linear",
+            "_mirrored",
+            "_mirrored_slope",
+            "_safe_norm",
+        ),
+        ("tests/shape/test_neural_prior.py", "tests/shape/test_prior_protocol.py"),
+    ),
+    "kernel_pca_prior": Target(
+        "directshape_torch/shape/kernel_pca_prior.py",
+        (
+            "KernelPCAShapePrior.coefficients",
+            "KernelPCAShapePrior.dimensions_and_derivative",
+            "CurvedGridShape.value_and_derivatives",
+        ),
+        ("tests/shape/test_kernel_pca_prior.py", "tests/shape/test_prior_protocol.py"),
+    ),
 }

@@ -10,10 +10,9 @@ import torch
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.pinhole import project
-from directshape_torch.laboratory.bench import TERM_NAMES, Bench
+from directshape_torch.laboratory.bench import TERM_NAMES, Bench, near_border
 from directshape_torch.laboratory.regimes import REGIMES, checked_name, regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene
-from directshape_torch.residuals.photometric import surface_slope
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 BenchOf = Callable[..., Bench]
@@ -46,29 +45,30 @@ def test_cars_are_cut_by_the_image_border(bench_of: BenchOf, scene: LaboratorySc
 
 def test_pixels_of_a_regime(bench_of: BenchOf, prior: PCAShapePrior) -> None:
     at = bench_of("contour")
-    term = at.terms["silhouette_left"]
-    points = at.projected.left.rays.at(at.projected.left.closest_depth)
-    sdf = at.projected.shape.value(points, at.problem.left.object_index)
-    assert len(sdf) > 5
-    assert ((term.zeta * sdf).abs() < 3).all()  # type: ignore[attr-defined]
+    filled = at.problem.masks.filled > 0
+    sdf = at.sight.field.value(at.sight.closest.points_obj, at.problem.masks.rays.owner)
+    exponent = (at.terms["silhouettes"].zeta * sdf).abs()[filled]  # type: ignore[attr-defined]
+    assert len(exponent) > 5
+    assert (exponent < 3).all()
 
     at = bench_of("grazing")
-    rays, root = at.projected.left.surface(torch.arange(len(at.problem.left)))
-    gradient = at.projected.shape.value_and_derivatives(rays.at(root.depth), rays.object_index).gradient
-    assert len(rays.object_index) > 5
-    assert surface_slope(gradient, rays.direction_obj, 0.31)[1].all()
+    num_left = len(at.problem.rays[0].owner)
+    left = at.problem.masks.filled[:num_left] > 0
+    direction = at.problem.masks.rays.in_objects(at.state.T_obj_cam).direction_obj[:, :num_left]
+    cosine = torch.cosine_similarity(at.sight.hits.normal_obj, direction, dim=0)[left]
+    assert len(cosine) > 5
+    assert (cosine.abs() < 0.31).all()
 
     at = bench_of("grid_border")
-    points = at.projected.right.rays.at(at.projected.right.closest_depth)
-    lower, upper = prior.bounds_obj
-    assert len(points) > 5
-    assert (torch.minimum(points - lower, upper - points).amin(dim=1) < prior.spacing_m).float().mean() > 0.9
+    near = near_border(prior, at.sight.closest.points_obj)[at.problem.masks.filled > 0]
+    assert len(near) > 5
+    assert near.float().mean() > 0.9
 
 
 def test_pixels_per_car_are_limited(bench_of: BenchOf) -> None:
     for regime in ("contour", "typical"):
-        assert bench_of(regime).pixels_per_car.max() <= 2 * 10 + 10
-        assert bench_of(regime).pixels_per_car.min() > 0
+        assert bench_of(regime).rays_per_car.max() <= 2 * 10 + 10
+        assert bench_of(regime).rays_per_car.min() > 0
 
 
 def test_draws_repeat_and_do_not_depend_on_other_regimes(scene: LaboratoryScene, prior: PCAShapePrior) -> None:
@@ -78,7 +78,7 @@ def test_draws_repeat_and_do_not_depend_on_other_regimes(scene: LaboratoryScene,
     again = Bench.build(scene, prior, REGIMES["far_80m"], 2, seed=3, pixels_per_car=4)
     other = Bench.build(scene, prior, REGIMES["far_80m"], 2, seed=4, pixels_per_car=4)
     assert torch.equal(first.state.T_obj_cam, again.state.T_obj_cam)
-    assert torch.equal(first.problem.left.uv, again.problem.left.uv)
+    assert torch.equal(first.problem.masks.rays.ray_cam, again.problem.masks.rays.ray_cam)
     assert not torch.equal(first.state.T_obj_cam, other.state.T_obj_cam)
 
 

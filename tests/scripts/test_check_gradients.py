@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import check_gradients as script
 import pytest
 import torch
 
-from directshape_torch.energy.prior_terms import PriorTerm
 from directshape_torch.laboratory.regimes import regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
 from directshape_torch.laboratory.study import StudyPlan, run_study
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.terms.priors import PriorTerm
+from directshape_torch.terms.term import Linear
 
-_QUICK = ["--states", "1", "--pixels", "4", "--regime", "far_80m", "--no-second", "--no-paper-depth"]
+_QUICK = ["--states", "1", "--pixels", "4", "--regime", "far_80m"]
 
 
 @pytest.fixture(autouse=True)
@@ -26,26 +28,50 @@ def _small_prior(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_tables_and_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
-    assert script.main([*_QUICK, "--term", "shape", "warp", "--out", str(tmp_path)]) == 0
+    assert script.main([*_QUICK, "--term", "shape", "transform", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "far_80m" in printed
     assert "BROKEN" not in printed
     assert {p.name for p in tmp_path.iterdir()} == {
-        "summary.md", "jacobians.csv", "float32.csv", "skip_rules.csv", "shape.png", "warp.png",
+        "summary.md", "jacobians.csv", "steps.csv", "shape.png", "transform.png", "gradient_of_shape.png",
     }  # fmt: skip
     assert "**All bounds hold.**" in (tmp_path / "summary.md").read_text()
     header, *lines = (tmp_path / "jacobians.csv").read_text().splitlines()
     assert header.startswith("subject,regime,entries,compared")
-    assert len(lines) == 2
+    assert len(lines) == 3
 
 
 def test_a_wrong_jacobian_makes_the_exit_code_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    right = PriorTerm.jacobian
-    monkeypatch.setattr(PriorTerm, "jacobian", lambda self, projected: -right(self, projected))
-    assert script.main([*_QUICK, "--term", "height", "--dtype", "float64"]) == 1
+    right = PriorTerm.linear
+
+    def negative(self: PriorTerm, *at: Any) -> Linear:
+        rows = right(self, *at)
+        return rows._replace(J_inner_state=-rows.J_inner_state)
+
+    monkeypatch.setattr(PriorTerm, "linear", negative)
+    assert script.main([*_QUICK, "--term", "height", "--no-second", "--no-steps"]) == 1
     assert "BROKEN   height, far_80m: analytic-autograd error 2.0e+00" in capsys.readouterr().out
+
+
+def test_a_term_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the command names it; one whose Jacobian has too few rows is wrong use, and says so."""
+    (tmp_path / "a_term_of_my_own.py").write_text(
+        "from directshape_torch.terms.priors import PriorTerm, height_prior\n\n\n"
+        "def make(frames, detections, cars, prior):\n    return PriorTerm('mine', 2.0, cars, height_prior, 1)\n\n\n"
+        "def misshapen(frames, detections, cars, prior):\n"
+        "    return PriorTerm('mine', 2.0, cars, height_prior, 3)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert script.main([*_QUICK, "--term", "a_term_of_my_own:make"]) == 0
+    printed = capsys.readouterr().out
+    assert "mine                                far_80m" in printed
+    assert "gradient of mine" in printed
+    assert script.main([*_QUICK, "--term", "a_term_of_my_own:misshapen"]) == 2
+    assert "extra term 'mine': linear(...).residual: expected shape (1, 3, 1), got (1, 1, 1)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("option", "message"), [
