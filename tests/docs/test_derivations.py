@@ -63,5 +63,5 @@ def test_the_overview_lists_every_page() -> None:
 def test_every_named_file_of_the_overview_exists() -> None:
     overview = (ROOT / "docs" / "derivations" / "README.md").read_text(encoding="utf-8")
 
-    for name in re.findall(r"`((?:geometry|residuals|shape|image)/\w+\.py)`", overview):
+    for name in re.findall(r"`((?:(?:geometry|terms|shape|image)/)?\w+\.py)`", overview):
         assert (ROOT / "directshape_torch" / name).is_file(), name

@@ -1,0 +1,103 @@
+"""LiDAR points as evidence: each car's own of `FrameBatch.points_cam`, on its surface (docs/extra_terms.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import PointCloudConfig
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.pinhole import project
+from directshape_torch.numerics.table_lookup import occurrences
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.stereo_matching.car_points import PointSamples, every_nth
+from directshape_torch.terms.cars import CarBatch
+from directshape_torch.terms.point_cloud import PointCloud
+
+_MASK_THRESHOLD = 0.5
+# A detector's error in place, beyond which a point belongs to something else.
+_BEYOND_BOX_M = 1.0
+# Above the ground plane, whose own error is 0.05 m: lower points are road.
+_LEAST_HEIGHT_M = 0.15
+_GREATEST_HEIGHT_M = 3.0
+# Fewer may all be of a pole or of a car behind, and would weigh as much as hundreds.
+_LEAST_POINTS = 10
+_MOST_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class LidarPoints:
+    """Makes the term "lidar" of the points that the frames bring: a `TermFactory`.
+
+    A point says where the surface is to about 4 cm: 2 to 3 cm of the scanner's noise, and as much again by which a
+    shape of a few codes in cells of 0.1 m differs from a real car. The second part is common to the points of a panel,
+    so all points of a car count as one sure measurement, in the units of the priors (half a squared standard deviation,
+    at weight 0.5): `0.5 / 0.04^2 = 300` per square metre. What is further off than a cell is no surface that the shape
+    can follow (mirrors, seats behind glass) and pulls with a constant force.
+
+    Attributes:
+        weight: of the mean over the points of a car, per square metre.
+        huber_m: corner of the Huber norm.
+
+    Example:
+        >>> LidarPoints()
+        LidarPoints(weight=300.0, huber_m=0.1)
+    """
+
+    weight: float = 300.0
+    huber_m: float = 0.1
+
+    def __call__(self, frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> PointCloud:
+        config = PointCloudConfig(self.weight, huber_m=self.huber_m, min_points=_LEAST_POINTS, max_points=_MOST_POINTS)
+        return PointCloud.of_points(config, lidar_points(frames, detections, cars.detection_row), "lidar")
+
+
+def lidar_points(frames: FrameBatch, detections: Detections, rows: Tensor) -> PointSamples:
+    """The points of each of some detections, `rows` (B,) of them.
+
+    A point is a car's that falls into its left mask (into its 2D box where it has none), stands above the ground and
+    lies no further from the middle of the box, along the ground, than the box reaches and a detector errs.
+
+    Raises:
+        InputError: the frames bring no points.
+    """
+    if frames.points_cam is None:
+        cure = "FrameBatch(points_cam=...), or refine --lidar DIR"
+        raise InputError("frames.points_cam", "LiDAR points of each frame", "None", cure)
+    frame = detections.frame_index[rows]
+    points = frames.points_cam.detach()[frame]
+    belongs = _in_mask(frames, detections, rows, points) & _within_reach(frames, detections, rows, points)
+    car, number = belongs.nonzero(as_tuple=True)
+    counts = occurrences(car, len(rows))
+    kept = every_nth(car, counts, _MOST_POINTS)
+    return PointSamples(car[kept], frames.points_cam[frame[car[kept]], number[kept]], counts)
+
+
+def _in_mask(frames: FrameBatch, detections: Detections, rows: Tensor, points_cam: Tensor) -> Tensor:
+    """Which points (B, P) the left camera sees in the mask, or the 2D box, of their car; NaN fails every comparison."""
+    frame = detections.frame_index[rows]
+    uv = project(points_cam, frames.camera.K_left[frame][:, None])
+    height, width = frames.sizes[frame, :, None].unbind(1)
+    column, row = uv.nan_to_num(-1.0).round().clamp(-1, max(frames.images_left.shape[2:])).long().unbind(-1)
+    seen = (points_cam[..., 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row = (torch.where(seen, x, torch.zeros_like(x)) for x in (column, row))
+    masked = detections.mask_left[rows[:, None], row, column] > _MASK_THRESHOLD
+    u_min, v_min, u_max, v_max = detections.box_2d[rows, :, None].unbind(1)
+    u, v = uv.unbind(-1)
+    in_box = (u >= u_min) & (u <= u_max) & (v >= v_min) & (v <= v_max)
+    return seen & torch.where(detections.has_mask_left[rows, None], masked, in_box)
+
+
+def _within_reach(frames: FrameBatch, detections: Detections, rows: Tensor, points_cam: Tensor) -> Tensor:
+    """Which points (B, P) are above the ground and near their car."""
+    frame = detections.frame_index[rows]
+    normal = frames.ground.normal[frame, None]
+    height = (normal * points_cam).sum(-1) + frames.ground.offset[frame, None]
+    offset = points_cam - detections.T_cam_obj[rows, None, :3, 3]
+    along_ground = offset - (offset * normal).sum(-1, keepdim=True) * normal
+    reach = 0.5 * detections.dimensions_hwl[rows, 1:].norm(dim=-1, keepdim=True) + _BEYOND_BOX_M
+    near: Tensor = along_ground.norm(dim=-1) <= reach
+    return near & (height >= _LEAST_HEIGHT_M) & (height <= _GREATEST_HEIGHT_M)

@@ -1,0 +1,54 @@
+"""A prior of one's own: cars stand upright in the camera's frame, whatever the ground plane says.
+
+    python examples/upright_prior.py
+
+A residual of the cars and their state with its Jacobian is all that a prior needs (docs/extra_terms.md).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+import directshape_torch
+from directshape_torch import DirectShapeRefiner, RefinementResult
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.priors import PriorResidual, PriorTerm
+
+ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
+
+
+def upright(cars: CarBatch, state: CarState) -> PriorResidual:
+    """Sines of pitch and roll: what the camera's y axis, seen from the car, has along the car's x and z axes.
+
+    The axis `a = R_obj_cam e_y` turns with the object frame, `da = omega x a`.
+    """
+    x, y, z = state.T_obj_cam[:, :3, 1].unbind(-1)
+    zero = torch.zeros_like(x)
+    J_x, J_z = torch.stack([zero, z, -y], dim=-1), torch.stack([y, -x, zero], dim=-1)
+    J_state = torch.nn.functional.pad(torch.stack([J_x, J_z], dim=1), (3, state.code.shape[1]))
+    return PriorResidual(torch.stack([x, z], dim=-1), J_state)
+
+
+def upright_prior(frames: FrameBatch, detections: Detections, cars: CarBatch, prior: ShapePrior) -> PriorTerm:
+    """The term: a standard deviation of 2 degrees is `0.5 / 0.035^2 = 400` in the units of the other priors."""
+    return PriorTerm("upright", 400.0, cars, upright, num_rows=2)
+
+
+def main() -> RefinementResult:
+    """Refine the bundled frame with it."""
+    loaded = KittiStereoDataset(ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks").load("000000")
+    result = DirectShapeRefiner(extra_terms=[upright_prior])(loaded.frame, loaded.detections)
+    column = result.term_names.index("upright")
+    for car, status in enumerate(result.status):
+        costs = " -> ".join(f"{float(cost[car, column]):.3f}" for cost in (result.cost_before, result.cost_after))
+        print(f"car {car}: {status.name}, upright {costs}")
+    return result
+
+
+if __name__ == "__main__":
+    main()

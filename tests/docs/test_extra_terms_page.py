@@ -1,0 +1,49 @@
+"""docs/extra_terms.md and docs/how_it_works.md name what exists."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+from directshape_torch.cli.main import make_parser
+from directshape_torch.terms.lidar import LidarPoints
+from directshape_torch.terms.term import Term
+
+ROOT = Path(__file__).parents[2]
+TERMS = (ROOT / "docs" / "extra_terms.md").read_text(encoding="utf-8")
+WALK = (ROOT / "docs" / "how_it_works.md").read_text(encoding="utf-8")
+
+
+def test_the_table_has_every_member_of_the_protocol() -> None:
+    table = TERMS[TERMS.index("| member | is |") : TERMS.index("## What a term may not do")]
+    first_column = " ".join(line.split("|")[1] for line in table.splitlines() if line.startswith("| `"))
+    named = {re.split(r"\W", name)[0] for name in re.findall(r"`([^`]+)`", first_column)}
+    assert named == {name for name in vars(Term) if not name.startswith("_")}
+
+
+def test_the_command_is_understood_and_the_settings_are_those_of_the_code() -> None:
+    command = next(line for line in TERMS.splitlines() if line.startswith("directshape "))
+    assert make_parser().parse_args(shlex.split(command)[1:]).lidar == Path("KITTI/training/velodyne")
+    assert f"Weight ({LidarPoints().weight:.0f}) and Huber corner ({LidarPoints().huber_m} m)" in " ".join(
+        TERMS.split()
+    )
+
+
+def test_the_snippet_is_the_prior_and_its_factory() -> None:
+    found = re.search(r'--8<-- "(examples/\w+\.py):(\d+):(\d+)"', TERMS)
+    assert found is not None
+    lines = (ROOT / found[1]).read_text(encoding="utf-8").splitlines()[int(found[2]) - 1 : int(found[3])]
+    assert lines[0].startswith("def upright(")
+    assert lines[-2 if not lines[-1] else -1].strip().startswith("return PriorTerm(")
+
+
+def test_the_walk_names_files_that_exist() -> None:
+    package = ROOT / "directshape_torch"
+    folder = package
+    for line in WALK.splitlines():
+        if line.startswith("## "):
+            named = re.findall(r"`(\w+)/`", line)
+            folder = package / named[-1] if named else package
+        for name in re.findall(r"`([\w/]+\.py)`", line):
+            assert (package / name).is_file() or (folder / name).is_file(), (name, line)
