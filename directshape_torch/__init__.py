@@ -2,7 +2,9 @@
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.config_files import load_config
-from directshape_torch.disparity_profile import DisparityProfile
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile
+from directshape_torch.diagnosis.observability import Observability
+from directshape_torch.diagnosis.quality import FitQuality
 from directshape_torch.errors import (
     ConfigError,
     DataFormatError,
@@ -13,8 +15,6 @@ from directshape_torch.errors import (
     ResumeError,
 )
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.observability import Observability
-from directshape_torch.quality import FitQuality
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera

@@ -12,23 +12,23 @@ import logging
 import os
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Generic, Literal, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import CompilationError
-from directshape_torch.gradient_mode import is_plain, nothing_is_differentiated
+from directshape_torch.numerics.gradient_mode import is_plain, nothing_is_differentiated
 
 CompileMode = Literal["auto", "on", "off"]
 
 # A cold start takes as long as compiled code saves with so many cars, in frames by themselves: `first_s` of
-#     python -m directshape_torch.benchmark.compile_probe --threads 1 --mode compiled|eager
+#     PYTHONPATH=scripts python -m benchmark_suites.compile_cost --threads 1 --mode compiled|eager
 # in the two modes differ by the former with an empty TORCHINDUCTOR_CACHE_DIR, `again_s` by the latter.
 CARS_WORTH_COMPILING = 3000
 
@@ -50,6 +50,7 @@ _MOST_FORMS = 64
 _logger = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_T = TypeVar("_T")
 
 
 @dataclass
@@ -183,6 +184,37 @@ def _can_compile(mode: CompileMode) -> bool:
     return problem is None
 
 
+def _mark(tensor: Tensor, axis: int) -> None:
+    # A wish and no demand: code that needs a size to be what it is may have it so. `dynamic=True` in place of marks has
+    # every size vary, which takes three times as long to compile; PyTorch's guide to dynamic shapes names no other way.
+    torch._dynamo.maybe_mark_dynamic(tensor, axis)
+
+
+def with_varying(value: _T, axes_of: Callable[[Tensor], Iterable[int]]) -> _T:
+    """The same tensor, named tuple or dataclass with the sizes marked that vary from call to call.
+
+    Tensors come out contiguous, without gradient and as objects of their own, for a mark must not stay on the caller's.
+
+    Args:
+        value: anything; what holds no tensors is returned as it is.
+        axes_of: the axes of a tensor whose sizes may vary.
+    """
+    if isinstance(value, Tensor):
+        marked = (value.clone() if value.is_inference() else value.detach()).contiguous()
+        for axis in axes_of(marked):
+            _mark(marked, axis)
+        return marked  # type: ignore[return-value]
+    if isinstance(value, tuple):
+        parts = [with_varying(part, axes_of) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    if is_dataclass(value) and not isinstance(value, type):
+        copy = object.__new__(type(value))
+        for part in fields(value):
+            object.__setattr__(copy, part.name, with_varying(getattr(value, part.name), axes_of))
+        return copy
+    return value
+
+
 def compilable(sizes: Mapping[str, int]) -> Callable[[Callable[_P, _R]], Compilable[_P, _R]]:
     """Mark a pure function of tensors, named tuples of them, numbers and strings for compilation.
 
@@ -271,15 +303,19 @@ def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
     """An argument as compiled code takes it: contiguous, without gradient, with its varying size marked."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return type(value)(*(_prepared(part, field, sizes) for field, part in zip(value._fields, value, strict=True)))
+    if type(value) is tuple:
+        return tuple(_prepared(part, name, sizes) for part in value)
     if not isinstance(value, Tensor):
-        return value
+        if value is None or isinstance(value, (int, float, str)) or is_dataclass(value):
+            return value
+        # What the compiler cannot look into is another one at each call.
+        raise _StaysPlainError
     if not _is_fit(value) or (name in sizes and value.shape[sizes[name]] < 2):
         raise _StaysPlainError
-    # A tensor object of its own, for the mark must not stay on the caller's. `dynamic=True` in place of marks has every
-    # size vary, which takes three times as long to compile; PyTorch's guide to dynamic shapes names no other function.
+    # A tensor object of its own, for the mark must not stay on the caller's.
     value = (value.clone() if value.is_inference() else value.detach()).contiguous()
     if name in sizes:
-        torch._dynamo.mark_dynamic(value, sizes[name])
+        _mark(value, sizes[name])
     return value
 
 

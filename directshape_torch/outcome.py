@@ -7,24 +7,23 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from directshape_torch.car_rows import kept, placed
 from directshape_torch.config import AcceptanceConfig
-from directshape_torch.covariance import covariance_of, covariance_xyz_yaw, shared_disparity_covariance
-from directshape_torch.disparity_profile import DisparityProfile, disparity_profile
-from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.car_problem import CarProblem
-from directshape_torch.energy.car_state import CarState
-from directshape_torch.evidence import Course
+from directshape_torch.diagnosis.car_rows import kept, placed
+from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, shared_disparity_covariance
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile, disparity_profile
+from directshape_torch.diagnosis.evidence import Course
+from directshape_torch.diagnosis.observability import Observability, observability_of
+from directshape_torch.diagnosis.quality import FitQuality, fit_quality
+from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
-from directshape_torch.observability import Observability, observability_of
-from directshape_torch.quality import FitQuality, fit_quality
+from directshape_torch.problem import CarProblem, CarStage
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
-from directshape_torch.trust_model import bundled_trust_model
+from directshape_torch.terms.cars import CarBatch, CarState
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Outcome:
         nothing = empty.code.new_zeros(0, 0, dtype=torch.float64)
         unknowns = 6 + empty.code.shape[1]
         none = torch.zeros(0, dtype=torch.long, device=nothing.device)
-        names = tuple(term.name for term in problem.terms)
+        names = problem.term_names
         return cls(
             state=empty,
             status=none,
@@ -71,37 +70,39 @@ class Outcome:
 def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch) -> Outcome:
     """Costs, covariance, quality, observability and profile of the cars of a problem at its minimum.
 
-    All of them where the iterations ended, which the solver has just projected and the problem remembers; cars that
-    the solver gave their input back show nothing of it in a result but their costs.
+    All of them where the iterations ended; cars that the solver gave their input back show nothing of it in a result
+    but their costs.
     """
     end, refined = minimum.end, is_refined(minimum.status)
-    at_end = problem.linearise_end(end)
-    cost_before, cost_end = problem.term_costs(initial), problem.term_costs(end)
-    covariance = covariance_of(at_end.fisher) + _rig_covariance(problem, end, cars)
+    stage: CarStage = minimum.stage
+    before, after = minimum.before, minimum.after
+    covariance = covariance_of(after.information.sum(dim=1)) + _rig_covariance(problem, end, cars)
+    at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
     course = Course(
         before=initial,
         after=end,
         detector_hwl=cars.detector_hwl,
-        cost_before=cost_before,
-        cost_after=torch.where(refined[:, None], cost_end, cost_before),
-        at_end=at_end,
+        cost_before=before.term_costs,
+        cost_after=torch.where(refined[:, None], after.term_costs, before.term_costs),
+        figures=after,
+        seen=minimum.seen_end,
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
-        profile=disparity_profile(problem, initial, end),
+        profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
     )
-    unseen = observability_of(problem.prior, end, at_end.fisher_seen)
+    unseen = observability_of(problem.prior, end, stage.information_of_measurements(after))
     return Outcome(
         state=minimum.state,
         status=minimum.status,
         iterations=minimum.iterations,
         cost_history=minimum.cost_history,
-        term_names=tuple(term.name for term in problem.terms),
-        cost_before=cost_before,
+        term_names=problem.term_names,
+        cost_before=course.cost_before,
         cost_after=course.cost_after,
         covariance=covariance,
         covariance_xyz_yaw=course.covariance_xyz_yaw,
-        quality=fit_quality(problem, course),
+        quality=fit_quality(stage, course),
         # The directions are mostly those of the depth, so its factor brings them to size.
         observability=unseen.scaled(bundled_trust_model().sigma_factors[0]),
         profile=course.profile,

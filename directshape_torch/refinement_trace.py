@@ -8,17 +8,19 @@ import torch
 from torch import Tensor
 
 from directshape_torch.compile import compiling
-from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.car_problem import CarProblem
-from directshape_torch.energy.car_state import CarState
-from directshape_torch.full_precision import full_precision
+from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
-from directshape_torch.initial_search import search_start
+from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.observation.packing import Observation, pack_pixels
+from directshape_torch.observation.refinable import without_empty_masks
+from directshape_torch.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, where_rows
+from directshape_torch.solver.search import search_start
+from directshape_torch.terms.cars import CarBatch, CarState
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,9 @@ class RefinementTrace:
         accepted: (N + 1, B) bool: the step to this state was taken.
         costs: (N + 1, B, T) of each term, all at the pixel sets and sharpness of the final stage, so that they can be
             compared; NaN for cars that did not take part.
-        problem: of the cars that took part, in the final stage.
-        rows: (R,) their numbers among the B cars, ascending.
+        rows: (R,) numbers of the cars that took part among the B cars, ascending.
+        last_stage: of these R cars, whose settings the costs have.
+        pixels: of these R cars.
     """
 
     result: RefinementResult
@@ -41,11 +44,17 @@ class RefinementTrace:
     stage: tuple[int, ...]
     accepted: Tensor
     costs: Tensor
-    problem: CarProblem
     rows: Tensor
+    last_stage: CarStage
+    pixels: Observation
 
     def __len__(self) -> int:
         return len(self.states)
+
+    @property
+    def config(self) -> RefinerConfig:
+        """Of the refiner."""
+        return self.last_stage.problem.config
 
     @property
     def T_cam_obj(self) -> Tensor:
@@ -81,66 +90,45 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
         InputError: frames, detections and prior do not fit together.
     """
     result = refiner(frames, detections)
-    with full_precision(frames.images_left.device.type):
-        return _traced(refiner, frames, detections, result)
-
-
-def _traced(
-    refiner: DirectShapeRefiner, frames: FrameBatch, detections: Detections, result: RefinementResult
-) -> RefinementTrace:
     took_part = result.cost_before.isfinite().all(dim=1)
     rows = took_part.nonzero()[:, 0]
-    everyone, initial = refiner.problem(frames, detections)
-    part, start = everyone.compact(took_part), CarState(*(x[rows] for x in initial))
-    if not len(rows):
-        nothing = result.cost_before[None]
-        none = torch.zeros_like(took_part)[None]
-        return RefinementTrace(result, (initial,), (-1,), none, nothing, part, rows)
-    with compiling(refiner.config.compile, len(detections)):
-        cars = CarBatch.from_scene(frames, detections).of_objects(took_part)
-        searched = search_start(part, start, cars, refiner.config.search)
-        minimum = minimise(part, start, refiner.config.solver, searched, record=True)
-        course = _course(start, searched, minimum)
-        costs = torch.stack([part.term_costs(state) for state in course.states])
+    everyone, inputs = refiner.problem(frames, detections)
+    problem, initial = everyone.of_cars(took_part), CarState(*(x[rows] for x in inputs))
+    with full_precision(frames.images_left.device.type), compiling(refiner.config.compile, len(detections)):
+        start = search_start(
+            problem, initial, CarBatch.from_scene(frames, detections).of_cars(took_part), refiner.config.search
+        )
+        minimum = minimise(problem, initial, refiner.config.solver, start, record=True)
+        states = [initial, *([] if start is initial else [start]), *_ends(minimum)]
+        costs = torch.stack([minimum.stage.figures(problem.look(state)).term_costs for state in states])
+    before = len(states) - len(minimum.trajectory)
+    none = torch.zeros_like(took_part)
+    accepted = [none.index_copy(0, rows, iteration.accepted) for iteration in minimum.trajectory]
     return RefinementTrace(
         result,
-        tuple(put_rows(initial, rows, state) for state in course.states),
-        course.stage,
-        torch.zeros(len(course.states), len(detections), dtype=torch.bool, device=rows.device).index_copy(
-            1, rows, course.accepted
-        ),
+        tuple(put_rows(inputs, rows, state) for state in states),
+        (-1,) * before + tuple(iteration.stage for iteration in minimum.trajectory),
+        torch.stack([none] * before + accepted),
         costs.new_full((len(costs), len(detections), costs.shape[2]), torch.nan).index_copy(1, rows, costs),
-        part,
         rows,
+        minimum.stage,
+        pack_pixels(frames, without_empty_masks(detections), refiner.config.sampling).of_objects(took_part),
     )
 
 
-@dataclass(frozen=True)
-class _Course:
-    """The same for the R cars that took part."""
-
-    states: tuple[CarState, ...]
-    stage: tuple[int, ...]
-    accepted: Tensor  # (N + 1, R)
-
-
-def _course(initial: CarState, start: CarState, minimum: Minimum[CarState]) -> _Course:
-    """The states in order: input, start of a search if it is another one, after each iteration."""
-    first = [initial] if start is initial else [initial, start]
-    none = torch.zeros(len(initial.code), dtype=torch.bool, device=initial.code.device)
-    states, stage, accepted = list(first), [-1] * len(first), [none] * len(first)
-    iterations = minimum.trajectory
-    ends = (*minimum.stage_starts[1:], minimum.end)
+def _ends(minimum: Minimum[CarState]) -> list[CarState]:
+    """The states that the iterations led to: where the next one of the stage began, or where the stage ended."""
+    stage_ends = (*minimum.stage_starts[1:], minimum.end)
     took_part = minimum.cost_history.isfinite()
-    for number, iteration in enumerate(iterations):
-        after, following = ends[iteration.stage], number + 1
-        if following < len(iterations) and iterations[following].stage == iteration.stage:
+    ends = []
+    followed = zip(minimum.trajectory, [*minimum.trajectory, None][1:], strict=True)
+    for number, (iteration, following) in enumerate(followed):
+        end = stage_ends[iteration.stage]
+        if following is not None and following.stage == iteration.stage:
             # Cars that have left the batch by then are where their stage ended.
-            after = where_rows(took_part[:, following], iterations[following].state, after)
-        states.append(after)
-        stage.append(iteration.stage)
-        accepted.append(iteration.accepted)
-    return _Course(tuple(states), tuple(stage), torch.stack(accepted))
+            end = where_rows(took_part[:, number + 1], following.state, end)
+        ends.append(end)
+    return ends
 
 
 def without_photometry(refiner: DirectShapeRefiner) -> DirectShapeRefiner:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
 from typing import NamedTuple
@@ -10,30 +10,27 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.admission import check_fit, check_no_tangents, refusals, without_empty_masks
-from directshape_torch.backward import attached_state
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
-from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.car_problem import CarProblem
-from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.direct_terms import stacked_weights
-from directshape_torch.energy.method import method_terms
 from directshape_torch.errors import InputError
-from directshape_torch.full_precision import full_precision
 from directshape_torch.geometry import se3
-from directshape_torch.initial_search import search_start
+from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
+from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
 from directshape_torch.outcome import Outcome, assemble, outcome_of, without_distrusted
+from directshape_torch.problem import CarProblem, TermFactory
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.solver.backward import attached_state
 from directshape_torch.solver.gauss_newton import minimise
+from directshape_torch.solver.search import search_start
 from directshape_torch.stereo_matching.car_points import PointSamples, car_points
 from directshape_torch.stereo_matching.dense_disparity import with_disparity
+from directshape_torch.terms.cars import CarBatch, CarState
 
 
 class DirectShapeRefiner(nn.Module):
@@ -43,6 +40,7 @@ class DirectShapeRefiner(nn.Module):
         prior: family of shapes in any encoding; default the bundled grids of parametric cars. It is a submodule: its
             tensors move with `.to(...)` and live in the `state_dict`.
         config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
+        extra_terms: make terms of one's own for the cars of a call (docs/extra_terms.md), beside those of the method.
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
@@ -54,7 +52,12 @@ class DirectShapeRefiner(nn.Module):
         True
     """
 
-    def __init__(self, prior: ShapePrior | None = None, config: RefinerConfig | None = None) -> None:
+    def __init__(
+        self,
+        prior: ShapePrior | None = None,
+        config: RefinerConfig | None = None,
+        extra_terms: Sequence[TermFactory] = (),
+    ) -> None:
         super().__init__()
         if isinstance(prior, RefinerConfig):
             raise InputError("prior", "a ShapePrior", "RefinerConfig", "pass it as config=")
@@ -62,6 +65,7 @@ class DirectShapeRefiner(nn.Module):
             raise InputError("config", "a RefinerConfig", repr(config), _config_cure(config))
         self.prior: ShapePrior = PCAShapePrior.load_bundled() if prior is None else prior
         self.config = RefinerConfig() if config is None else config
+        self.extra_terms = tuple(extra_terms)
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
         check_prior(self.prior, by_autograd=needs_graph)
 
@@ -116,7 +120,7 @@ class DirectShapeRefiner(nn.Module):
         failure = refusals(frames, detections, seen.pixels, seen.points, self.config)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
-        cars = CarBatch.from_scene(frames, detections).of_objects(usable)
+        cars = CarBatch.from_scene(frames, detections).of_cars(usable)
         problem = self._problem(frames, detections, cars, seen.of_objects(usable), term_weights)
         # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
         state, status = self._input_state(detections.T_cam_obj.detach()), failure
@@ -159,12 +163,17 @@ class DirectShapeRefiner(nn.Module):
         term_weights: Mapping[str, Tensor] | None,
     ) -> CarProblem:
         """The problem of some of the detections, of which `cars` and `seen` are."""
-        terms = method_terms(self.config, self.prior, frames, detections, cars, seen.pixels, seen.points)
-        weights = stacked_weights(
-            term_weights, terms, self.prior.initial_code(len(detections)).to(detections.T_cam_obj)
+        return CarProblem.of_scene(
+            self.config,
+            self.prior,
+            frames,
+            detections,
+            cars,
+            seen.pixels,
+            seen.points,
+            self.extra_terms,
+            term_weights,
         )
-        weights = None if weights is None else weights[cars.detection_row]
-        return CarProblem(self.prior, terms, seen.pixels.left, seen.pixels.right, self.config, weights)
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
         record = torch.is_grad_enabled() and self.config.backward.mode == "unroll"

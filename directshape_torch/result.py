@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from directshape_torch.disparity_profile import DisparityProfile
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile
+from directshape_torch.diagnosis.observability import Observability
+from directshape_torch.diagnosis.quality import FitQuality
+from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
-from directshape_torch.observability import Observability
-from directshape_torch.quality import FitQuality
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
 from directshape_torch.status import Status, is_refined
-from directshape_torch.trust_model import bundled_trust_model
 
 if TYPE_CHECKING:
     import trimesh

@@ -15,7 +15,10 @@ import torch
 from kornia.geometry import camera as kornia_camera
 from torch import Tensor
 
-from directshape_torch.checks import (
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.se3 import from_rotation_translation
+from directshape_torch.numerics.checks import (
     check_flags,
     check_integer,
     check_mask_dtype,
@@ -24,9 +27,6 @@ from directshape_torch.checks import (
     check_sigmas,
     is_no_rotation,
 )
-from directshape_torch.errors import InputError
-from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.se3 import from_rotation_translation
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
@@ -243,6 +243,8 @@ class FrameBatch(_TensorRecord):
         frame_ids: a name for each frame.
         disparity: (F, H, W) measured `u_left - u_right` of the left pixels, NaN where unknown, for the methods that fit
             a point cloud; None: they match the images themselves.
+        points_cam: (F, P, 3) points of a LiDAR in the left camera frame, metres, NaN where a frame has fewer than P,
+            for `terms.lidar`; None: nobody has measured any.
     """
 
     images_left: Tensor
@@ -252,6 +254,7 @@ class FrameBatch(_TensorRecord):
     ground: GroundPlane
     frame_ids: tuple[str, ...]
     disparity: Tensor | None = None
+    points_cam: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("images_left", self.images_left, ("F", 3, "H", "W"), "stack images as (F, 3, H, W) in [0, 1]")
@@ -268,9 +271,12 @@ class FrameBatch(_TensorRecord):
                 raise InputError("images_right", f"the {what} of images_left ({left})", str(right))
         if self.disparity is not None:
             check_shape("disparity", self.disparity, (num_frames, height, width))
-            if self.disparity.dtype != self.images_left.dtype or self.disparity.device != self.images_left.device:
-                got = f"{self.disparity.dtype} on {self.disparity.device}"
-                raise InputError("disparity", f"{self.images_left.dtype} on {self.images_left.device}", got)
+        if self.points_cam is not None:
+            check_shape("points_cam", self.points_cam, (num_frames, "P", 3))
+        for name in ("disparity", "points_cam"):
+            measured, image = getattr(self, name), self.images_left
+            if measured is not None and (measured.dtype != image.dtype or measured.device != image.device):
+                raise InputError(name, f"{image.dtype} on {image.device}", f"{measured.dtype} on {measured.device}")
         _check_brightness("images_left", self.images_left)
         _check_brightness("images_right", self.images_right)
         if len(self.frame_ids) != num_frames:

@@ -47,11 +47,11 @@ from quality_calibration.report import (
 
 from directshape_torch.config import AcceptanceConfig, RigConfig
 from directshape_torch.config_files import load_config
-from directshape_torch.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.trust_model import TrustModel
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.trust_model import TrustModel
 
 EVERYTHING = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
 # The detectors whose share of worse cars the default policy is to bring below the bound: those of the development data.

@@ -19,7 +19,7 @@ import torch
 from command_line import run_command
 
 from directshape_torch.config_files import load_config
-from directshape_torch.disparity_profile import DisparityProfile
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner

@@ -28,7 +28,7 @@ def inputs() -> StreetInputs:
 def test_modes_agree_with_each_other_and_with_differences(inputs: StreetInputs, what: str) -> None:
     implicit = gradient_by(inputs, with_mode("implicit"), what)
     unrolled = gradient_by(inputs, with_mode("unroll"), what)
-    step = 1e-4
+    step = 1e-5
     ends = [float(summary(inputs.refine(SETTLED, what, sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
     assert abs(implicit) > 1e-4
@@ -178,7 +178,7 @@ def test_the_brightness_follows_the_images(
 ) -> None:
     matched = replace(SETTLED, photometric=replace(SETTLED.photometric, brightness=brightness))
     implicit, unrolled = (gradient_by(inputs, with_mode(mode, matched), "images") for mode in ("implicit", "unroll"))
-    step = 1e-4
+    step = 1e-5
     ends = [float(summary(inputs.refine(matched, "images", sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
     # Left out: the state at which the stage begins follows the images. Constants would be 20 and 50 percent off.

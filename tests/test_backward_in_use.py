@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +15,6 @@ from helpers.street_inputs import SETTLED, StreetInputs, gradient_by, summary, w
 from helpers.synthetic_scene import cached_street, disturbed
 from torch import Tensor
 
-from directshape_torch import refinement_trace
 from directshape_torch import refiner as refiner_module
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
@@ -164,26 +164,24 @@ def test_under_autocast_it_computes_in_the_precision_of_its_inputs() -> None:
     assert torch.equal(plain.T_cam_obj, cast.T_cam_obj)
 
 
-@pytest.mark.parametrize("module", [refiner_module, refinement_trace])
-def test_products_have_all_digits_whatever_the_network_around_is_allowed(module, monkeypatch) -> None:
+def test_products_have_all_digits_whatever_the_network_around_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
-    minimise = module.minimise
 
-    def watched(*args, **kwargs):
+    def watched(*args: Any, **kwargs: Any) -> Any:
         asked.append(torch.get_float32_matmul_precision())
         return minimise(*args, **kwargs)
 
-    monkeypatch.setattr(module, "minimise", watched)
+    minimise = refiner_module.minimise
+    monkeypatch.setattr(refiner_module, "minimise", watched)
     _, scene = cached_street()
     refiner = DirectShapeRefiner(ellipsoid_prior(torch.float64), DEFAULT)
     torch.set_float32_matmul_precision("high")
     try:
-        refinement_trace.trace_refinement(refiner, scene.frames, disturbed(scene.detections))
+        refiner(scene.frames, disturbed(scene.detections))
     finally:
         after = torch.get_float32_matmul_precision()
         torch.set_float32_matmul_precision("highest")
-    assert asked == ["highest"]
-    assert after == "high"
+    assert (asked, after) == (["highest"], "high")
 
 
 def test_a_compiled_model_around_it_has_one_break_in_its_graph(inputs: StreetInputs) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from benchmark_suites.workloads import demo_scene, with_cars
 from helpers.compiled_lookup import (
     Nearest,
     graphs,
@@ -25,14 +26,12 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch import compile as compile_module
-from directshape_torch.benchmark.workloads import demo_scene, with_cars
 from directshape_torch.compile import CARS_WORTH_COMPILING, Compilable, cars_ahead, compiling, num_forms, will_compile
 from directshape_torch.config_files import load_config
+from directshape_torch.depth import marched_views
 from directshape_torch.errors import CompilationError
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.compiled_march import sample_grids
-from directshape_torch.shape.compiled_probe import probe_grids
-from directshape_torch.tracking import photometric, silhouette
+from directshape_torch.terms.term import parts_of
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")
 
@@ -137,14 +136,14 @@ class TestForms:
         assert graphs() == 1
 
     def test_other_numbers_of_cars_and_pixels_compile_nothing_anew(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        functions = (sample_grids, probe_grids, silhouette._of_grids, photometric._of_grids)
+        functions = (marched_views, parts_of)
         for function in functions:
             monkeypatch.setattr(function, "_compiled", None)
             monkeypatch.setattr(function, "_has_worked", False)
         torch.compiler.reset()
         stages = "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 2}, {max_iterations: 2}]"
         more, fewer = (load_config(None, ["compile=on", stages, f"sampling.max_pixels={n}"]) for n in (900, 450))
-        for config, num_cars in ((more, 3), (more, 1), (fewer, 2), (fewer, 8)):
+        for config, num_cars in ((more, 3), (fewer, 2), (fewer, 8)):
             result = DirectShapeRefiner(config=config)(*with_cars(demo_scene().frames, num_cars))
             assert len(result.status) == num_cars
             assert graphs() == len(functions)

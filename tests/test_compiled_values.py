@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 import torch
+from benchmark_suites.workloads import demo_scene, with_cars
 from helpers.compiled_lookup import needs_compiler
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from directshape_torch.benchmark.workloads import demo_scene, with_cars
 from directshape_torch.compile import Compilable
 from directshape_torch.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
@@ -24,11 +24,10 @@ from directshape_torch.refiner import DirectShapeRefiner
 FEW_STEPS = ("compile=on", "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 2}]")
 
 # For each output the axes of its components, which are quantities of their own.
+SUMS: list[tuple[int, ...]] = [(), (1, 2), (1, 2), (1, 2)]  # cost, products, information, residual of a term
 COMPONENT_AXES: dict[str, list[tuple[int, ...]]] = {
-    "sample_grids": [(0,), (0,), (), (), ()],
-    "probe_grids": [(0,), (0,)],
-    "silhouette._of_grids": [(), (1, 2), (0,)],
-    "photometric._of_grids": [(), (1, 2), (0,), (0,)],
+    "marched_views": [(0,), (), (), (0,), (0,), (0,), (), ()],
+    "parts_of": [*SUMS[:3], (2,), (0,), (), (), (0,), *SUMS[:3], (2,), (0,), (0,), (), (), (), *(4 * SUMS)],
 }
 
 # Of the mean size of a component, and metres or whatever its unit is. Rounding takes a pixel over a threshold now and
@@ -58,17 +57,13 @@ def test_compiled_functions_compute_what_they_compute_plainly(num_cars: int, mon
         found = run_compiled(function, values)
         with torch.no_grad():
             expected = function.plain(*values)
-        wrong.setdefault(name_of(function), set()).update(differences(name_of(function), found, expected))
+        name = function.plain.__name__
+        wrong.setdefault(name, set()).update(differences(name, found, expected))
         return found
 
     monkeypatch.setattr(Compilable, "_run", compare)
     DirectShapeRefiner(config=load_config(None, FEW_STEPS))(*with_cars(demo_scene().frames, num_cars))
     assert wrong == {name: set() for name in COMPONENT_AXES}
-
-
-def name_of(function: Compilable[..., Any]) -> str:
-    module, name = function.plain.__module__.split(".")[-1], function.plain.__qualname__
-    return f"{module}.{name}" if name == "_of_grids" else name
 
 
 def differences(name: str, found: object, expected: object) -> Iterator[str]:
@@ -99,14 +94,12 @@ def share_that_differs(found: Tensor, expected: Tensor) -> Tensor:
 
 
 def test_what_is_wrong_is_seen_component_by_component() -> None:
-    products = torch.randn(75, 15, 14, generator=torch.Generator().manual_seed(0)).double()
-    products[:, :14] *= 1000
-    cost, points = torch.ones(75), torch.randn(3, 75, 64)
-    right = cost, products, points
-    assert list(differences("silhouette._of_grids", right, right)) == []
-    no_gradient, overwritten = products.clone(), points.clone()
-    no_gradient[:, 14] = 0
+    flags, depth = torch.rand(75, 64) < 0.5, torch.rand(75, 64)
+    points, faces = torch.randn(2, 3, 75, 64, generator=torch.Generator().manual_seed(0)).unbind(0)
+    right = points, depth, flags, faces, points, faces, flags, depth
+    assert list(differences("marched_views", right, right)) == []
+    overwritten = points.clone()
     overwritten[2] = overwritten[0]
-    assert len(list(differences("silhouette._of_grids", (cost, no_gradient, points), right))) == 14
-    assert len(list(differences("silhouette._of_grids", (cost, products, overwritten), right))) == 1
-    assert len(list(differences("silhouette._of_grids", (cost * torch.nan, products, points), right))) == 1
+    assert len(list(differences("marched_views", (overwritten, *right[1:]), right))) == 1
+    assert len(list(differences("marched_views", (*right[:7], depth * torch.nan), right))) == 1
+    assert len(list(differences("marched_views", (*right[:2], ~flags, *right[3:]), right))) == 1

@@ -1,4 +1,4 @@
-"""Constants and kept properties: right in every mode, whichever of them asked first."""
+"""Constants: right in every mode, whichever of them asked first."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from directshape_torch.device_constants import constant_like, kept_property, made_once
+from directshape_torch.numerics.device_constants import constant_like, made_once
 
 
 class Constants:
@@ -31,15 +31,6 @@ class Constants:
     def product(self, x: Tensor) -> Tensor:
         one, other = self.of(x)
         return x * (one + other)
-
-
-class Numbers:
-    def __init__(self, numbers: Tensor) -> None:
-        self.numbers = numbers
-
-    @kept_property
-    def doubled(self) -> Tensor:
-        return 2 * self.numbers
 
 
 def _asked_plainly(constants: Constants) -> None:
@@ -103,35 +94,3 @@ def test_constants_of_another_type_are_others() -> None:
     constants = Constants(5.0)
     for dtype in (torch.float64, torch.float32):
         assert [x.dtype for x in constants.of(torch.ones(1, dtype=dtype))] == [dtype, dtype]
-
-
-def test_a_property_is_kept() -> None:
-    numbers = Numbers(torch.ones(2))
-    assert numbers.doubled is numbers.doubled
-    assert isinstance(Numbers.doubled, kept_property)
-
-
-def test_a_property_of_a_transform_is_not_kept() -> None:
-    numbers = Numbers(torch.ones(2))
-    torch.func.jvp(lambda x: x * numbers.doubled, (torch.ones(2),), (torch.ones(2),))
-    assert copy.deepcopy(numbers).doubled.tolist() == [2.0, 2.0]
-
-
-def test_a_property_with_a_graph_or_a_tangent_is_not_kept() -> None:
-    numbers = Numbers(torch.ones(2, requires_grad=True))
-    for _ in range(2):
-        numbers.doubled.sum().backward()
-    with torch.autograd.forward_ad.dual_level():
-        dual = Numbers(torch.autograd.forward_ad.make_dual(torch.ones(2), torch.ones(2)))
-        assert dual.doubled.tolist() == [2.0, 2.0]
-    assert "doubled" not in numbers.__dict__
-    assert "doubled" not in dual.__dict__
-
-
-def test_a_property_that_inference_mode_asked_for_can_be_differentiated_with() -> None:
-    numbers, x = Numbers(torch.ones(2)), torch.ones(2, requires_grad=True)
-    with torch.inference_mode():
-        assert numbers.doubled.tolist() == [2.0, 2.0]
-    (x * numbers.doubled).sum().backward()
-    assert x.grad is not None
-    assert x.grad.tolist() == [2.0, 2.0]

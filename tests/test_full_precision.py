@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from directshape_torch.full_precision import full_precision
+from directshape_torch.numerics.full_precision import full_precision
 
 CUDA, CPU = torch.backends.cuda.matmul, torch.backends.mkldnn.matmul
 

@@ -8,12 +8,11 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import Street, cached_street, disturbed
 
 from directshape_torch.config import SearchConfig
-from directshape_torch.energy.car_batch import CarBatch
-from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
-from directshape_torch.initial_search import move_by_disparity, search_start, turn
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.solver.search import move_by_disparity, search_start, turn
+from directshape_torch.terms.cars import CarBatch, CarState
 
 
 def _state() -> CarState:
@@ -46,8 +45,9 @@ def test_the_cheapest_start_wins_and_never_loses_to_the_input() -> None:
     problem, initial = DirectShapeRefiner(prior, DEFAULT).problem(scene.frames, detections)
     wide = SearchConfig((-2.0, -1.0, 1.0, 2.0), (-10.0, 10.0))
     start = search_start(problem, initial, CarBatch.from_scene(scene.frames, detections), wide)
-    problem.begin_stage(problem.stages()[0], initial)
-    assert (problem.cost(start) <= problem.cost(initial)).all()
+    seen = problem.look(initial)
+    stage = problem.begin(problem.stages()[0], seen)
+    assert (stage.figures(problem.look(start)).cost <= stage.figures(seen).cost).all()
     moved = (start.T_obj_cam - initial.T_obj_cam).abs().amax((1, 2)) > 0
     assert moved.any()
 

@@ -76,10 +76,10 @@ def test_iterations_let_the_host_wait_once_a_block_and_compactions_not_at_all(fo
     assert waits["by place"] == {"tolist in _read": waits["blocks"]}
 
 
-def test_a_whole_call_lets_the_host_wait_some_fifty_times(found: dict[str, Any]) -> None:
+def test_a_whole_call_lets_the_host_wait_some_forty_times(found: dict[str, Any]) -> None:
     """A guard: places and pixels that are counted, numbers that are sent, a decomposition that may fail."""
     by_place = _of(found, "waits of blocks")["in all"]
-    assert 40 < sum(by_place.values()) <= 56, by_place
+    assert 30 < sum(by_place.values()) <= 44, by_place
     # No operation is asked for its places by a mask: each such index is one wait more.
     assert not any(place.startswith("aten.index") for place in by_place)
 

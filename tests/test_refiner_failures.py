@@ -186,6 +186,7 @@ def test_a_nan_image_fails_its_own_frame_only(side: str, config: RefinerConfig) 
     assert result.status[:2] == expected.status[:2]
     torch.testing.assert_close(result.T_cam_obj[:2], expected.T_cam_obj[:2], rtol=0, atol=1e-11)
     torch.testing.assert_close(result.code[:2], expected.code[:2], rtol=0, atol=1e-10)
+    torch.testing.assert_close(result.profile.cost_after[:2], expected.profile.cost_after[:2], rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("what", ["K_left", "K_right", "T_right_cam", "t_cam_ref"])

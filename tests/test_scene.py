@@ -12,7 +12,6 @@ from helpers.synthetic_scene import cached_street
 from kornia.geometry import camera as kornia_camera
 from kornia.geometry.camera.pinhole import PinholeCamerasList
 
-from directshape_torch.checks import check_shape
 from directshape_torch.errors import (
     ConfigError,
     DataFormatError,
@@ -24,6 +23,7 @@ from directshape_torch.errors import (
 )
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.pinhole import project
+from directshape_torch.numerics.checks import check_shape
 from directshape_torch.scene import GroundPlane, Occluders, StereoCamera
 from directshape_torch.status import Status
 

@@ -29,6 +29,7 @@ from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_manifest import RunManifest
 from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 
 # Detection files that tell how many cars are ahead.
@@ -245,15 +246,23 @@ def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha2
 
     Device, batch size and kinds of outputs are left out: they do not change what is computed.
     """
-    settings = {
+    settings: dict[str, Any] = {
         "refiner": config_to_mapping(refiner.config),
         "classes": sorted(dataset.classes),
         "ground": dataset.ground,
         "camera_height_m": dataset.camera_height_m,
         "dtype": str(refiner.prior.origin.dtype).removeprefix("torch."),
     }
+    if refiner.extra_terms:
+        settings["extra_terms"] = [_described(make) for make in refiner.extra_terms]
     hashes = {"prior": prior_sha256, "stereo_bias": hash_field(dataset.disparity_field)}
     return RunManifest(package_version(), settings, hashes)
+
+
+def _described(make: TermFactory) -> str:
+    """A factory of terms in words that stay: a function by its name, anything else as it prints itself."""
+    name = getattr(make, "__qualname__", None)
+    return repr(make) if name is None else f"{make.__module__}.{name}"
 
 
 def package_version() -> str:

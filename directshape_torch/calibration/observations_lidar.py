@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.calibration.disparity_observations import KnownDepth
-from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.pinhole import project
-from directshape_torch.io.image_files import read_file_bytes
 from directshape_torch.io.kitti_calibration import KittiCalibration
+from directshape_torch.io.velodyne import read_scan
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.points import disparity_of_depth
 
@@ -33,9 +32,9 @@ def known_depth_from_lidar(
     """Scan points that fall into the left image and are not hidden from the camera.
 
     Raises:
-        DataFormatError: the scan is not four float32 a point, or the calibration lacks R0_rect or Tr_velo_to_cam.
+        DataFormatError: see `read_scan`.
     """
-    points_cam = _points_cam(path, calibration, camera)
+    points_cam = read_scan(path, calibration, camera)
     depth = points_cam[:, 2]
     near_enough = (depth > _DEPTH_RANGE_M[0]) & (depth < _DEPTH_RANGE_M[1])
     points_cam, depth = points_cam[near_enough], depth[near_enough]
@@ -47,21 +46,6 @@ def known_depth_from_lidar(
     disparity = disparity_of_depth(uv, depth, *matrices)[:, 0]
     visible = ~_hidden(uv, disparity, size_wh)
     return KnownDepth(uv[visible], depth[visible])
-
-
-def _points_cam(path: Path, calibration: KittiCalibration, camera: StereoCamera) -> Tensor:
-    if calibration.R0_rect is None or calibration.Tr_velo_to_cam is None:
-        missing = "R0_rect" if calibration.R0_rect is None else "Tr_velo_to_cam"
-        raise DataFormatError(
-            calibration.path, f"has no line {missing}:", cure="LiDAR needs R0_rect and Tr_velo_to_cam"
-        )
-    content = read_file_bytes(path)
-    if len(content) == 0 or len(content) % 16:
-        raise DataFormatError(path, f"expected 16 bytes a point (x, y, z, reflectance), got {len(content)} bytes")
-    points_velo = np.frombuffer(content, dtype="<f4").reshape(-1, 4)[:, :3].astype(np.float64)
-    rotation = calibration.R0_rect @ calibration.Tr_velo_to_cam[:, :3]
-    points_ref = points_velo @ rotation.T + calibration.R0_rect @ calibration.Tr_velo_to_cam[:, 3]
-    return torch.from_numpy(points_ref) + camera.t_cam_ref[0].double()
 
 
 def _hidden(

@@ -84,6 +84,7 @@ def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
         camera_height_m=args.camera_height,
         disparity_field=None if args.stereo_bias is None else DisparityField.load(args.stereo_bias),
         disparity_dir=getattr(args, "disparity", None),
+        lidar_dir=getattr(args, "lidar", None),
     )
 
 

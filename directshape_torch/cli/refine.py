@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from directshape_torch.errors import InputError
 if TYPE_CHECKING:
     import torch
 
+    from directshape_torch.problem import TermFactory
     from directshape_torch.refiner import DirectShapeRefiner
 
 _DESCRIPTION = """
@@ -25,7 +27,11 @@ all frames done, 1 some frames failed, 2 wrong usage or input, or a run that cou
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command and its options."""
     parser = subparsers.add_parser("refine", help="refine the cars of a data set", description=_DESCRIPTION)
-    add_data_options(parser.add_argument_group("input"))
+    inputs = parser.add_argument_group("input")
+    add_data_options(inputs)
+    inputs.add_argument(
+        "--lidar", type=Path, metavar="DIR", help="LiDAR scans NNNNNN.bin (KITTI's velodyne) as further evidence"
+    )
     _add_outputs(parser.add_argument_group("output"))
     _add_settings(parser.add_argument_group("settings"))
     _add_workers(parser.add_argument_group("workers (docs/run_on_everything.md)"))
@@ -111,12 +117,14 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.cli.rerun_option import check_rerun, write_recording
+    from directshape_torch.terms.lidar import LidarPoints
 
     check_rerun(args.rerun)
     workers = WorkerOptions(args.workers, args.threads, args.ray, args.retries)
     options = RefineOptions(args.meshes, args.overlays, args.batch_frames)
     chosen = [] if args.method is None else [f"method={args.method}"]
-    refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device)
+    extra = [] if args.lidar is None else [LidarPoints()]
+    refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)
     _check_disparity_is_used(args.disparity, refiner.config.method)
     dataset = dataset_of(args)
     with ProgressBar() as progress:
@@ -135,7 +143,13 @@ def _check_disparity_is_used(folder: Path | None, method: str) -> None:
         raise InputError("--disparity", "a method that uses it", "direct", "add --method geometric or combined")
 
 
-def make_refiner(config: str | None, overrides: list[str], prior: Path | str | None, device: str) -> DirectShapeRefiner:
+def make_refiner(
+    config: str | None,
+    overrides: list[str],
+    prior: Path | str | None,
+    device: str,
+    extra_terms: Sequence[TermFactory] = (),
+) -> DirectShapeRefiner:
     """The refiner that the options describe.
 
     Raises:
@@ -148,7 +162,8 @@ def make_refiner(config: str | None, overrides: list[str], prior: Path | str | N
     from directshape_torch.shape.load_prior import load_prior
 
     settings = load_config(config, overrides)
-    return DirectShapeRefiner(load_prior("pca" if prior is None else prior), settings).to(find_device(device))
+    refiner = DirectShapeRefiner(load_prior("pca" if prior is None else prior), settings, extra_terms)
+    return refiner.to(find_device(device))
 
 
 def find_device(name: str) -> torch.device:

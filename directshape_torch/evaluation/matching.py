@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.numerics.checks import check_shape
 
 MINIMUM_IOU_2D = 0.3
 

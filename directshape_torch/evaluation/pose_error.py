@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.checks import check_shape
 from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.geometry.box3d import wrap_angle
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.numerics.checks import check_shape
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.checks import check_shape
+from directshape_torch.numerics.checks import check_shape
 
 _BEV_LAYOUT = "columns are x, z, length, width, rotation_y"
 _BOX_LAYOUT = "columns are x, y, z (bottom centre), height, width, length, rotation_y"

@@ -12,9 +12,10 @@ from torch import Tensor
 from directshape_torch.evaluation.shape_error import Points
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.shape.raycast import ObjectRays, Root, closest_approach_depth, first_crossing, march
+from directshape_torch.ray_cast import cast
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.terms.cars import CarState
 
 _SAMPLES_PER_RAY = 96
 
@@ -51,8 +52,12 @@ class EstimatedCar:
         K_left: Tensor,  # (3, 3)
     ) -> NDArray[np.float64]:  # (P,)
         """Depth along the optical axis where the rays of left pixels first meet the surface, NaN where they miss it."""
-        root = self._first_surface(rays_from_pixels(torch.from_numpy(uv_left), K_left.double()))
-        return np.where(root.found.numpy(), root.depth.double().numpy(), np.nan)
+        like = self.prior.origin
+        rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double()).to(like)
+        state = CarState(se3.inverse(self.T_cam_obj.double())[None].to(like), self._code())
+        return np.asarray(
+            cast(self.prior, state, torch.zeros_like(like), rays_cam, _SAMPLES_PER_RAY).depth.double().cpu()
+        )
 
     def points_at_pixels(
         self,
@@ -64,18 +69,6 @@ class EstimatedCar:
         rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double()).numpy()
         hit = np.isfinite(depth)
         return np.asarray(depth[hit, None] * rays_cam[hit])
-
-    def _first_surface(self, rays_cam: Tensor) -> Root:
-        """Depths of the first hits of rays (P, 3) of unit depth from the camera's centre."""
-        T_obj_cam = se3.inverse(self.T_cam_obj.double())
-        like = self.prior.origin
-        origin = T_obj_cam[:3, 3].expand(len(rays_cam), 3).to(like)
-        index = torch.zeros(len(rays_cam), dtype=torch.int64, device=like.device)
-        rays = ObjectRays(origin, (rays_cam @ T_obj_cam[:3, :3].T).to(like), index)
-        shape = self.prior.bind(self._code())
-        marched = march(shape, rays, self.prior.bounds_obj, _SAMPLES_PER_RAY)
-        root = first_crossing(shape, rays, marched, closest_approach_depth(marched))
-        return Root(root.depth.cpu(), root.found.cpu())
 
     def _code(self) -> Tensor:
         return self.code[None].to(self.prior.origin)

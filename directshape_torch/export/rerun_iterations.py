@@ -18,9 +18,9 @@ from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.status import Status
 from directshape_torch.visualize.inspection.residual_values import (
+    CarResiduals,
     PixelResiduals,
-    photometric_residuals,
-    silhouette_residuals,
+    car_residuals,
 )
 
 # -log 0.01: what a pixel pays whose mask is certain and wrong.
@@ -52,23 +52,21 @@ class IterationLog:
     def log_state(self, number: int) -> None:
         """Surfaces, boxes, residuals and costs of all cars in a state; what a car shares with the one before stays."""
         self.stream.log("world/boxes/iteration", self._boxes(number))
+        moved = [car for car in self.cars if number in self.trace.steps_of(car)]
+        residuals = car_residuals(self.trace, number) if moved else {}
         for car in self.cars:
-            if number in self.trace.steps_of(car):
+            if car in moved:
                 self._log_surface(car, number)
-                self.log_residuals(car, number)
+                self.log_residuals(car, residuals[car])
             self._log_costs(car, number)
 
-    def log_residuals(self, car: int, number: int) -> None:
+    def log_residuals(self, car: int, residuals: CarResiduals) -> None:
         """Sampled pixels coloured by what they cost: silhouettes in both images, photometry in the left one."""
-        line, trace = self.line(car), self.trace
-        for entity, values, colours in (
-            (f"{LEFT}/silhouette/{line}", silhouette_residuals(trace, car, number, "left"), _heat),
-            (f"{RIGHT}/silhouette/{line}", silhouette_residuals(trace, car, number, "right"), _heat),
-            (f"{LEFT}/photometric/{line}", photometric_residuals(trace, car, number), _blue_red),
-        ):
+        names = f"{LEFT}/silhouette", f"{RIGHT}/silhouette", f"{LEFT}/photometric"
+        for name, values, colours in zip(names, residuals, (_heat, _heat, _blue_red), strict=True):
             # Rerun's pixels have their corners at whole numbers, ours their centres.
             dots = self.stream.rr.Points2D(values.uv + 0.5, colors=colours(values), radii=_DOT_PX)
-            self.stream.log(entity, dots)
+            self.stream.log(f"{name}/{self.line(car)}", dots)
 
     def _log_surface(self, car: int, number: int) -> None:
         state, prior = self.trace.states[number], self.trace.result.prior

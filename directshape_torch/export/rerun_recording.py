@@ -15,6 +15,7 @@ from directshape_torch.export.rerun_stream import RerunStream, import_rerun
 from directshape_torch.export.run_folder import RunFolder
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.visualize.inspection.residual_values import car_residuals
 
 
 class RerunExporter:
@@ -84,8 +85,9 @@ class RerunExporter:
             stream.at(iteration=self.iteration + number)
             log.log_state(number)
         stream.at(frame)
+        residuals = car_residuals(trace, len(trace) - 1)
         for car in log.cars:
-            log.log_residuals(car, len(trace) - 1)
+            log.log_residuals(car, residuals[car])
         self.iteration += len(trace)
 
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.gradient_mode import is_plain
+from directshape_torch.numerics.gradient_mode import is_plain
 
 SCHEMA = "directshape disparity field"
 SCHEMA_VERSION = 1

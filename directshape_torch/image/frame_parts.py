@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.image.gradients import grey_levels, length_2d
-from directshape_torch.table_lookup import take
+from directshape_torch.numerics.table_lookup import take
 
 
 def gradient_magnitude_of_part(

@@ -6,8 +6,8 @@ import torch
 from kornia.color import rgb_to_grayscale
 from torch import Tensor
 
-from directshape_torch.device_constants import constant_like
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.device_constants import constant_like
 
 # Of red, green and blue in a grey level of 0..255 (ITU-R BT.601).
 _WEIGHTS = (255 * 0.299, 255 * 0.587, 255 * 0.114)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -72,3 +74,18 @@ def halve_intrinsics(
         raise InputError("K", "shape (..., 3, 3)", f"{tuple(K.shape)}")
     level_from_full = K.new_tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
     return level_from_full @ K
+
+
+@dataclass(frozen=True)
+class GreyPair:
+    """Grey levels of both images at one pyramid level."""
+
+    left: Tensor  # (F, H, W)
+    right: Tensor  # (F, H, W)
+    sizes: Tensor  # (F, 2)
+    scale: float  # level pixels per full-resolution pixel
+
+    def halved(self) -> GreyPair:
+        """The next coarser level."""
+        left, right = (halve(image[:, None])[:, 0] for image in (self.left, self.right))
+        return GreyPair(left, right, halve_sizes(self.sizes), 0.5 * self.scale)

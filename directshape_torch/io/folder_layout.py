@@ -128,6 +128,14 @@ class FolderLayout:
     def scan(self, frame_id: str) -> None:
         """None: this layout has no scans."""
 
+    def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
+        """`folder/ID.bin`."""
+        return {"lidar": folder / f"{frame_id}.bin"}
+
+    def lidar_calibration(self, frame_id: str) -> KittiCalibration:
+        """The calibration of the frame; its format does not place a scanner, so a scan is refused by name."""
+        return self.calibration(frame_id)
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """Those of the frame's file, where it has them."""
         return self._frame(frame_id).times_s

@@ -38,6 +38,7 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
         ground=_grounds([item.frame.ground for item in loaded]),
         frame_ids=tuple(frame_id for item in loaded for frame_id in item.frame.frame_ids),
         disparity=_disparities([item.frame.disparity for item in loaded], size_hw),
+        points_cam=_points([item.frame.points_cam for item in loaded]),
     )
     return frame, _detections([item.detections for item in loaded], size_hw)
 
@@ -66,6 +67,16 @@ def _disparities(maps: Sequence[Tensor | None], size_hw: tuple[int, int]) -> Ten
         raise InputError("loaded", "frames with disparity maps, or frames without", f"{len(known)} of {len(maps)} with")
     # Zero is no disparity, like NaN.
     return _padded(known, size_hw)
+
+
+def _points(clouds: Sequence[Tensor | None]) -> Tensor | None:
+    known = [points for points in clouds if points is not None]
+    if not known:
+        return None
+    if len(known) < len(clouds):
+        raise InputError("loaded", "frames with LiDAR points, or frames without", f"{len(known)} of {len(clouds)} with")
+    most = max(points.shape[1] for points in known)
+    return torch.cat([pad(points, (0, 0, 0, most - points.shape[1]), value=torch.nan) for points in known])
 
 
 def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:

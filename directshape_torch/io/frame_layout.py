@@ -76,6 +76,14 @@ class FrameLayout(Protocol):
         """The LiDAR scan of a frame and a calibration that places it in the camera, or None where there is no scan."""
         ...
 
+    def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
+        """By role: the scan of a frame in a folder of scans ("lidar"), and a file of the scanner's place."""
+        ...
+
+    def lidar_calibration(self, frame_id: str) -> KittiCalibration:
+        """The calibration that places the scanner in the camera, where its format can."""
+        ...
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """When the left and the right image were taken, seconds from any start, or None where no file says so."""
         ...

@@ -18,7 +18,7 @@ class KittiStereoDataset(FileStereoDataset):
         detections_dir: folder of `NNNNNN.txt` result files, or the one above a folder `data` with them.
         masks: folder of masks (see `mask_source`), a `MaskSource`, or None: then no car has a mask.
         options: `split`, `frames`, `classes`, `ground`, `camera_height_m`, `disparity_field`, `disparity_dir`,
-            `dtype`, as `FileStereoDataset` has them.
+            `lidar_dir`, `dtype`, as `FileStereoDataset` has them.
 
     Raises:
         DataFormatError: a folder or the split file is missing.

@@ -45,7 +45,15 @@ class KittiTextLayout(ABC):
     def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
         """The scan, where there is one, with the matrices of the calibration file."""
         path = self.scan_file(frame_id)
-        return None if path is None or not path.is_file() else (path, self.calibration(frame_id))
+        return None if path is None or not path.is_file() else (path, self.lidar_calibration(frame_id))
+
+    def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
+        """`folder/NNNNNN.bin`."""
+        return {"lidar": folder / f"{frame_id}.bin"}
+
+    def lidar_calibration(self, frame_id: str) -> KittiCalibration:
+        """The calibration of the frame, which places the scanner too."""
+        return self.calibration(frame_id)
 
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """None: no file of this layout says so."""

@@ -32,7 +32,7 @@ def open_dataset(
         detections_dir: folder of detections; None for "folder" only: `root/frames`.
         masks: folder of masks, a `MaskSource`, or None: those of a "folder", else none.
         options: see `FileStereoDataset`: split, frames, classes, ground, camera_height_m, disparity_field,
-            disparity_dir, dtype.
+            disparity_dir, lidar_dir, dtype.
 
     Raises:
         DataFormatError: a folder is missing or not laid out so.

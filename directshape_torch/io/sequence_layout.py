@@ -111,13 +111,21 @@ class SequenceLayout(KittiTextLayout):
 
     def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
         """Raw recordings have a file of its own for the place of the LiDAR; without it a scan is of no use."""
-        found, velo_to_cam = super().scan(frame_id), self._split(frame_id)[0].velo_to_cam
-        if found is None or velo_to_cam is None:
-            return found
-        if not velo_to_cam.is_file():
-            return None
-        path, calibration = found
-        return path, replace(calibration, Tr_velo_to_cam=read_velo_to_cam(velo_to_cam))
+        velo_to_cam = self._split(frame_id)[0].velo_to_cam
+        return None if velo_to_cam is not None and not velo_to_cam.is_file() else super().scan(frame_id)
+
+    def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
+        """`folder/NNNNNN.bin`, of several sequences `folder/SEQUENCE/NNNNNN.bin`; raw: the scanner's place too."""
+        sequence, stem = self._split(frame_id)
+        place = {} if sequence.velo_to_cam is None else {"lidar_calibration": sequence.velo_to_cam}
+        return {"lidar": (folder if self._single else folder / sequence.name) / f"{stem}.bin", **place}
+
+    def lidar_calibration(self, frame_id: str) -> KittiCalibration:
+        """The matrices of the calibration file, in raw recordings with those of the file beside it."""
+        calibration, velo_to_cam = self.calibration(frame_id), self._split(frame_id)[0].velo_to_cam
+        return (
+            calibration if velo_to_cam is None else replace(calibration, Tr_velo_to_cam=read_velo_to_cam(velo_to_cam))
+        )
 
     def detection_path(self, frame_id: str) -> Path:
         """The frame's own file where there is one, else its sequence's."""

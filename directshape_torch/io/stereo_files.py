@@ -23,6 +23,7 @@ from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
 from directshape_torch.io.text_files import read_lines
+from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene import FrameBatch, GroundPlane, StereoCamera
 
 DEFAULT_CAMERA_HEIGHT_M = 1.65
@@ -38,6 +39,7 @@ class DatasetOptions(TypedDict, total=False):
     camera_height_m: float
     disparity_field: DisparityField | None
     disparity_dir: Path | str | None
+    lidar_dir: Path | str | None
     dtype: torch.dtype
 
 
@@ -56,6 +58,8 @@ class FileStereoDataset:
         disparity_field: residual disparity of the rig, or None.
         disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with the disparity maps of any stereo method, for the
             methods that fit a point cloud; None: they match the images themselves.
+        lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, which the calibration of the frames places; None: frames
+            come without points.
         dtype: of the tensors.
 
     Raises:
@@ -75,6 +79,7 @@ class FileStereoDataset:
         camera_height_m: float = DEFAULT_CAMERA_HEIGHT_M,
         disparity_field: DisparityField | None = None,
         disparity_dir: Path | str | None = None,
+        lidar_dir: Path | str | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if ground not in get_args(GroundSource):
@@ -93,6 +98,7 @@ class FileStereoDataset:
         self.disparity_dir = (
             None if disparity_dir is None else existing_folder(Path(disparity_dir), "is no folder of disparity maps")
         )
+        self.lidar_dir = None if lidar_dir is None else existing_folder(Path(lidar_dir), "is no folder of LiDAR scans")
         self.dtype = dtype
         self.frame_ids = self._choose_frames(split, frames)
 
@@ -122,6 +128,7 @@ class FileStereoDataset:
             ground=ground,
             frame_ids=(frame_id,),
             disparity=self._disparity(frame_id, (height, width)),
+            points_cam=self._points(frame_id, (height, width)),
         )
         objects = self.objects(frame_id)
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
@@ -148,6 +155,8 @@ class FileStereoDataset:
         }
         if self.disparity_dir is not None:
             files["disparity"] = self.layout.disparity_path(self.disparity_dir, frame_id)
+        if self.lidar_dir is not None:
+            files |= self.layout.lidar_files(self.lidar_dir, frame_id)
         plane = self.layout.plane_path(frame_id)
         if self.ground in ("auto", "file") and plane is not None:
             files["ground_plane"] = plane
@@ -190,6 +199,15 @@ class FileStereoDataset:
             return None
         disparity = read_disparity(self.layout.disparity_path(self.disparity_dir, frame_id), size_hw)
         return torch.from_numpy(disparity)[None].to(self.dtype)
+
+    def _points(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
+        if self.lidar_dir is None:
+            return None
+        # Of a camera without a disparity field: a scan has no part in the rig's error.
+        calibration = self.layout.lidar_calibration(frame_id)
+        camera = to_stereo_camera([calibration], dtype=torch.float64)
+        points = read_scan(self.layout.lidar_files(self.lidar_dir, frame_id)["lidar"], calibration, camera)
+        return in_image(points, size_hw, camera)[None].to(self.dtype)
 
     def _ground(
         self, frame_id: str, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera

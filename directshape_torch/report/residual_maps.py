@@ -14,19 +14,20 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from directshape_torch.geometry import se3
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import warp_to_right
 from directshape_torch.image.gradients import grey_levels
 from directshape_torch.image.interpolate import bilinear_with_gradient
+from directshape_torch.ray_cast import cast
 from directshape_torch.report.pictures import Window
-from directshape_torch.residuals.silhouette import clamp_foreground, project_closest_approach, silhouette_residual
 from directshape_torch.scene import StereoCamera
-from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.silhouette import closest_approach_residual
 
 Floats = npt.NDArray[np.floating[Any]]
 
-_SAMPLES_PER_RAY = 32
 # A near car needs no ray for each of its pixels.
 _MOST_COLUMNS = 240
 # Two exposures differ by a few percent (as in the energy); more is a wrong place.
@@ -103,26 +104,19 @@ def residual_maps(
     """Both maps of a car in one state."""
     grid = pixel_grid(window)
     uv = grid.reshape(-1, 2)
-    T = torch.from_numpy(np.asarray(T_cam_obj)).to(prior.origin)
-    shape = prior.bind(torch.from_numpy(np.asarray(code))[None].to(prior.origin))
+    T, code_of_car = (torch.from_numpy(np.asarray(x))[None].to(prior.origin) for x in (T_cam_obj, code))
     ray_cam = rays_from_pixels(uv, pair.camera.K_left[0])
-    rays = ObjectRays(
-        (-T[:3, :3].T @ T[:3, 3]).expand_as(ray_cam), ray_cam @ T[:3, :3], torch.zeros(len(uv), dtype=torch.int64)
-    )
-    marched = march(shape, rays, prior.bounds_obj, _SAMPLES_PER_RAY)
-    closest = closest_approach_depth(marched)
-    closest_sdf = shape.value(rays.at(closest), rays.object_index)
-    root = first_crossing(shape, rays, marched, closest, closest_sdf=closest_sdf)
+    seen = cast(prior, CarState(se3.inverse(T), code_of_car), torch.zeros_like(ray_cam[0]), ray_cam)
     out = torch.from_numpy(hidden)[uv[:, 1].long(), uv[:, 0].long()]
     photometric = None
     if pair.right is not None:
-        photometric = _photometric(pair, uv, ray_cam, root.depth, root.found & ~out, settings)
+        hit = seen.depth.isfinite()
+        photometric = _photometric(pair, uv, ray_cam, seen.depth.where(hit, 1.0), hit & ~out, settings)
     silhouette = None
     if foreground is not None:
-        missed = torch.where(marched.crosses_bounds, closest_sdf, torch.full_like(closest_sdf, torch.inf))
         p_fg = torch.from_numpy(foreground)[uv[:, 1].long(), uv[:, 0].long()].to(uv)
-        zeta = _zeta(pair.camera, float(T[2, 3]), settings)
-        silhouette = torch.where(out, torch.zeros_like(p_fg), _silhouette(missed, p_fg, zeta, settings))
+        zeta = _zeta(pair.camera, float(T[0, 2, 3]), settings)
+        silhouette = torch.where(out, torch.zeros_like(p_fg), _silhouette(seen.closest_sdf, p_fg, zeta, settings))
     size = grid.shape[:2]
     return ResidualMaps(
         None if photometric is None else photometric.reshape(size).numpy(),
@@ -151,10 +145,9 @@ def _photometric(
 
 def _silhouette(closest_sdf: Tensor, p_fg: Tensor, zeta: float, settings: MapSettings) -> Tensor:
     """The residual with the sign of projection minus mask."""
-    finite = closest_sdf.nan_to_num(posinf=settings.saturation)
-    projection = project_closest_approach(finite, torch.full_like(p_fg, zeta), settings.saturation)
-    p_fg = clamp_foreground(p_fg, settings.probability_floor)
-    return silhouette_residual(projection, p_fg) * torch.sign(projection.log_hit.exp() - p_fg)
+    p_fg = p_fg.clamp(settings.probability_floor, 1 - settings.probability_floor)
+    residual, _ = closest_approach_residual(closest_sdf, torch.full_like(p_fg, zeta), settings.saturation, p_fg)
+    return residual * torch.sign(torch.sigmoid(-zeta * closest_sdf) - p_fg)
 
 
 def _zeta(camera: StereoCamera, depth_m: float, settings: MapSettings) -> float:

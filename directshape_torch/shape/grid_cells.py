@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.device_constants import constant_like
 from directshape_torch.geometry.short_axes import length
+from directshape_torch.numerics.device_constants import constant_like
 
 
 class GridField(NamedTuple):

@@ -13,10 +13,10 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from directshape_torch.device_constants import constant_like
+from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.table_lookup import take
 from directshape_torch.shape.grid_cells import Cells, GridField, Lookup, cells_at
 from directshape_torch.shape.traced_lookup import traced_derivatives_at, traced_value_at
-from directshape_torch.table_lookup import take
 
 # What belongs to the 8, 4, 2 or 1 corners that are left of a cell: one tensor, corners first, or a list where a tensor
 # would not stay in the caches.

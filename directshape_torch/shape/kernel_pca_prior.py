@@ -13,8 +13,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.checks import check_shape
 from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance, training_codes
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives

@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.checks import check_shape
-from directshape_torch.device_constants import constant_like
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.device_constants import constant_like
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.checks import check_shape
-from directshape_torch.device_constants import constant_like
 from directshape_torch.errors import InputError
-from directshape_torch.shape.sdf_grid import GridMemory, GridShape
+from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.shape.zero_level import zero_level_extents
 
@@ -128,24 +128,15 @@ class PCAShapePrior(nn.Module):
         """Codes of the mean shape, (B, K) zeros."""
         return self.mean.new_zeros(num_objects, self.num_codes)
 
-    def values(self, code: Tensor, memory: GridMemory | None = None) -> Tensor:
-        """Signed distance at the nodes, (B, nx, ny, nz), metres, for codes (B, K).
-
-        With a memory, whose last values end, nothing can be differentiated.
-        """
+    def values(self, code: Tensor) -> Tensor:
+        """Signed distance at the nodes, (B, nx, ny, nz), metres, for codes (B, K)."""
         check_shape("code", code, ("B", self.num_codes))
-        if memory is None:
-            flat = torch.addmm(self.mean.reshape(1, -1), code, self.basis.reshape(-1, self.num_codes).T)
-        else:
-            flat = memory.values(self.mean, self.basis, code)
+        flat = torch.addmm(self.mean.reshape(1, -1), code, self.basis.reshape(-1, self.num_codes).T)
         return flat.reshape(-1, *self.mean.shape)
 
-    def bind(self, code: Tensor, memory: GridMemory | None = None) -> GridShape:
-        """The fields of B objects with codes (B, K): the basis collapses into one grid per object.
-
-        With a memory the shape lives until the next one is bound with it, and cannot be differentiated by the code.
-        """
-        return GridShape(self.values(code, memory), self.basis, self.origin, self.spacing_m)
+    def bind(self, code: Tensor) -> GridShape:
+        """The fields of B objects with codes (B, K): the basis collapses into one grid per object."""
+        return GridShape(self.values(code), self.basis, self.origin, self.spacing_m)
 
     def dimensions_hwl(self, code: Tensor) -> Tensor:
         """Height, width and length (B, 3), metres, that codes (B, K) have by the linear map of the training cars.

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.checks import check_shape
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 NEAR_SURFACE_M = 0.07

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.checks import check_shape
 from directshape_torch.errors import MeshError
+from directshape_torch.numerics.checks import check_shape
 
 if TYPE_CHECKING:
     import trimesh

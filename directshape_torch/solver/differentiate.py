@@ -14,7 +14,14 @@ from torch import Tensor
 
 from directshape_torch.solver.damped_solve import damped_step, limit_step
 from directshape_torch.solver.gauss_newton import Iteration, Minimum
-from directshape_torch.solver.problem import DifferentiableProblem, Linearisation, StateT, take_rows, where_rows
+from directshape_torch.solver.problem import (
+    DifferentiableProblem,
+    DifferentiableStage,
+    EnergyAt,
+    StateT,
+    take_rows,
+    where_rows,
+)
 
 
 class NotStationaryWarning(UserWarning):
@@ -48,14 +55,14 @@ def unrolled_state(
     from_the_end = led_to_the_end.long().flip(0).cumsum(0).flip(0)
     repeated = led_to_the_end & (from_the_end <= num_iterations)
     state = where_rows(from_the_end[0] <= num_iterations, start, _first_states(trajectory, repeated))
-    stages, begun = problem.stages(), -1
+    stages, begun, stage = problem.stages(), -1, None
     for iteration, taken in zip(trajectory, repeated, strict=True):
         if not bool(taken.any()):
             continue
-        if iteration.stage != begun:
+        if stage is None or iteration.stage != begun:
             begun = iteration.stage
-            problem.begin_stage(stages[begun], take_rows(minimum.stage_starts[begun], rows))
-        state = where_rows(taken, _step(problem, state, iteration), state)
+            stage = problem.begin(stages[begun], problem.look(take_rows(minimum.stage_starts[begun], rows)))
+        state = where_rows(taken, _step(stage, state, iteration), state)
     return _with_values(take_rows(minimum.state, rows), state)
 
 
@@ -107,34 +114,34 @@ def implicit_state(
         States of the R problems: the values of `minimum`; unknowns at a bound are constants.
     """
     state = take_rows(minimum.state, rows)
-    problem.begin_stage(problem.stages()[-1], take_rows(minimum.stage_starts[-1], rows))
-    free = problem.free_unknowns(state)
+    stage = problem.begin(problem.stages()[-1], problem.look(take_rows(minimum.stage_starts[-1], rows)))
+    free = stage.free_unknowns(state)
     delta = torch.zeros(free.shape, dtype=torch.float64, device=free.device)
-    at, J = _gradient_and_its_jacobian(problem, state, delta, exact)
+    at, J = _gradient_and_its_jacobian(stage, state, delta, exact)
     both = free[:, :, None] & free[:, None, :]
     J = torch.where(both, J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
     factor, pivots, info = torch.linalg.lu_factor_ex(J)
     gradient = torch.where(free, at.gradient, torch.zeros_like(at.gradient))
     remaining = torch.linalg.lu_solve(factor, pivots, gradient.detach()[..., None])[..., 0]
-    size = (remaining.abs() / problem.step_limits().to(remaining)).amax(dim=-1)
+    size = (remaining.abs() / stage.step_limits().to(remaining)).amax(dim=-1)
     stationary = (info == 0) & size.isfinite() & (size <= max_remaining_step)
     _warn_of_the_others(stationary, rows if names is None else names)
     # The graph runs through the gradient alone; where it is not used the system is replaced, so that no NaN passes.
     safe = torch.where(stationary[:, None, None], J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
     gradient = torch.where(stationary[:, None], gradient, torch.zeros_like(gradient))
     step = -torch.linalg.solve(safe, gradient[..., None])[..., 0]
-    return _with_values(state, problem.retract(state, step - step.detach()))
+    return _with_values(state, stage.retract(state, step - step.detach()))
 
 
 def _gradient_and_its_jacobian(
-    problem: DifferentiableProblem[StateT], state: StateT, delta: Tensor, exact: bool
-) -> tuple[Linearisation, Tensor]:
+    stage: DifferentiableStage[StateT], state: StateT, delta: Tensor, exact: bool
+) -> tuple[EnergyAt, Tensor]:
     """g with its graph to the problem, and its Jacobian (R, D, D) by the tangent at the state, without one."""
     if not exact:
-        at = problem.linearise_differentiably(state)
+        at = stage.linearise_differentiably(state)
         return at, at.hessian.detach()
     delta = delta.requires_grad_()
-    at = problem.linearise_differentiably(problem.retract(state, delta))
+    at = stage.linearise_differentiably(stage.retract(state, delta))
     # Each row of g belongs to one problem, so the sum over the problems has the rows of all of them at once.
     rows = [torch.autograd.grad(g.sum(), delta, retain_graph=True)[0] for g in at.gradient.unbind(dim=1)]
     return at, torch.stack(rows, dim=1)
@@ -156,11 +163,11 @@ def _listed(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
 
 
-def _step(problem: DifferentiableProblem[StateT], state: StateT, iteration: Iteration[StateT]) -> StateT:
-    at = problem.linearise_differentiably(state)
+def _step(stage: DifferentiableStage[StateT], state: StateT, iteration: Iteration[StateT]) -> StateT:
+    at = stage.linearise_differentiably(state)
     step, _ = damped_step(at.hessian, at.gradient, iteration.damping)
     step = step * iteration.lengths[:, None]
-    return problem.retract(state, limit_step(step, problem.step_limits().to(step)))
+    return stage.retract(state, limit_step(step, stage.step_limits().to(step)))
 
 
 def _rows_of(iteration: Iteration[StateT], rows: Tensor) -> Iteration[StateT]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic
+from typing import Any, Generic
 
 import torch
 from torch import Tensor
@@ -12,11 +12,10 @@ from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.solver.damped_solve import step_lengths
 from directshape_torch.solver.iteration import RUNNING, Outcome, begin, has_failed, iterate
 from directshape_torch.solver.problem import (
+    BegunStage,
     Problem,
-    StageProblem,
     StateT,
     put_rows,
-    take_rows,
     where_rows,
 )
 from directshape_torch.status import Status, is_refined
@@ -55,6 +54,9 @@ class Minimum(Generic[StateT]):
         cost_history: cost of the current state after each iteration, (B, iterations done in all), NaN where a problem
             took no part. Costs of different stages are not comparable.
         stage_starts: states at which each stage began and fixed its sets.
+        stage: the last stage that has begun, of all problems.
+        seen_initial, seen_end: what the problem's `look` gave at the input states and where the iterations ended.
+        before, after: the last stage's figures there.
         trajectory: all iterations in order, if they were asked for.
     """
 
@@ -63,7 +65,12 @@ class Minimum(Generic[StateT]):
     status: Tensor
     iterations: Tensor
     cost_history: Tensor
-    stage_starts: tuple[StateT, ...] = ()
+    stage_starts: tuple[StateT, ...]
+    stage: Any
+    seen_initial: Any
+    seen_end: Any
+    before: Any
+    after: Any
     trajectory: tuple[Iteration[StateT], ...] = ()
 
 
@@ -141,32 +148,49 @@ def minimise(
         record: keep the trajectory.
     """
     with torch.no_grad():
-        state = initial if start is None else start
+        seen_initial = problem.look(initial)
+        state, seen = (initial, seen_initial) if start is None or start is initial else (start, problem.look(start))
         num_problems = len(initial[0])
-        device = initial[0].device
-        ended = torch.full((num_problems,), RUNNING, device=device)
+        ended = torch.full((num_problems,), RUNNING, device=initial[0].device)
         iterations = torch.zeros_like(ended)
         unfailed = _Unfailed(ended < 0, list(range(num_problems)))
         history: list[Tensor] = []
         starts: list[StateT] = []
         trajectory: list[Iteration[StateT]] | None = [] if record else None
-        for stage in problem.stages():
-            part = problem.begin_stage(stage, state)
+        for config_of_stage in problem.stages():
+            stage = problem.begin(config_of_stage, seen)
             starts.append(state)
-            log = _Log(history, trajectory, len(starts) - 1, state, stage.over_relaxation)
-            state, ended, done, unfailed = _run_stage(part, stage, state, ended, unfailed, config, log)
+            log = _Log(history, trajectory, len(starts) - 1, state, config_of_stage.over_relaxation)
+            state, ended, done, unfailed = _run_stage(stage, config_of_stage, state, seen, ended, unfailed, config, log)
             iterations = iterations + done
-        status = _final_status(problem, initial, state, ended)
-        refined = is_refined(status)
-        columns = torch.cat(history, dim=1) if history else torch.empty(num_problems, 0, device=device)
-        final = where_rows(refined, state, initial)
-        return Minimum(final, state, status, iterations, columns, tuple(starts), tuple(trajectory or ()))
+            seen = problem.look(state)
+        before, after = stage.figures(seen_initial), stage.figures(seen)
+        # Compared at the final stage: nothing ends worse than it began.
+        status = torch.where(ended < 0, Status.max_iterations.code, ended)
+        worse = ~(after.cost <= before.cost)
+        status = torch.where(worse & ~has_failed(ended), Status.rejected_worse.code, status)
+        nothing = torch.empty(num_problems, 0, device=initial[0].device)
+        return Minimum(
+            state=where_rows(is_refined(status), state, initial),
+            end=state,
+            status=status,
+            iterations=iterations,
+            cost_history=torch.cat(history, dim=1) if history else nothing,
+            stage_starts=tuple(starts),
+            stage=stage,
+            seen_initial=seen_initial,
+            seen_end=seen,
+            before=before,
+            after=after,
+            trajectory=tuple(trajectory or ()),
+        )
 
 
 def _run_stage(
-    part: StageProblem[StateT],
+    begun: BegunStage[StateT],
     stage: StageConfig,
     state: StateT,
+    seen: Any,
     ended: Tensor,
     unfailed: _Unfailed,
     config: SolverConfig,
@@ -177,14 +201,12 @@ def _run_stage(
     numbers = unfailed.numbers
     if not numbers:
         return state, ended, iterations, unfailed
+    part, at_state = begun.start(seen)
+    progress = begin(state, at_state, ended, config)
+    rows = torch.arange(len(ended), device=ended.device)
     if len(numbers) < len(ended):
         rows = torch.nonzero_static(unfailed.keep, size=len(numbers))[:, 0]
-        part = part.compact(unfailed.keep, numbers)
-        progress = begin(part, take_rows(state, rows), ended[rows], config)
-    else:
-        # The very tensors at which the stage was begun: a problem may remember them.
-        rows = torch.arange(len(ended), device=ended.device)
-        progress = begin(part, state, ended, config)
+        part, progress = progress.take(part, unfailed.keep, numbers)
     limits = part.step_limits().to(progress.at_state.gradient)
     failed: set[int] = set()
     done = 0
@@ -200,12 +222,15 @@ def _run_stage(
         places = [place for place, code in enumerate(codes) if code < 0]
         if len(places) < len(numbers):
             state, ended, iterations = progress.scatter(rows, state, ended, iterations)
+            numbers = [numbers[place] for place in places]
+            if not numbers or done == stage.max_iterations:
+                numbers = []
+                break
             keep = progress.ended < 0
-            index = torch.nonzero_static(keep, size=len(places))[:, 0]
-            rows, numbers = rows[index], [numbers[place] for place in places]
-            part = part.compact(keep, places)
-            progress = progress.take(index)
-    state, ended, iterations = progress.scatter(rows, state, ended, iterations)
+            rows = rows[torch.nonzero_static(keep, size=len(places))[:, 0]]
+            part, progress = progress.take(part, keep, places)
+    if numbers:
+        state, ended, iterations = progress.scatter(rows, state, ended, iterations)
     if done:
         unfailed = _Unfailed(~has_failed(ended), [number for number in unfailed.numbers if number not in failed])
     return state, ended, iterations, unfailed
@@ -215,10 +240,3 @@ def _read(ended: Tensor) -> list[int]:
     """How problems (B,) ended, read by the host: the only synchronisation of a block, at its end."""
     codes: list[int] = ended.tolist()
     return codes
-
-
-def _final_status(problem: Problem[StateT], initial: StateT, final: StateT, ended: Tensor) -> Tensor:
-    """Compare input and output at the final stage: nothing ends worse than it began."""
-    worse = ~(problem.cost(final) <= problem.cost(initial))
-    status = torch.where(ended < 0, Status.max_iterations.code, ended)
-    return torch.where(worse & ~has_failed(ended), Status.rejected_worse.code, status)

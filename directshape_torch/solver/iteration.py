@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, NamedTuple
+from typing import Any, Generic, NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
 from directshape_torch.solver.damped_solve import damped_step, is_finite, limited_step, step_lengths
-from directshape_torch.solver.problem import Linearisation, StageProblem, StateT, put_rows, take_rows, where_rows
+from directshape_torch.solver.problem import EnergyAt, StageProblem, StateT, put_rows, take_rows, where_rows
 from directshape_torch.status import Status
 
 # Of a problem that goes on; else the code of the status with which it ended.
@@ -35,24 +36,21 @@ class Progress(Generic[StateT]):
     state: StateT
     best_state: StateT
     best_cost: Tensor  # (B,)
-    at_state: Linearisation
+    at_state: Any  # `EnergyAt`
     damping: Tensor  # (B,)
     stretched: Tensor  # (B,) bool: where steps are over-relaxed, the next one is
     ended: Tensor  # (B,) status code or RUNNING
     iterations: Tensor  # (B,)
 
-    def take(self, index: Tensor) -> Progress[StateT]:
-        """That of some of the problems."""
-        return Progress(
-            take_rows(self.state, index),
-            take_rows(self.best_state, index),
-            self.best_cost[index],
-            take_rows(self.at_state, index),
-            self.damping[index],
-            self.stretched[index],
-            self.ended[index],
-            self.iterations[index],
-        )
+    def take(
+        self, problem: StageProblem[StateT], keep: Tensor, numbers: Sequence[int]
+    ) -> tuple[StageProblem[StateT], Progress[StateT]]:
+        """Those of the problems where `keep` (B,) holds, `numbers` of them, and their progress."""
+        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
+        part, at_state = problem.of_problems(keep, numbers, self.at_state)
+        state, best_state = (take_rows(state, index) for state in (self.state, self.best_state))
+        others = (self.damping, self.stretched, self.ended, self.iterations)
+        return part, Progress(state, best_state, self.best_cost[index], at_state, *(x[index] for x in others))
 
     def scatter(self, rows: Tensor, state: StateT, ended: Tensor, iterations: Tensor) -> tuple[StateT, Tensor, Tensor]:
         """Best states, ends and iterations of all problems, of which these are the rows."""
@@ -73,9 +71,8 @@ def has_failed(ended: Tensor) -> Tensor:
     return (ended >= 0) & (ended != Status.converged.code)
 
 
-def begin(problem: StageProblem[StateT], state: StateT, ended: Tensor, config: SolverConfig) -> Progress[StateT]:
-    """At the first states of a stage, with the ends (B,) of the stage before."""
-    at_state = problem.linearise(state)
+def begin(state: StateT, at_state: Any, ended: Tensor, config: SolverConfig) -> Progress[StateT]:
+    """At the first states of a stage and their evaluation, with the ends (B,) of the stage before."""
     fresh = torch.where(_is_finite(at_state), RUNNING, Status.non_finite.code)
     return Progress(
         state=state,
@@ -111,14 +108,13 @@ def iterate(
         step = step * step_lengths(p.stretched, over_relaxation).to(step.dtype).unsqueeze(1)
     step, size = limited_step(step, limits)
     candidate = problem.retract(p.state, step)
-    at_candidate = problem.linearise(candidate)
+    at_candidate = problem.evaluate(candidate, p.at_state)
     running = p.ended < 0
     usable = running & solvable
     decrease = p.at_state.cost - at_candidate.cost
     takeable = usable & _is_finite(at_candidate)
     downhill = takeable & (at_candidate.cost <= p.at_state.cost)
     accepted = takeable if config.accept_every_step else downhill
-    problem.follow(accepted)
     # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.
     at_limit = p.damping >= config.max_damping
     p.iterations = p.iterations + running
@@ -139,11 +135,11 @@ def iterate(
     p.ended = torch.where(hopeless, Status.singular.code, p.ended)
     if config.accept_every_step:
         p.ended = torch.where(usable & ~takeable, Status.non_finite.code, p.ended)
-    improved = _move(p, candidate, at_candidate, accepted, config)
+    improved = _move(problem, p, candidate, at_candidate, accepted, config)
     return Outcome(running, accepted, improved)
 
 
-def _changes_little(at: Linearisation, step: Tensor, decrease: Tensor, config: SolverConfig) -> Tensor:
+def _changes_little(at: EnergyAt, step: Tensor, decrease: Tensor, config: SolverConfig) -> Tensor:
     """Where (B,) a step that was refused promised next to nothing, and raised the cost by no more than that."""
     little = _FLAT * config.cost_tolerance * at.cost.abs()
     promised = -0.5 * (at.gradient * step).sum(dim=1)
@@ -151,11 +147,16 @@ def _changes_little(at: Linearisation, step: Tensor, decrease: Tensor, config: S
 
 
 def _move(
-    p: Progress[StateT], candidate: StateT, at_candidate: Linearisation, accepted: Tensor, config: SolverConfig
+    problem: StageProblem[StateT],
+    p: Progress[StateT],
+    candidate: StateT,
+    at_candidate: Any,
+    accepted: Tensor,
+    config: SolverConfig,
 ) -> Tensor:
     """To the candidates where they are accepted; returns where that made the best state."""
     p.state = where_rows(accepted, candidate, p.state)
-    p.at_state = where_rows(accepted, at_candidate, p.at_state)
+    p.at_state = problem.choose(accepted, at_candidate, p.at_state)
     if config.initial_damping > 0:
         smaller = (p.damping * config.damping_decrease).clamp_min(config.min_damping)
         larger = (p.damping * config.damping_increase).clamp_max(config.max_damping)
@@ -164,11 +165,12 @@ def _move(
         # Nothing uphill is taken: the present state is the best one.
         p.best_state, p.best_cost = p.state, p.at_state.cost
         return accepted
-    better = accepted & (at_candidate.cost <= p.best_cost)
+    better: Tensor = accepted & (at_candidate.cost <= p.best_cost)
     p.best_state = where_rows(better, candidate, p.best_state)
     p.best_cost = torch.where(better, at_candidate.cost, p.best_cost)
     return better
 
 
-def _is_finite(at: Linearisation) -> Tensor:
-    return is_finite(at.cost + at.gradient.sum(dim=1) + at.hessian.sum(dim=(1, 2)))
+def _is_finite(at: EnergyAt) -> Tensor:
+    total: Tensor = at.cost + at.gradient.sum(dim=1) + at.hessian.sum(dim=(1, 2))
+    return is_finite(total)

@@ -1,39 +1,55 @@
-"""What the solver sees of a batch of B independent least-squares problems of D unknowns each."""
+"""What the solver sees of a batch of B independent least-squares problems of D unknowns each.
+
+A problem is looked at, at a state; there a stage begins, whose iterations evaluate state after state, each near the
+one before. All of these are values: whoever needs one later keeps it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import StageConfig
 
+StateT = TypeVar("StateT", bound=tuple[Tensor, ...])
 
-class Linearisation(NamedTuple):
+
+class EnergyAt(Protocol):
     """Cost, gradient and Gauss-Newton matrix of each problem at one state, in float64."""
 
-    cost: Tensor  # (B,)
-    gradient: Tensor  # (B, D)
-    hessian: Tensor  # (B, D, D)
+    @property
+    def cost(self) -> Tensor:  # (B,)
+        ...
+
+    @property
+    def gradient(self) -> Tensor:  # (B, D)
+        ...
+
+    @property
+    def hessian(self) -> Tensor:  # (B, D, D)
+        ...
 
 
-StateT = TypeVar("StateT", bound=tuple[Tensor, ...])
+class FiguresAt(Protocol):
+    """What a stage says of a state; the solver compares nothing but costs."""
+
+    @property
+    def cost(self) -> Tensor:  # (B,)
+        ...
 
 
 class StageProblem(Protocol[StateT]):
     """What the iterations of a stage see of B problems, and of fewer and fewer of them."""
 
-    def linearise(self, state: StateT) -> Linearisation:
-        """Cost, gradient and Gauss-Newton matrix in the present stage."""
+    def evaluate(self, state: StateT, near: Any) -> Any:
+        """The `EnergyAt` a state next to that of another evaluation."""
         ...
 
-    def follow(self, accepted: Tensor) -> None:
-        """The states of these problems (B,) bool are now those of the latest `linearise`.
-
-        What is tracked from iteration to iteration moves on with them, and stays where it was for the others.
-        """
+    def choose(self, accepted: Tensor, new: Any, old: Any) -> Any:
+        """The new evaluation of problems whose step was accepted (B,) bool, the old one of the others."""
         ...
 
     def retract(self, state: StateT, step: Tensor) -> StateT:
@@ -44,8 +60,23 @@ class StageProblem(Protocol[StateT]):
         """Largest trusted step of each unknown, (D,)."""
         ...
 
-    def compact(self, keep: Tensor, numbers: Sequence[int]) -> StageProblem[StateT]:
-        """The same problems without those where `keep` (B,) is false; `numbers` of the others, which the host knows."""
+    def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Any) -> tuple[StageProblem[StateT], Any]:
+        """The same without the problems where `keep` (B,) is false, with their evaluation.
+
+        `numbers` of those that stay, which the host knows.
+        """
+        ...
+
+
+class BegunStage(Protocol[StateT]):
+    """A stage of all problems, with everything fixed that must not change while costs are compared."""
+
+    def start(self, seen: Any) -> tuple[StageProblem[StateT], Any]:
+        """What the iterations work on, and the `EnergyAt` the state where they begin."""
+        ...
+
+    def figures(self, seen: Any) -> Any:
+        """The `FiguresAt` a state, at which the problem was looked at by itself."""
         ...
 
 
@@ -54,16 +85,28 @@ class Problem(Protocol[StateT]):
 
     def stages(self) -> Sequence[StageConfig]: ...
 
-    def begin_stage(self, stage: StageConfig, state: StateT) -> StageProblem[StateT]:
-        """Fix everything that must not change while costs are compared; what the stage's iterations work on."""
+    def look(self, state: StateT) -> Any:
+        """What everything that is asked of a state begins with."""
         ...
 
-    def cost(self, state: StateT) -> Tensor:
-        """Cost (B,) of a state in the present stage."""
+    def begin(self, stage: StageConfig, seen: Any) -> BegunStage[StateT]:
+        """A stage that begins at a state that was looked at."""
+        ...
+
+
+class DifferentiableStage(BegunStage[StateT], Protocol):
+    """A stage whose linearisation can be differentiated, by the state and by whatever the problem is made of."""
+
+    def linearise_differentiably(self, state: StateT) -> Any:
+        """The `EnergyAt` a state, with an autograd graph to the state and to the problem's own inputs."""
+        ...
+
+    def free_unknowns(self, state: StateT) -> Tensor:
+        """Unknowns (B, D) that are not held by a bound, bool."""
         ...
 
     def retract(self, state: StateT, step: Tensor) -> StateT:
-        """The state moved by tangent vectors (B, D): the only place where a state changes."""
+        """The state moved by tangent vectors (B, D)."""
         ...
 
     def step_limits(self) -> Tensor:
@@ -72,15 +115,9 @@ class Problem(Protocol[StateT]):
 
 
 class DifferentiableProblem(Problem[StateT], Protocol):
-    """A problem whose linearisation can be differentiated, by the state and by whatever the problem is made of."""
+    """A problem whose stages can be differentiated."""
 
-    def linearise_differentiably(self, state: StateT) -> Linearisation:
-        """`linearise` with an autograd graph to the state and to the problem's own inputs."""
-        ...
-
-    def free_unknowns(self, state: StateT) -> Tensor:
-        """Unknowns (B, D) that are not held by a bound, bool."""
-        ...
+    def begin(self, stage: StageConfig, seen: Any) -> DifferentiableStage[StateT]: ...
 
 
 def take_rows(state: StateT, index: Tensor) -> StateT:

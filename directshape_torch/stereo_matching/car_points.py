@@ -9,9 +9,9 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.table_lookup import occurrences
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.points import points_from_disparity
-from directshape_torch.table_lookup import occurrences
 
 _MASK_THRESHOLD = 0.5
 
@@ -78,7 +78,7 @@ def car_points(frames: FrameBatch, detections: Detections, config: PointCloudCon
     passed = _passes(frames, detections, config, object_index, points_cam.detach()).nonzero()[:, 0]
     object_index, points_cam = object_index[passed], points_cam[passed]
     counts = occurrences(object_index, len(detections))
-    kept = _every_nth(object_index, counts, config.max_points)
+    kept = every_nth(object_index, counts, config.max_points)
     return PointSamples(object_index[kept], points_cam[kept], counts)
 
 
@@ -117,7 +117,7 @@ def _passes(
     return near & (height >= config.min_height_m) & (height <= config.max_height_m)
 
 
-def _every_nth(object_index: Tensor, counts: Tensor, most: int) -> Tensor:
+def every_nth(object_index: Tensor, counts: Tensor, most: int) -> Tensor:
     """Rows of at most `most` points of each object, evenly spread over its pixels in row-major order."""
     first = torch.cumsum(counts, 0) - counts
     place = torch.arange(len(object_index), device=counts.device) - first[object_index]

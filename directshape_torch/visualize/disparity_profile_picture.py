@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from directshape_torch.disparity_profile import DisparityProfile, ProfileFigures
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile, ProfileFigures
 from directshape_torch.errors import InputError
 from directshape_torch.visualize.panel_row import write_panel_row
 
@@ -45,7 +45,7 @@ def write_profile_picture(path: Path | str, profile: DisparityProfile, names: Se
 
     Example:
         >>> import tempfile, torch
-        >>> from directshape_torch.disparity_profile import profile_offsets
+        >>> from directshape_torch.diagnosis.disparity_profile import profile_offsets
         >>> offsets, path = profile_offsets(), Path(tempfile.mkdtemp()) / "profiles.png"
         >>> curve = 5 + offsets[None] ** 2
         >>> write_profile_picture(path, DisparityProfile(offsets, 2 * curve, curve, torch.ones(1)), ["a car"], "cars")

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from directshape_torch.diagnosis.trust_model import LogisticHead
 from directshape_torch.io.atomic_files import write_bytes
 from directshape_torch.io.figure_files import figure_png, new_figure
-from directshape_torch.trust_model import LogisticHead
 from quality_calibration.fit import SigmaScales
 from quality_calibration.judgement import (
     ReliabilityBin,

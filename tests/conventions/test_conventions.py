@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
-from helpers.problems import DEFAULT, begun_problem
+from helpers.ground import cars_on
+from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from directshape_torch.energy.car_state import CarState, retract
-from directshape_torch.energy.photometric_term import PhotometricTerm
+from directshape_torch.depth import march
 from directshape_torch.geometry import box3d, se3
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
@@ -33,13 +33,15 @@ from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_c
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import RefinedBox, write_result_text
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.residuals.photometric import DSO_PATTERN
-from directshape_torch.residuals.priors import dimensions_prior, height_prior, shape_prior
-from directshape_torch.residuals.silhouette import project_product
-from directshape_torch.residuals.state_chain import sdf_state_jacobian
 from directshape_torch.result import RefinementResult
-from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
+from directshape_torch.shape.grid_cells import Lookup
+from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.terms.photometric import DSO_PATTERN
+from directshape_torch.terms.priors import dimensions_prior, height_prior, shape_prior
+from directshape_torch.terms.silhouette import sdf_state_jacobian
+from directshape_torch.terms.silhouette_product import product_residual
 
 ROOT = Path(__file__).parents[2]
 K = torch.tensor([[720.0, 0.0, 610.0], [0.0, 720.0, 172.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -90,7 +92,7 @@ def test_02_forbidden_names_do_not_occur() -> None:
                     used.add(name)
     assert len(used) > 500
     assert not used & {"pose", "poses", "extrinsic", "extrinsics", "w2c", "c2w"}
-    assert {"points_obj", "points_cam", "origin_obj"} <= used
+    assert {"points_obj", "points_cam", "centre_obj"} <= used
 
 
 def test_03_ref_is_rectified_camera_0() -> None:
@@ -229,8 +231,8 @@ def test_15_update_is_on_the_left_and_in_one_place() -> None:
         for path in (ROOT / "directshape_torch").rglob("*.py")
         if re.search(r"se3\.exp\([^)]*\) @ \w+\.T_obj_cam", path.read_text(encoding="utf-8"))
     ]
-    # `initial_search` makes start states by turning the input; all iterations go through `retract`.
-    assert set(callers) <= {"car_state.py", "initial_search.py"}
+    # `search` makes start states by turning the input; all iterations go through `retract`.
+    assert set(callers) <= {"cars.py", "search.py"}
 
 
 def test_16_the_code_is_whitened() -> None:
@@ -247,7 +249,8 @@ def test_17_signed_distances_are_negative_inside() -> None:
     assert inside < 0
     assert float(outside) == pytest.approx(0.5, abs=0.02)
     # With the paper's Phi = -sdf, pi = 1 - prod 1 / (exp(Phi zeta) + 1): inside the car the ray hits.
-    hit = project_product(torch.stack([inside, outside])[:, None], torch.full((2,), 30.0).double()).log_hit.exp()
+    # r = -log pi for a pixel that is surely foreground.
+    hit = torch.exp(-product_residual(torch.stack([inside, outside])[None], vector(30.0), vector(1.0 - 1e-15))[0])
     assert hit[0] > 0.99
     assert hit[1] < 0.01
 
@@ -287,10 +290,10 @@ def test_21_bias_is_measured_minus_true_disparity() -> None:
 
 def test_22_jacobians_are_out_in() -> None:
     gradient, X = vector(0.1, -0.6, 0.7), vector(1.0, -0.8, 0.4)
-    at = SdfDerivatives(vector(0.0), gradient[None], torch.zeros(1, 2).double())
+    points, at = X.view(3, 1, 1), Lookup(torch.zeros(1, 1), gradient.view(3, 1, 1), torch.zeros(1, 1, 2).double())
     J_sdf_point = gradient[None]
     J_point_state = torch.cat([torch.eye(3).double(), -So3.hat(X)], dim=1)  # of v + omega x X
-    J_sdf_state = sdf_state_jacobian(X[None], at)
+    J_sdf_state = sdf_state_jacobian(points, at.gradient, at)[0]
     torch.testing.assert_close(J_sdf_state[:, :6], J_sdf_point @ J_point_state)
     assert J_sdf_state.shape == (1, 8)
 
@@ -301,14 +304,15 @@ def test_23_residuals_are_predicted_minus_observed() -> None:
     assert (shape_is_larger.residual > 0).all()
     # A car predicted lower (greater y) than the ground: positive.
     T = se3.inverse(box3d.pose_from_kitti(vector(0, 1.9, 10), torch.tensor(0.0).double()))[None]
-    assert height_prior(T, vector(0, -1, 0)[None], vector(1.65), 0).residual > 0
+    assert height_prior(cars_on(vector(0, -1, 0), vector(1.65), 1), CarState(T, torch.zeros(1, 0))).residual > 0
     prior, scene = cached_street()
     darker_left = replace(scene.frames, images_left=scene.frames.images_left - 0.1)
     config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, brightness="none"))
-    problem, state = begun_problem(prior, darker_left, scene.detections, config)
-    term = next(t for t in problem.terms if isinstance(t, PhotometricTerm))
-    _, residual = term._usable_and_residual(problem.project(CarState(state.T_obj_cam, scene.code)))
-    assert float(residual.residual.median()) == pytest.approx(25.5, abs=3)  # right minus left
+    stage, state = begun_stage(prior, darker_left, scene.detections, config)
+    part = stage.photometric_part(figures_at(stage, CarState(state.T_obj_cam, scene.code)))
+    assert part is not None
+    counted = photometric_of(stage).row_weight > 0
+    assert float(part.residual[counted].median()) == pytest.approx(25.5, abs=3)  # right minus left
 
 
 def test_24_the_step_solves_h_delta_equals_minus_g() -> None:
@@ -320,17 +324,17 @@ def test_24_the_step_solves_h_delta_equals_minus_g() -> None:
 
 def test_25_letters() -> None:
     prior, scene = cached_street()
-    problem, state = begun_problem(prior, scene.frames, scene.detections)
+    stage, state = begun_stage(prior, scene.frames, scene.detections)
     B, K_, F = len(scene.detections), prior.num_codes, len(scene.frames)
     D, S, N = 6 + K_, DEFAULT.silhouette.samples_per_ray, len(DSO_PATTERN)
-    P = len(problem.left)
+    term, sight = photometric_of(stage), stage.problem.look(state)
+    P = len(term.pixels)
     H, W = scene.frames.images_left.shape[2:]
-    assert problem.left.uv.shape == (P, 2)
-    assert problem.project(state).left.march.sdf.shape == (P, S)
-    term = next(t for t in problem.terms if isinstance(t, PhotometricTerm))
-    assert term.fixed is not None
-    assert term.fixed.intensity_left.shape[1] == N == 8
-    at = problem.linearise(state)
+    assert term.pixels.uv.shape == (P, 2)
+    owner, rays = stage.problem.rays[0].owner, stage.problem.rays[0].in_objects(state.T_obj_cam)
+    assert march(sight.field, owner, rays, prior.bounds_obj, S).sdf.shape == (S, len(owner), 64)
+    assert len(term.pixel_set.rows.intensity_left) == N == 8
+    _, at = stage.start(sight)
     assert (at.cost.shape, at.gradient.shape, at.hessian.shape) == ((B,), (B, D), (B, D, D))
     assert scene.frames.images_left.shape == (F, 3, H, W)
     assert scene.detections.mask_left.shape == (B, H, W)
@@ -338,12 +342,12 @@ def test_25_letters() -> None:
 
 def test_26_systems_are_float64() -> None:
     scene = cached_street()[1]
-    problem, state = begun_problem(
+    stage, state = begun_stage(
         ellipsoid_prior(torch.float32), scene.frames.to(dtype=torch.float32), scene.detections.to(dtype=torch.float32)
     )
-    at = problem.linearise(state)
+    _, at = stage.start(stage.problem.look(state))
     assert at.cost.dtype == at.gradient.dtype == at.hessian.dtype == torch.float64
-    assert problem.left.uv.dtype == state.code.dtype == torch.float32
+    assert photometric_of(stage).pixels.uv.dtype == state.code.dtype == torch.float32
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

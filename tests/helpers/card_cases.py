@@ -122,7 +122,7 @@ def waits_of_blocks() -> dict[str, Any]:
     refiner(*inputs)  # sends the constants
     with noted_waits() as waits:
         result = refiner(*inputs)
-    of_blocks = [wait for wait in waits if "_run_stage" in wait.functions]
+    of_blocks = [wait for wait in waits if "_run_stage" in wait.functions and "start" not in wait.functions]
     return {
         "blocks": sum(-(-stage.max_iterations // block) for stage in config.stages),
         "iterations": result.iterations.tolist(),

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry import se3
+from directshape_torch.terms.cars import CarState
 
 
 def moved(state: CarState, delta: Tensor) -> CarState:

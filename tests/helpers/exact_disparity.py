@@ -6,13 +6,13 @@ from dataclasses import replace
 from functools import lru_cache
 
 import torch
+from reference.rays import RaysObj, first_entry
 from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
 from directshape_torch.stereo_matching.points import disparity_of_depth
 from helpers.synthetic_scene import Street, cached_street
 
@@ -25,12 +25,11 @@ def exact_disparity(prior: PCAShapePrior, scene: Street) -> Tensor:
     uv = torch.stack([u, v], dim=-1).reshape(-1, 2).to(prior.origin)
     rays_cam = rays_from_pixels(uv, camera.K_left)
     shape, depth = prior.bind(scene.code), torch.full_like(uv[:, 0], torch.inf)
-    for i, T_obj_cam in enumerate(se3.inverse(scene.detections.T_cam_obj)):
-        own = torch.full_like(depth, i, dtype=torch.long)
-        rays = ObjectRays(T_obj_cam[:3, 3].expand_as(rays_cam), rays_cam @ T_obj_cam[:3, :3].T, own)
-        marched = march(shape, rays, prior.bounds_obj, 48)
-        root = first_crossing(shape, rays, marched, closest_approach_depth(marched), 12)
-        depth = torch.where(root.found & (root.depth < depth), root.depth, depth)
+    for i in range(len(scene.code)):
+        car = torch.full_like(depth, i, dtype=torch.long)
+        rays = RaysObj.of(se3.inverse(scene.detections.T_cam_obj), car, torch.zeros_like(rays_cam), rays_cam)
+        of_car, found = first_entry(rays, shape, prior.bounds_obj)
+        depth = torch.where(found & (of_car < depth), of_car, depth)
     disparity = disparity_of_depth(uv, depth, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])[:, 0]
     return torch.where(depth.isfinite(), disparity, torch.nan).view(1, height, width)
 

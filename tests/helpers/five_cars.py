@@ -9,12 +9,11 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.energy.car_problem import CarProblem
-from directshape_torch.energy.car_state import CarState
+from directshape_torch.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.solver.problem import StageProblem
+from directshape_torch.terms.cars import CarState
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detections, joined_frames, select, street
@@ -39,13 +38,13 @@ def begun_stage(
     stage: int = 1,
     cars: list[int] | None = None,
     term_weights: dict[str, Tensor] | None = None,
-) -> tuple[CarProblem, StageProblem[CarState], CarState]:
-    """The problem of some of the cars, what the iterations of a stage see of it, and the state where it began."""
+) -> tuple[CarStage, CarState]:
+    """A stage of the problem of some of the cars, and the state where it began."""
     prior, frames, detections = five_cars()
     if cars is not None:
         detections = select(detections, torch.tensor(cars, dtype=torch.long))
     problem, state = DirectShapeRefiner(prior, config).problem(frames, detections, term_weights)
-    return problem, problem.begin_stage(problem.stages()[stage], state), state
+    return problem.begin(problem.stages()[stage], problem.look(state)), state
 
 
 def with_solver(config: RefinerConfig, **changes: object) -> RefinerConfig:

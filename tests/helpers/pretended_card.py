@@ -25,7 +25,7 @@ from torch.utils import backend_registration
 from torch.utils._python_dispatch import return_and_correct_aliasing
 from torch.utils._pytree import tree_flatten, tree_map
 
-from directshape_torch import gradient_mode
+from directshape_torch.numerics import gradient_mode
 from helpers.host_traffic import INDEXED, WAITS
 
 
@@ -41,7 +41,7 @@ CARD = torch.device("card:0")
 
 # On a card tensors of a single number from the processor go with operations element by element, and with no others.
 _NO_SINGLE_NUMBERS = {"aten.cat", "aten.stack"}
-_PACKAGE = str(Path(gradient_mode.__file__).parent)
+_PACKAGE = str(Path(gradient_mode.__file__).parents[1])
 
 
 class Wait(NamedTuple):

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig, RefinerConfig, StageConfig
-from directshape_torch.energy.car_problem import CarProblem
-from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.projected_state import ProjectedState
+from directshape_torch.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.term import Figures
 
 DEFAULT = RefinerConfig(
     stages=(StageConfig(2.0, 1, 6), StageConfig(0.5, 0, 8)),
@@ -42,22 +43,27 @@ NORMALISED = replace(DEFAULT, photometric=replace(DEFAULT.photometric, patch="no
 CONFIGS = {"default": DEFAULT, "paper": PAPER, "truncated": TRUNCATED, "normalised": NORMALISED}
 
 
-def begun_problem(
+def begun_stage(
     prior: PCAShapePrior,
     frames: FrameBatch,
     detections: Detections,
     config: RefinerConfig = DEFAULT,
     stage: int = 1,
-) -> tuple[CarProblem, CarState]:
-    """A problem whose given stage has begun at the input state, and that state."""
+) -> tuple[CarStage, CarState]:
+    """A stage of the problem of these cars that has begun at the input state, and that state."""
     problem, state = DirectShapeRefiner(prior, config).problem(frames, detections)
-    problem.begin_stage(problem.stages()[stage], state)
-    return problem, state
+    return problem.begin(problem.stages()[stage], problem.look(state)), state
 
 
-def frozen_like(problem: CarProblem, state: CarState, at: ProjectedState) -> ProjectedState:
-    """The projection of another state whose intervals and sample depths stay those of `at`."""
-    return problem.project(state, frozen=at)
+def figures_at(stage: CarStage, state: CarState) -> Figures:
+    """The energy at a state, every ray of which is marched."""
+    return stage.figures(stage.problem.look(state))
+
+
+def photometric_of(stage: CarStage) -> Photometric:
+    """The photometric term of a stage that has one."""
+    assert stage.photometric is not None
+    return stage.photometric
 
 
 def with_code(state: CarState, code: Any) -> CarState:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from directshape_torch.config import StageConfig
-from directshape_torch.solver.problem import Linearisation
+from directshape_torch.solver.problem import take_rows, where_rows
 
 
 class Vector(NamedTuple):
@@ -18,8 +18,72 @@ class Vector(NamedTuple):
     x: Tensor  # (B, D)
 
 
-class ResidualProblem:
-    """Minimises `sum_i r_i(x)^2 / 2` of a residual given per problem, with the Jacobian by autograd."""
+class Energy(NamedTuple):
+    """Cost, gradient and Gauss-Newton matrix of B problems, and the point where they were evaluated."""
+
+    cost: Tensor  # (B,)
+    gradient: Tensor  # (B, D)
+    hessian: Tensor  # (B, D, D)
+    x: Tensor  # (B, D)
+
+
+class VectorProblem:
+    """B problems over points whose stages fix nothing: a `Problem`, its stages and its iterations in one.
+
+    A subclass says what the energy is and which problems are left when some have ended.
+    """
+
+    def __init__(self, stages: Sequence[StageConfig], num_unknowns: int, limit: float = 1e6) -> None:
+        self.stage_configs, self.num_unknowns, self.limit = list(stages), num_unknowns, limit
+        self.begun: list[StageConfig] = []
+
+    def energy(self, x: Tensor) -> Energy:
+        """At points (B, D)."""
+        raise NotImplementedError
+
+    def part(self, index: Tensor) -> Self:
+        """Some of the problems (Q,)."""
+        raise NotImplementedError
+
+    def stages(self) -> list[StageConfig]:
+        return self.stage_configs
+
+    def look(self, state: Vector) -> Vector:
+        return state
+
+    def begin(self, stage: StageConfig, seen: Vector) -> Self:
+        self.begun.append(stage)
+        return self
+
+    def figures(self, seen: Vector) -> Energy:
+        return self.energy(seen.x)
+
+    def start(self, seen: Vector) -> tuple[Self, Energy]:
+        return self, self.evaluate(seen, None)
+
+    def evaluate(self, state: Vector, near: Energy | None) -> Energy:
+        return self.energy(state.x)
+
+    def choose(self, accepted: Tensor, new: Energy, old: Energy) -> Energy:
+        return where_rows(accepted, new, old)
+
+    def retract(self, state: Vector, step: Tensor) -> Vector:
+        return Vector(state.x + step)
+
+    def step_limits(self) -> Tensor:
+        return torch.full((self.num_unknowns,), self.limit, dtype=torch.float64)
+
+    def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Energy) -> tuple[Self, Energy]:
+        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
+        return self.part(index), take_rows(at, index)
+
+
+class ResidualProblem(VectorProblem):
+    """Minimises `sum_i r_i(x)^2 / 2` of a residual given per problem, with the Jacobian by autograd.
+
+    It keeps the points at which the iterations evaluated it, the points that each was said to be near, and how many
+    problems were left whenever some had ended.
+    """
 
     def __init__(
         self,
@@ -29,51 +93,33 @@ class ResidualProblem:
         stages: Sequence[StageConfig],
         limit: float = 1e6,
     ) -> None:
-        self.residual, self.identity, self.limit = residual, identity, limit
-        self.num_unknowns, self._stages = num_unknowns, list(stages)
-        self.begun: list[StageConfig] = []
+        super().__init__(stages, num_unknowns, limit)
+        self.residual, self.identity = residual, identity
         self.compactions: list[int] = []
         self.evaluated: list[Tensor] = []
-        self.followed: list[Tensor] = []
+        self.near: list[Tensor] = []
 
-    def stages(self) -> list[StageConfig]:
-        return self._stages
-
-    def begin_stage(self, stage: StageConfig, state: Vector) -> ResidualProblem:
-        self.begun.append(stage)
-        return self
-
-    def cost(self, state: Vector) -> Tensor:
-        r = self.residual(state.x, self.identity)
-        return 0.5 * (r * r).sum(1)
-
-    def linearise(self, state: Vector) -> Linearisation:
-        self.evaluated.append(state.x)
-        r = self.residual(state.x, self.identity)
-        if len(state.x):
+    def energy(self, x: Tensor) -> Energy:
+        r = self.residual(x, self.identity)
+        if len(x):
             with torch.enable_grad():
                 J = torch.func.vmap(torch.func.jacrev(lambda x, i: self.residual(x[None], i[None])[0]))(
-                    state.x, self.identity
+                    x, self.identity
                 )
         else:
             J = r.new_zeros(0, r.shape[1], self.num_unknowns)
-        gradient = (J.mT @ r[..., None])[..., 0]
-        return Linearisation(0.5 * (r * r).sum(1), gradient, J.mT @ J)
+        return Energy(0.5 * (r * r).sum(1), (J.mT @ r[..., None])[..., 0], J.mT @ J, x)
 
-    def follow(self, accepted: Tensor) -> None:
-        """Nothing is tracked; kept for tests of the loop."""
-        self.followed.append(accepted)
+    def evaluate(self, state: Vector, near: Energy | None) -> Energy:
+        self.evaluated.append(state.x)
+        if near is not None:
+            self.near.append(near.x)
+        return super().evaluate(state, near)
 
-    def retract(self, state: Vector, step: Tensor) -> Vector:
-        return Vector(state.x + step)
-
-    def step_limits(self) -> Tensor:
-        return torch.full((self.num_unknowns,), self.limit, dtype=torch.float64)
-
-    def compact(self, keep: Tensor, numbers: Sequence[int]) -> ResidualProblem:
-        self.compactions.append(int(keep.sum()))
-        part = ResidualProblem(self.residual, self.identity[keep], self.num_unknowns, self._stages, self.limit)
-        part.compactions, part.evaluated, part.followed = self.compactions, self.evaluated, self.followed
+    def part(self, index: Tensor) -> Self:
+        self.compactions.append(len(index))
+        part = type(self).__new__(type(self))
+        part.__dict__ = {**self.__dict__, "identity": self.identity[index]}
         return part
 
 

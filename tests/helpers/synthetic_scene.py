@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
+from reference.rays import RaysObj, first_entry
 from torch import Tensor
 
 from directshape_torch.geometry import se3
@@ -15,7 +16,6 @@ from directshape_torch.geometry.stereo import right_rays
 from directshape_torch.laboratory.scenes import select_detections
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, StereoCamera
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
 
 CAMERA_HEIGHT_M = 1.65
 BACKDROP_M = 150.0
@@ -57,14 +57,12 @@ def _render_side(
     visible = torch.full(depth.shape, -1)
     shape = prior.bind(code)
     for i in range(len(code)):
-        T_obj_cam = se3.inverse(T_cam_obj[i])
-        directions = ray_cam @ T_obj_cam[:3, :3].T
-        rays = ObjectRays(se3.transform(T_obj_cam, origin_cam), directions, torch.full(depth.shape, i))
-        marched = march(shape, rays, prior.bounds_obj, 48)
-        root = first_crossing(shape, rays, marched, closest_approach_depth(marched), 12)
-        nearer = root.found & (root.depth < depth)
-        depth = torch.where(nearer, root.depth, depth)
-        grey = torch.where(nearer, _texture(0.5 * rays.at(root.depth), 1.7 + i), grey)
+        rays = RaysObj.of(se3.inverse(T_cam_obj), torch.full(depth.shape, i), origin_cam, ray_cam)
+        of_car, found = first_entry(rays, shape, prior.bounds_obj)
+        nearer = found & (of_car < depth)
+        depth = torch.where(nearer, of_car, depth)
+        point_obj = rays.centre + of_car[:, None] * rays.direction
+        grey = torch.where(nearer, _texture(0.5 * point_obj, 1.7 + i), grey)
         visible = torch.where(nearer, torch.full_like(visible, i), visible)
     return grey, visible
 

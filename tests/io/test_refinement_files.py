@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.disparity_profile import DisparityProfile
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile
+from directshape_torch.diagnosis.observability import Observability
+from directshape_torch.diagnosis.quality import FitQuality
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.frame_detections import MatchingSummary
@@ -17,8 +19,6 @@ from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observability import Observability
-from directshape_torch.quality import FitQuality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, StereoCamera
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance

@@ -67,6 +67,9 @@ def test_tracking(kitti: Path, tmp_path: Path, expected: Points, single: bool) -
     folder = tmp_path / "velodyne" if single else tmp_path / "training" / "velodyne" / SEQUENCE
     put(kitti / "training" / "velodyne" / f"{FRAME}.bin", folder / f"{FRAME}.bin")
     torch.testing.assert_close(scanned(layout, frame_id), expected)
+    # `--lidar DIR` finds them in any folder.
+    named = layout.lidar_files(Path("scans"), frame_id)
+    assert named == {"lidar": Path("scans") / ("" if single else SEQUENCE) / f"{FRAME}.bin"}
 
 
 @pytest.mark.parametrize("single", [True, False])
@@ -85,6 +88,9 @@ def test_raw(kitti: Path, tmp_path: Path, expected: Points, single: bool) -> Non
         drive.parent / "calib_velo_to_cam.txt", f"calib_time: 15-Mar-2012 11:37:16\nR: {ROTATION}\nT: {TRANSLATION}\n"
     )
     torch.testing.assert_close(scanned(layout, frame_id), expected)
+    place = layout.lidar_files(Path("scans"), frame_id)["lidar_calibration"]
+    assert place == drive.parent / "calib_velo_to_cam.txt"
+    assert layout.lidar_calibration(frame_id).Tr_velo_to_cam is not None
 
 
 def test_a_plain_folder_has_none(kitti: Path, tmp_path: Path) -> None:

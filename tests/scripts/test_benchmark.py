@@ -2,87 +2,92 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import benchmark
 import pytest
+from benchmark_suites.baseline import Expected, write_baseline
+from benchmark_suites.figures import Row, SuiteResult
+from benchmark_suites.machine import describe_machine
 
-from directshape_torch.benchmark import run, suite_kernels
-from directshape_torch.benchmark.baseline import Expected, write_baseline
-from directshape_torch.benchmark.machine import describe_machine
-from directshape_torch.benchmark.report import read_run
-from directshape_torch.benchmark.rows import SuiteResult
-
-RATIO = "kernels: one iteration over the lookups it needs, eager"
+RATIO = "cpu: a ratio"
+_ROW = Row("cpu", "a ratio", 5.0, "", "ratio")
 
 
-def test_a_quick_run_writes_its_figures_and_fails_against_a_baseline_that_it_cannot_meet(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The suites that were run, each of which finds the one row."""
+    names: list[str] = []
+
+    def run_suite(name: str, _: object) -> SuiteResult:
+        names.append(name)
+        return SuiteResult(name, (_ROW,) if name == "cpu" else ())
+
+    monkeypatch.setattr(benchmark, "_run_suite", run_suite)
+    monkeypatch.delenv("DIRECTSHAPE_DATA", raising=False)
+    return names
+
+
+@pytest.mark.parametrize(("before", "code"), [(1.0, 1), (5.0, 0)])
+def test_figures_are_written_and_compared(
+    before: float, code: int, measured: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Compiling takes longer than a test may.
-    monkeypatch.setattr(suite_kernels, "available_modes", lambda: ("eager",))
-    baseline, out = tmp_path / "baseline.json", tmp_path / "run.json"
-    write_baseline(baseline, {RATIO: Expected(1e-6, "ratio", "lower", 0.3)})
-
-    arguments = ["--suite", "kernels", "--quick", "--json", str(out), "--check", "--baseline", str(baseline)]
-    code = benchmark.main(arguments)
-
-    printed = capsys.readouterr()
-    assert code == 1
-    assert f"regression: {RATIO}" in printed.out
-    assert "kernels: parts" in printed.err
-    written = read_run(out)
-    assert written.quick
-    assert "--suite kernels" in written.command_line
-    assert all(row.value > 0 for row in written.rows)
-    assert RATIO in {row.key for row in written.rows}
+    baseline, out = tmp_path / "baseline.json", tmp_path / "out" / "run.json"
+    write_baseline(baseline, {RATIO: Expected(before, "ratio", "lower", 0.3)})
+    arguments = ["--suite", "cpu", "--quick", "--json", str(out), "--check", "--baseline", str(baseline)]
+    assert benchmark.main(arguments) == code
+    assert (f"regression: {RATIO}" in capsys.readouterr().out) == bool(code)
+    written = json.loads(out.read_text())
+    assert written["quick"]
+    assert "--suite cpu" in written["command_line"]
+    assert written["suites"][0]["rows"][0]["value"] == 5.0
+    assert measured == ["cpu"]
 
 
-def test_quick_figures_are_no_baseline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert benchmark.main(["--quick", "--write-baseline", "--baseline", str(tmp_path / "b.json")]) == 2
-    assert "--write-baseline" in capsys.readouterr().err
+def test_without_a_choice_everything_is_measured_that_needs_nothing_else(measured: list[str]) -> None:
+    assert benchmark.main([]) == 0
+    assert measured == ["cpu", "scaling", "gpu"]
+    assert benchmark.main(["--profile"]) == 0
+    assert measured[3:] == ["profile"]
+
+
+def test_every_suite_is_there() -> None:
+    folder = Path(benchmark.__file__).parent / "benchmark_suites"
+    for module, function in benchmark.SUITES.values():
+        assert f"def {function}(" in (folder / f"{module}.py").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (["--quick", "--check"], "--check: expected a run without --quick"),
+        (["--quick", "--write-baseline", "--baseline", "b.json"], "--write-baseline: expected a run without --quick"),
         (["--threads", "0"], "--threads: expected at least 1, got 0"),
-        (["--suite", "cpu", "--plots", "out"], "--plots: expected the suite scaling"),
         (["--data", "nowhere", "--profile"], "--data or DIRECTSHAPE_DATA"),
         (["--json", "/proc/version/run.json"], "--json: expected a file in a folder that can be written to"),
+        (["--check", "--baseline", "none.json"], "--write-baseline"),
     ],
 )
 def test_wrong_use_is_told_before_anything_is_measured(
-    arguments: list[str], named: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], named: str, measured: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delenv("DIRECTSHAPE_DATA", raising=False)
-    monkeypatch.setattr(run, "_run_suite", lambda *_: pytest.fail("it was measured"))
     assert benchmark.main(arguments) == 2
     assert named in capsys.readouterr().err
+    assert measured == []
 
 
-def test_a_check_that_compares_nothing_has_found_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "_run_suite", lambda name, _: SuiteResult(name, ()))
+@pytest.mark.usefixtures("measured")
+def test_a_check_that_compares_nothing_has_found_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_baseline(tmp_path / "b.json", {RATIO: Expected(5.0, "ratio", "lower", 0.3)})
     assert benchmark.main(["--suite", "gpu", "--check", "--baseline", str(tmp_path / "b.json")]) == 2
-    printed = capsys.readouterr()
-    assert "compared 0 rows" in printed.out
-    assert "no regression" not in printed.out
+    assert "no regression" not in capsys.readouterr().out
     assert benchmark.main(["--suite", "gpu", "--write-baseline", "--baseline", str(tmp_path / "n.json")]) == 2
     assert not (tmp_path / "n.json").exists()
 
 
-def test_a_busy_machine_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_busy_machine_is_noted() -> None:
     machine = describe_machine()
-    for load, notes in ((machine.cores + 0.2, 0), (machine.cores + 1.0, 1)):
-        monkeypatch.setattr(run, "describe_machine", lambda load=load: replace(machine, load=load))
-        assert len(run._with_note_on_load(SuiteResult("cpu", ())).notes) == notes
-
-
-def test_a_check_without_a_baseline_says_how_to_make_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert benchmark.main(["--check", "--baseline", str(tmp_path / "none.json")]) == 2
-    assert "--write-baseline" in capsys.readouterr().err
+    assert not replace(machine, load=machine.cores + 0.2).is_busy
+    assert replace(machine, load=machine.cores + 1.0).is_busy

@@ -11,9 +11,9 @@ import torch
 from helpers.synthetic_scene import cached_street
 from quality_calibration import fit, judgement, noise, observations
 
-from directshape_torch.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.trust_model import load_trust_model
 from directshape_torch.geometry.box3d import rotation_y_from_pose
-from directshape_torch.trust_model import load_trust_model
 
 
 def simulated(count: int = 6000, frames: int = 24):

@@ -6,11 +6,9 @@ import torch
 from helpers.host_traffic import host_traffic
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance
-from directshape_torch.shape.sdf_grid import GridMemory
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
 
@@ -145,28 +143,6 @@ def test_bind_agrees_with_the_sum_over_components(prior):
     expected = prior.mean[4, 6, 3] + (prior.basis[4, 6, 3] * code[0]).sum()
     torch.testing.assert_close(prior.bind(code).value(point[None], torch.tensor([0]))[0], expected)
     assert prior.values(prior.initial_code(0)).shape == (0, *SHAPE)
-
-
-def test_shapes_bound_one_after_the_other_with_one_memory(prior):
-    memory, codes = GridMemory(), torch.randn(3, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-
-    def assert_bound(prior: PCAShapePrior, codes: Tensor) -> Tensor:
-        values = prior.bind(codes, memory).values
-        torch.testing.assert_close(values, prior.values(codes))
-        return values
-
-    first = assert_bound(prior, codes)
-    table = memory._table
-    second = assert_bound(prior, codes[1:])
-    assert second.data_ptr() == first.data_ptr()
-    assert memory._table is table
-    # A memory that is too small, or of other numbers, or of another prior, is replaced.
-    assert_bound(prior, codes.repeat(2, 1))
-    assert_bound(copy.deepcopy(prior).float(), codes.float())
-    assert_bound(prior.with_num_codes(2), codes[:, :2])
-    with torch.inference_mode():
-        prior.bind(codes.repeat(3, 1), memory)
-    assert_bound(prior, codes)
 
 
 def test_fewer_codes(prior):

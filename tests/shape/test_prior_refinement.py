@@ -85,4 +85,5 @@ def test_gradients_through_the_refinement_reach_the_tensors_of_the_prior(
     numeric = (refined(step)[0] - refined(-step)[0]) / (2 * step)
     _, by_autograd = refined(0.0)
     assert by_autograd.abs() > 1e-3
-    torch.testing.assert_close(by_autograd, numeric, atol=0, rtol=1e-3)
+    # Of shapes that tell nothing but values, where a ray comes closest moves as parabolas 3 cm wide have it.
+    torch.testing.assert_close(by_autograd, numeric, atol=0, rtol=1e-3 if kind == "pca" else 1e-2)

@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.quadratics import Vector
+from helpers.quadratics import Energy, Vector, VectorProblem
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.solver.differentiate import NotStationaryWarning, implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum, minimise
-from directshape_torch.solver.problem import Linearisation
 
 EXACT = SolverConfig(
     cost_tolerance=0.0,
@@ -24,21 +23,20 @@ EXACT = SolverConfig(
 STAGES = [StageConfig(2.0, 1, 30), StageConfig(1.0, 0, 60)]
 
 
-class Curved:
+class Curved(VectorProblem):
     """B curved least-squares problems in two unknowns that do not fit exactly; `theta` (B, 3) are their data.
 
     The residuals of the first stage are scaled: it has another minimum than the last one.
     """
 
-    def __init__(self, theta: Tensor, stages: list[StageConfig] = STAGES, bound: float = torch.inf) -> None:
-        self.theta, self._stages, self.bound, self.scale = theta, stages, bound, 1.0
+    def __init__(self, theta: Tensor, stages: Sequence[StageConfig] = STAGES, bound: float = torch.inf) -> None:
+        super().__init__(stages, num_unknowns=2, limit=1.0)
+        self.theta, self.bound, self.scale = theta, bound, 1.0
 
-    def stages(self) -> list[StageConfig]:
-        return self._stages
-
-    def begin_stage(self, stage: StageConfig, state: Vector) -> Curved:
-        self.scale = stage.contour_width_px
-        return self
+    def begin(self, stage: StageConfig, seen: Vector) -> Curved:
+        begun = Curved(self.theta, self.stage_configs, self.bound)
+        begun.scale = stage.contour_width_px
+        return begun
 
     def residual(self, x: Tensor, theta: Tensor) -> Tensor:
         a, b, c = theta.unbind(-1)
@@ -51,15 +49,11 @@ class Curved:
             dim=-1,
         )
 
-    def cost(self, state: Vector) -> Tensor:
-        r = self.residual(state.x, self.theta)
-        return 0.5 * (r * r).sum(dim=1)
-
-    def linearise(self, state: Vector) -> Linearisation:
+    def energy(self, x: Tensor) -> Energy:
         with torch.no_grad():
-            return self.linearise_differentiably(state)
+            return self.linearise_differentiably(Vector(x))
 
-    def linearise_differentiably(self, state: Vector) -> Linearisation:
+    def linearise_differentiably(self, state: Vector) -> Energy:
         x, (a, _, c) = state.x, self.theta.unbind(-1)
         r = self.residual(x, self.theta)
         cosine = c * torch.cos(x[:, 0] * x[:, 1])
@@ -72,10 +66,7 @@ class Curved:
             ],
             dim=1,
         )
-        return Linearisation(0.5 * (r * r).sum(dim=1), (J.mT @ r[..., None])[..., 0], J.mT @ J)
-
-    def follow(self, accepted: Tensor) -> None:
-        """Nothing is tracked."""
+        return Energy(0.5 * (r * r).sum(dim=1), (J.mT @ r[..., None])[..., 0], J.mT @ J, x)
 
     def retract(self, state: Vector, step: Tensor) -> Vector:
         return Vector((state.x + step).clamp(-self.bound, self.bound))
@@ -83,11 +74,8 @@ class Curved:
     def free_unknowns(self, state: Vector) -> Tensor:
         return state.x.abs() < self.bound
 
-    def step_limits(self) -> Tensor:
-        return torch.ones(2, dtype=torch.float64)
-
-    def compact(self, keep: Tensor, numbers: Sequence[int]) -> Curved:
-        part = Curved(self.theta[keep], self._stages, self.bound)
+    def part(self, index: Tensor) -> Curved:
+        part = Curved(self.theta[index], self.stage_configs, self.bound)
         part.scale = self.scale
         return part
 
@@ -104,7 +92,7 @@ def _polished(problem: Curved, minimum: Minimum[Vector]) -> Minimum[Vector]:
     """Costs decide to 1e-8 of the state only; differences of minima need more digits."""
     state = minimum.state
     for _ in range(60):
-        at = problem.linearise(state)
+        at = problem.energy(state.x)
         state = problem.retract(state, -torch.linalg.solve(at.hessian, at.gradient))
     return replace(minimum, state=state)
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
 import torch
-from helpers.quadratics import ResidualProblem, Vector, linear_problem
+from helpers.quadratics import Energy, ResidualProblem, Vector, linear_problem
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
@@ -43,7 +42,7 @@ def test_pure_gauss_newton_solves_linear_problems_in_one_step(count: int) -> Non
     result = minimise(problem, start(count), PURE)
     torch.testing.assert_close(result.state.x, solution)
     assert status_of(result.status) == [Status.converged] * count
-    torch.testing.assert_close(result.cost_history[:, 0], problem.cost(Vector(solution)))
+    torch.testing.assert_close(result.cost_history[:, 0], problem.energy(solution).cost)
     assert (result.iterations <= 2).all()
 
 
@@ -67,7 +66,7 @@ def test_accepting_every_step_goes_uphill_but_returns_the_best_state() -> None:
     free = replace(PURE, step_tolerance=0.0)
     problem = rosenbrock(1, [StageConfig(1.0, 0, 3)], limit=1e6)
     result = minimise(problem, start(1, 2, -1.0), free)
-    history = torch.cat([problem.cost(start(1, 2, -1.0)), result.cost_history[0]])
+    history = torch.cat([problem.energy(start(1, 2, -1.0).x).cost, result.cost_history[0]])
     # By hand: the first step leads to (1, -3), cost 72 after 20; the second to the minimum (1, 1).
     torch.testing.assert_close(history[:3], torch.tensor([20.0, 72.0, 0.0], dtype=torch.float64))
     torch.testing.assert_close(result.state.x, torch.ones(1, 2, dtype=torch.float64))
@@ -172,21 +171,23 @@ TWO_STAGES = [StageConfig(2.0, 1, 30), StageConfig(1.0, 0, 30)]
 
 @pytest.mark.parametrize("block", [1, 4])
 @pytest.mark.parametrize("kind", ["nan at the input", "singular", "nan after a step"])
-def test_what_failed_is_not_evaluated_in_the_next_stage(kind: str, block: int) -> None:
+def test_what_failed_takes_no_part_in_the_iterations_of_the_next_stage(kind: str, block: int) -> None:
     config = replace(PURE, block_iterations=block)
     problem = _poisoned(kind)
-    problem._stages = TWO_STAGES
+    problem.stage_configs = TWO_STAGES
     evaluated_before: list[int] = []
 
     class Counted(ResidualProblem):
-        def begin_stage(self, stage: StageConfig, state: Vector) -> ResidualProblem:
+        def begin(self, stage: StageConfig, seen: Vector) -> Counted:
             evaluated_before.append(len(self.evaluated))
-            return super().begin_stage(stage, state)
+            return super().begin(stage, seen)
 
     problem.__class__ = Counted
     result = minimise(problem, start(3, 2, -1.3), config)
-    second = [len(x) for x in problem.evaluated[evaluated_before[1] :]]
-    assert second[0] == max(second) == 2
+    # All are evaluated where a stage begins.
+    first_of_stage, *iterations = [len(x) for x in problem.evaluated[evaluated_before[1] :]]
+    assert first_of_stage == 3
+    assert iterations[0] == max(iterations) == 2
     healthy = minimise(rosenbrock(3, TWO_STAGES), start(3, 2, -1.3), config)
     others = torch.tensor([0, 2])
     assert torch.equal(result.state.x[others], healthy.state.x[others])
@@ -200,7 +201,7 @@ def test_what_failed_is_not_evaluated_in_the_next_stage(kind: str, block: int) -
 
 def test_stages_of_problems_that_have_all_failed_evaluate_nothing() -> None:
     problem = _poisoned("nan at the input")
-    problem.identity, problem._stages = torch.tensor([1, 1]), TWO_STAGES
+    problem.identity, problem.stage_configs = torch.tensor([1, 1]), TWO_STAGES
     result = minimise(problem, start(2, 2, -1.3), PURE)
     assert status_of(result.status) == [Status.non_finite] * 2
     assert len(problem.begun) == 2
@@ -212,7 +213,7 @@ def test_stages_of_problems_that_have_all_failed_evaluate_nothing() -> None:
 def test_what_failed_unseen_by_the_host_is_told_from_what_it_saw() -> None:
     """A stage without iterations is not read: its failures are only known at the end of the next block."""
     problem = _poisoned("nan at the input")
-    problem._stages = [StageConfig(2.0, 1, 0), *TWO_STAGES]
+    problem.stage_configs = [StageConfig(2.0, 1, 0), *TWO_STAGES]
     result = minimise(problem, start(3, 2, -1.3), PURE)
     healthy = minimise(rosenbrock(3, TWO_STAGES), start(3, 2, -1.3), PURE)
     assert status_of(result.status)[1] is Status.non_finite
@@ -233,9 +234,6 @@ def test_a_problem_that_can_only_get_worse_keeps_its_input() -> None:
         def retract(self, state: Vector, step: Tensor) -> Vector:
             return Vector(state.x - step)
 
-        def compact(self, keep: Tensor, numbers: Sequence[int]) -> ResidualProblem:
-            return Uphill(self.residual, self.identity[keep], 2, self.stages(), self.limit)
-
     base = rosenbrock(2)
     for config in (DAMPED, PURE):
         problem = Uphill(base.residual, base.identity, 2, ONE_STAGE, limit=1.0)
@@ -244,17 +242,19 @@ def test_a_problem_that_can_only_get_worse_keeps_its_input() -> None:
 
 
 def test_a_result_worse_than_the_input_is_rejected() -> None:
-    """The first stage leads away from what the last stage wants, and the last has no iterations to repair it."""
+    """What a stage says of a state afterwards decides, here the opposite of what its iterations lowered."""
 
     class Deceitful(ResidualProblem):
-        def cost(self, state: Vector) -> Tensor:
-            return -super().cost(state) if len(self.begun) == 2 else super().cost(state)
+        def figures(self, seen: Vector) -> Energy:
+            at = super().figures(seen)
+            return at._replace(cost=-at.cost)
 
     base, _ = linear_problem(2, 2, [])
-    problem = Deceitful(base.residual, base.identity, 2, [StageConfig(2.0, 1, 5), StageConfig(1.0, 0, 0)])
+    problem = Deceitful(base.residual, base.identity, 2, ONE_STAGE)
     result = minimise(problem, start(2, 2), DAMPED)
     assert status_of(result.status) == [Status.rejected_worse] * 2
     assert (result.state.x == 0).all()
+    assert (result.end.x != 0).all()
 
 
 def test_running_out_of_iterations_says_so() -> None:
@@ -278,16 +278,23 @@ def test_steps_stay_in_the_trust_region() -> None:
     assert moved.max() <= 0.1 + 1e-12  # a refused candidate is followed by one from the old state
 
 
-def test_problems_follow_the_steps_that_were_taken() -> None:
-    """Once an iteration, after its `linearise`: the states that `follow` names are the latest evaluated ones."""
+def test_each_state_is_evaluated_near_the_last_one_that_was_taken() -> None:
     problem = rosenbrock(3)
     result = minimise(problem, start(3, 2, -1.3), replace(DAMPED, block_iterations=1000), record=True)
-    assert len(problem.followed) == len(result.trajectory) == len(problem.evaluated) - 1
-    for accepted, it in zip(problem.followed, result.trajectory, strict=True):
-        assert torch.equal(accepted, it.accepted)
-    for n, accepted in enumerate(problem.followed[:-1]):
-        moved_on = torch.where(accepted[:, None], problem.evaluated[n + 1], result.trajectory[n].state.x)
-        assert torch.equal(moved_on, result.trajectory[n + 1].state.x)
+    assert not all(it.accepted.all() for it in result.trajectory)
+    assert len(problem.near) == len(result.trajectory) == len(problem.evaluated) - 1
+    for near, it in zip(problem.near, result.trajectory, strict=True):
+        assert torch.equal(near, it.state.x)
+
+
+def test_what_was_seen_and_said_at_both_ends_is_returned() -> None:
+    problem = rosenbrock(3)
+    result = minimise(problem, start(3, 2, -1.3), DAMPED)
+    assert torch.equal(result.seen_initial.x, start(3, 2, -1.3).x)
+    assert torch.equal(result.seen_end.x, result.end.x)
+    assert result.stage is problem
+    assert torch.equal(result.before.cost, problem.energy(start(3, 2, -1.3).x).cost)
+    assert torch.equal(result.after.cost, problem.energy(result.end.x).cost)
 
 
 def test_the_end_is_known_whatever_the_status() -> None:

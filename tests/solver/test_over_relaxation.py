@@ -8,43 +8,36 @@ from itertools import pairwise
 
 import pytest
 import torch
-from helpers.quadratics import ResidualProblem, Vector, linear_problem
+from helpers.quadratics import Energy, ResidualProblem, Vector, VectorProblem, linear_problem
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.config_files import load_config
-from directshape_torch.energy.method import method_stages
 from directshape_torch.errors import ConfigError
+from directshape_torch.problem import method_stages
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import minimise
-from directshape_torch.solver.problem import Linearisation
 
 DAMPED = SolverConfig()
 PURE = SolverConfig(initial_damping=0.0, accept_every_step=True, cost_tolerance=0.0, step_tolerance=0.0)
 FACTOR = 1.6
 
 
-class GeometricMedians(ResidualProblem):
+class GeometricMedians(VectorProblem):
     """The points with the least sum of distances to others, by reweighting: the matrix lacks what the weights do."""
 
-    def __init__(self, points: Tensor, identity: Tensor, stages: Sequence[StageConfig]) -> None:
-        super().__init__(lambda x, _: x, identity, 2, stages)
+    def __init__(self, points: Tensor, stages: Sequence[StageConfig]) -> None:
+        super().__init__(stages, num_unknowns=2)
         self.points = points
 
-    def _distances(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        offset = x[:, None] - self.points[self.identity]
-        return offset, (offset.square().sum(-1) + 1e-6).sqrt()
-
-    def cost(self, state: Vector) -> Tensor:
-        return self._distances(state.x)[1].sum(1)
-
-    def linearise(self, state: Vector) -> Linearisation:
-        offset, distance = self._distances(state.x)
+    def energy(self, x: Tensor) -> Energy:
+        offset = x[:, None] - self.points
+        distance = (offset.square().sum(-1) + 1e-6).sqrt()
         gradient = (offset / distance[..., None]).sum(1)
-        return Linearisation(distance.sum(1), gradient, (1 / distance).sum(1)[:, None, None] * torch.eye(2))
+        return Energy(distance.sum(1), gradient, (1 / distance).sum(1)[:, None, None] * torch.eye(2), x)
 
-    def compact(self, keep: Tensor, numbers: Sequence[int]) -> GeometricMedians:
-        return GeometricMedians(self.points, self.identity[keep], self._stages)
+    def part(self, index: Tensor) -> GeometricMedians:
+        return GeometricMedians(self.points[index], self.stage_configs)
 
 
 def zeros(count: int, unknowns: int) -> Vector:
@@ -64,7 +57,7 @@ def test_reweighted_problems_settle_in_fewer_iterations_at_the_same_minimum() ->
     config = replace(DAMPED, cost_tolerance=1e-12, min_damping=0.0, step_tolerance=0.0)
     plain, longer = (
         minimise(
-            GeometricMedians(points, torch.arange(8), [StageConfig(1.0, 0, 300, over_relaxation=factor)]),
+            GeometricMedians(points, [StageConfig(1.0, 0, 300, over_relaxation=factor)]),
             zeros(8, 2),
             config,
         )
@@ -87,7 +80,7 @@ def test_what_was_refused_is_tried_again_plain(solver: dict[str, float]) -> None
     lengths = [float(iteration.lengths) for iteration in trajectory]
     assert lengths == pytest.approx([FACTOR, *(FACTOR if before else 1.0 for before in taken[:-1])])
     for now, then in pairwise(trajectory):
-        at = problem.linearise(now.state)
+        at = problem.energy(now.state.x)
         step = damped_step(at.hessian, at.gradient, now.damping)[0] * now.lengths[:, None]
         expected = now.state.x + step if bool(now.accepted) else now.state.x
         torch.testing.assert_close(then.state.x, expected, rtol=1e-6, atol=1e-9)
@@ -102,8 +95,8 @@ class Bent(ResidualProblem):
         )
         self.factor = factor
 
-    def linearise(self, state: Vector) -> Linearisation:
-        at = super().linearise(state)
+    def energy(self, x: Tensor) -> Energy:
+        at = super().energy(x)
         return at._replace(hessian=at.hessian / self.factor)
 
 
@@ -152,15 +145,12 @@ def test_a_candidate_that_is_not_finite_is_not_the_end() -> None:
     class Broken(Bent):
         """Beyond 1.2 there is a lower cost, but nothing else."""
 
-        def linearise(self, state: Vector) -> Linearisation:
-            at = super().linearise(state)
-            broken = state.x[:, 0] > 1.2
+        def energy(self, x: Tensor) -> Energy:
+            at = super().energy(x)
+            broken = x[:, 0] > 1.2
             return at._replace(
                 cost=torch.where(broken, 0.0, at.cost), gradient=torch.where(broken[:, None], torch.nan, at.gradient)
             )
-
-        def compact(self, keep: Tensor, numbers: Sequence[int]) -> Broken:
-            return self
 
     problem = Broken(1.5, [StageConfig(1.0, 0, 30, over_relaxation=FACTOR)])
     result = minimise(problem, zeros(1, 1), DAMPED)
@@ -179,7 +169,7 @@ def test_compaction_changes_nothing(block: int) -> None:
     points = torch.randn(8, 9, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     reference, result = (
         minimise(
-            GeometricMedians(points, torch.arange(8), [StageConfig(1.0, 0, 60, over_relaxation=FACTOR)]),
+            GeometricMedians(points, [StageConfig(1.0, 0, 60, over_relaxation=FACTOR)]),
             zeros(8, 2),
             replace(DAMPED, block_iterations=length, cost_tolerance=1e-6, step_tolerance=0.0),
         )
@@ -190,7 +180,7 @@ def test_compaction_changes_nothing(block: int) -> None:
     torch.testing.assert_close(result.state.x, reference.state.x, rtol=0, atol=1e-13)
 
 
-def test_rounds_of_the_rival_take_plain_steps() -> None:
+def test_rounds_of_the_point_cloud_method_take_plain_steps() -> None:
     assert {stage.over_relaxation for stage in method_stages(load_config("default"))} == {FACTOR}
     assert {stage.over_relaxation for stage in method_stages(load_config("default", ["method=geometric"]))} == {1.0}
     assert {stage.over_relaxation for stage in load_config("paper").stages} == {1.0}

@@ -8,7 +8,7 @@ import cv2
 import pytest
 import torch
 
-from directshape_torch.disparity_profile import DisparityProfile, profile_offsets
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile, profile_offsets
 from directshape_torch.errors import InputError
 from directshape_torch.visualize.disparity_profile_picture import write_profile_picture
 

@@ -26,7 +26,7 @@ from directshape_torch.visualize.inspection.drift_figure import distance_course
 from directshape_torch.visualize.inspection.iteration_animation import animation_frames
 from directshape_torch.visualize.inspection.known_point_figure import write_known_point_figure
 from directshape_torch.visualize.inspection.point_figure import point_sets, shape_points_cam, stereo_points
-from directshape_torch.visualize.inspection.residual_values import photometric_residuals, silhouette_residuals
+from directshape_torch.visualize.inspection.residual_values import car_residuals
 from directshape_torch.visualize.inspection.sampling_figure import sampled_pixels
 
 _CAR = 1
@@ -76,7 +76,7 @@ def test_contour_encloses_what_the_projected_mesh_covers(view: CarView) -> None:
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_sampled_pixels_are_those_of_the_observation(view: CarView, side: str) -> None:
-    seen = pack_pixels(view.loaded.frame, view.loaded.detections, view.trace.problem.config.sampling)
+    seen = pack_pixels(view.loaded.frame, view.loaded.detections, view.trace.config.sampling)
     pixels = seen.left if side == "left" else seen.right
     expected = pixels.uv[pixels.object_index == _CAR].long().numpy()
     sampled = sampled_pixels(view, side)
@@ -104,20 +104,42 @@ def test_residuals_of_the_pixels_make_the_costs_of_the_trace(view: CarView, numb
     trace = view.trace
     number %= len(trace)
     costs = dict(zip(trace.result.term_names, trace.costs[number, _CAR].tolist(), strict=True))
-    for side in ("left", "right"):
-        values = silhouette_residuals(trace, _CAR, number, side).value
-        weight = trace.problem.config.silhouette.weight
-        assert weight * values.mean() == pytest.approx(costs[f"silhouette_{side}"], rel=1e-5)
+    *silhouettes, _ = car_residuals(trace, number)[_CAR]
+    for side, pixels in zip(("left", "right"), silhouettes, strict=True):
+        weight = trace.config.silhouette.weight
+        assert weight * pixels.value.mean() == pytest.approx(costs[f"silhouette_{side}"], rel=1e-5)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_silhouette_residuals_stand_where_shape_and_mask_differ(view: CarView, side: int) -> None:
+    pixels, d = car_residuals(view.trace, 0)[_CAR][side], view.loaded.detections
+    mask = (d.mask_left, d.mask_right)[side][_CAR].numpy() > 0.5
+    shape = np.zeros(mask.shape, np.uint8)
+    cv2.fillPoly(shape, [np.round(line).astype(np.int32) for line in view.contours(("left", "right")[side], 0)], 1)
+    u, v = pixels.uv.astype(int).T
+    differ = (mask != (shape > 0))[v, u]
+    assert differ.sum() > 15
+    assert ((pixels.value > np.log(2)) == differ).mean() > 0.97
+    assert not pixels.lost.any()
 
 
 def test_photometric_residuals_fall_and_hardly_a_pixel_is_lost(view: CarView) -> None:
-    before, after = (photometric_residuals(view.trace, _CAR, k) for k in (0, len(view.trace) - 1))
+    before, after = (car_residuals(view.trace, k)[_CAR].photometric for k in (0, len(view.trace) - 1))
     assert np.array_equal(before.uv, after.uv)
     assert after.lost.mean() < 0.05
     both = ~before.lost & ~after.lost
     assert np.abs(after.value[both]).mean() < np.abs(before.value[both]).mean()
-    term = next(t for t in view.trace.problem.terms if t.name == "photometric")
-    assert len(after.uv) == int(term.support()[view.trace.place_of(_CAR)])
+    term = view.trace.last_stage.photometric
+    assert term is not None
+    assert len(after.uv) == int(term.pixel_set.support[view.trace.place_of(_CAR)])
+    u, v = after.uv.astype(int).T
+    assert view.loaded.detections.mask_left[_CAR].numpy()[v, u].mean() > 0.9
+
+
+def test_a_refinement_without_images_has_no_residuals_to_show(view: CarView) -> None:
+    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", "method=geometric"]))
+    trace = trace_refinement(refiner, view.loaded.frame, view.loaded.detections)
+    assert [len(pixels.uv) for pixels in car_residuals(trace, 0)[_CAR]] == [0, 0, 0]
 
 
 def test_costs_end_at_those_of_the_result(view: CarView) -> None:
@@ -158,7 +180,7 @@ def test_points_of_the_shape_lie_on_it_and_under_the_mask(view: CarView) -> None
 
 
 def test_stereo_points_are_near_the_car(view: CarView) -> None:
-    clouds = stereo_points(view.loaded.frame, view.loaded.detections, view.trace.problem.config.point_cloud)
+    clouds = stereo_points(view.loaded.frame, view.loaded.detections, view.trace.config.point_cloud)
     assert len(clouds) == len(view.loaded.detections)
     sets = point_sets(replace(view, stereo_points_cam=clouds[_CAR]))
     assert [s.name for s in sets] == ["dense stereo", "refined shape"]

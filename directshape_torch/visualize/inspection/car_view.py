@@ -12,25 +12,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.admission import without_empty_masks
-from directshape_torch.energy.car_state import CarState
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import car_regions
+from directshape_torch.observation.refinable import without_empty_masks
+from directshape_torch.ray_cast import RayCast, cast
 from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.shape.zero_level import zero_level_extents
+from directshape_torch.terms.cars import CarState
 from directshape_torch.visualize.drawing import Picture, picture_of
 from directshape_torch.visualize.inspection.shape_in_image import (
     PixelGrid,
-    SeenShape,
     Window,
     level_lines,
     rays_of_pixels,
-    see_shape,
     zero_contours,
 )
 
@@ -110,7 +109,7 @@ class CarView:
     @cached_property
     def regions(self) -> tuple[Window, Window]:
         """Regions of the left and the right image whose pixels speak about the car."""
-        config = self.trace.problem.config.sampling
+        config = self.trace.config.sampling
         detections = without_empty_masks(self.loaded.detections)
         left, right = (r[self.car].tolist() for r in car_regions(self.loaded.frame, detections, config))
         return (left[0], left[1], left[2], left[3]), (right[0], right[1], right[2], right[3])
@@ -130,12 +129,12 @@ class CarView:
         tallest = max((v1 - v0) / (u1 - u0) for u0, v0, u1, v1 in windows)
         return min(max(tallest, 0.3), 1.0)
 
-    def seen(self, side: Side, number: int) -> tuple[PixelGrid, SeenShape]:
-        """A state as the camera sees it, within the window."""
+    def seen(self, side: Side, number: int) -> tuple[PixelGrid, RayCast]:
+        """A state as the camera sees it, within the window, at the points of a grid finer than the refinement's own."""
         grid = PixelGrid.covering(self.window(side))
         uv = grid.uv(self.loaded.frame.images_left)
         rays = rays_of_pixels(self.loaded.frame, self.loaded.detections, self.car, side, uv)
-        return grid, see_shape(self.prior, self.state(number), *rays, grid.shape)
+        return grid, cast(self.prior, self.state(number), *rays)
 
     def contours(self, side: Side, number: int) -> list[Array]:
         """Outline of a state in the image, lines (n, 2) of pixels."""

@@ -62,7 +62,7 @@ def shape_points_cam(view: CarView) -> Array:
     """(P, 3) where the pixels of the car's left mask see the refined shape."""
     grid, seen = view.seen("left", len(view.trace) - 1)
     uv = grid.uv(view.loaded.frame.images_left).cpu()
-    depth = seen.depth.flatten()
+    depth = seen.depth.cpu()
     u, v = uv.round().long().unbind(1)
     mask = view.loaded.detections.mask_left[view.car].cpu()
     height, width = mask.shape

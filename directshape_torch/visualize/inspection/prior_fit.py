@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.checks import check_shape
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.checks import check_shape
 from directshape_torch.shape.mesh_to_sdf import GridSpec
 from directshape_torch.shape.prior_quality import NEAR_SURFACE_M
 from directshape_torch.shape.shape_prior import ShapePrior

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from directshape_torch.io.figure_files import new_figure
+from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.panels import draw_lines, show_crop, write_figure
 from directshape_torch.visualize.inspection.residual_values import (
     PixelResiduals,
-    photometric_residuals,
-    silhouette_residuals,
+    car_residuals,
 )
 
 _PANEL_INCHES = 3.6
@@ -40,18 +40,16 @@ def write_residual_figure(path: Path | str, view: CarView) -> None:
     figure = new_figure(_WIDTH_INCHES, height_inches, "drawing residuals")
     figure.suptitle(view.title)
     axes = figure.subplots(2, 3)
-    grey_levels = view.trace.problem.config.photometric.lost_grey_levels
+    grey_levels = view.trace.config.photometric.lost_grey_levels
     for row, (number, name) in enumerate(((0, "before"), (len(view.trace) - 1, "after"))):
-        sides: tuple[Side, Side] = ("left", "right")
-        for column, side in enumerate(sides):
-            values = silhouette_residuals(view.trace, view.car, number, side)
+        *silhouettes, photometry = car_residuals(view.trace, number)[view.car]
+        for column, (side, values) in enumerate(zip(SIDES, silhouettes, strict=True)):
             title = f"{name}: silhouette {side}, mean {_mean(values)}"
             _backdrop(axes[row, column], view, side, number, title)
             silhouette = _dots(axes[row, column], values, "inferno", (0, _WORST_SILHOUETTE))
-        values = photometric_residuals(view.trace, view.car, number)
-        title = f"{name}: photometric, mean |r| {_mean(values)}, lost {int(values.lost.sum())}"
+        title = f"{name}: photometric, mean |r| {_mean(photometry)}, lost {int(photometry.lost.sum())}"
         _backdrop(axes[row, 2], view, "left", number, title)
-        photometric = _dots(axes[row, 2], values, "RdBu_r", (-2 * grey_levels, 2 * grey_levels))
+        photometric = _dots(axes[row, 2], photometry, "RdBu_r", (-2 * grey_levels, 2 * grey_levels))
     bars = {"orientation": "horizontal", "aspect": 40, "shrink": 0.7}
     figure.colorbar(silhouette, ax=axes[:, :2], label="silhouette residual", **bars)
     figure.colorbar(photometric, ax=axes[:, 2], label="right less left [grey levels]", extend="both", **bars)

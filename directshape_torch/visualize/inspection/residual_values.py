@@ -1,4 +1,4 @@
-"""Residuals of one car pixel by pixel at one of its states, as the terms of the final stage count them."""
+"""Residuals pixel by pixel at one state of a refinement, as the terms of the final stage count them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.energy.car_problem import CarProblem
-from directshape_torch.energy.car_state import CarState
-from directshape_torch.energy.photometric_term import PhotometricTerm
-from directshape_torch.energy.silhouette_term import SilhouetteTerm
-from directshape_torch.observation.occlusion import Side
-from directshape_torch.photometric_match import stage_pixels
+from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.refinement_trace import RefinementTrace
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.photometric import Photometric, Surface
+from directshape_torch.terms.silhouette import MaskRows
+from directshape_torch.terms.term import Part
 
 
 class PixelResiduals(NamedTuple):
@@ -26,51 +25,58 @@ class PixelResiduals(NamedTuple):
     lost: NDArray[np.bool_]  # (P,) there is nothing to compare, and the pixel pays a constant
 
 
-_NOTHING = PixelResiduals(np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.bool_))
+class CarResiduals(NamedTuple):
+    """What the images say of one car; no pixels where there is no such term."""
+
+    silhouette_left: PixelResiduals  # `-log` of the probability of the mask; a ray that passes by is not lost
+    silhouette_right: PixelResiduals
+    photometric: PixelResiduals  # right less left, grey levels, mean over the part of the neighbourhood on the car
 
 
-def problem_of_car(trace: RefinementTrace, car: int) -> CarProblem:
-    """The final stage's problem of one car that took part."""
-    return trace.problem.compact(trace.rows == car)
+class _Pixels(NamedTuple):
+    """Pixels of all cars: `PixelResiduals` with the car of each."""
+
+    car: Tensor
+    uv: Tensor
+    value: Tensor
+    lost: Tensor
+
+    def of_car(self, place: int) -> PixelResiduals:
+        uv, value, lost = (x[self.car == place].cpu().numpy() for x in self[1:])
+        return PixelResiduals(uv.astype(np.float64), value.astype(np.float64), lost)
 
 
 @torch.no_grad()
-def silhouette_residuals(trace: RefinementTrace, car: int, number: int, side: Side) -> PixelResiduals:
-    """`-log` of the probability of each sampled pixel's mask, for state `number` of the trace.
-
-    Nothing is lost: a ray that passes the shape by says so. No pixels where there is no such term.
-    """
-    problem = problem_of_car(trace, car)
-    projected = problem.project(_state(trace, car, number))
-    for term in problem.terms:
-        if isinstance(term, SilhouetteTerm) and term.side == side:
-            values = _array(term.pixel_residual(projected))
-            return PixelResiduals(_array(term.pixels.uv), values, np.zeros(len(values), dtype=np.bool_))
-    return _NOTHING
-
-
-@torch.no_grad()
-def photometric_residuals(trace: RefinementTrace, car: int, number: int) -> PixelResiduals:
-    """Right image less left image, in grey levels, averaged over the part of each neighbourhood that is on the car.
-
-    Pixels that have no surface under them, leave the right image or are hidden there are lost.
-    """
-    problem = problem_of_car(trace, car)
-    projected = problem.project(_state(trace, car, number))
-    for term in problem.terms:
-        if isinstance(term, PhotometricTerm):
-            fixed, (usable, residual) = stage_pixels(term), term.values(projected)
-            weight = fixed.neighbour_weight
-            mean = (residual * weight).sum(dim=1) / weight.sum(dim=1).clamp_min(1)
-            uv = term.pixels.uv[fixed.pixel_index]
-            return PixelResiduals(_array(uv), _array(mean), np.asarray(~usable.cpu()))
-    return _NOTHING
+def car_residuals(trace: RefinementTrace, number: int) -> dict[int, CarResiduals]:
+    """Residuals for state `number` of the trace of each car that took part, by its row among the detections."""
+    stage, state = trace.last_stage, CarState(*(x[trace.rows] for x in trace.states[number]))
+    figures = stage.figures(stage.problem.look(state))
+    nothing = torch.zeros(0)
+    parts = dict.fromkeys(CarResiduals._fields, _Pixels(nothing, nothing.view(0, 2), nothing, nothing.bool()))
+    for term, at in zip(stage.terms, figures.parts, strict=True):
+        for side, pixels in enumerate((trace.pixels.left, trace.pixels.right)):
+            if term.names == CarResiduals._fields[:2]:
+                parts[term.names[side]] = _of_silhouette(stage.problem.masks, side, pixels, at)
+    photometric, at_photometric = stage.photometric, stage.photometric_part(figures)
+    if photometric is not None and at_photometric is not None:
+        parts["photometric"] = _of_photometry(photometric, at_photometric)
+    return {
+        car: CarResiduals(*(parts[name].of_car(place) for name in CarResiduals._fields))
+        for place, car in enumerate(trace.rows.tolist())
+    }
 
 
-def _state(trace: RefinementTrace, car: int, number: int) -> CarState:
-    state = trace.states[number]
-    return CarState(*(x[car : car + 1] for x in state))
+def _of_silhouette(masks: MaskRows, side: int, pixels: PixelSamples, at: Part) -> _Pixels:
+    mine = (masks.filled > 0) & (masks.side == side)[:, None]
+    value = at.residual[..., 0][mine]
+    return _Pixels(pixels.object_index, pixels.uv, value, torch.zeros_like(value, dtype=torch.bool))
 
 
-def _array(values: Tensor) -> NDArray[np.float64]:
-    return np.asarray(values.double().cpu())
+def _of_photometry(term: Photometric, at: Part) -> _Pixels:
+    fixed = term.pixel_set
+    counted = fixed.rows.pixel_weight > 0
+    weight = fixed.rows.neighbour_weight.movedim(0, -1)
+    mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
+    pixel = term.all_rows.row.flatten()[fixed.sight_place]
+    car = fixed.blocks.owner[:, None].expand_as(counted)
+    return _Pixels(car[counted], term.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted])

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.admission import without_empty_masks
 from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.figure_files import new_figure
@@ -18,6 +17,7 @@ from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.occlusion import Side, hidden_pixels
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.panels import draw_lines, show_crop, write_figure
 from directshape_torch.visualize.sampling_picture import PANEL_GAP_PX, occlusion_picture
@@ -55,7 +55,7 @@ class SampledPixels(NamedTuple):
 
 def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
     """The pixels as the refinement chose them, with the round that each comes from."""
-    config = view.trace.problem.config.sampling
+    config = view.trace.config.sampling
     frames, detections = view.loaded.frame, without_empty_masks(view.loaded.detections)
     left, right = car_regions(frames, detections, config)
     images, regions = (frames.images_left, left) if side == "left" else (frames.images_right, right)
@@ -92,7 +92,7 @@ def write_sampling_figure(path: Path | str, view: CarView) -> None:
 def write_occlusion_picture(path: Path | str, view: CarView) -> None:
     """Write, as PNG, image, masks and occlusion mask, the left image above the right one where it has a region too."""
     detections = without_empty_masks(view.loaded.detections)
-    config = view.trace.problem.config.sampling
+    config = view.trace.config.sampling
     regions = car_regions(view.loaded.frame, detections, config)
     # One scale for both images, or the car would seem to change its size.
     scale = max(2, round(_LEAST_HEIGHT_PX / max(v1 - v0 for _, v0, _, v1 in view.regions)))

@@ -5,28 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.energy.car_state import CarState
 from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import residual_offsets
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.shape.raycast import ObjectRays, closest_approach_depth, first_crossing, march
-from directshape_torch.shape.shape_prior import ShapePrior
 
 Array = NDArray[np.float64]
 Window = tuple[int, int, int, int]
 
 _MOST_PIXELS = 10_000
-_FINEST_STEP_PX, _SAMPLES_PER_RAY = 0.25, 32
-# Of rays that pass by the region where the field is known: certainly outside.
+_FINEST_STEP_PX = 0.25
+# Between a pixel that shows the car and one whose ray misses all that is known of it lies a contour too.
 _FAR_OUTSIDE_M = 1.0
 
 
@@ -69,35 +66,6 @@ class PixelGrid:
         return np.asarray(self.first_uv) + self.step_px * row_column[:, ::-1]
 
 
-class SeenShape(NamedTuple):
-    """What the rays of a grid meet."""
-
-    closest_sdf: Tensor  # (h, w) least signed distance along the ray, metres
-    depth: Tensor  # (h, w) of the surface in the ray's own camera, metres; NaN where the ray passes by
-
-
-@torch.no_grad()
-def see_shape(
-    prior: ShapePrior,
-    state: CarState,  # of one car
-    origin_cam: Tensor,  # (h w, 3)
-    ray_cam: Tensor,  # (h w, 3)
-    shape: tuple[int, int],
-) -> SeenShape:
-    """Cast the rays of a grid at one car."""
-    R, t = state.T_obj_cam[0, :3, :3], state.T_obj_cam[0, :3, 3]
-    index = torch.zeros(len(ray_cam), dtype=torch.long, device=ray_cam.device)
-    rays = ObjectRays(origin_cam @ R.mT + t, ray_cam @ R.mT, index)
-    bound = prior.bind(state.code)
-    marched = march(bound, rays, prior.bounds_obj, _SAMPLES_PER_RAY)
-    closest = closest_approach_depth(marched)
-    sdf = bound.value(rays.at(closest), index)
-    root = first_crossing(bound, rays, marched, closest, closest_sdf=sdf)
-    sdf = torch.where(marched.crosses_bounds, sdf, torch.full_like(sdf, _FAR_OUTSIDE_M))
-    depth = torch.where(root.found, root.depth, torch.full_like(root.depth, torch.nan))
-    return SeenShape(sdf.view(shape).cpu(), depth.view(shape).cpu())
-
-
 def rays_of_pixels(
     frames: FrameBatch,
     detections: Detections,
@@ -121,8 +89,9 @@ def rays_of_pixels(
 
 
 def zero_contours(grid: PixelGrid, closest_sdf: Tensor) -> list[Array]:
-    """Lines (n, 2) in pixels along which the projected signed distance is zero: the shape's outline."""
-    return [grid.uv_of(line) for line in level_lines(closest_sdf.double().numpy(), 0.0)]
+    """Lines (n, 2) in pixels along which the projected signed distance (h w,) is zero: the shape's outline."""
+    known = closest_sdf.double().clamp_max(_FAR_OUTSIDE_M).view(grid.shape).cpu()
+    return [grid.uv_of(line) for line in level_lines(known.numpy(), 0.0)]
 
 
 def level_lines(values: Array, level: float) -> list[Array]:

@@ -1,0 +1,276 @@
+"""What is known at run time of how a refinement went: a row of numbers for each car, for the model of trust to read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.diagnosis.disparity_profile import DisparityProfile
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
+from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.problem import CarStage
+from directshape_torch.shape.shape_prior import DimensionsDerivative
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.term import Figures, Sight
+
+EVIDENCE_NAMES = (
+    "log_depth",
+    "log_sigma_depth",
+    "log_sigma_side",
+    "log_sigma_yaw",
+    "log_expected_misfit",
+    "log_expected_gain",
+    "moved_depth",
+    "turned",
+    "log_moved_sigmas",
+    "length_change",
+    "mask_misfit_left",
+    "mask_misfit_right",
+    "log_photometric_error",
+    "unmatched_share",
+    "log_support",
+    "log_silhouette_cost",
+    "log_prior_cost",
+    "silhouette_decrease",
+    "photometric_decrease",
+    "relative_decrease",
+    "log_conflict",
+    "code_size",
+    "unsettled",
+    "log_profile_sigma",
+    "log_profile_offset",
+    "log_profile_contrast",
+    "profile_offset_before",
+    "log_profile_fall_before",
+    "outside_basin",
+)
+"""Columns of the evidence; `docs/results.md` says which of them the bundled model reads.
+
+`log_depth` metres over 20; `log_sigma_*` of the uncalibrated covariance, along and across the viewing ray in the ground
+plane (metres) and of the heading (radians); `log_expected_misfit` the share of the box, seen from above, that these
+sigmas let one expect to be wrong, `log_expected_gain` by how much more it would be at the input; `moved_depth` motion
+along the viewing ray, metres; `turned` radians; `log_moved_sigmas` Mahalanobis length of the motion; `length_change`
+metres; `mask_misfit_*` one minus the overlap with the mask; `*_decrease` log of cost before over cost after;
+`log_conflict` share of the cost that photometry alone would still gain by a step; `code_size` root mean square;
+`unsettled` 1 where the iterations ran out. Of the disparity profile at the end: `log_profile_sigma` and
+`log_profile_offset` of its minimum, pixels, `log_profile_contrast`, how much more a pixel of disparity to the better
+side costs, `outside_basin` 1 where a ridge lies between the state and the minimum. Of the one at the input:
+`profile_offset_before` of its minimum, pixels, and `log_profile_fall_before`, cost there over that at the minimum.
+"""
+
+_TINY = 1e-9
+# Round figures of the calibration: what the sigmas are short of, and the least errors of length, width and heading.
+_SIGMA_FACTOR = 2.0
+_SIGMA_FLOORS = (0.05, 0.04, 0.01, 0.1, 0.03)
+
+
+@dataclass(frozen=True)
+class Course:
+    """The course of a refinement of B cars, as far as the evidence needs it.
+
+    Attributes:
+        before, after: input and final state.
+        detector_hwl: (B, 3) metres, of the input.
+        cost_before, cost_after: (B, T) at the final stage.
+        figures: of the energy at the final state.
+        seen: what the rays see there.
+        covariance: (B, D, D) in the tangent of `retract`, uncalibrated.
+        covariance_xyz_yaw: (B, 4, 4), uncalibrated.
+        unsettled: (B,) bool, the iterations ran out.
+        profile: photometric cost over the disparity.
+    """
+
+    before: CarState
+    after: CarState
+    detector_hwl: Tensor
+    cost_before: Tensor
+    cost_after: Tensor
+    figures: Figures
+    seen: Sight
+    covariance: Tensor
+    covariance_xyz_yaw: Tensor
+    unsettled: Tensor
+    profile: DisparityProfile
+
+
+class Agreement(NamedTuple):
+    """Agreement of B cars with the images, (B,) each; see `FitQuality`."""
+
+    mask_iou_left: Tensor
+    mask_iou_right: Tensor
+    photometric_error_grey: Tensor
+    matched_share: Tensor
+
+
+def evidence_of(stage: CarStage, course: Course, agreement: Agreement) -> Tensor:
+    """The evidence (B, E), float64, columns `EVIDENCE_NAMES`; NaN where a figure does not exist."""
+    columns = {
+        **_motion(stage, course),
+        **_agreement(stage, course, agreement),
+        **_costs(stage, course),
+        **_profile(course.profile),
+    }
+    return torch.stack([columns[name].to(torch.float64) for name in EVIDENCE_NAMES], dim=1)
+
+
+def _motion(stage: CarStage, course: Course) -> dict[str, Tensor]:
+    """How far the box moved, in metres, in shares of itself and in standard deviations."""
+    T_obj_cam = torch.stack([course.before.T_obj_cam, course.after.T_obj_cam]).to(torch.float64)
+    T_cam_obj = se3.inverse(T_obj_cam)
+    T_before, T_after = T_cam_obj
+    dimensions = stage.problem.prior.dimensions_and_derivative(course.after.code)
+    hwl = dimensions.hwl.to(torch.float64)
+    shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
+    heading_before, heading_after = rotation_y_from_pose(T_cam_obj)
+    turned = wrap_angle(heading_after - heading_before)
+    change_hwl = hwl - course.detector_hwl
+    shift_obj = (shift_cam[:, None] @ T_after[:, :3, :3])[:, 0]
+    motion = torch.cat([shift_obj[:, 0::2], turned[:, None], change_hwl[:, 1:].flip(1)], dim=1)
+    misfit, gain = _expected(motion, _footprint_sigmas(course, dimensions), hwl)
+    J = _view_jacobian(T_after[:, :3, 3])
+    shift_and_turn = torch.cat([shift_cam, turned[:, None]], dim=1)
+    in_view = (J @ shift_and_turn[..., None])[..., 0]
+    covariance = J @ course.covariance_xyz_yaw @ J.mT
+    log_sigma = 0.5 * covariance.diagonal(dim1=1, dim2=2).clamp_min(_TINY**2).log()
+    return {
+        "log_depth": (T_after[:, 2, 3].clamp_min(1.0) / 20).log(),
+        "log_sigma_depth": log_sigma[:, 0],
+        "log_sigma_side": log_sigma[:, 1],
+        "log_sigma_yaw": log_sigma[:, 2],
+        "log_expected_misfit": misfit.log(),
+        "log_expected_gain": (gain + 0.005).log(),
+        "moved_depth": in_view[:, 0].abs(),
+        "turned": turned.abs(),
+        "log_moved_sigmas": torch.log1p(_mahalanobis(in_view, covariance)),
+        "length_change": change_hwl[:, 2].abs(),
+        "code_size": course.after.code.square().mean(1).sqrt(),
+    }
+
+
+def _footprint_sigmas(course: Course, dimensions: DimensionsDerivative) -> Tensor:
+    """Standard deviations (B, 5) along and across the car, of its heading, length and width, of the right size."""
+    J = dimensions.J_hwl_code[:, 1:].flip(1).to(torch.float64)
+    C = course.covariance
+    size_variance = (J @ C[:, 6:, 6:] * J).sum(dim=2)
+    variance = torch.cat([C.diagonal(dim1=1, dim2=2)[:, 0:6:2], size_variance], dim=1)
+    return (variance * _SIGMA_FACTOR**2 + constant_like(_SIGMA_FLOORS, variance).square()).sqrt()
+
+
+def _expected(motion: Tensor, sigma: Tensor, hwl: Tensor) -> tuple[Tensor, Tensor]:
+    """Expected misfit (B,) of footprints whose errors are normal, and how much larger it is at the input.
+
+    Args:
+        motion: (B, 5) of the output against the input, along and across the car, of heading, length and width.
+        sigma: (B, 5) of the output.
+        hwl: (B, 3) metres.
+    """
+    _, width, length = hwl.clamp_min(0.1).unbind(1)
+    # IoU falls by twice the shift over the side, by the change of a side over itself, and by the corners cut in a turn.
+    turn = 0.5 * (length / width + width / length)
+    per_length, per_width = 1 / length, 1 / width
+    loss = torch.stack([2 * per_length, 2 * per_width, turn, per_length, per_width], dim=1)
+    # E|x| of x ~ N(0, sigma^2) and of N(motion, sigma^2).
+    at_output = sigma * math.sqrt(2 / math.pi)
+    ratio = motion / sigma
+    at_input = at_output * torch.exp(-0.5 * ratio.square()) + motion * torch.erf(ratio / math.sqrt(2))
+    return (loss * at_output).sum(1), (loss * (at_input - at_output)).sum(1).clamp_min(0)
+
+
+def _agreement(stage: CarStage, course: Course, agreement: Agreement) -> dict[str, Tensor]:
+    """How well the images agree with the final state, and how many pixels say so."""
+    return {
+        "mask_misfit_left": 1 - agreement.mask_iou_left,
+        "mask_misfit_right": 1 - agreement.mask_iou_right,
+        "log_photometric_error": (agreement.photometric_error_grey.clamp_min(0.1) / 10).log(),
+        "unmatched_share": 1 - agreement.matched_share,
+        "log_support": torch.log1p(_support(stage, course.unsettled)),
+        "unsettled": course.unsettled.to(torch.float64),
+    }
+
+
+def _costs(stage: CarStage, course: Course) -> dict[str, Tensor]:
+    """What the terms paid before and after, and whether photometry pulls against the others at the end."""
+    names = stage.problem.term_names
+    silhouettes = [name.startswith("silhouette") for name in names]
+    photometric = [name == "photometric" for name in names]
+    priors = stage.is_prior_column
+    # (T, 2, B): before and after.
+    costs = torch.stack([course.cost_before, course.cost_after]).permute(2, 0, 1)
+    everything = costs.sum(dim=0)
+    paid = torch.stack([*(_total(costs, chosen) for chosen in (silhouettes, priors, photometric)), everything])
+    log_before, log_after = paid.clamp_min(_TINY).log().unbind(dim=1)
+    decrease = log_before - log_after
+    return {
+        "log_silhouette_cost": log_after[0],
+        "log_prior_cost": log_after[1],
+        "silhouette_decrease": decrease[0],
+        "photometric_decrease": decrease[2],
+        "relative_decrease": decrease[3],
+        "log_conflict": _conflict(course.figures, photometric, everything[1]),
+    }
+
+
+def _total(costs: Tensor, chosen: list[bool]) -> Tensor:
+    """Sum (2, B) of some rows of the costs (T, 2, B); the host knows which, so that no device has to look."""
+    rows = [row for row, wanted in zip(costs, chosen, strict=True) if wanted]
+    return torch.stack(rows).sum(dim=0) if rows else torch.zeros_like(costs[0])
+
+
+def _profile(profile: DisparityProfile) -> dict[str, Tensor]:
+    """How sharply the images know the disparity at the end, and how far they pulled the input."""
+    before, after = profile.figures
+    lowest = profile.lowest
+    here, *sides = (profile.cost_at(offset_px) for offset_px in (0.0, -1.0, 1.0))
+    rise_after, fall_before = torch.minimum(sides[0].after, sides[1].after) / lowest.after, here.before / lowest.before
+    return {
+        # A flat curve has no width: no offset of its range is any worse.
+        "log_profile_sigma": after.sigma_px.minimum(profile.range_px).log(),
+        "log_profile_offset": (after.offset_px.abs() + 0.05).log(),
+        "log_profile_contrast": rise_after.log(),
+        "profile_offset_before": before.offset_px.abs(),
+        "log_profile_fall_before": fall_before.log(),
+        "outside_basin": torch.where(after.offset_px.isnan(), after.offset_px, (~after.in_basin).to(torch.float64)),
+    }
+
+
+def _conflict(at_end: Figures, photometric: list[bool], cost: Tensor) -> Tensor:
+    """log(1 + 100 g_p^T H^-1 g_p / 2 / cost): what photometry alone asks for at the minimum of the sum."""
+    if not any(photometric):
+        return torch.zeros_like(cost)
+    gain = 0.5 * _mahalanobis(at_end.gradient[:, photometric.index(True)], at_end.hessian.sum(dim=1)).square()
+    return torch.log1p(100 * gain / cost.clamp_min(_TINY))
+
+
+def _support(stage: CarStage, like: Tensor) -> Tensor:
+    """Pixels (B,) of the photometric set."""
+    term = stage.photometric
+    return torch.zeros_like(like, dtype=torch.float64) if term is None else term.pixel_set.support
+
+
+def _view_jacobian(location: Tensor) -> Tensor:
+    """J (B, 3, 4) of shifts along and across the viewing ray in the plane y = 0, and of the heading, by (x, y, z, yaw).
+
+    Args:
+        location: (B, 3) of the object origins.
+    """
+    ray = location[:, 0::2]
+    x, z = (ray / ray.norm(dim=1, keepdim=True).clamp_min(_TINY)).unbind(dim=1)
+    zero = torch.zeros_like(x)
+    rows = [x, zero, z, zero, z, zero, -x, zero, zero, zero, zero, zero + 1]
+    return torch.stack(rows, dim=1).view(-1, 3, 4)
+
+
+def _mahalanobis(vector: Tensor, matrix: Tensor) -> Tensor:
+    """sqrt(v^T M^-1 v) (B,) of vectors (B, n); NaN where M is not positive definite."""
+    finite = matrix.flatten(1).isfinite().all(1)
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], matrix, identity))
+    regular = finite & (info == 0)
+    factor = torch.where(regular[:, None, None], factor, identity)
+    white = torch.linalg.solve_triangular(factor, vector[..., None], upper=False)[..., 0]
+    return torch.where(regular, white.norm(dim=1), torch.full_like(white[:, 0], torch.nan))

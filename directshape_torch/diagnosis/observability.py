@@ -1,0 +1,161 @@
+"""What a view does not show: the directions in which the images alone leave a car undetermined, in a driver's terms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from directshape_torch.diagnosis.car_rows import kept, placed
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.terms.cars import CarState
+
+CAR_QUANTITIES = ("depth", "sideways position", "height above ground", "heading", "length", "width", "height")
+"""The quantities (7) that a direction is made of; all in metres.
+
+Depth is the distance from the camera along the ground and grows away from it, the sideways position grows to the
+camera's right, and the heading counts as the way of the car's end as it turns: radians times `HEADING_LEVER_M`.
+"""
+
+HEADING_LEVER_M = 2.0
+"""Half the length of a typical car."""
+
+# What nothing shows at all would have an infinite sigma: 100 m, radians and standard deviations stand for it.
+_BLIND_SIGMA = 100.0
+# Partners below this share of the largest one are not worth a word.
+_NAMED_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What the images say of B cars without any prior, NaN where they were not refined.
+
+    Attributes:
+        sigmas_m: (B, 7) standard deviations along the principal directions, the weakest direction first; in a result
+            scaled by the calibrated factor of the depth.
+        directions: (B, 7, 7) unit vectors, row i that of sigma i, columns `CAR_QUANTITIES`.
+        viewing_angle_rad: (B,) KITTI's alpha of the car, which says from where it is seen.
+    """
+
+    sigmas_m: Tensor
+    directions: Tensor
+    viewing_angle_rad: Tensor
+
+    @classmethod
+    def nothing(cls, like: Tensor, count: int) -> Observability:
+        """Of `count` cars of which nothing is known."""
+        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
+        return cls(nan[:, None].expand(-1, 7), nan[:, None, None].expand(-1, 7, 7), nan)
+
+    def spread(self, rows: Tensor, count: int) -> Observability:
+        """Some cars placed among `count` cars."""
+        return Observability(*(placed(getattr(self, f.name), rows, count) for f in fields(self)))
+
+    def where(self, condition: Tensor) -> Observability:
+        """What is known where the condition (B,) holds, NaN elsewhere."""
+        return Observability(*(kept(getattr(self, f.name), condition) for f in fields(self)))
+
+    def scaled(self, factor: float) -> Observability:
+        """With all standard deviations multiplied."""
+        return Observability(factor * self.sigmas_m, self.directions, self.viewing_angle_rad)
+
+    def words(self) -> list[str]:
+        """The weakest direction of each car, largest part first; empty for cars that were not refined.
+
+        Example:
+            >>> direction = torch.tensor([0.45, 0.0, 0.0, 0.0, 0.89, 0.0, 0.0]).expand(1, 7, 7)
+            >>> Observability(torch.full((1, 7), 0.6), direction, torch.tensor([-math.pi / 2])).words()
+            ['rear view: length and depth trade 1 to 0.5 (sigma 0.60 m)']
+        """
+        rows = zip(self.viewing_angle_rad.tolist(), self.directions[:, 0].tolist(), self.sigmas_m[:, 0], strict=True)
+        return [
+            f"{view_in_words(angle)}: {direction_in_words(direction)} (sigma {sigma:.2f} m)" if sigma == sigma else ""
+            for angle, direction, sigma in rows
+        ]
+
+
+def view_in_words(alpha_rad: float) -> str:
+    """From where a car is seen at KITTI's observation angle, in steps of 45 degrees.
+
+    Example:
+        >>> [view_in_words(math.radians(a)) for a in (-90, -50, 0, 90)]
+        ['rear view', 'rear quarter view', 'side view', 'front view']
+    """
+    # The camera looks at the back of a car that heads away from it, where alpha is -90 degrees.
+    facing = math.degrees(math.asin(max(-1.0, min(1.0, math.sin(alpha_rad)))))
+    side = "front" if facing > 0 else "rear"
+    if abs(facing) > 67.5:
+        return f"{side} view"
+    return f"{side} quarter view" if abs(facing) > 22.5 else "side view"
+
+
+def direction_in_words(direction: Sequence[float]) -> str:
+    """The largest parts of a direction (7,); a minus says that the one falls as the other grows.
+
+    Example:
+        >>> direction_in_words([0.0, 0.02, 0.0, 0.0, 0.1, 0.99, 0.0])
+        'width alone'
+    """
+    order = sorted(range(len(direction)), key=lambda i: -abs(direction[i]))
+    first = direction[order[0]]
+    named = [i for i in order if abs(direction[i] / first) >= _NAMED_SHARE][:3]
+    names = [CAR_QUANTITIES[i] for i in named]
+    if len(named) == 1:
+        return f"{names[0]} alone"
+    ratios = " to ".join(f"{direction[i] / first + 0.0:.1f}".removesuffix(".0") for i in named)
+    return f"{', '.join(names[:-1])} and {names[-1]} trade {ratios}"
+
+
+def observability_of(prior: ShapePrior, state: CarState, seen: Tensor | None) -> Observability:
+    """Principal directions of the car's quantities under the Fisher information of the terms that are no priors.
+
+    Args:
+        prior: the shapes, for the dimensions.
+        state: B cars.
+        seen: (B, D, D) that information at that state; None without such a term.
+    """
+    T_cam_obj = se3.inverse(state.T_obj_cam)
+    alpha = alpha_from_kitti(T_cam_obj[:, :3, 3], rotation_y_from_pose(T_cam_obj)).to(torch.float64)
+    if seen is None:
+        return Observability.nothing(alpha, len(alpha))
+    sigmas, directions = _principal(seen, quantities_jacobian(prior, state))
+    return Observability(sigmas, directions, alpha)
+
+
+def quantities_jacobian(prior: ShapePrior, state: CarState) -> Tensor:
+    """J (B, 7, D) of `CAR_QUANTITIES` by the tangent of `retract`.
+
+    The object origin, in the middle of the footprint, moves by `-R_cam_obj v`; `rotation_y` by `-R_cam_obj[1] omega`.
+    """
+    T_cam_obj = se3.inverse(state.T_obj_cam).to(torch.float64)
+    R_cam_obj = T_cam_obj[:, :3, :3]
+    J_hwl_code = prior.dimensions_and_derivative(state.code).J_hwl_code.to(torch.float64)
+    ray = T_cam_obj[:, 0:3:2, 3]
+    x, z = (ray / ray.norm(dim=1, keepdim=True).clamp_min(1e-9)).unbind(dim=1)
+    zero = torch.zeros_like(x)
+    axes = torch.stack([-x, zero, -z, -z, zero, x, zero, zero + 1, zero], dim=1).view(-1, 3, 3)
+    J_position = torch.cat([axes @ R_cam_obj, torch.zeros_like(R_cam_obj)], dim=2)
+    J_heading = torch.cat([torch.zeros_like(R_cam_obj[:, 1]), -HEADING_LEVER_M * R_cam_obj[:, 1]], dim=1)
+    J_pose = torch.cat([J_position, J_heading[:, None]], dim=1)
+    no_pose, no_code = J_pose.new_zeros(len(x), 3, 6), J_pose.new_zeros(len(x), 4, J_hwl_code.shape[2])
+    return torch.cat([torch.cat([J_pose, no_code], dim=2), torch.cat([no_pose, J_hwl_code.flip(1)], dim=2)], dim=1)
+
+
+def _principal(information: Tensor, J: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviations (B, 7), falling, and directions (B, 7, 7), rows, of J (B, 7, D) times the unknowns."""
+    finite = torch.cat([information, J], dim=1).flatten(1).isfinite().all(1)
+    identity = torch.eye(information.shape[-1], dtype=information.dtype, device=information.device)
+    information = torch.where(finite[:, None, None], information, 0.0) + identity / _BLIND_SIGMA**2
+    J = torch.where(finite[:, None, None], J, 0.0)
+    half = torch.linalg.solve_triangular(torch.linalg.cholesky_ex(information)[0], J.mT, upper=False)
+    variances, vectors = torch.linalg.eigh(half.mT @ half)
+    directions = vectors.mT.flip(1)
+    # The sign of a direction means nothing: its largest part grows.
+    largest = directions.gather(2, directions.abs().argmax(2, keepdim=True))
+    sigmas = torch.where(finite[:, None], variances.flip(1).clamp_min(0).sqrt(), torch.nan)
+    return sigmas, torch.where(finite[:, None, None], directions * largest.sign(), torch.nan)

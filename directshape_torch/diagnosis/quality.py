@@ -1,0 +1,108 @@
+"""How well a car fits what the images show: figures that say when not to trust a result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from directshape_torch.diagnosis.car_rows import kept, placed
+from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
+from directshape_torch.diagnosis.trust_model import bundled_trust_model
+from directshape_torch.problem import CarStage
+from directshape_torch.rows import CarSums
+from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.silhouette import MaskRows
+from directshape_torch.terms.term import Part, Sight
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """Agreement of B refined cars with the images; NaN where there is nothing to compare.
+
+    Attributes:
+        mask_iou_left, mask_iou_right: (B,) overlap of the projected shape with the instance mask over the sampled,
+            unoccluded pixels. Good fits stand above 0.9; below 0.8 mask or fit is wrong.
+        photometric_error_grey: (B,) mean absolute difference between the images over the pixels that count, in grey
+            levels of 0..255, after matching the brightness.
+        matched_share: (B,) share of the photometric pixel set that could be compared at the end.
+        evidence: (B, E) what is known of the refinement's course, columns `evidence.EVIDENCE_NAMES`.
+        probability_better: (B,) calibrated probability that the refined box overlaps the true one more than the input
+            does, seen from above; NaN for the methods "geometric" and "combined".
+        probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Figures of cars whose status is
+            `not_trusted` speak of the refinement that was not returned.
+    """
+
+    mask_iou_left: Tensor
+    mask_iou_right: Tensor
+    photometric_error_grey: Tensor
+    matched_share: Tensor
+    evidence: Tensor
+    probability_better: Tensor
+    probability_not_worse: Tensor
+
+    @classmethod
+    def nothing(cls, like: Tensor, count: int) -> FitQuality:
+        """No figures for `count` cars."""
+        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
+        return cls(nan, nan, nan, nan, nan[:, None].expand(-1, len(EVIDENCE_NAMES)), nan, nan)
+
+    def spread(self, rows: Tensor, count: int) -> FitQuality:
+        """The figures of some cars placed among `count` cars."""
+        return FitQuality(*(placed(getattr(self, f.name), rows, count) for f in fields(self)))
+
+    def where(self, condition: Tensor) -> FitQuality:
+        """The figures where the condition (B,) holds, NaN elsewhere."""
+        return FitQuality(*(kept(getattr(self, f.name), condition) for f in fields(self)))
+
+
+@torch.no_grad()
+def fit_quality(stage: CarStage, course: Course) -> FitQuality:
+    """Figures of B cars at the end of a refinement, in its last stage."""
+    agreed = _agreement(stage, course)
+    evidence = evidence_of(stage, course, agreed)
+    better, not_worse = _probabilities(stage, evidence)
+    return FitQuality(*agreed, evidence, better, not_worse)
+
+
+def _probabilities(stage: CarStage, evidence: Tensor) -> tuple[Tensor, Tensor]:
+    """Of a better and of a not worse box, (B,) each; the model knows the terms of the method "direct" alone."""
+    names = set(stage.problem.term_names)
+    if not {"silhouette_left", "photometric"} <= names or "point_cloud" in names:
+        unknown = torch.full_like(evidence[:, 0], torch.nan)
+        return unknown, unknown
+    model = bundled_trust_model()
+    return model.better(evidence), model.not_worse(evidence)
+
+
+def _agreement(stage: CarStage, course: Course) -> Agreement:
+    left, right = mask_ious(stage.problem.masks, course.seen)
+    nan = torch.full_like(left, torch.nan)
+    term, at = stage.photometric, stage.photometric_part(course.figures)
+    return Agreement(left, right, *((nan, nan) if term is None or at is None else photometric_agreement(term, at)))
+
+
+def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
+    """Overlap (2, B) of shape and mask over the pixels of the left and the right image."""
+    distance = seen.field.value(seen.closest.points_obj, masks.rays.owner, constant=True)
+    counts = masks.filled.to(torch.float64)
+    covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > 0.5
+    both, either = ((x * counts).sum(dim=1) for x in (covered & masked, covered | masked))
+    num_cars = len(masks.blocks.counts)
+    sums = CarSums.of(masks.rays.owner + num_cars * masks.side, 2 * num_cars)
+    overlap, union = sums.sum(torch.stack([both, either], dim=1)).unbind(dim=1)
+    return torch.where(union > 0, overlap / union, torch.nan).view(2, num_cars)
+
+
+def photometric_agreement(term: Photometric, at: Part) -> tuple[Tensor, Tensor]:
+    """Mean absolute residual (B,) in grey levels of the usable pixels, and their share (B,) of the pixel set."""
+    fixed, usable = term.pixel_set, at.where.usable
+    in_set = usable & (fixed.rows.pixel_weight > 0)
+    weight = in_set[..., None] * fixed.rows.neighbour_weight.movedim(0, -1)
+    per_block = [(weight * at.residual.abs()).sum(dim=(1, 2)), weight.sum(dim=(1, 2)), in_set.sum(dim=1)]
+    table = torch.stack([x.to(torch.float64) for x in per_block], dim=1)
+    error, total, compared = CarSums.of(fixed.blocks.owner, len(term.cars)).sum(table).unbind(dim=1)
+    nothing = torch.full_like(total, torch.nan)
+    share = torch.where(fixed.support > 0, compared / fixed.support.clamp_min(1), nothing)
+    return torch.where(total > 0, error / total.clamp_min(1), nothing), share

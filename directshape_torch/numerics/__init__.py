@@ -1,0 +1,1 @@
+"""Small tools over PyTorch: constants on a device, gradient modes, full precision, checked shapes."""

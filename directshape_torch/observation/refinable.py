@@ -1,0 +1,147 @@
+"""Which cars can be refined at all, and whether the parts of a call fit together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from copy import copy
+from dataclasses import fields, is_dataclass
+
+import torch
+from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.errors import InputError
+from directshape_torch.numerics.gradient_mode import is_forward_mode
+from directshape_torch.numerics.table_lookup import occurrences
+from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
+from directshape_torch.observation.packing import Observation
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.status import Status
+from directshape_torch.stereo_matching.car_points import PointSamples
+
+# A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
+_MIN_DEPTH_M = 1.0
+_DTYPES = (torch.float32, torch.float64)
+
+
+def check_no_tangents(*records: object) -> None:
+    """Raise `InputError` where a tensor of a record is a dual number of forward-mode differentiation.
+
+    What the iterations hold constant, they hold back from gradients; tangents would pass through it and come out wrong.
+
+    Args:
+        records: mappings of tensors, and dataclasses of tensors and of further such dataclasses.
+    """
+    # Of the whole process, other threads' regions too: what counts is whether these tensors take part.
+    if is_forward_mode() and any(map(_has_tangent, _tensors(records))):
+        raise InputError(
+            "refiner",
+            "tensors without tangents of forward-mode differentiation (torch.func.jvp, jacfwd)",
+            "some with",
+            "differentiate in reverse mode: .backward(), torch.func.vjp or jacrev, with backward.mode",
+        )
+
+
+def _has_tangent(tensor: Tensor) -> bool:
+    return unpack_dual(tensor).tangent is not None  # type: ignore[no-untyped-call]
+
+
+def _tensors(records: Iterable[object]) -> Iterator[Tensor]:
+    for record in records:
+        if isinstance(record, Tensor):
+            yield record
+        elif isinstance(record, Mapping):
+            yield from _tensors(record.values())
+        elif is_dataclass(record):
+            yield from _tensors(getattr(record, field.name) for field in fields(record))
+
+
+def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> None:
+    """Raise `InputError` unless frames, detections and prior share dtype, device, mask size and frame numbers."""
+    # By what they have and not by `isinstance`: a record of one's own will do.
+    needed = ("frames", frames, FrameBatch, "images_left"), ("detections", detections, Detections, "mask_left")
+    for name, given, kind, member in needed:
+        if not hasattr(given, member):
+            raise InputError(name, f"a {kind.__name__}", type(given).__name__, "call it as refiner(frames, detections)")
+    if frames.images_left.dtype not in _DTYPES:
+        # A refiner in half precision would be asked for next: said before dtypes are compared.
+        raise InputError(
+            "frames",
+            "float32 or float64",
+            str(frames.images_left.dtype),
+            "refine outside of half precision: .to(dtype=torch.float32) of frames, detections and refiner",
+        )
+    tensors = {"frames": frames.images_left, "detections": detections.T_cam_obj}
+    if detections.pose_sigma is not None:
+        tensors["detections.pose_sigma"] = detections.pose_sigma
+    for name, tensor in tensors.items():
+        if tensor.dtype != prior.origin.dtype or tensor.device != prior.origin.device:
+            raise InputError(
+                name,
+                f"dtype {prior.origin.dtype} on {prior.origin.device}, like the refiner",
+                f"{tensor.dtype} on {tensor.device}",
+                "move them together with .to(device, dtype)",
+            )
+    if len(detections):
+        if detections.mask_left.shape[1:] != frames.images_left.shape[2:]:
+            raise InputError(
+                "detections.mask_left",
+                f"masks of the (padded) image size {tuple(frames.images_left.shape[2:])}",
+                f"{tuple(detections.mask_left.shape[1:])}",
+            )
+        lowest, highest = torch.stack(torch.aminmax(detections.frame_index)).tolist()
+        if lowest < 0 or highest >= len(frames):
+            raise InputError("detections.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
+
+
+def without_empty_masks(detections: Detections, extents: SceneExtents | None = None) -> Detections:
+    """A mask without any foreground counts as none: it would only say that there is no car.
+
+    Args:
+        detections: B cars.
+        extents: of their masks, where they are known already; they hold for the result too.
+    """
+    areas = (scene_extents(detections) if extents is None else extents).areas()
+    left, right = (areas > 0).unbind(dim=1)
+    # A copy and not `replace`, which would check all over again what is not touched.
+    same = copy(detections)
+    object.__setattr__(same, "has_mask_left", left)
+    object.__setattr__(same, "has_mask_right", right)
+    return same
+
+
+def refusals(
+    frames: FrameBatch, detections: Detections, pixels: Observation, points: PointSamples | None, config: RefinerConfig
+) -> Tensor:
+    """For each car the code (B,) of the status that forbids its refinement, or -1.
+
+    Args:
+        frames: F frames.
+        detections: B cars.
+        pixels: packed pixels of all cars.
+        points: their stereo points; None for methods without.
+        config: method and least numbers.
+    """
+    T = detections.T_cam_obj
+    finite = T.isfinite().all(-1).all(-1)
+    upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
+    in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
+    if config.method == "geometric" and points is not None:
+        lacking = [(points.counts < config.point_cloud.min_points, Status.too_few_points)]
+    else:
+        lacking = _lacking_pixels(pixels, config.sampling.min_usable_pixels)
+    code = torch.full((len(detections),), -1, device=T.device)
+    # Later ones say more.
+    for condition, status in (*lacking, (~in_front, Status.behind_camera), (~finite, Status.non_finite)):
+        code = torch.where(condition, torch.full_like(code, status.code), code)
+    return code
+
+
+def _lacking_pixels(pixels: Observation, least: int) -> list[tuple[Tensor, Status]]:
+    areas = pixels.mask_areas
+    left, right = (occurrences(x.object_index, len(areas)) for x in (pixels.left, pixels.right))
+    # A region always has pixels, but masks that show next to nothing cannot tell a car from its surroundings.
+    too_few = torch.minimum(left + right, areas.sum(dim=1)) < least
+    return [(too_few, Status.too_few_pixels), (~(areas > 0).any(dim=1), Status.no_mask)]

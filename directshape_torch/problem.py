@@ -1,0 +1,465 @@
+"""The energy of B cars (paper, E) as the solver sees it: what rays see of a state, stages, and their iterations.
+
+Nothing here remembers anything: a look at a state, the stage that begins there and every evaluation are values that
+are handed on to whoever needs them next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig, SolverConfig, StageConfig
+from directshape_torch.depth import marched_views
+from directshape_torch.errors import ConfigError, InputError
+from directshape_torch.geometry import se3
+from directshape_torch.image.gradients import grey_levels
+from directshape_torch.image.pyramid import GreyPair
+from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.observation.packing import Observation
+from directshape_torch.rows import CarSums, Rays, Rows
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.field import Field, field_of
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.stereo_matching.car_points import PointSamples
+from directshape_torch.terms.cars import CarBatch, CarState, retract
+from directshape_torch.terms.check_term import check_term
+from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.point_cloud import PointCloud
+from directshape_torch.terms.priors import prior_terms
+from directshape_torch.terms.silhouette import MaskRows, Silhouettes
+from directshape_torch.terms.silhouette_product import SilhouetteProducts
+from directshape_torch.terms.term import (
+    Evaluation,
+    Figures,
+    Part,
+    Sight,
+    Term,
+    Where,
+    by_autograd,
+    choose_blocks,
+    part_of,
+    part_of_rows,
+    parts_of,
+    summed,
+    take_blocks,
+    with_varying_blocks,
+)
+
+# Those of "point_cloud" hold for the methods with points, the first two for the others.
+_WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
+
+TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
+"""Makes a user's term for some cars of a call: of these frames, all detections, the cars to refine, the shapes."""
+
+
+@dataclass(frozen=True)
+class CarProblem:
+    """Minimise the sum of terms over pose and shape of B cars: a `solver.Problem`.
+
+    Attributes:
+        prior: the family of shapes.
+        terms: summands of the energy.
+        masks: the rays of both images, left ones first, which everything that looks at a state shares.
+        rays: of the blocks of the left and of the right image by themselves.
+        config: stages, trust region, samples per ray.
+        factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
+        num_extra: how many of the terms, the last ones, are a user's own.
+    """
+
+    prior: ShapePrior
+    terms: tuple[Term, ...]
+    masks: MaskRows
+    rays: tuple[Rays, Rays]
+    config: RefinerConfig
+    factors: Tensor | None = None
+    num_extra: int = 0
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Of the T columns of costs."""
+        return tuple(name for term in self.terms for name in term.names)
+
+    def stages(self) -> list[StageConfig]:
+        return method_stages(self.config)
+
+    @classmethod
+    def of_scene(
+        cls,
+        config: RefinerConfig,
+        prior: ShapePrior,
+        frames: FrameBatch,
+        detections: Detections,
+        cars: CarBatch,
+        observation: Observation,
+        points: PointSamples | None = None,
+        extra_terms: Sequence[TermFactory] = (),
+        term_weights: Mapping[str, Tensor] | None = None,
+    ) -> CarProblem:
+        """The problem of `config.method`; terms of weight zero are left out, so ablations cost nothing.
+
+        Args:
+            config: weights and forms.
+            prior: the shapes.
+            frames: F frames.
+            detections: all detections of the call, which `cars.detection_row` points into.
+            cars: the B cars to refine.
+            observation: packed pixels of these cars.
+            points: stereo points of these cars; None for the method "direct".
+            extra_terms: make further terms.
+            term_weights: (detections,) factors of named terms.
+
+        Raises:
+            ConfigError: every term has weight zero, so there is nothing to minimise.
+            InputError: a factor of a term that does not exist (a misspelt name, or a term of weight zero), of a wrong
+                shape, or less than 0; an extra term that is not what `Term` says.
+        """
+        pixels = observation.left, observation.right
+        sides = [Rows.of_sorted(p.object_index, len(cars)) for p in pixels]
+        masks = MaskRows.of_pixels(pixels, sides, config.silhouette, len(cars))
+        terms: list[Term] = []
+        if points is not None:
+            cloud, weight = config.point_cloud, config.point_cloud.combined_weight
+            cloud = cloud if config.method == "geometric" else replace(cloud, weight=weight)
+            terms += [PointCloud.of_points(cloud, points)] if cloud.weight > 0 else []
+        if config.method != "geometric" and config.silhouette.weight > 0:
+            form = SilhouetteProducts if config.silhouette.form == "product" else Silhouettes
+            terms.append(form(config.silhouette, cars, masks, prior.bounds_obj, torch.ones_like(masks.filled[:, :1])))
+        if config.method != "geometric" and config.photometric.weight > 0:
+            pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
+            of_images = pyramid, observation.hidden_right, detections.mask_left
+            terms.append(Photometric.of_pixels(config.photometric, cars, pixels[0], sides[0], *of_images))
+        terms += prior_terms(config.priors, prior, cars)
+        names = [name for term in terms for name in term.names]
+        extra = [make(frames, detections, cars, prior) for make in extra_terms]
+        terms += extra
+        if not terms:
+            raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
+        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, num_extra=len(extra))
+        if extra:
+            code = prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
+            sight = problem.look(CarState(se3.inverse(cars.detector_T_cam_obj), code))
+            for term in extra:
+                check_term(term, problem.stages()[0], sight, names)
+                names += term.names
+        factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
+        return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
+
+    def parts(
+        self, terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...]
+    ) -> tuple[Part, ...]:
+        """What the terms, or the same ones of fewer cars, say of a state.
+
+        Ours in one function, which is compiled as a whole; terms of one's own by themselves, for what the compiler
+        makes of them must not concern ours: they may mark their functions `compile.compilable`.
+        """
+        own = len(terms) - self.num_extra
+        extra = zip(terms[own:], wheres[own:], strict=True)
+        of_extra = tuple(part_of(term, term.linear(field, state, where)) for term, where in extra)
+        return parts_of(terms[:own], field, state, wheres[:own]) + of_extra
+
+    def look(self, state: CarState) -> Sight:
+        """What every ray sees at a state, marched: constants."""
+        with torch.no_grad():
+            field = field_of(self.prior.bind(state.code))
+            bounds, num_samples = self.prior.bounds_obj, self.config.silhouette.samples_per_ray
+            return Sight(state, field, *marched_views(*self.rays, bounds, num_samples, field, state.T_obj_cam))
+
+    def begin(self, stage: StageConfig, sight: Sight) -> CarStage:
+        """The stage with everything fixed at a state that must not change while costs are compared."""
+        stages = self.stages()
+        earlier = stages[: stages.index(stage)] if stage in stages else []
+        after_wider = any(other.contour_width_px > stage.contour_width_px for other in earlier)
+        return CarStage(self, stage, tuple(term.begin(stage, sight) for term in self.terms), after_wider)
+
+    def of_cars(self, keep: Tensor) -> CarProblem:
+        """The problem of the cars where `keep` (B,) holds."""
+        numbers = keep.nonzero()[:, 0].tolist()
+        masks = self.masks.of_cars(keep, numbers)
+        terms = tuple(term.of_cars(keep, numbers) for term in self.terms)
+        factors = None if self.factors is None else self.factors[keep]
+        return CarProblem(self.prior, terms, masks, masks.of_sides(), self.config, factors, self.num_extra)
+
+
+@dataclass(frozen=True)
+class CarStage:
+    """A stage that has begun.
+
+    Attributes:
+        problem: of B cars.
+        config: of the stage.
+        terms: with pixel sets, counts and widths fixed.
+        after_wider: an earlier stage had a wider contour.
+    """
+
+    problem: CarProblem
+    config: StageConfig
+    terms: tuple[Term, ...]
+    after_wider: bool
+
+    @property
+    def photometric(self) -> Photometric | None:
+        """The photometric term, which the disparity profile is made of."""
+        return next((term for term in self.terms if isinstance(term, Photometric)), None)
+
+    def photometric_part(self, figures: Figures) -> Part | None:
+        """What the photometric term says among the figures of a state."""
+        return next((at for term, at in zip(self.terms, figures.parts, strict=True) if term is self.photometric), None)
+
+    @property
+    def is_prior_column(self) -> list[bool]:
+        """Which of the T columns of costs belong to priors."""
+        return [term.is_prior for term in self.terms for _ in term.names]
+
+    def information_of_measurements(self, figures: Figures) -> Tensor | None:
+        """The Fisher matrix (B, D, D) of the terms that are no priors; None without any."""
+        seen = [
+            part for part, prior in zip(figures.information.unbind(1), self.is_prior_column, strict=True) if not prior
+        ]
+        return torch.stack(seen).sum(dim=0) if seen else None
+
+    def figures(self, sight: Sight) -> Figures:
+        """The energy at a state, column by column, with every ray marched; differentiable where gradients are on."""
+        # The marked terms are constants, so those of the stage, which may be differentiated, stay as they are.
+        terms = self.terms if torch.is_grad_enabled() else tuple(with_varying_blocks(term) for term in self.terms)
+        wheres = tuple(term.where(sight) for term in terms)
+        parts = self.problem.parts(terms, sight.field, sight.state, wheres)
+        layout = _Layout.of(self.terms, self.problem.factors)
+        cells = CarSums.of(layout.owner * layout.num_columns + layout.column, layout.num_cars * layout.num_columns)
+        cost, products = (torch.cat(x) for x in zip(*(part[:2] for part in parts), strict=True))
+        information = torch.cat([part.information for part in parts])
+        by_car = layout.num_cars, layout.num_columns
+
+        def of_cells(table: Tensor, weight: Tensor) -> Tensor:
+            return cells.sum(table, weight).view(*by_car, *table.shape[1:])
+
+        products = of_cells(products, layout.weight)
+        return Figures(
+            of_cells(cost, layout.weight),
+            products[:, :, -1],
+            products[:, :, :-1],
+            of_cells(information, layout.information),
+            parts,
+        )
+
+    def start(self, sight: Sight) -> tuple[CarIterations, Evaluation]:
+        """What the iterations work on, and the energy where they begin."""
+        problem = self.problem
+        # What is differentiated afterwards is the marched energy, so its minimum must be found.
+        if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
+            terms, rest = self.terms, None
+            wheres = tuple(term.where(sight) for term in terms)
+        else:
+            moving = [term.moving(sight, self.after_wider) for term in self.terms]
+            terms, wheres, costs = (tuple(x) for x in zip(*moving, strict=True))
+            by_column = torch.cat(costs, dim=1)
+            rest = (by_column if problem.factors is None else by_column * problem.factors).sum(dim=1)
+        iterations = CarIterations.of(self, terms, rest, problem.factors, problem.masks)
+        return iterations, iterations.evaluated(sight.field, sight.state, wheres)
+
+    def linearise_differentiably(self, state: CarState) -> Evaluation:
+        """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
+        sight = self.problem.look(CarState(*(x.detach() for x in state)))
+        field = field_of(self.problem.prior.bind(state.code))
+        layout = _Layout.of(self.terms, self.problem.factors)
+        wheres = tuple(term.where(sight) for term in self.terms)
+        parts = self.problem.parts(self.terms, field, state, wheres)
+        return without_held(summed(layout.sums(), layout.weight, parts), self.config)
+
+    def free_unknowns(self, state: CarState) -> Tensor:
+        """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
+        free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
+        free = torch.cat([free_pose, state.code.abs() < self.problem.config.solver.max_code], dim=1)
+        return free & moving_unknowns(self.config, state.code)
+
+    def retract(self, state: CarState, step: Tensor) -> CarState:
+        """The state moved by tangent vectors (B, D)."""
+        return retract(state, step, self.problem.config.solver.max_code)
+
+    def step_limits(self) -> Tensor:
+        """Largest trusted step of each unknown, (D,)."""
+        return step_limits(self.problem.config.solver, self.problem.prior)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The blocks of all terms, one after the other."""
+
+    owner: Tensor  # (M,) car
+    column: Tensor  # (M,) of the costs
+    weight: Tensor  # (M,) float64
+    information: Tensor  # (M,) float64
+    num_cars: int
+    num_columns: int
+
+    @classmethod
+    def of(cls, terms: Sequence[Term], factors: Tensor | None) -> _Layout:
+        owner = torch.cat([term.blocks.owner for term in terms])
+        first = [sum(len(term.names) for term in terms[:n]) for n in range(len(terms))]
+        column = torch.cat([term.column + n for term, n in zip(terms, first, strict=True)])
+        weight, information = (
+            torch.cat(x) for x in zip(*((t.block_weight, t.information) for t in terms), strict=True)
+        )
+        if factors is not None:
+            factor = factors.to(torch.float64)[owner, column]
+            weight, information = weight * factor, information * factor
+        num_columns = sum(len(term.names) for term in terms)
+        return cls(owner, column, weight, information, len(terms[0].blocks.counts), num_columns)
+
+    def sums(self) -> CarSums:
+        """Over the blocks of each car."""
+        return CarSums.of(self.owner, self.num_cars)
+
+
+@dataclass(frozen=True)
+class CarIterations:
+    """The cars of a stage that still move: a `solver.StageProblem`.
+
+    Attributes:
+        stage: of all cars of the problem.
+        terms: of the B cars that still move, with the rows that can still change.
+        layout: of the blocks of these terms.
+        sums: over these blocks.
+        rest: (B,) cost of the other rows; None where every row is marched at every state.
+        factors: (B, T) as in `CarProblem`.
+    """
+
+    stage: CarStage
+    terms: tuple[Term, ...]
+    layout: _Layout
+    sums: CarSums
+    rest: Tensor | None
+    factors: Tensor | None
+    masks: MaskRows
+
+    @classmethod
+    def of(
+        cls, stage: CarStage, terms: tuple[Term, ...], rest: Tensor | None, factors: Tensor | None, masks: MaskRows
+    ) -> CarIterations:
+        layout, terms = _Layout.of(terms, factors), tuple(with_varying_blocks(term) for term in terms)
+        return cls(stage, terms, layout, layout.sums(), rest, factors, masks)
+
+    def evaluate(self, state: CarState, near: Evaluation) -> Evaluation:
+        """The energy at a state, looking near where it was evaluated last."""
+        problem = self.stage.problem
+        if self.rest is None:
+            sight = replace(problem, masks=self.masks, rays=self.masks.of_sides()).look(state)
+            return self.evaluated(sight.field, state, tuple(term.where(sight) for term in self.terms))
+        return self.evaluated(field_of(problem.prior.bind(state.code)), state, near.wheres)
+
+    def evaluated(self, field: Field, state: CarState, wheres: tuple[Where, ...]) -> Evaluation:
+        """The energy at a state, looking near the points given."""
+        problem, terms = self.stage.problem, self.terms
+        parts = problem.parts(terms, field, state, wheres)
+        if problem.config.solver.jacobian == "autograd":
+            looked = [part.where for part in parts]
+            rows = by_autograd(terms, problem.prior, state, looked)
+            parts = tuple(part_of_rows(t, *r, where) for t, r, where in zip(terms, rows, looked, strict=True))
+        at = summed(self.sums, self.layout.weight, parts)
+        cost = at.cost if self.rest is None else at.cost + self.rest
+        return without_held(at._replace(cost=cost), self.stage.config)
+
+    def choose(self, accepted: Tensor, new: Evaluation, old: Evaluation) -> Evaluation:
+        """The new evaluation of cars whose step was accepted (B,), the old one of the others."""
+        conditions = accepted, accepted[:, None], accepted[:, None, None]
+        cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
+        pairs = zip(self.terms, new.wheres, old.wheres, strict=True)
+        return Evaluation(
+            cost, gradient, hessian, tuple(choose_blocks(accepted[term.blocks.owner], *pair) for term, *pair in pairs)
+        )
+
+    def retract(self, state: CarState, step: Tensor) -> CarState:
+        """The state moved by tangent vectors (B, D) within the trust region."""
+        config = self.stage.problem.config.solver
+        # No component of the rotation is larger than its limit.
+        return retract(state, step, config.max_code, math.sqrt(3) * config.max_step_rotation_rad)
+
+    def step_limits(self) -> Tensor:
+        """Largest trusted step of each unknown, (D,)."""
+        return self.stage.step_limits()
+
+    def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
+        """Those of the cars where `keep` (B,) holds, `numbers` of them, with their evaluation."""
+        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
+        kept = (term.blocks.of_cars(keep, numbers)[1] for term in self.terms)
+        wheres = tuple(take_blocks(where, blocks) for where, blocks in zip(at.wheres, kept, strict=True))
+        rest, factors = (None if x is None else x.index_select(0, index) for x in (self.rest, self.factors))
+        masks = self.masks if self.rest is not None else self.masks.of_cars(keep, numbers)
+        terms = tuple(term.of_cars(keep, numbers) for term in self.terms)
+        cost, gradient, hessian = (x.index_select(0, index) for x in at[:3])
+        return CarIterations.of(self.stage, terms, rest, factors, masks), Evaluation(cost, gradient, hessian, wheres)
+
+
+def _pyramid(frames: FrameBatch, num_halvings: int) -> list[GreyPair]:
+    pyramid = [GreyPair(grey_levels(frames.images_left), grey_levels(frames.images_right), frames.sizes, 1.0)]
+    for _ in range(num_halvings):
+        pyramid.append(pyramid[-1].halved())
+    return pyramid
+
+
+def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: Tensor) -> Tensor | None:
+    """Factors (detections, T) of the columns from those given by name, 1 for the others."""
+    if weights is None:
+        return None
+    for name, weight in weights.items():
+        if name not in names:
+            raise InputError("term_weights", f"names among {', '.join(names)}", repr(name))
+        check_shape(f"term_weights[{name!r}]", weight, (len(code),), "one factor for each car")
+        negative = (weight < 0).nonzero()[:, 0].tolist()
+        if negative:
+            got = f"{float(weight[negative[0]]):.3g} for car {negative[0]}"
+            cure = "let a network predict their logarithm"
+            raise InputError(f"term_weights[{name!r}]", "factors of at least 0", got, cure)
+    ones = code.new_ones(len(code))
+    return torch.stack([weights[name].to(code) if name in weights else ones for name in names], dim=1)
+
+
+def method_stages(config: RefinerConfig) -> list[StageConfig]:
+    """The stages of `config.method`: rounds of its own for "geometric", else those of the configuration.
+
+    Example:
+        >>> from directshape_torch.config_files import load_config
+        >>> stages = method_stages(load_config(None, ["method=geometric", "point_cloud.rounds=2"]))
+        >>> [stage.unknowns for stage in stages]
+        ['pose', 'shape', 'pose', 'shape']
+    """
+    if config.method != "geometric":
+        return list(config.stages)
+    # Contour and pyramid level mean nothing to a point cloud: the last stage's, for whoever draws or measures.
+    last, cloud = config.stages[-1], config.point_cloud
+    pose_stage, shape_stage, joint_stage = (
+        StageConfig(last.contour_width_px, last.image_level, cloud.max_iterations, unknowns=unknowns)
+        for unknowns in ("pose", "shape", "both")
+    )
+    return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]
+
+
+def moving_unknowns(stage: StageConfig, code: Tensor) -> Tensor:
+    """Unknowns (D,) that the stage moves."""
+    is_motion = torch.arange(6 + code.shape[1], device=code.device) < 6
+    return (
+        is_motion if stage.unknowns == "pose" else ~is_motion if stage.unknowns == "shape" else is_motion | ~is_motion
+    )
+
+
+def without_held(at: Evaluation, stage: StageConfig) -> Evaluation:
+    """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
+    if stage.unknowns == "both":
+        return at
+    moving = moving_unknowns(stage, at.gradient[:, 6:])
+    identity = torch.eye(len(moving), dtype=at.hessian.dtype, device=at.hessian.device)
+    hessian = torch.where(moving[:, None] & moving, at.hessian, identity)
+    return at._replace(gradient=torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian=hessian)
+
+
+def step_limits(config: SolverConfig, prior: ShapePrior) -> Tensor:
+    """Largest trusted step (D,) of each unknown, float64; not to be written to."""
+    limits = [config.max_step_translation_m] * 3 + [config.max_step_rotation_rad] * 3
+    limits += [config.max_step_code] * prior.num_codes
+    return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))

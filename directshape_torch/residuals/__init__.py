@@ -1,1 +1,0 @@
-"""The residuals of the energy, each with its Jacobian, and robust norms."""

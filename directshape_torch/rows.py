@@ -1,0 +1,189 @@
+"""Rows of residuals in blocks that belong to one car each: the one layout of everything that is summed per car.
+
+Pixels are packed once, 64 of one car to a block. What a car has once (its pose, its camera's centre) is looked up per
+block and not per row, the products of a block's rows have a fixed shape, and a car that leaves the batch takes its
+blocks along without a row being moved. Tensors have the blocks at their last axis but one: (..., M, R).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.numerics.table_lookup import occurrences
+
+BLOCK = 64
+"""Rows of a block."""
+# Stands for a component of a direction that is zero.
+_LEAST_DIRECTION = 1e-12
+
+
+class Blocks(NamedTuple):
+    """M blocks of B cars, a car's not necessarily side by side.
+
+    The host knows how many blocks each car has, so that leaving cars out makes it wait for nothing.
+    """
+
+    owner: Tensor  # (M,) car of each block
+    counts: tuple[int, ...]  # (B,) of each car
+
+    @classmethod
+    def one_each(cls, num_cars: int, device: torch.device) -> Blocks:
+        """One block of every car."""
+        return cls(torch.arange(num_cars, device=device), (1,) * num_cars)
+
+    @classmethod
+    def join(cls, parts: Sequence[Blocks]) -> Blocks:
+        """Blocks of the same cars, those of the parts one after the other."""
+        counts = tuple(map(sum, zip(*(part.counts for part in parts), strict=True)))
+        return cls(torch.cat([part.owner for part in parts]), counts)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> tuple[Blocks, Tensor]:
+        """The blocks of the cars where `keep` (B,) holds, renumbered, and which (R,) of the blocks they are.
+
+        Args:
+            keep: (B,) bool.
+            numbers: where it holds, as the host knows it.
+        """
+        counts = tuple(self.counts[number] for number in numbers)
+        kept = torch.nonzero_static(keep[self.owner], size=sum(counts))[:, 0]
+        new_number = torch.cumsum(keep.long(), 0) - 1
+        return Blocks(new_number[self.owner[kept]], counts), kept
+
+
+class Rows(NamedTuple):
+    """How packed rows, sorted by car, fill blocks."""
+
+    blocks: Blocks
+    row: Tensor  # (M, 64) row in each place; an empty place repeats a row of its own car
+    filled: Tensor  # (M, 64) bool
+    num_rows: int
+
+    @classmethod
+    def of_sorted(cls, car: Tensor, num_cars: int) -> Rows:
+        """Blocks of rows whose cars (P,) ascend.
+
+        Example:
+            >>> rows = Rows.of_sorted(torch.tensor([0, 0, 2]), 3)
+            >>> rows.blocks.owner, rows.row[:, :3]
+            (tensor([0, 2]), tensor([[0, 1, 0],
+                    [2, 2, 2]]))
+        """
+        rows_of_car = occurrences(car, num_cars)
+        blocks_of_car = (rows_of_car + BLOCK - 1) // BLOCK
+        counts = tuple(blocks_of_car.tolist())
+        cars = torch.arange(num_cars, device=car.device)
+        owner = torch.repeat_interleave(cars, blocks_of_car, output_size=sum(counts))
+        first_row, first_block = (torch.cumsum(n, 0) - n for n in (rows_of_car, blocks_of_car))
+        block_in_car = torch.arange(len(owner), device=car.device) - first_block[owner]
+        place = block_in_car[:, None] * BLOCK + torch.arange(BLOCK, device=car.device)
+        filled = place < rows_of_car[owner][:, None]
+        # An empty place must not bring another car's numbers, which may be NaN, nor an index out of range.
+        row = first_row[owner][:, None] + torch.where(filled, place, place[:, :1])
+        return cls(Blocks(owner, counts), row, filled, len(car))
+
+    @property
+    def places(self) -> Tensor:
+        """Place (P,) of each row among the M * 64 of all blocks."""
+        return torch.nonzero_static(self.filled.flatten(), size=self.num_rows)[:, 0]
+
+
+class CarSums(NamedTuple):
+    """The order in which the blocks of each car are added: sums are the same to the bit whatever other cars have."""
+
+    by_car: Tensor  # (M,) blocks of the first car in order, then of the second, ...
+    first: Tensor  # (B,) where those of each car begin
+
+    @classmethod
+    def of(cls, owner: Tensor, num_cars: int) -> CarSums:
+        """Of blocks of cars (M,).
+
+        Example:
+            >>> CarSums.of(torch.tensor([0, 2, 0]), 3)
+            CarSums(by_car=tensor([0, 2, 1]), first=tensor([0, 2, 2]))
+        """
+        ascending, by_car = owner.sort(stable=True)
+        return cls(by_car, torch.searchsorted(ascending, torch.arange(num_cars, device=owner.device)))
+
+    def sum(self, table: Tensor, weight: Tensor | None = None) -> Tensor:
+        """Sums (B, ...) of the entries (M, ...) of each car, times weights (M,); no entry enters another car's sum.
+
+        Example:
+            >>> CarSums.of(torch.tensor([0, 2, 0]), 3).sum(torch.tensor([1.0, 2.0, 4.0]))
+            tensor([5., 0., 2.])
+        """
+        weight = None if weight is None else weight[self.by_car]
+        flat = table[:, None] if table.ndim == 1 else table.flatten(1)
+        # A lookup in a table of rows, which are added as they are read: nothing but the sums is written.
+        sums = torch.nn.functional.embedding_bag(self.by_car, flat, self.first, mode="sum", per_sample_weights=weight)
+        return sums.view(len(self.first), *table.shape[1:])
+
+
+class Rays(NamedTuple):
+    """Rays of blocks in the left camera's frame; each block has one camera and one car."""
+
+    owner: Tensor  # (M,) car
+    centre_cam: Tensor  # (M, 3) of the pixels' own camera, metres
+    ray_cam: Tensor  # (3, M, R) of unit depth in that camera
+
+    @classmethod
+    def of_rows(cls, rows: Rows, centre_cam: Tensor, ray_cam: Tensor) -> Rays:
+        """From the camera centres and rays (P, 3) of packed rows."""
+        return cls(rows.blocks.owner, centre_cam[rows.row[:, 0]], ray_cam[rows.row].movedim(-1, 0).contiguous())
+
+    def take(self, blocks: Tensor, owner: Tensor) -> Rays:
+        """Some of the blocks (Q,), of cars (Q,) that may be numbered anew."""
+        return Rays(owner, self.centre_cam[blocks], self.ray_cam.index_select(1, blocks))
+
+    def in_objects(self, T_obj_cam: Tensor) -> ObjectRays:
+        """The rays in the frames of their cars, by the poses (B, 4, 4) of the cars."""
+        T = T_obj_cam[self.owner, :3]
+        centre = (T[:, :, :3] * self.centre_cam[:, None]).sum(-1) + T[:, :, 3]
+        x_axis, y_axis, z_axis = T[:, :, :3].permute(2, 1, 0)[..., None]  # columns of R, (3, M, 1) each
+        x, y, z = self.ray_cam
+        direction = torch.addcmul(torch.addcmul(x_axis * x, y_axis, y), z_axis, z)
+        return ObjectRays(centre.mT[..., None], direction)
+
+
+class ObjectRays(NamedTuple):
+    """Rays in the frame of their car: `point_obj = centre + depth * direction`, depth in the ray's own camera."""
+
+    centre_obj: Tensor  # (3, M, 1) metres
+    direction_obj: Tensor  # (3, M, R) per metre of depth
+
+    def at(self, depth: Tensor) -> Tensor:
+        """Points (3, ..., M, R) at depths (..., M, R)."""
+        centre, direction = self.centre_obj, self.direction_obj
+        for _ in range(depth.ndim - 2):
+            centre, direction = centre[:, None], direction[:, None]
+        return torch.addcmul(centre, depth, direction)
+
+    def depth_next_to(self, points_obj: Tensor) -> Tensor:
+        """Depths (M, R) at which the rays come closest to points (3, M, R)."""
+        along = ((points_obj - self.centre_obj) * self.direction_obj).sum(0)
+        return along / (self.direction_obj * self.direction_obj).sum(0)
+
+    def interval(self, bounds_obj: Tensor) -> Interval:
+        """Where the rays are inside bounds (2, 3), in front of their camera."""
+        direction = self.direction_obj
+        inverse = 1 / torch.where(direction.abs() < _LEAST_DIRECTION, _LEAST_DIRECTION, direction)
+        to_lower, to_upper = ((corner.view(3, 1, 1) - self.centre_obj) * inverse for corner in bounds_obj)
+        near, near_axis = torch.minimum(to_lower, to_upper).max(dim=0)
+        far, far_axis = torch.maximum(to_lower, to_upper).min(dim=0)
+        near = near.clamp_min(0)
+        hit = far > near
+        near = torch.where(hit, near, 1.0)
+        return Interval(near, torch.where(hit, far, near + 1), hit, near_axis, far_axis)
+
+
+class Interval(NamedTuple):
+    """Where rays (M, R) are inside bounds; depths of those that miss them mean nothing, but are finite."""
+
+    near: Tensor  # (M, R) metres of depth
+    far: Tensor  # (M, R)
+    hit: Tensor  # (M, R) bool
+    near_axis: Tensor  # (M, R) axis 0, 1 or 2 of the face through which the ray enters
+    far_axis: Tensor  # (M, R) and leaves

@@ -1,0 +1,119 @@
+"""Points of a car, `lambda / P sum_p Huber(sdf(T_obj_cam X_p))`, the mean over its points (Engelmann et al., 2016).
+
+A point that lies on the surface has no residual. It is fixed in the camera; the state moves it in the object frame. The
+points may come from dense stereo (the methods "geometric" and "combined") or from a LiDAR. Derivation:
+docs/derivations/point_cloud.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import PointCloudConfig, StageConfig
+from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.numerics.table_lookup import occurrences
+from directshape_torch.rows import Blocks, Rays, Rows
+from directshape_torch.shape.field import Field
+from directshape_torch.stereo_matching.car_points import PointSamples
+from directshape_torch.terms import robust
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.silhouette import sdf_state_jacobian
+from directshape_torch.terms.term import Linear, Sight, Where
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """See module. Build with `of_points`; the points are those of the whole refinement.
+
+    Attributes:
+        name: of the term.
+        huber_m: corner of the norm, metres.
+        all_blocks: M blocks.
+        points_cam: points as rays from the camera that are there at the depth 1, (M, 64) places.
+        filled: (M, 64) 1 in filled places, else 0.
+        weight: (M,) float64, lambda over the number of points of the car.
+    """
+
+    name: str
+    huber_m: float
+    all_blocks: Blocks
+    points_cam: Rays
+    filled: Tensor
+    weight: Tensor
+
+    is_prior = False
+
+    @classmethod
+    def of_points(cls, config: PointCloudConfig, points: PointSamples, name: str = "point_cloud") -> PointCloud:
+        """The term of the cars whose points these are; a car with fewer than `min_points` has no part in it."""
+        num_cars = len(points.counts)
+        enough = points.counts >= config.min_points
+        chosen = enough[points.object_index].nonzero()[:, 0]
+        car = points.object_index[chosen]
+        rows = Rows.of_sorted(car, num_cars)
+        xyz = points.points_cam[chosen]
+        count = occurrences(car, num_cars).clamp_min(1).to(torch.float64)
+        owner = rows.blocks.owner
+        rays = Rays.of_rows(rows, torch.zeros_like(xyz), xyz)
+        return cls(name, config.huber_m, rows.blocks, rays, rows.filled.to(xyz.dtype), (config.weight / count)[owner])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name,)
+
+    @property
+    def blocks(self) -> Blocks:
+        return self.all_blocks
+
+    @property
+    def column(self) -> Tensor:
+        return torch.zeros_like(self.points_cam.owner)
+
+    @property
+    def block_weight(self) -> Tensor:
+        return self.weight
+
+    @property
+    def information(self) -> Tensor:
+        """The points count one by one, each with the corner of the norm as its standard deviation."""
+        return torch.full_like(self.weight, 1 / self.huber_m**2)
+
+    @property
+    def row_weight(self) -> Tensor:
+        return self.filled[..., None]
+
+    def begin(self, stage: StageConfig, sight: Sight) -> PointCloud:
+        return self
+
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[PointCloud, Where, Tensor]:
+        return self, (), torch.zeros_like(sight.state.T_obj_cam[:, 0, :1], dtype=torch.float64)
+
+    def where(self, sight: Sight) -> Where:
+        return ()
+
+    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+        points = self._points_obj(state)
+        at = field.derivatives(points, self.points_cam.owner, nothing_is_differentiated())
+        residual = at.value[..., None]
+        return Linear(residual, torch.ones_like(residual), sdf_state_jacobian(points, at.gradient, at), where)
+
+    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+        return field.value(self._points_obj(state), self.points_cam.owner)[..., None]
+
+    def norm(self, residual: Tensor) -> robust.RobustValue:
+        return robust.huber(residual, self.huber_m)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> PointCloud:
+        blocks, kept = self.all_blocks.of_cars(keep, numbers)
+        points, filled = self.points_cam.take(kept, blocks.owner), self.filled.index_select(0, kept)
+        return replace(
+            self, all_blocks=blocks, points_cam=points, filled=filled, weight=self.weight.index_select(0, kept)
+        )
+
+    def _points_obj(self, state: CarState) -> Tensor:
+        rays = self.points_cam.in_objects(state.T_obj_cam)
+        return rays.centre_obj + rays.direction_obj

@@ -1,0 +1,263 @@
+"""Priors, `lambda r^2 / 2`: shape code, height above the ground, tilt against it, the detector's dimensions and pose.
+
+Each residual is a function of the cars and a state that returns it with its Jacobian by `(v, omega, dcode)`; a prior of
+one's own is such a function in a `PriorTerm` (docs/extra_terms.md). Derivations: docs/derivations/priors.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import PriorConfig, StageConfig
+from directshape_torch.geometry import se3
+from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.rows import Blocks
+from directshape_torch.shape.field import Field
+from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
+from directshape_torch.terms import robust
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.term import Linear, Sight, Where
+
+
+class PriorResidual(NamedTuple):
+    """Residual of a prior for B cars, with its Jacobian."""
+
+    residual: Tensor  # (B, R)
+    J_residual_state: Tensor  # (B, R, 6 + K)
+
+
+@dataclass(frozen=True)
+class PriorTerm:
+    """`weight * sum_i r_i^2 / 2` of a residual of the state alone: one block of R rows for each car.
+
+    Attributes:
+        name: of the term.
+        weight: lambda.
+        cars: constants of the cars.
+        residual_of: the residual with its Jacobian, from the constants and a state.
+        num_rows: R.
+    """
+
+    name: str
+    weight: float
+    cars: CarBatch
+    residual_of: Callable[[CarBatch, CarState], PriorResidual]
+    num_rows: int
+
+    is_prior = True
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name,)
+
+    @property
+    def blocks(self) -> Blocks:
+        return Blocks.one_each(len(self.cars), self.cars.frame_index.device)
+
+    @property
+    def column(self) -> Tensor:
+        return torch.zeros_like(self.cars.frame_index)
+
+    @property
+    def block_weight(self) -> Tensor:
+        return torch.full_like(self.cars.input_depth, self.weight, dtype=torch.float64)
+
+    @property
+    def information(self) -> Tensor:
+        return self.block_weight
+
+    @property
+    def row_weight(self) -> Tensor:
+        return torch.ones_like(self.cars.input_depth, dtype=torch.float64).expand(self.num_rows, 1, -1).movedim(-1, 0)
+
+    def begin(self, stage: StageConfig, sight: Sight) -> PriorTerm:
+        return self
+
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[PriorTerm, Where, Tensor]:
+        return self, (), torch.zeros_like(self.cars.input_depth[:, None], dtype=torch.float64)
+
+    def where(self, sight: Sight) -> Where:
+        return ()
+
+    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+        at = self.residual_of(self.cars, state)
+        residual = at.residual.to(torch.float64)[..., None]
+        return Linear(residual, torch.ones_like(residual), at.J_residual_state.to(torch.float64), where)
+
+    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+        return self.residual_of(self.cars, state).residual.to(torch.float64)[..., None]
+
+    def norm(self, residual: Tensor) -> robust.RobustValue:
+        return robust.quadratic(residual)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> PriorTerm:
+        return replace(self, cars=self.cars.of_cars(keep, numbers))
+
+
+def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:
+    """Shape, height, tilt, dimensions, and pose where its sigma is known; those of weight zero left out."""
+
+    def of_dimensions(cars: CarBatch, state: CarState) -> PriorResidual:
+        sigma = constant_like(config.dimensions_sigma_m, state.code)
+        return dimensions_prior(prior.dimensions_and_derivative(state.code), cars.detector_hwl, sigma)
+
+    def of_pose(cars: CarBatch, state: CarState) -> PriorResidual:
+        sigma = detector_pose_sigma(config, cars)
+        return pose_prior(state.T_obj_cam, cars.detector_T_cam_obj, sigma, state.code.shape[1])
+
+    tilt, num_tilts = (tilt_prior_normal, 2) if config.tilt_form == "normal" else (tilt_prior_cosine, 1)
+    all_terms = [
+        PriorTerm("shape", config.shape_weight, cars, lambda _, state: shape_prior(state.code), prior.num_codes),
+        PriorTerm("height", config.height_weight, cars, height_prior, 1),
+        PriorTerm("tilt", config.tilt_weight, cars, tilt, num_tilts),
+        PriorTerm("dimensions", config.dimensions_weight, cars, of_dimensions, 3),
+    ]
+    if cars.detector_pose_sigma is not None or any(_pose_sigmas(config)):
+        all_terms.append(PriorTerm("pose", config.pose_weight, cars, of_pose, 4))
+    return [term for term in all_terms if term.weight > 0]
+
+
+def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
+    """Standard deviations (B, 4) of the input poses, see `Detections.pose_sigma`; infinite where nobody knows them."""
+    if cars.detector_pose_sigma is not None:
+        return cars.detector_pose_sigma
+    along_share, *constant = _pose_sigmas(config)
+    origin = cars.detector_T_cam_obj[:, :3, 3]
+    sigma = constant_like(tuple(s if s > 0 else math.inf for s in constant), origin).repeat(len(origin), 1)
+    if along_share > 0:
+        # constant[0], for infinity stands for nothing known here.
+        distance = torch.hypot(origin[:, 0], origin[:, 2])
+        sigma[:, 0] = torch.sqrt((along_share * distance) ** 2 + constant[0] ** 2)
+    return sigma
+
+
+def _pose_sigmas(p: PriorConfig) -> tuple[float, float, float, float, float]:
+    """Along the ray as a share of the distance, then metres, metres, metres and radians; 0 for not known."""
+    metres = p.pose_sigma_along_m, p.pose_sigma_across_m, p.pose_sigma_vertical_m
+    return p.pose_sigma_along_share, *metres, math.radians(p.pose_sigma_yaw_deg)
+
+
+def shape_prior(code: Tensor) -> PriorResidual:
+    """Pulls the whitened code (B, K) to the mean shape (paper, E_shape; sigma is folded into the basis).
+
+    Example:
+        >>> shape_prior(torch.ones(1, 2)).J_residual_state[0, 0]
+        tensor([0., 0., 0., 0., 0., 0., 1., 0.])
+    """
+    num_cars, num_codes = code.shape
+    identity = torch.eye(num_codes, dtype=code.dtype, device=code.device)
+    return PriorResidual(code, torch.nn.functional.pad(identity, (6, 0)).expand(num_cars, -1, -1))
+
+
+def height_prior(cars: CarBatch, state: CarState) -> PriorResidual:
+    """Height of the object origin against the ground plane, along the camera's y axis (paper, r_trans), metres.
+
+    `r = (n . t + d) / n_y` with t the object origin in the camera frame, which moves by `-R_cam_obj v`.
+    """
+    R_cam_obj = state.T_obj_cam[:, :3, :3].transpose(1, 2)
+    origin_cam = -(R_cam_obj @ state.T_obj_cam[:, :3, 3:])[..., 0]
+    n_over_ny = cars.ground_normal_cam / cars.ground_normal_cam[:, 1:2]
+    residual = (n_over_ny * origin_cam).sum(-1) + cars.ground_offset / cars.ground_normal_cam[:, 1]
+    J_v = -(n_over_ny[:, None] @ R_cam_obj)
+    return PriorResidual(residual[:, None], torch.nn.functional.pad(J_v, (0, 3 + state.code.shape[1])))
+
+
+def tilt_prior_normal(cars: CarBatch, state: CarState) -> PriorResidual:
+    """Horizontal components of the ground normal in the object frame: zero for a car that stands on the ground.
+
+    `n_obj = R_obj_cam n`, `r = (n_obj.x, n_obj.z)`; unlike the paper's form its Jacobian does not vanish at zero.
+    """
+    x, y, z = _ground_normal_obj(cars, state)
+    zero = torch.zeros_like(x)
+    J_x, J_z = torch.stack([zero, z, -y], dim=-1), torch.stack([y, -x, zero], dim=-1)
+    return PriorResidual(torch.stack([x, z], dim=-1), _by_rotation(torch.stack([J_x, J_z], dim=1), state))
+
+
+def tilt_prior_cosine(cars: CarBatch, state: CarState) -> PriorResidual:
+    """The paper's `r_rot = 1 - (R_cam_obj [0, -1, 0]) . n = 1 + n_obj.y`; its Jacobian vanishes where r does."""
+    x, y, z = _ground_normal_obj(cars, state)
+    J_omega = torch.stack([-z, torch.zeros_like(x), x], dim=-1)[:, None]
+    return PriorResidual((1 + y)[:, None], _by_rotation(J_omega, state))
+
+
+def _ground_normal_obj(cars: CarBatch, state: CarState) -> tuple[Tensor, ...]:
+    return (state.T_obj_cam[:, :3, :3] @ cars.ground_normal_cam[..., None])[..., 0].unbind(-1)
+
+
+def _by_rotation(J_omega: Tensor, state: CarState) -> Tensor:
+    """Jacobian by the whole state of a residual that only rotation changes, from its part (B, R, 3)."""
+    return torch.nn.functional.pad(J_omega, (3, state.code.shape[1]))
+
+
+def dimensions_prior(
+    shape: DimensionsDerivative,  # of B shapes
+    detector_hwl: Tensor,  # (B, 3) metres
+    sigma_hwl: Tensor,  # (3,) metres
+) -> PriorResidual:
+    """Shape dimensions against the detector's, in the detector's standard deviations.
+
+    A car seen from behind does not show its length: the detector's dimensions are information (not in the paper).
+
+    Example:
+        >>> shape = DimensionsDerivative(torch.zeros(1, 3), torch.zeros(1, 3, 2))
+        >>> dimensions_prior(shape, torch.ones(1, 3), torch.ones(3)).residual
+        tensor([[-1., -1., -1.]])
+    """
+    J_residual_code = shape.J_hwl_code / sigma_hwl[:, None]
+    return PriorResidual((shape.hwl - detector_hwl) / sigma_hwl, torch.nn.functional.pad(J_residual_code, (6, 0)))
+
+
+def pose_prior(
+    T_obj_cam: Tensor,  # (B, 4, 4)
+    detector_T_cam_obj: Tensor,  # (B, 4, 4) input pose
+    sigma: Tensor,  # (B, 4) along the viewing ray, across it, vertically (metres), heading (radians); infinite: no part
+    num_codes: int,
+) -> PriorResidual:
+    """Object origin and heading against the detector's, in the detector's standard deviations (not in the paper).
+
+    The axes are those of the detector's viewing ray, so they stay while the car moves; the heading is the angle about
+    the camera's y axis from the detector's x axis to the car's, in (-pi, pi].
+
+    Example:
+        >>> T_cam_obj = torch.eye(4)[None].clone()
+        >>> T_cam_obj[:, 2, 3] = 10.0
+        >>> nearer = T_cam_obj.clone()
+        >>> nearer[:, 2, 3] = 9.0
+        >>> pose_prior(se3.inverse(nearer), T_cam_obj, torch.tensor([[0.5, 1.0, 1.0, 0.1]]), 0).residual
+        tensor([[-2.,  0.,  0.,  0.]])
+    """
+    T_cam_obj = se3.inverse(T_obj_cam)
+    R_cam_obj, axes = T_cam_obj[:, :3, :3], viewing_axes(detector_T_cam_obj[:, :3, 3])
+    moved = (axes @ (T_cam_obj[:, :3, 3:] - detector_T_cam_obj[:, :3, 3:]))[..., 0]
+    x_axis, x_detector = R_cam_obj[:, 0::2, 0], detector_T_cam_obj[:, 0::2, 0]
+    sine = x_axis[:, 0] * x_detector[:, 1] - x_axis[:, 1] * x_detector[:, 0]
+    turned = torch.atan2(sine, (x_axis * x_detector).sum(-1))
+    # The x axis h moves by R_cam_obj (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], its angle atan2(-h_z, h_x) by
+    # (h_z dh_x - h_x dh_z) / |h|^2.
+    dh_y, dh_z = R_cam_obj[:, 0::2, 2], -R_cam_obj[:, 0::2, 1]
+    by_y, by_z = (x_axis[:, 1] * dh[:, 0] - x_axis[:, 0] * dh[:, 1] for dh in (dh_y, dh_z))
+    J_yaw_omega = torch.stack([torch.zeros_like(by_y), by_y, by_z], dim=-1) / (x_axis * x_axis).sum(-1, keepdim=True)
+    J = T_obj_cam.new_zeros(len(T_obj_cam), 4, 6 + num_codes)
+    J[:, :3, :3] = -axes @ R_cam_obj
+    J[:, 3, 3:6] = J_yaw_omega
+    return PriorResidual(torch.cat([moved, turned[:, None]], dim=-1) / sigma, J / sigma[..., None])
+
+
+def viewing_axes(origin_cam: Tensor) -> Tensor:
+    """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down.
+
+    Example:
+        >>> viewing_axes(torch.tensor([[0.0, 1.6, 10.0]]))[0, 0]
+        tensor([0., 0., 1.])
+    """
+    x, z = origin_cam[:, 0], origin_cam[:, 2]
+    distance = torch.sqrt(x * x + z * z)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    rows = (x / distance, zero, z / distance, z / distance, zero, -x / distance, zero, one, zero)
+    return torch.stack(rows, dim=-1).view(-1, 3, 3)

@@ -1,0 +1,280 @@
+"""Silhouettes: does the projected shape agree with the instance masks of both images? (paper, E_silh and r_silh)
+
+`r = -log(pi p_fg + (1 - pi) p_bg)` for every ray, with the projection `pi = sigmoid(-zeta m)` of the least signed
+distance m along it. By the envelope theorem the Jacobian of m is that of the point where it is taken. Derivation:
+docs/derivations/silhouette_closest_approach.md. The paper's product over samples: `silhouette_product`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import SilhouetteConfig, StageConfig
+from directshape_torch.depth import Closest, along_face, attached_closest_depth, tracked_closest
+from directshape_torch.geometry.short_axes import cross
+from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.rows import Blocks, CarSums, Rays, Rows
+from directshape_torch.shape.field import Field
+from directshape_torch.shape.grid_cells import Lookup
+from directshape_torch.terms import robust
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.term import Linear, Sight
+
+# A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
+IN_PLAY_EXPONENT = 8.0
+# And as far again as the contour may move during a stage, beyond which the next stage picks it up.
+_IN_PLAY_MARGIN_M = 0.2
+# Where a wider contour has gone before, what is left to move is little: no more than a narrow contour's own reach.
+_MARGIN_EXPONENT_AFTER_WIDER = 10.0
+
+
+@dataclass(frozen=True)
+class MaskRows:
+    """The rays of both images with what the masks say, in blocks; shared by both forms of the projection.
+
+    Attributes:
+        blocks: M blocks, first those of the left image, then of the right one.
+        rays: of these blocks.
+        side: (M,) 0 for the left image, 1 for the right one.
+        foreground: (M, 64) probability of the mask, clamped.
+        filled: (M, 64) 1 in filled places, else 0.
+        weight: (M,) float64, lambda over the number of rays that the car has in this image.
+        left_counts: (B,) blocks of the left image, which the host knows.
+    """
+
+    blocks: Blocks
+    rays: Rays
+    side: Tensor
+    foreground: Tensor
+    filled: Tensor
+    weight: Tensor
+    left_counts: tuple[int, ...]
+
+    @classmethod
+    def of_pixels(
+        cls, pixels: Sequence[PixelSamples], sides: Sequence[Rows], config: SilhouetteConfig, num_cars: int
+    ) -> MaskRows:
+        """From the packed pixels of the left and the right image, and how they fill blocks."""
+        rays = [Rays.of_rows(rows, p.origin_cam, p.ray_cam) for rows, p in zip(sides, pixels, strict=True)]
+        owner = torch.cat([r.owner for r in rays])
+        filled = torch.cat([rows.filled for rows in sides])
+        foreground = torch.cat([p.foreground[rows.row] for rows, p in zip(sides, pixels, strict=True)])
+        side = torch.cat([torch.full_like(r.owner, number) for number, r in enumerate(rays)])
+        of_side = owner + num_cars * side
+        in_block = filled.sum(dim=1).to(torch.float64)
+        count = CarSums.of(of_side, 2 * num_cars).sum(in_block)
+        return cls(
+            Blocks.join([rows.blocks for rows in sides]),
+            Rays(owner, torch.cat([r.centre_cam for r in rays]), torch.cat([r.ray_cam for r in rays], dim=1)),
+            side,
+            foreground.clamp(config.probability_floor, 1 - config.probability_floor),
+            filled.to(foreground.dtype),
+            (config.weight / count.clamp_min(1))[of_side],
+            sides[0].blocks.counts,
+        )
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> MaskRows:
+        """The rows of the cars where `keep` (B,) holds, `numbers` of them."""
+        return self.kept_of_cars(keep, numbers)[0]
+
+    def kept_of_cars(self, keep: Tensor, numbers: Sequence[int]) -> tuple[MaskRows, Tensor]:
+        """The same, and which (Q,) of the blocks they are."""
+        blocks, kept = self.blocks.of_cars(keep, numbers)
+        of_blocks = (x.index_select(0, kept) for x in (self.side, self.foreground, self.filled, self.weight))
+        side, foreground, filled, weight = of_blocks
+        left_counts = tuple(self.left_counts[number] for number in numbers)
+        rays = self.rays.take(kept, blocks.owner)
+        return MaskRows(blocks, rays, side, foreground, filled, weight, left_counts), kept
+
+    def chosen(self, rays: Tensor) -> tuple[MaskRows, Tensor]:
+        """Some of the rays (M, 64) bool, packed anew, and the place (Q, 64) of each among the flat places (M * 64)."""
+        place = rays.flatten().nonzero()[:, 0]
+        num_cars = len(self.blocks.counts)
+        block = place // rays.shape[1]
+        of_side = self.rays.owner + num_cars * self.side
+        # Blocks are sorted by side, then by car: numbered so, rays of one image and car lie side by side.
+        packed = Rows.of_sorted(of_side.index_select(0, block), 2 * num_cars)
+        places = place[packed.row]
+        first = places[:, 0] // rays.shape[1]
+        counts = packed.blocks.counts
+        both = tuple(left + right for left, right in zip(counts[:num_cars], counts[num_cars:], strict=True))
+        owner = self.rays.owner[first]
+        ray_cam = self.rays.ray_cam.flatten(1)[:, places]
+        return MaskRows(
+            Blocks(owner, both),
+            Rays(owner, self.rays.centre_cam[first], ray_cam.contiguous()),
+            self.side[first],
+            self.foreground.flatten()[places],
+            packed.filled.to(self.foreground.dtype),
+            self.weight[first],
+            counts[:num_cars],
+        ), places
+
+    def of_sides(self) -> tuple[Rays, Rays]:
+        """The rays of the left and of the right image by themselves."""
+        num_left = sum(self.left_counts)
+        left, right = torch.arange(len(self.side), device=self.side.device).tensor_split([num_left])
+        return self.rays.take(left, self.rays.owner[left]), self.rays.take(right, self.rays.owner[right])
+
+    def residual_of_a_miss(self) -> Tensor:
+        """Of rays (M, 64) that do not come near the car at all: `-log p_bg`."""
+        return -torch.log1p(-self.foreground)
+
+
+def contour_zeta(cars: CarBatch, config: SilhouetteConfig, stage: StageConfig) -> Tensor:
+    """Steepness (B,) of the projection per metre: a contour as wide as the stage says, in pixels at the input depth."""
+    zeta = cars.focal_over_depth / stage.contour_width_px
+    return zeta.clamp(config.min_zeta_per_m, config.max_zeta_per_m)
+
+
+@dataclass(frozen=True)
+class Silhouettes:
+    """The term of both images, with the projection by closest approach; see module.
+
+    Attributes:
+        config: weight and forms.
+        cars: B cars.
+        rows: their rays.
+        bounds_obj: (2, 3) of the prior.
+        zeta: (M, 1) per metre; set when a stage begins.
+    """
+
+    config: SilhouetteConfig
+    cars: CarBatch
+    rows: MaskRows
+    bounds_obj: Tensor
+    zeta: Tensor
+
+    names = ("silhouette_left", "silhouette_right")
+    is_prior = False
+
+    @property
+    def blocks(self) -> Blocks:
+        return self.rows.blocks
+
+    @property
+    def column(self) -> Tensor:
+        return self.rows.side
+
+    @property
+    def block_weight(self) -> Tensor:
+        return self.rows.weight
+
+    @property
+    def information(self) -> Tensor:
+        return torch.ones_like(self.rows.weight)
+
+    @property
+    def row_weight(self) -> Tensor:
+        return self.rows.filled[..., None]
+
+    def begin(self, stage: StageConfig, sight: Sight) -> Silhouettes:
+        return replace(self, zeta=contour_zeta(self.cars, self.config, stage)[self.rows.rays.owner][:, None])
+
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[Silhouettes, Closest, Tensor]:
+        """Rays near the contour, or that may come to be: the others are certain, whatever the next steps do."""
+        distance = self._least_distance(sight)
+        margin = _IN_PLAY_MARGIN_M * self.zeta
+        if after_wider:
+            margin = margin.clamp_max(_MARGIN_EXPONENT_AFTER_WIDER)
+        in_play = (distance.abs() * self.zeta < IN_PLAY_EXPONENT + margin) | ~sight.closest.crosses
+        resting = torch.where(in_play, torch.zeros_like(distance), self.rows.filled)
+        rows, places = self.rows.chosen(in_play & (self.rows.filled > 0))
+        cost = (resting * self._of_distance(distance, sight.closest.crosses)[0]).to(torch.float64).sum(dim=1)
+        of_side = self.rows.rays.owner + len(self.cars) * self.rows.side
+        at_rest = CarSums.of(of_side, 2 * len(self.cars)).sum(cost, self.rows.weight).view(2, -1).T
+        zeta = self.zeta[places[:, 0] // self.rows.filled.shape[1]]
+        where = Closest(*(x.flatten(-2)[..., places] for x in sight.closest))
+        return replace(self, rows=rows, zeta=zeta), where, at_rest
+
+    def where(self, sight: Sight) -> Closest:
+        return sight.closest
+
+    def linear(self, field: Field, state: CarState, where: Closest) -> Linear:
+        rays = self.rows.rays.in_objects(state.T_obj_cam)
+        now = tracked_closest(field, self.rows.rays, rays, self.bounds_obj, where)
+        constant = nothing_is_differentiated()
+        depth = now.depth if constant else attached_closest_depth(field, self.rows.rays.owner, rays, now)
+        points = rays.at(depth)
+        at = field.derivatives(points, self.rows.rays.owner, constant)
+        gradient = along_face(at.gradient, rays.direction_obj, now.face_obj)
+        residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
+        return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
+
+    def residual(self, field: Field, state: CarState, where: Closest) -> Tensor:
+        rays = self.rows.rays.in_objects(state.T_obj_cam)
+        points = rays.at(where.depth)
+        across = (where.face_obj * rays.direction_obj).sum(0).detach()
+        is_kink = across != 0
+        # At a kink the point stays on its face; at a smooth minimum the depth does not matter.
+        off_face = (where.face_obj * (points - where.points_obj)).sum(0)
+        depth = where.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
+        sdf = field.value(rays.at(depth), self.rows.rays.owner)
+        return self._of_distance(sdf, where.crosses)[0][..., None]
+
+    def norm(self, residual: Tensor) -> robust.RobustValue:
+        return robust.identity(residual, self.config.residual_floor)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Silhouettes:
+        (rows, kept), cars = self.rows.kept_of_cars(keep, numbers), self.cars.of_cars(keep, numbers)
+        return replace(self, cars=cars, rows=rows, zeta=self.zeta.index_select(0, kept))
+
+    def _least_distance(self, sight: Sight) -> Tensor:
+        return sight.field.value(sight.closest.points_obj, self.rows.rays.owner, constant=True)
+
+    def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
+        """Residual (M, R) of least distances and its derivative by them; rays that miss the bounds have a constant."""
+        of_closest = closest_approach_residual(sdf, self.zeta, self.config.saturation, self.rows.foreground)
+        elsewhere = self.rows.residual_of_a_miss(), torch.zeros_like(sdf)
+        residual, slope = (torch.where(crosses, x, y) for x, y in zip(of_closest, elsewhere, strict=True))
+        return residual, slope
+
+
+def closest_approach_residual(
+    closest_sdf: Tensor,  # (..., P) least signed distance along each ray, metres
+    zeta: Tensor,  # broadcastable to (..., P), per metre
+    saturation: float,
+    foreground: Tensor,  # (..., P)
+) -> tuple[Tensor, Tensor]:
+    """Residual and `J_residual_sdf` (..., P) at the point of closest approach, zero where saturated.
+
+    `pi = sigmoid(-zeta m)`; beyond `|zeta m| = saturation` the projection is certain. Without logarithms: of pi and
+    1 - pi the smaller one is a quotient and no difference, so the likelihood `A = pi p_fg + (1 - pi) p_bg` loses no
+    digit. `d r / d sdf = zeta pi (1 - pi) (p_fg - p_bg) / A`.
+
+    Example:
+        >>> on_contour = (torch.zeros(1), torch.full((1,), 2.0), 16.0, torch.full((1,), 0.75))
+        >>> closest_approach_residual(*on_contour)
+        (tensor([0.6931]), tensor([0.5000]))
+    """
+    x = zeta * closest_sdf
+    is_outside = x > 0
+    # Not `abs`, whose derivative at zero is zero: on the contour itself the residual has one.
+    distance = torch.where(is_outside, x, -x)
+    decay = torch.exp(-distance.clamp_max(saturation))
+    larger = 1 / (1 + decay)
+    smaller = decay * larger
+    hit, miss = torch.where(is_outside, smaller, larger), torch.where(is_outside, larger, smaller)
+    likelihood = hit * foreground + miss * (1 - foreground)
+    derivative = zeta * smaller * larger * (2 * foreground - 1) / likelihood
+    return -likelihood.log(), torch.where(distance < saturation, derivative, torch.zeros_like(derivative))
+
+
+def sdf_state_jacobian(
+    points_obj: Tensor,  # (3, M, R) metres
+    gradient: Tensor,  # (3, M, R) of the signed distance
+    at: Lookup,
+) -> Tensor:
+    """`J_sdf_state = [grad, X x grad, basis]` (M, R, 6 + K): per metre, per radian, per standard deviation.
+
+    The last factor of every chain. The state is moved by `delta = (v, omega, dcode)` with `T_obj_cam <- exp(delta[:6])
+    T_obj_cam`, so a point fixed in the camera frame moves in the object frame by `v + omega x X` (paper, supplement,
+    generators of SE(3)).
+    """
+    points, gradient = points_obj.movedim(0, -1), gradient.movedim(0, -1)
+    return torch.cat([gradient, cross(points, gradient), at.J_value_code], dim=-1)

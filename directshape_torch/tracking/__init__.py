@@ -1,1 +1,0 @@
-"""Following the cars' rays from iteration to iteration: the fast form of the silhouette and photometric terms."""

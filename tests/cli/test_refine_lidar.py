@@ -1,0 +1,121 @@
+"""`directshape refine --lidar` as a user types it: scans in KITTI's format, missing, damaged and exchanged ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.kitti_folder import write_data_set
+from helpers.output_folders import result_files
+
+from directshape_torch.cli.main import main
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.result_files import read_shapes
+
+FRAMES = ("000000", "000001")
+# The scanner stands in camera 0: x forward, y left, z up becomes x right, y down, z forward.
+PLACE = "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0\n"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two frames and their scans: points in the plane of the first label's origin that face the camera."""
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root, FRAMES)
+    for frame_id in FRAMES:
+        with (root / "training" / "calib" / f"{frame_id}.txt").open("a") as calibration:
+            calibration.write(PLACE)
+        words = (root / "training" / "label_2" / f"{frame_id}.txt").read_text().splitlines()[0].split()
+        x, y, z = map(float, words[11:14])
+        right, down = np.meshgrid(np.linspace(-0.5, 0.5, 8), np.linspace(-1.2, -0.4, 8))
+        points = np.stack([np.full(right.size, z), -(x + right.ravel()), -(y + down.ravel())], axis=1)
+        write_scan(root / "velodyne" / f"{frame_id}.bin", points)
+    return root
+
+
+def write_scan(path: Path, points_velo: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.concatenate([points_velo, np.full((len(points_velo), 1), 0.3)], axis=1).astype("<f4").tofile(path)
+
+
+@pytest.fixture
+def scans(source: Path, tmp_path: Path) -> Path:
+    """Scans that a test may change."""
+    return Path(shutil.copytree(source / "velodyne", tmp_path / "velodyne"))
+
+
+def refine(root: Path, out: Path, *extra: object) -> int:
+    words = ["refine", "--data", root, "--detections", root / "detections", "--out", out, "--prior", root / "prior.npz"]
+    words += ["--masks", root / "masks", "--device", "cpu", "--set", "stages=[{max_iterations: 2}]", *extra]
+    return main([str(word) for word in words])
+
+
+def test_scans_are_read_in_the_left_camera_and_batched(source: Path) -> None:
+    from directshape_torch.io.frame_collation import collate
+
+    dataset = KittiStereoDataset(source, source / "detections", source / "masks", lidar_dir=source / "velodyne")
+    loaded = [dataset.load(frame_id) for frame_id in FRAMES]
+    points = loaded[0].frame.points_cam
+    assert points is not None
+    label = np.array((source / "training" / "label_2" / "000000.txt").read_text().split()[11:14], dtype=float)
+    # The grid's middle, 0.8 m above the label's origin; the left camera stands beside camera 0 and sees all of it.
+    middle = loaded[0].frame.camera.t_cam_ref[0].double().numpy() + label - [0, 0.8, 0]
+    np.testing.assert_allclose(points[0].double().mean(dim=0).numpy(), middle, atol=1e-5)
+    frames, _ = collate(loaded)
+    assert frames.points_cam is not None
+    assert frames.points_cam.shape == (2, 64, 3)
+
+
+def test_workers_give_the_same_bytes_and_the_manifest_knows_the_scans(source: Path, tmp_path: Path) -> None:
+    assert refine(source, tmp_path / "a", "--lidar", source / "velodyne", "--threads", 1) == 0
+    assert refine(source, tmp_path / "b", "--lidar", source / "velodyne", "--workers", 2) == 0
+    assert result_files(tmp_path / "a") == result_files(tmp_path / "b")
+    assert "lidar" in read_shapes(tmp_path / "a" / "shapes" / "000000.npz").term_names
+    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    assert "lidar" in summary["inputs"]["000001"]
+    assert summary["config"]["extra_terms"] == ["LidarPoints(weight=300.0, huber_m=0.1)"]
+
+
+def test_other_scans_or_none_are_no_resumption(
+    source: Path, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert refine(source, out, "--lidar", scans) == 0
+    write_scan(scans / "000001.bin", np.ones((20, 3)))
+    assert refine(source, out, "--lidar", scans) == 2
+    assert "cannot resume: frame 000001: sha256 of 'lidar' was" in capsys.readouterr().err
+    assert refine(source, out) == 2
+    assert "cannot resume: setting 'extra_terms' was" in capsys.readouterr().err
+
+
+def test_a_missing_or_damaged_scan_fails_its_frame_by_name(
+    source: Path, scans: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def failure(content: bytes | None) -> str:
+        (scans / "000000.bin").unlink(missing_ok=True)
+        if content is not None:
+            (scans / "000000.bin").write_bytes(content)
+        out = tmp_path / "out"
+        assert refine(source, out, "--lidar", scans, "--fresh") == 1
+        assert (out / "data" / "000001.txt").is_file()
+        return capsys.readouterr().err
+
+    at = f"frame 000000 failed: {scans / '000000.bin'}: "
+    assert at + "cannot be read (No such file or directory)" in failure(None)
+    assert at + "expected 16 bytes a point (x, y, z, reflectance), got 17 bytes" in failure(bytes(17))
+    cut = np.array([[9, 0, 0, 0], [9, np.nan, 0, 0]], dtype="<f4").tobytes()
+    assert at + "expected finite coordinates, got [9.0, nan, 0.0] in point 1" in failure(cut)
+
+
+def test_no_folder_and_a_calibration_without_scanner(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert refine(source, tmp_path / "out", "--lidar", tmp_path / "none") == 2
+    assert "none: is no folder of LiDAR scans" in capsys.readouterr().err
+    (bare := tmp_path / "bare").mkdir()
+    write_data_set(bare, FRAMES)
+    assert refine(bare, tmp_path / "out", "--lidar", source / "velodyne") == 1
+    assert "calib/000000.txt: has no line R0_rect:; LiDAR needs R0_rect and Tr_velo_to_cam" in capsys.readouterr().err

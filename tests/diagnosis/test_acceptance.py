@@ -1,0 +1,125 @@
+"""Results that are not trusted: the input comes back, with its gradient, and no other car is touched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import cached_street, disturbed
+
+from directshape_torch.config import AcceptanceConfig, BackwardConfig, RefinerConfig, RigConfig
+from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections
+from directshape_torch.status import Status
+
+
+def accepting(min_probability: float, config: RefinerConfig = DEFAULT) -> RefinerConfig:
+    return replace(config, acceptance=AcceptanceConfig(0.0, min_probability))
+
+
+def refine(config: RefinerConfig, detections: Detections) -> RefinementResult:
+    prior, scene = cached_street()
+    result: RefinementResult = DirectShapeRefiner(prior, config)(scene.frames, detections)
+    return result
+
+
+@cache
+def trusting() -> tuple[Detections, RefinementResult]:
+    _, scene = cached_street()
+    detections = disturbed(scene.detections)
+    return detections, refine(accepting(0.0), detections)
+
+
+def test_probabilities_and_evidence_come_with_every_refined_car() -> None:
+    _, result = trusting()
+    quality = result.quality
+    assert quality.evidence.shape == (2, len(EVIDENCE_NAMES))
+    assert quality.evidence.isfinite().all()
+    for probability in (quality.probability_better, quality.probability_not_worse):
+        assert ((probability > 0) & (probability < 1)).all()
+    assert (result.sigma_xyz_yaw > 0).all()
+
+
+def test_a_threshold_between_two_cars_returns_the_input_of_one() -> None:
+    detections, before = trusting()
+    probability = before.quality.probability_not_worse
+    less, more = probability.argsort().tolist()
+    assert probability[less] < probability[more]
+    result = refine(accepting(float(probability.mean())), detections)
+    assert result.status[less] is Status.not_trusted
+    assert result.status[more] is before.status[more]
+    assert result.refined.tolist() == [i == more for i in range(2)]
+    assert torch.equal(result.T_cam_obj[less], detections.T_cam_obj[less])
+    assert torch.equal(result.boxes().dimensions_hwl[less], detections.dimensions_hwl[less])
+    assert torch.equal(result.T_cam_obj[more], before.T_cam_obj[more])
+    assert (result.code[less] == 0).all()
+    # Why it is not trusted can be read off.
+    assert torch.equal(result.quality.probability_not_worse, probability)
+    assert result.sigma_xyz_yaw[less].isnan().all()
+    assert "`acceptance`" in result.status[less].value
+
+
+def test_zero_returns_everything_and_one_nothing() -> None:
+    detections, before = trusting()
+    assert before.refined.all()
+    nothing = refine(accepting(1.0), detections)
+    assert nothing.status == [Status.not_trusted] * 2
+    assert torch.equal(nothing.T_cam_obj, detections.T_cam_obj)
+
+
+def test_either_probability_refuses() -> None:
+    detections, before = trusting()
+    limit = float(before.quality.probability_better.mean())
+    result = refine(replace(DEFAULT, acceptance=AcceptanceConfig(limit, 0.0)), detections)
+    assert (
+        result.refined.tolist()
+        == (before.quality.probability_better >= limit).tolist()
+        in ([True, False], [False, True])
+    )
+
+
+@pytest.mark.parametrize("mode", ["unroll", "implicit"])
+def test_gradients_pass_where_results_do_not(mode: str) -> None:
+    """A car that is not trusted passes its input through, with the gradient 1."""
+    detections, before = trusting()
+    probability = before.quality.probability_not_worse
+    less = int(probability.argmin())
+    config = replace(accepting(float(probability.mean())), backward=BackwardConfig(mode=mode, max_remaining_step=10.0))
+    T = detections.T_cam_obj.clone().requires_grad_()
+    weight = torch.ones(2, dtype=torch.float64, requires_grad=True)
+    prior, scene = cached_street()
+    refiner = DirectShapeRefiner(prior, config)
+    result = refiner(scene.frames, replace(detections, T_cam_obj=T), {"silhouette_left": weight})
+    gradient, by_weight = torch.autograd.grad(result.T_cam_obj[:, :3, 3].sum(), (T, weight))
+    expected = torch.zeros(4, 4, dtype=torch.float64)
+    expected[:3, 3] = 1
+    torch.testing.assert_close(gradient[less], expected)
+    assert gradient.isfinite().all()
+    assert by_weight.isfinite().all()
+    assert by_weight[less] == 0
+    assert by_weight[1 - less] != 0
+
+
+def test_other_methods_have_no_probability_and_are_not_refused() -> None:
+    prior, scene = cached_street()
+    blind = replace(DEFAULT, photometric=replace(DEFAULT.photometric, weight=0.0))
+    result = DirectShapeRefiner(prior, accepting(1.0, blind))(scene.frames, scene.detections)
+    assert result.quality.probability_better.isnan().all()
+    assert Status.not_trusted not in result.status
+
+
+def test_a_rig_known_to_be_off_is_trusted_less_the_further_the_car_and_moves_no_result() -> None:
+    detections, sure = trusting()
+    doubtful = refine(replace(accepting(0.0), rig=RigConfig(disparity_sigma_px=0.4)), detections)
+    assert torch.equal(doubtful.T_cam_obj, sure.T_cam_obj)
+    assert (doubtful.quality.probability_not_worse < sure.quality.probability_not_worse).all()
+    added = (doubtful.sigma_xyz_yaw.square() - sure.sigma_xyz_yaw.square()).clamp_min(0).sqrt()[:, 2]
+    _, scene = cached_street()
+    depth, camera = sure.T_cam_obj[:, 2, 3], scene.frames.camera
+    expected = 0.4 * depth.square() / (camera.K_left[0, 0, 0] * camera.baseline[0])
+    torch.testing.assert_close(added, expected, rtol=0.02, atol=0)

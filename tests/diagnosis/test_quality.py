@@ -1,0 +1,148 @@
+"""Agreement with the images pixel by pixel, and the costs of a car that the solver gave its input back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
+from helpers.synthetic_scene import cached_street, disturbed
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.quality import _probabilities, mask_ious, photometric_agreement
+from directshape_torch.outcome import outcome_of
+from directshape_torch.problem import CarStage
+from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.status import Status
+from directshape_torch.terms.cars import CarBatch, CarState
+
+
+def begun(config: RefinerConfig = DEFAULT) -> tuple[CarStage, CarState]:
+    scene = cached_street()[1]
+    return begun_stage(ellipsoid_prior(), scene.frames, disturbed(scene.detections), config)
+
+
+def test_mask_overlap_is_that_of_rays_through_the_shape() -> None:
+    """Covered: some of 400 points on the ray is inside; counted car by car in a loop."""
+    stage, state = begun()
+    problem = stage.problem
+    masks, seen = problem.masks, problem.look(state)
+    found = mask_ious(masks, seen)
+    assert found.shape == (2, 2)
+    rays = masks.rays.in_objects(state.T_obj_cam)
+    inside = rays.interval(problem.prior.bounds_obj)
+    depths = inside.near + torch.linspace(0, 1, 400)[:, None, None] * (inside.far - inside.near)
+    covered = (seen.field.value(rays.at(depths), masks.rays.owner) < 0).any(dim=0) & inside.hit
+    for side in range(2):
+        for car in range(2):
+            mine = (masks.filled > 0) & ((masks.rays.owner == car) & (masks.side == side))[:, None]
+            of_shape, of_mask = covered[mine], masks.foreground[mine] > 0.5
+            expected = (of_shape & of_mask).sum() / (of_shape | of_mask).sum()
+            assert 0.3 < float(expected) < 0.99
+            # A ray that grazes the shape may touch it between two of the samples.
+            assert abs(float(found[side, car] - expected)) < 0.01
+
+
+def test_a_mask_of_nothing_on_a_shape_beside_all_pixels_has_no_overlap() -> None:
+    scene = cached_street()[1]
+    stage, state = begun_stage(ellipsoid_prior(), scene.frames, scene.detections)
+    T = state.T_obj_cam.clone()
+    T[0, 2, 3] += 500.0
+    masks = stage.problem.masks
+    empty = ((masks.rays.owner == 0) & (masks.side == 0))[:, None]
+    masks = replace(masks, foreground=torch.where(empty, 0.0, masks.foreground))
+    found = mask_ious(masks, stage.problem.look(CarState(T, state.code)))
+    assert found[0, 0].isnan()
+    assert found[1, 0] == 0
+    assert (found[:, 1] > 0.8).all()
+
+
+def test_photometric_agreement_is_the_mean_over_the_usable_pixels_car_by_car() -> None:
+    stage, state = begun()
+    term = photometric_of(stage)
+    fixed = term.pixel_set
+    T = state.T_obj_cam.clone()
+    T[:, 0, 3] += 0.5  # where part of the pixel set has no surface any more
+    for at in (state, CarState(T, state.code)):
+        rows = stage.photometric_part(figures_at(stage, at))
+        assert rows is not None
+        error, share = photometric_agreement(term, rows)
+        for car in range(2):
+            in_set = (fixed.rows.pixel_weight > 0) & (fixed.blocks.owner == car)[:, None]
+            usable = in_set & rows.where.usable
+            weight = fixed.rows.neighbour_weight.movedim(0, -1)[usable]
+            expected = (weight * rows.residual[usable].abs()).sum() / weight.sum()
+            torch.testing.assert_close(error[car], expected, rtol=1e-9, atol=0)
+            torch.testing.assert_close(share[car], usable.sum() / in_set.sum().double(), rtol=1e-12, atol=0)
+
+
+def test_what_is_hidden_in_the_right_image_is_not_compared() -> None:
+    """Right of the middle column something stands in front of everything."""
+    stage, state = begun()
+    term = photometric_of(stage)
+    rows = stage.photometric_part(figures_at(stage, state))
+    assert rows is not None
+    fixed = term.pixel_set
+    u, _, w = fixed.rows.along_ray[:, 4] * rows.where.depth + fixed.rows.along_baseline  # of the pixel itself
+    right_half = (u / w).round() >= 80
+    blocks = len(fixed.filled)
+    wall = fixed.rows.right._replace(
+        crop=torch.tensor([[80, 0, 160, 120, 0, 80]]).expand(blocks, -1),
+        in_front=torch.ones(blocks, 1, dtype=torch.long),
+        covering=torch.ones(80 * 120, 1, dtype=torch.long),
+    )
+    hidden = replace(term, fixed=fixed._replace(rows=fixed.rows._replace(right=wall)))
+    behind = replace(stage, terms=tuple(hidden if t is term else t for t in stage.terms))
+    found = behind.photometric_part(figures_at(behind, state))
+    assert found is not None
+    assert torch.equal(found.where.usable, rows.where.usable & ~right_half)
+    assert (photometric_agreement(hidden, found)[1] < photometric_agreement(term, rows)[1]).any()
+
+
+def test_no_cars_agree_with_nothing() -> None:
+    stage, state = begun()
+    none = stage.problem.of_cars(torch.zeros(2, dtype=torch.bool))
+    seen = none.look(CarState(state.T_obj_cam[:0], state.code[:0]))
+    empty = none.begin(none.stages()[1], seen)
+    rows = empty.photometric_part(empty.figures(seen))
+    assert rows is not None
+    error, share = photometric_agreement(photometric_of(empty), rows)
+    assert error.shape == share.shape == (0,)
+    assert mask_ious(none.masks, seen).shape == (2, 0)
+
+
+def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
+    stage, initial = begun()
+    problem = stage.problem
+    end = CarState(initial.T_obj_cam.clone(), initial.code + 0.5)
+    seen_initial, seen_end = problem.look(initial), problem.look(end)
+    minimum = Minimum(
+        state=CarState(*(torch.stack([a[0], b[1]]) for a, b in zip(initial, end, strict=True))),
+        end=end,
+        status=torch.tensor([Status.rejected_worse.code, Status.converged.code]),
+        iterations=torch.zeros(2, dtype=torch.long),
+        cost_history=torch.zeros(2, 0).double(),
+        stage_starts=(initial,),
+        stage=stage,
+        seen_initial=seen_initial,
+        seen_end=seen_end,
+        before=stage.figures(seen_initial),
+        after=stage.figures(seen_end),
+    )
+    scene = cached_street()[1]
+    found = outcome_of(problem, initial, minimum, CarBatch.from_scene(scene.frames, disturbed(scene.detections)))
+    at_end, at_input = (figures_at(stage, state).term_costs for state in (end, initial))
+    assert torch.equal(found.cost_before, at_input)
+    assert torch.equal(found.cost_after, torch.stack([at_input[0], at_end[1]]))
+    assert not torch.allclose(at_end[0], at_input[0])
+
+
+def test_probabilities_exist_for_the_method_they_were_fitted_to_alone() -> None:
+    evidence = torch.zeros(2, len(EVIDENCE_NAMES), dtype=torch.float64)
+    for probability in _probabilities(begun()[0], evidence):
+        assert ((probability > 0) & (probability < 1)).all()
+    blind = replace(DEFAULT, photometric=replace(DEFAULT.photometric, weight=0.0))
+    for probability in _probabilities(begun(blind)[0], evidence):
+        assert probability.isnan().all()

@@ -1,0 +1,99 @@
+"""Probabilities and calibrated sigmas: against the formulas by hand, from file, and at the borders."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.trust_model import LogisticHead, TrustModel, bundled_trust_model, load_trust_model
+from directshape_torch.errors import DataFormatError
+
+HEAD = LogisticHead(("log_depth", "turned"), (0.5, 0.1), (2.0, 0.05), (1.0, -2.0), 0.25)
+MODEL = TrustModel(HEAD, HEAD, (2.0, 3.0, 1.0, 0.5), (0.1, 0.2, 0.0, 0.01), {"made_by": "a test"})
+
+
+def evidence(log_depth: float, turned: float) -> torch.Tensor:
+    row = torch.full((1, len(EVIDENCE_NAMES)), torch.nan, dtype=torch.float64)
+    row[0, EVIDENCE_NAMES.index("log_depth")] = log_depth
+    row[0, EVIDENCE_NAMES.index("turned")] = turned
+    return row
+
+
+def test_a_head_is_the_logistic_function_of_standardised_columns() -> None:
+    # (1.5 - 0.5) / 2 = 0.5 and (0.15 - 0.1) / 0.05 = 1: 0.25 + 0.5 - 2 = -1.25.
+    expected = 1 / (1 + math.exp(1.25))
+    torch.testing.assert_close(HEAD(evidence(1.5, 0.15)), torch.tensor([expected]).double())
+
+
+def test_beyond_three_deviations_nothing_changes_and_unknown_counts_as_the_mean() -> None:
+    torch.testing.assert_close(HEAD(evidence(100.0, 0.1)), torch.tensor([1 / (1 + math.exp(-3.25))]).double())
+    torch.testing.assert_close(HEAD(evidence(torch.nan, 0.1)), torch.tensor([1 / (1 + math.exp(-0.25))]).double())
+
+
+def test_a_batch_equals_its_cars() -> None:
+    model = bundled_trust_model()
+    rows = torch.randn(50, len(EVIDENCE_NAMES), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    one_by_one = torch.cat([model.better(row[None]) for row in rows])
+    assert torch.equal(model.better(rows), one_by_one)
+    assert model.not_worse(rows[:0]).shape == (0,)
+
+
+def test_sigmas_are_scaled_along_and_across_the_viewing_ray() -> None:
+    """Straight ahead the ray is z and x lies across it."""
+    covariance = torch.diag(torch.tensor([0.01, 0.04, 0.09, 0.0004])).double()[None]
+    calibrated = MODEL.calibrated_covariance(covariance, torch.tensor([[0.0, 1.6, 20.0]]))
+    expected = [(3 * 0.1) ** 2 + 0.2**2, 0.2**2, (2 * 0.3) ** 2 + 0.1**2, (0.5 * 0.02) ** 2 + 0.01**2]
+    torch.testing.assert_close(calibrated[0], torch.diag(torch.tensor(expected).double()))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(-math.pi, math.pi))
+def test_sigmas_turn_with_the_scene(angle: float) -> None:
+    """A scene turned about the vertical axis gives the same covariance, turned."""
+    c, s = math.cos(angle), math.sin(angle)
+    R = torch.eye(4, dtype=torch.float64)
+    R[0, 0], R[0, 2], R[2, 0], R[2, 2] = c, s, -s, c
+    A = torch.randn(4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    covariance, location = (A @ A.T)[None], torch.tensor([[3.0, 1.5, 14.0]]).double()
+    turned = MODEL.calibrated_covariance(R @ covariance @ R.T, location @ R[:3, :3].T)
+    torch.testing.assert_close(turned, R @ MODEL.calibrated_covariance(covariance, location) @ R.T)
+
+
+def test_a_model_survives_its_file(tmp_path: Path) -> None:
+    MODEL.save(tmp_path / "model.json")
+    assert load_trust_model(tmp_path / "model.json") == MODEL
+
+
+def test_damaged_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    MODEL.save(path)
+    content = json.loads(path.read_text())
+    for change, words in (
+        ({"schema": "other/1"}, "has schema 'other/1'"),
+        ({"sigma_floors": [0.1]}, "not four sigmas"),
+        ({"better": {**content["better"], "columns": ["log_depth", "colour"]}}, "unknown columns .'colour'."),
+        ({"better": {**content["better"], "weights": [1.0]}}, "2 columns need as many"),
+    ):
+        path.write_text(json.dumps(content | change))
+        with pytest.raises(DataFormatError, match=words):
+            load_trust_model(path)
+    path.write_text("not JSON")
+    with pytest.raises(DataFormatError, match="is no model of trust"):
+        load_trust_model(path)
+
+
+def test_the_bundled_model_is_physically_sensible() -> None:
+    """More uncertainty and a larger turn never raise the trust; a larger fall of the photometric cost raises it."""
+    head = bundled_trust_model().not_worse
+    weight = dict(zip(head.columns, head.weights, strict=True))
+    assert all(weight.get(name, 0.0) <= 0 for name in ("turned", "log_expected_misfit", "log_silhouette_cost"))
+    assert weight["photometric_decrease"] > 0
+    assert bundled_trust_model().provenance["made_by"] == "scripts/calibrate_quality.py"
+    assert min(bundled_trust_model().sigma_factors) > 0

@@ -1,0 +1,188 @@
+"""The photometric term: warp by hand, what is fixed in a stage, what a lost pixel pays, brightness, occlusion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT, PAPER, TRUNCATED, begun_stage, figures_at, photometric_of
+from helpers.synthetic_scene import cached_street, disturbed, street
+from helpers.term_cases import case
+from reference import residuals as reference
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.problem import CarStage
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.photometric import DSO_PATTERN, compared, is_grazing, residuals_at
+from directshape_torch.terms.robust import huber_cost
+
+
+def _stage(config: RefinerConfig = PAPER) -> tuple[CarStage, CarState]:
+    prior, scene = cached_street()
+    return begun_stage(prior, scene.frames, disturbed(scene.detections, 0.05, 0.02), config)
+
+
+def _translated(state: CarState, metres: list[float]) -> CarState:
+    """All cars moved by a vector in the camera frame."""
+    shift = -(state.T_obj_cam[:, :3, :3] @ torch.tensor(metres, dtype=torch.float64)[:, None])[..., 0]
+    T = state.T_obj_cam.clone()
+    T[:, :3, 3] += shift
+    return CarState(T, state.code)
+
+
+def test_dso_pattern_has_eight_pixels_and_its_centre() -> None:
+    assert len(set(DSO_PATTERN)) == 8
+    assert (0, 0) in DSO_PATTERN
+    assert all(abs(u) + abs(v) <= 2 for u, v in DSO_PATTERN)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("regime", ["typical", "near", "rotated_right_camera"])
+def test_residuals_at_any_depth_are_the_references_and_have_its_slope(regime: str, number: int) -> None:
+    """At every pyramid level, off the surface too, as the disparity profile asks for them."""
+    stage, _ = case(regime, "paper", number)
+    term = photometric_of(stage)
+    rows, level = term.pixel_set.rows, stage.config.image_level
+    depth = term.cars.input_depth[rows.rays.owner][:, None] * (1 + 0.1 * torch.rand_like(rows.pixel_weight))
+    at = compared(rows, term.config, depth)
+    expected, landed, in_front = reference.photometric(term, level, depth)
+    size = term.pyramid[level].sizes[0]
+    inside = ((landed >= 0) & (landed <= size.flip(0) - 1)).all(-1) & (in_front > 0)
+    counted = at.comparable & (rows.pixel_weight > 0)
+    assert counted.double().mean() > 0.3
+    assert inside.all(-1)[counted].all()
+    torch.testing.assert_close(at.residual[counted], expected[counted], rtol=1e-9, atol=1e-8)
+    step = 1e-6 * depth.mean()
+    ends = [reference.photometric(term, level, depth + sign * step)[0] for sign in (1, -1)]
+    error = ((ends[0] - ends[1]) / (2 * step) - at.J_residual_depth)[counted].abs()
+    # A step that crosses into the next pixel sees another slope.
+    assert (error < 1e-4 * at.J_residual_depth.abs().max()).double().mean() > 0.995
+    several, comparable = residuals_at(rows, term.config, torch.stack([depth, 1.2 * depth]))
+    torch.testing.assert_close(several[0], at.residual)
+    assert torch.equal(comparable[0], at.comparable)
+
+
+def test_grazing_rays_are_those_below_the_cosine() -> None:
+    # |grad . ray| / (|grad| |ray|) is 0.099 and 0.101.
+    cosine = torch.tensor([0.099, 0.101], dtype=torch.float64)
+    normal = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64).view(3, 1, 1).expand(3, 1, 2)
+    direction = 3 * torch.stack([cosine, 0 * cosine, (1 - cosine**2).sqrt()])[:, None]
+    config = replace(DEFAULT.photometric, min_ray_cosine=0.1)
+    assert is_grazing(normal, direction, config)[0].tolist() == [True, False]
+
+
+@pytest.mark.parametrize("config", [PAPER, TRUNCATED], ids=["plain", "truncated"])
+def test_a_pixel_that_loses_its_surface_pays_the_constant(config: RefinerConfig) -> None:
+    stage, state = _stage(config)
+    term, column = photometric_of(stage), 2
+    gone, still = (figures_at(stage, s) for s in (_translated(state, [30.0, 0.0, 0.0]), state))
+    lost = huber_cost(term.config.lost_grey_levels, term.config.huber_grey_levels)
+    weight = term.row_weight * term.block_weight[:, None, None]
+    expected = torch.stack([lost * weight[term.blocks.owner == car].sum() for car in range(2)])
+    torch.testing.assert_close(gone.term_costs[:, column], expected)
+    assert (gone.gradient[:, column] == 0).all()
+    assert (gone.hessian[:, column] == 0).all()
+    assert (expected > 2 * still.term_costs[:, column]).all()
+
+
+def test_a_pixel_that_leaves_the_right_image_pays_the_constant() -> None:
+    """The car comes so near that its disparity carries pixels over the left border of the right image."""
+    scene = street(ellipsoid_prior(), [(-2.1, 1.65, 8.0)], [0.4])
+    stage, state = begun_stage(ellipsoid_prior(), scene.frames, scene.detections, PAPER)
+    term = photometric_of(stage)
+    # Along its viewing ray, so that the pixels still hit it.
+    nearer = _translated(state, (-0.5 * torch.linalg.inv(state.T_obj_cam[0])[:3, 3]).tolist())
+    sight = stage.problem.look(nearer)
+    at = term.linear(sight.field, nearer, term.where(sight))
+    depth, found = reference.surface_depth(stage.problem.prior, term, nearer)
+    _, landed, _ = reference.photometric(term, 0, torch.where(found, depth, 1.0))
+    left_image = found & (landed[..., 0] < -0.5).any(-1) & (term.pixel_set.rows.pixel_weight > 0)
+    assert left_image.any()
+    assert (at.residual[left_image] == term.config.lost_grey_levels).all()
+    assert (at.J_residual_inner[left_image] == 0).all()
+
+
+def test_moving_a_car_out_of_its_mask_always_costs() -> None:
+    stage, state = _stage(DEFAULT)
+    truth = figures_at(stage, state).cost
+    for metres in ([3.0, 0, 0], [-3.0, 0, 0], [0, 0, 6.0], [0, 0, -3.0], [40.0, 0, 0], [0, 0, 40.0]):
+        assert (figures_at(stage, _translated(state, metres)).cost > truth).all()
+
+
+def test_a_pixel_that_lands_on_a_nearer_cars_mask_is_not_compared() -> None:
+    """In the right image the near car covers part of what the far one shows in the left image."""
+    prior = ellipsoid_prior()
+    scene = street(prior, [(0.9, 1.65, 6.0), (-0.2, 1.65, 13.0)], [1.5, 1.5])
+    support = []
+    for occlusion in (True, False):
+        config = replace(DEFAULT, sampling=replace(DEFAULT.sampling, occlusion=occlusion))
+        stage, state = begun_stage(prior, scene.frames, scene.detections, config)
+        term = photometric_of(stage)
+        support.append(term.pixel_set.support)
+        if occlusion:
+            depth, _ = reference.surface_depth(prior, term, state)
+            _, landed, _ = reference.photometric(term, 0, depth)
+            far = (term.blocks.owner == 1)[:, None] & (term.pixel_set.rows.pixel_weight > 0)
+            u, v = landed[..., DSO_PATTERN.index((0, 0)), :][far].round().long().unbind(-1)
+            assert (scene.detections.mask_right[0, v, u] < 0.5).all()
+    assert support[0][0] == support[1][0]
+    assert support[0][1] < support[1][1]
+
+
+def test_pixel_sets_and_their_weights() -> None:
+    """Hits on the mask, and for the paper every hit; `c^2 / (c^2 + |grad I_l|^2)` of each."""
+    for config, needs_mask in ((DEFAULT, True), (PAPER, False)):
+        stage, _ = _stage(config)
+        term = photometric_of(stage)
+        counted = term.pixel_set.rows.pixel_weight > 0
+        own = term.all_rows.row.flatten()[term.pixel_set.sight_place][counted]
+        assert bool((term.pixels.foreground[own] > 0.5).all()) is needs_mask
+        assert int(counted.sum()) == int(term.pixel_set.support.sum())
+        c2 = term.config.gradient_constant_grey_levels**2
+        expected = c2 / (c2 + term.pixels.gradient_magnitude[own] ** 2)
+        torch.testing.assert_close(term.pixel_set.rows.pixel_weight[counted], expected)
+
+
+def test_the_set_stays_as_it_is_while_a_stage_lasts() -> None:
+    stage, state = _stage()
+    before = photometric_of(stage).pixel_set
+    figures_at(stage, _translated(state, [2.0, 0.0, 0.0]))
+    assert photometric_of(stage).pixel_set is before
+
+
+def test_gain_brings_the_left_image_to_the_brightness_of_the_right_one() -> None:
+    prior, scene = cached_street()
+    darker = replace(scene.frames, images_right=0.9 * scene.frames.images_right)
+    levels = []
+    for frames in (scene.frames, darker):
+        stage, _ = begun_stage(prior, frames, scene.detections, DEFAULT)
+        levels.append(photometric_of(stage).pixel_set.rows.intensity_left)
+    torch.testing.assert_close(levels[1], 0.9 * levels[0])
+
+
+@pytest.mark.parametrize("change", ["darker", "flatter"])
+def test_forms_that_do_not_see_a_change_of_the_right_image_have_the_same_gradient(change: str) -> None:
+    """20 grey levels darker, or 0.9 of the contrast about 100: the paper's residuals see both, the others not."""
+    prior, scene = cached_street()
+    grey = 255 * scene.frames.images_right
+    changed = grey - 20 if change == "darker" else 0.9 * grey + 10
+    assert 0 <= float(changed.min()) <= float(changed.max()) <= 255
+    frames = replace(scene.frames, images_right=changed / 255)
+
+    def off_by(**photometric: Any) -> float:
+        settings = replace(DEFAULT, photometric=replace(DEFAULT.photometric, **{"brightness": "none", **photometric}))
+        g: list[Tensor] = []
+        for each in (scene.frames, frames):
+            stage, state = begun_stage(prior, each, disturbed(scene.detections, 0.05, 0.02), settings)
+            g.append(figures_at(stage, state).gradient[:, 2])
+        return float((g[1] - g[0]).norm() / g[0].norm())
+
+    assert off_by() > 0.1
+    # Residuals after the match are those of the right image, so its contrast is a factor of them, squared in g.
+    assert off_by(brightness="affine") < (1e-6 if change == "darker" else 0.2)
+    assert off_by(patch="normalised", contrast_floor_grey_levels=0.1) < 1e-2
+    assert (off_by(patch="zero_mean") < 1e-9) is (change == "darker")

@@ -1,0 +1,88 @@
+"""Points of a car: signs by hand, weights of the methods, cars that lack points, gradients to the points."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import pytest
+import torch
+from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
+from helpers.exact_disparity import measured_street
+from helpers.problems import begun_stage, figures_at
+from helpers.synthetic_scene import disturbed
+from helpers.term_cases import CLOUD, COMBINED
+from torch import Tensor
+
+from directshape_torch.config import PointCloudConfig
+from directshape_torch.geometry import se3
+from directshape_torch.problem import CarStage
+from directshape_torch.shape.field import field_of
+from directshape_torch.stereo_matching.car_points import PointSamples
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.point_cloud import PointCloud
+from directshape_torch.terms.term import Linear
+
+PRIOR = ellipsoid_prior()
+FRONT = torch.tensor([[HALF_AXES[0] + 0.2, CENTRE_OBJ[1], 0.0]], dtype=torch.float64)
+T_CAM_OBJ = se3.exp(torch.tensor([[2.0, 1.6, 10.0, 0.0, 0.7, 0.0]], dtype=torch.float64))
+
+
+def _at(points_cam: Tensor, T_cam_obj: Tensor = T_CAM_OBJ) -> Linear:
+    """The term of one car and its points (P, 3)."""
+    points = PointSamples(torch.zeros(len(points_cam), dtype=torch.long), points_cam, torch.tensor([len(points_cam)]))
+    term = PointCloud.of_points(PointCloudConfig(min_points=1), points)
+    state = CarState(se3.inverse(T_cam_obj), PRIOR.initial_code(1))
+    return term.linear(field_of(PRIOR.bind(state.code)), state, ())
+
+
+def test_signs_by_hand() -> None:
+    """A point 0.2 m beyond the front bumper: outside, hence positive; a car moved forward by 0.2 m meets it."""
+    points_cam = se3.transform(T_CAM_OBJ, FRONT)
+    at = _at(points_cam)
+    assert 0.1 < float(at.residual[0, 0]) < 0.3
+    # v_x is the camera's motion in the object frame, so the car moves forward by -v_x: the residual grows with v_x.
+    assert float(at.J_inner_state[0, 0, 0]) > 0.8
+    # A longer car is nearer to the point.
+    assert float(at.J_inner_state[0, 0, 6]) < -0.05
+    forward = T_CAM_OBJ @ se3.exp(torch.tensor([0.2, 0, 0, 0, 0, 0], dtype=torch.float64))
+    assert abs(float(_at(points_cam, forward).residual[0, 0])) < 0.02
+
+
+def test_moving_the_whole_scene_changes_nothing() -> None:
+    points_cam = se3.transform(T_CAM_OBJ, FRONT + torch.randn(70, 3, dtype=torch.float64))
+    motion = se3.exp(torch.tensor([1.0, -0.4, 3.0, 0.2, 0.7, -0.3], dtype=torch.float64))
+    still, moved = _at(points_cam), _at(se3.transform(motion, points_cam), motion @ T_CAM_OBJ)
+    torch.testing.assert_close(moved.residual, still.residual, rtol=0, atol=1e-10)
+    torch.testing.assert_close(moved.J_inner_state, still.J_inner_state, rtol=0, atol=1e-9)
+
+
+def test_gradient_to_the_points() -> None:
+    points_cam = se3.transform(T_CAM_OBJ, FRONT + 0.3 * torch.randn(6, 3, dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: _at(x).residual[:, :6], points_cam)
+
+
+def _of(config: PointCloudConfig, method: Literal["geometric", "combined"] = "combined") -> tuple[CarStage, CarState]:
+    prior, scene = measured_street()
+    settings = replace(COMBINED, method=method, point_cloud=config)
+    return begun_stage(prior, scene.frames, disturbed(scene.detections, 0.08, 0.03), settings, 0)
+
+
+def test_each_method_has_its_own_weight() -> None:
+    config = replace(CLOUD, weight=7.0, combined_weight=3.0)
+    costs = [figures_at(*_of(config, method)).term_costs[:, 0] for method in ("geometric", "combined")]
+    torch.testing.assert_close(3.0 * costs[0], 7.0 * costs[1])
+
+
+def test_a_car_without_enough_points_has_no_part_in_the_term() -> None:
+    car, counts = torch.tensor([0] * 4 + [1] * 5), torch.tensor([4, 5])
+    points = PointSamples(car, torch.randn(9, 3, dtype=torch.float64), counts)
+    term = PointCloud.of_points(PointCloudConfig(min_points=5), points)
+    assert term.blocks.counts == (0, 1)
+    assert float(term.block_weight[0]) == PointCloudConfig().weight / 5
+
+
+@pytest.mark.parametrize("count", [0, 1, 65])
+def test_any_number_of_points(count: int) -> None:
+    at = _at(se3.transform(T_CAM_OBJ, FRONT).expand(count, 3))
+    assert at.residual.shape == (-(-count // 64), 64, 1)

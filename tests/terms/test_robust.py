@@ -1,0 +1,58 @@
+"""Robust norms: value, gradient weight and matrix weight belong together."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch.terms.robust import RobustValue, huber, huber_cost, identity, quadratic, truncated_huber
+
+RESIDUALS = torch.tensor(
+    [-40.0, -9.0001, -8.9999, -0.5, 0.0, 0.5, 8.9999, 9.0001, 14.9, 15.1, 40.0], dtype=torch.float64
+)
+
+
+def _check_weights(norm: RobustValue, residual: Tensor) -> None:
+    (slope,) = torch.autograd.grad(norm.rho.sum(), residual)
+    torch.testing.assert_close(norm.gradient_weight, slope)
+    torch.testing.assert_close(norm.hessian_weight * residual, slope)
+
+
+def test_weights_are_derivatives_of_the_value() -> None:
+    for norm in (quadratic, lambda r: huber(r, 9.0), lambda r: truncated_huber(r, 9.0, 15.0)):
+        residual = RESIDUALS.clone().requires_grad_()
+        _check_weights(norm(residual), residual)
+
+
+def test_huber_is_half_the_square_inside_and_linear_outside() -> None:
+    # Corner 9: rho(4) = 8; rho(20) = 9 (20 - 4.5) = 139.5, weight 9 / 20.
+    norm = huber(torch.tensor([4.0, -20.0], dtype=torch.float64), 9.0)
+    assert norm.rho.tolist() == [8.0, 139.5]
+    assert norm.gradient_weight.tolist() == [4.0, -9.0]
+    assert norm.hessian_weight.tolist() == [1.0, 0.45]
+
+
+@pytest.mark.parametrize("magnitude", [0.0, 4.0, 9.0, 20.0])
+def test_the_cost_of_one_number_is_that_of_the_norm(magnitude: float) -> None:
+    assert huber_cost(magnitude, 9.0) == huber(torch.tensor(magnitude, dtype=torch.float64), 9.0).rho.item()
+
+
+def test_huber_is_smooth_at_its_corner() -> None:
+    below, above = huber(torch.tensor([9 - 1e-9, 9 + 1e-9], dtype=torch.float64), 9.0).rho
+    assert abs(float(above - below) - 9 * 2e-9) < 1e-12
+
+
+def test_the_truncated_norm_is_constant_beyond_its_limit() -> None:
+    norm = truncated_huber(torch.tensor([14.0, 15.0, 90.0], dtype=torch.float64), 9.0, 15.0)
+    assert norm.rho.tolist() == [9 * (14 - 4.5), 9 * (15 - 4.5), 9 * (15 - 4.5)]
+    assert norm.gradient_weight.tolist() == [9.0, 0.0, 0.0]
+    torch.testing.assert_close(norm.hessian_weight, torch.tensor([9 / 14, 0.0, 0.0], dtype=torch.float64))
+
+
+def test_identity_is_the_papers_reweighting_with_a_floor() -> None:
+    residual = torch.tensor([4.6, 0.5, 0.01, 0.001], dtype=torch.float64)
+    norm = identity(residual, 0.01)
+    assert (norm.rho == residual).all()
+    assert (norm.gradient_weight == 1).all()
+    torch.testing.assert_close(norm.hessian_weight, torch.tensor([1 / 4.6, 2.0, 100.0, 100.0], dtype=torch.float64))

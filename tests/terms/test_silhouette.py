@@ -1,0 +1,218 @@
+"""Silhouettes, both forms: figures by hand, log space, saturation, and where the contour lies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import pytest
+import torch
+from helpers.derivatives import central_differences, relative_error
+from helpers.ellipsoids import Ellipsoid
+from helpers.problems import DEFAULT, begun_stage, figures_at
+from helpers.synthetic_scene import cached_street, disturbed
+from torch import Tensor
+
+from directshape_torch.depth import closest_of_march, march
+from directshape_torch.geometry import se3
+from directshape_torch.rows import ObjectRays
+from directshape_torch.shape.field import PackedField
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.silhouette import Silhouettes, closest_approach_residual
+from directshape_torch.terms.silhouette_product import SilhouetteProducts, log_one_minus_exp, product_residual
+
+SATURATION = 16.0
+ZETAS = {"far": 9.0, "typical": 90.0, "near": 400.0}
+
+
+def vector(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def closest(sdf: Tensor, zeta: Tensor, foreground: Tensor) -> Tensor:
+    return closest_approach_residual(sdf, zeta, SATURATION, foreground)[0]
+
+
+def product(sdf: Tensor, zeta: Tensor, foreground: Tensor) -> Tensor:
+    return product_residual(sdf, zeta, foreground)[0]
+
+
+def foreground(count: int) -> Tensor:
+    return torch.linspace(0, 1, count, dtype=torch.float64).clamp(0.01, 0.99)
+
+
+@pytest.mark.parametrize("regime", ZETAS)
+def test_closest_approach_derivative_three_ways(regime: str) -> None:
+    """From deep inside to far outside; the last few are saturated, where the derivative is zero by definition."""
+    zeta = torch.full((60,), ZETAS[regime], dtype=torch.float64)
+    sdf = torch.linspace(-20, 20, 60, dtype=torch.float64) / zeta
+    fg = foreground(60)[torch.randperm(60)]
+    _, analytic = closest_approach_residual(sdf, zeta, SATURATION, fg)
+    leaf = sdf.clone().requires_grad_()
+    (by_autograd,) = torch.autograd.grad(closest(leaf, zeta, fg).sum(), leaf)
+    torch.testing.assert_close(analytic, by_autograd, rtol=1e-10, atol=1e-12)
+    numeric = torch.diagonal(central_differences(lambda x: closest(x, zeta, fg), sdf, 1e-6 / ZETAS[regime]))
+    assert relative_error(analytic, numeric) < 1e-7
+    assert (analytic[(zeta * sdf).abs() > SATURATION] == 0).all()
+
+
+@pytest.mark.parametrize("regime", ZETAS)
+def test_product_derivative_three_ways(regime: str) -> None:
+    zeta = torch.full((30,), ZETAS[regime], dtype=torch.float64)
+    sdf = (3 * torch.randn(8, 30, dtype=torch.float64) + torch.linspace(-3, 12, 30)) / zeta
+    fg = foreground(30)
+    _, analytic = product_residual(sdf, zeta, fg)
+    leaf = sdf.clone().requires_grad_()
+    (by_autograd,) = torch.autograd.grad(product(leaf, zeta, fg).sum(), leaf)
+    torch.testing.assert_close(analytic, by_autograd, rtol=1e-9, atol=1e-12 * ZETAS[regime])
+    numeric = central_differences(lambda x: product(x, zeta, fg), sdf, 1e-6 / ZETAS[regime])
+    rows = torch.arange(30)
+    assert relative_error(analytic, numeric[rows, :, rows].mT) < 1e-6
+
+
+def test_by_hand() -> None:
+    """On the contour (sdf = 0, pi = 1/2) of a sure foreground pixel: dr/dsdf = zeta/4 (p_fg - p_bg) / (1/2)."""
+    residual, derivative = closest_approach_residual(vector(0.0), vector(80.0), SATURATION, vector(0.99))
+    assert float(residual) == pytest.approx(math.log(2))
+    assert float(derivative) == pytest.approx(80 / 4 * 0.98 / 0.5)
+    # A mask that says one half says nothing.
+    of_both = closest_approach_residual(vector(-0.1, 0.3), vector(80.0), SATURATION, vector(0.5, 0.5))
+    torch.testing.assert_close(of_both[0], vector(math.log(2), math.log(2)))
+    assert (of_both[1] == 0).all()
+
+
+def test_moving_the_surface_away_costs_in_the_foreground_and_pays_in_the_background() -> None:
+    zeta, fg, sdf = vector(80.0, 80.0), vector(0.99, 0.01), vector(0.0, 0.0)
+    assert torch.sign(closest_approach_residual(sdf, zeta, SATURATION, fg)[1]).tolist() == [1.0, -1.0]
+    assert torch.sign(product_residual(sdf[None], zeta, fg)[1][0]).tolist() == [1.0, -1.0]
+
+
+def test_the_forms_agree_for_one_sample() -> None:
+    sdf = torch.linspace(-0.1, 0.1, 21, dtype=torch.float64)
+    zeta, fg = torch.full((21,), 90.0, dtype=torch.float64), foreground(21)
+    torch.testing.assert_close(closest(sdf, zeta, fg), product(sdf[None], zeta, fg))
+
+
+@pytest.mark.parametrize("form", [closest, lambda s, z, f: product(s.expand(64, -1), z, f)])
+def test_extremes_are_finite_in_float32(form: Callable[[Tensor, Tensor, Tensor], Tensor]) -> None:
+    sdf = torch.tensor([-50.0, -2.0, -1e-20, 0.0, 1e-20, 2.0, 50.0]).repeat(2).requires_grad_()
+    fg = torch.tensor([0.01] * 7 + [0.99] * 7)
+    residual = form(sdf, torch.full((14,), 400.0), fg)
+    (gradient,) = torch.autograd.grad(residual.sum(), sdf)
+    assert residual.isfinite().all()
+    assert gradient.isfinite().all()
+    # The worst that a pixel can cost is that of a sure ray against a sure mask: -log 0.01.
+    assert residual.detach().max() == pytest.approx(-math.log(0.01), rel=1e-4)
+    assert residual.detach().min() == pytest.approx(-math.log(0.99), rel=1e-2)
+
+
+def test_log_one_minus_exp_keeps_its_digits() -> None:
+    # log(1 - exp(-1e-20)) = log(1e-20); log(1 - exp(-50)) = -exp(-50): both lost without care.
+    expected = vector(math.log(1e-20), -math.exp(-50))
+    torch.testing.assert_close(log_one_minus_exp(vector(-1e-20, -50.0)), expected, rtol=1e-13, atol=0)
+    assert log_one_minus_exp(torch.zeros(1)).isfinite().all()
+
+
+# In an energy
+
+SOFT = replace(DEFAULT.silhouette, min_zeta_per_m=0.2, max_zeta_per_m=0.2)
+
+
+@pytest.mark.parametrize("form", ["closest_approach", "product"])
+def test_a_ray_that_misses_the_bounds_counts_as_background(form: Literal["closest_approach", "product"]) -> None:
+    """However soft the contour: so soft here that the distance alone would still give a gradient."""
+    prior, scene = cached_street()
+    config = replace(DEFAULT, silhouette=replace(SOFT, form=form))
+    stage, state = begun_stage(prior, scene.frames, disturbed(scene.detections), config)
+    away = se3.exp(vector(40.0, 0, 0, 0, 0, 0))
+    at = figures_at(stage, CarState(away @ state.T_obj_cam, state.code))
+    term = stage.terms[0]
+    assert isinstance(term, (Silhouettes, SilhouetteProducts))
+    torch.testing.assert_close(at.parts[0].residual[..., 0], -torch.log(1 - term.rows.foreground))
+    assert (at.gradient[:, :2] == 0).all()
+
+
+def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
+    prior, scene = cached_street()
+    detections = disturbed(scene.detections)
+    stage, state = begun_stage(prior, scene.frames, detections)
+    term = stage.terms[0]
+    assert isinstance(term, Silhouettes)
+    expected = (150.0 / (detections.T_cam_obj[:, 2, 3] * 0.5)).clamp(4.0, 400.0)
+    torch.testing.assert_close(term.zeta[:, 0], expected[term.blocks.owner])
+    nearer = CarState(se3.exp(vector(0, 0, 2.0, 0, 0, 0)) @ state.T_obj_cam, state.code)
+    problem = stage.problem
+    again, softer = (problem.begin(x, problem.look(nearer)).terms[0] for x in problem.stages()[::-1])
+    assert isinstance(again, Silhouettes)
+    assert isinstance(softer, Silhouettes)
+    assert torch.equal(again.zeta, term.zeta)
+    torch.testing.assert_close(softer.zeta, term.zeta / 4)
+
+
+# Where the contour of the rendered silhouette lies
+
+FOCAL_PX = 720.0
+CAR = Ellipsoid(vector(2.0, 0.75, 0.85), vector(0.0, -0.75, 0.0), 0.75)
+EYE = vector(0.4, -0.9, 0.0)
+DIRECTIONS = torch.linspace(0, 2 * math.pi, 25, dtype=torch.float64)[:-1]
+
+
+def _is_hit(uv: Tensor, depth_m: float, contour_px: float, form: str) -> Tensor:
+    """Whether the projection of the ellipsoid is above one half at pixels relative to the principal point."""
+    direction = torch.cat([uv / FOCAL_PX, torch.ones_like(uv[:, :1])], dim=1)
+    centre = EYE - vector(0.0, 0.0, depth_m)
+    owner, field = torch.zeros(1, dtype=torch.long), PackedField(CAR)
+    rays = ObjectRays(centre.view(3, 1, 1), direction.mT[:, None])
+    marched = march(field, owner, rays, CAR.bounds, 32)
+    zeta, sure = torch.full((1, 1), FOCAL_PX / (depth_m * contour_px), dtype=torch.float64), torch.ones(1, len(uv))
+    if form == "product":
+        return (product(marched.sdf, zeta, sure.double()) < math.log(2))[0]
+    points = closest_of_march(field, owner, rays, CAR.bounds, marched).points_obj
+    return (closest(field.value(points, owner), zeta, sure.double()) < math.log(2))[0]
+
+
+def _true_contour(depth_m: float) -> tuple[Tensor, Tensor]:
+    """Points (24, 2) on the true outline and outward unit normals, from the projected quadric (its dual conic)."""
+    P = torch.tensor([[FOCAL_PX, 0, 0, 0], [0, FOCAL_PX, 0, 0], [0, 0, 1, 0]], dtype=torch.float64)
+    H = torch.eye(4, dtype=torch.float64)
+    H[:3, :3], H[:3, 3] = torch.diag(CAR.half_axes), CAR.centre - EYE + vector(0.0, 0.0, depth_m)
+    conic = torch.linalg.inv(P @ H @ torch.diag(vector(1.0, 1, 1, -1)) @ H.T @ P.T)
+    conic = conic / conic[:2, :2].diagonal().sum()
+    middle = torch.linalg.solve(conic[:2, :2], -conic[:2, 2])
+    level = float(middle @ conic[:2, 2] + conic[2, 2])
+    ray = torch.stack([DIRECTIONS.cos(), DIRECTIONS.sin()], dim=1)
+    points = middle + (-level / (ray @ conic[:2, :2] * ray).sum(1)).sqrt()[:, None] * ray
+    return points, torch.nn.functional.normalize((points - middle) @ conic[:2, :2], dim=1)
+
+
+def _dilation_px(depth_m: float, contour_px: float, form: str) -> Tensor:
+    """How far outside (24,) the true outline the 0.5 contour lies, by bisection."""
+    points, normal = _true_contour(depth_m)
+    low, high = (torch.full((len(points),), x, dtype=torch.float64) for x in (-4.0, 4.0))
+    for _ in range(25):
+        middle = (low + high) / 2
+        hit = _is_hit(points + middle[:, None] * normal, depth_m, contour_px, form)
+        low, high = torch.where(hit, middle, low), torch.where(hit, high, middle)
+    return (low + high) / 2
+
+
+@pytest.mark.parametrize("contour_px", [0.25, 2.0])
+@pytest.mark.parametrize("depth_m", [8.0, 30.0, 60.0])
+def test_the_default_contour_is_the_true_one(depth_m: float, contour_px: float) -> None:
+    assert _dilation_px(depth_m, contour_px, "closest_approach").abs().max() < 0.05
+
+
+def test_the_product_dilates_far_cars() -> None:
+    """At a contour of one pixel the outline of a car at 45 m is more than a pixel too large."""
+    near, far = (_dilation_px(depth, 1.0, "product").mean() for depth in (8.0, 45.0))
+    assert far > 1.0
+    assert far > near + 0.2
+
+
+@pytest.mark.parametrize("n", [1, 2, 10, 32])
+def test_dilation_of_n_equal_samples_is_the_formula(n: int) -> None:
+    outside = math.log(1 / (2 ** (1 / n) - 1)) / 55.0
+    residual = product(torch.full((n, 1), outside, dtype=torch.float64), vector(55.0), vector(1.0 - 1e-15))
+    assert float(residual) == pytest.approx(math.log(2), abs=1e-12)

@@ -1,0 +1,73 @@
+"""Surfaces that are tracked from state to state: found again where they are, and lost where there are none."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from helpers.ellipsoids import Ellipsoid
+
+from directshape_torch.depth import Hits, tracked_depth
+from directshape_torch.rows import Rays
+from directshape_torch.shape.field import PackedField
+
+RADIUS_M = 1.5
+FIELD = PackedField(Ellipsoid.sphere(RADIUS_M))
+OWNER = torch.zeros(1, dtype=torch.long)
+
+
+def _pose(shift: tuple[float, float, float]) -> torch.Tensor:
+    """The camera 10 m in front of the sphere, the sphere shifted by metres."""
+    T_obj_cam = torch.eye(4, dtype=torch.float64)[None].clone()
+    T_obj_cam[0, :3, 3] = torch.tensor([0.0, 0.0, -10.0], dtype=torch.float64) - torch.tensor(shift)
+    return T_obj_cam
+
+
+def _rays() -> Rays:
+    """64 rays that meet the sphere at less than 60 degrees."""
+    angle, share = torch.linspace(0, 6.28, 64, dtype=torch.float64), torch.linspace(0.05, 0.125, 64).double()
+    ray = torch.stack([share * angle.cos(), share * angle.sin(), torch.ones_like(angle)])
+    return Rays(OWNER, torch.zeros(1, 3, dtype=torch.float64), ray[:, None])
+
+
+def _depth_of(rays: Rays, T_obj_cam: torch.Tensor) -> torch.Tensor:
+    """Of the first point of the sphere, by the quadratic equation."""
+    x = rays.in_objects(T_obj_cam)
+    a, b = (x.direction_obj**2).sum(0), (x.centre_obj * x.direction_obj).sum(0)
+    return (-b - (b**2 - a * ((x.centre_obj**2).sum(0) - RADIUS_M**2)).sqrt()) / a
+
+
+@pytest.mark.parametrize(
+    ("shift", "bound_m"), [((0.0, 0.0, 0.5), 1e-4), ((0.05, 0.0, 0.05), 1e-4), ((0.15, -0.1, 0.2), 5e-3)]
+)
+def test_a_surface_is_found_again(shift: tuple[float, float, float], bound_m: float) -> None:
+    """Within a Newton step of it, as the photometric term takes one more."""
+    rays, before = _rays(), _pose((0.0, 0.0, 0.0))
+    points = rays.in_objects(before).at(_depth_of(rays, before))
+    hits = Hits(points, FIELD.gradient(points, OWNER), torch.ones(1, 64, dtype=torch.bool), _depth_of(rays, before))
+    there = _pose(shift)
+    if shift[2] == 0.5:
+        hits = hits._replace(depth=hits.depth + 3)  # where a hit lies is told by its point alone
+    found = tracked_depth(FIELD, rays, rays.in_objects(there), hits)
+    assert (found - _depth_of(rays, there)).abs().max() < bound_m
+
+
+def test_a_surface_that_is_gone_is_not_found() -> None:
+    """The car has moved aside: no ray meets it, and the signed distance there says so."""
+    rays, before = _rays(), _pose((0.0, 0.0, 0.0))
+    points = rays.in_objects(before).at(_depth_of(rays, before))
+    hits = Hits(points, FIELD.gradient(points, OWNER), torch.ones(1, 64, dtype=torch.bool), _depth_of(rays, before))
+    in_objects = rays.in_objects(_pose((4.0, 0.0, 0.0)))
+    depth = tracked_depth(FIELD, rays, in_objects, hits)
+    assert depth.isfinite().all()
+    assert (FIELD.value(in_objects.at(depth), OWNER) > 0.03).all()
+
+
+def test_a_plane_along_the_ray_is_no_guide() -> None:
+    """The depth stays within a step's limits of where it was, and nowhere near infinity."""
+    rays = _rays()
+    in_objects = rays.in_objects(_pose((0.0, 0.0, 0.0)))
+    points = in_objects.at(_depth_of(rays, _pose((0.0, 0.0, 0.0))))
+    sideways = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64).view(3, 1, 1).expand_as(points) * 1e-9
+    hits = Hits(points, sideways, torch.ones(1, 64, dtype=torch.bool), in_objects.depth_next_to(points))
+    depth = tracked_depth(FIELD, rays, in_objects, hits)
+    assert (depth - in_objects.depth_next_to(points)).abs().max() < 1.0

@@ -1,0 +1,235 @@
+"""Terms that a user brings count like ours; mistakes in them are named, and what is no number stays in its car."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from helpers.exact_disparity import measured_street
+from helpers.problems import DEFAULT
+from helpers.street_inputs import SETTLED, StreetInputs, with_mode
+from helpers.synthetic_scene import cached_street, disturbed, select
+from torch import Tensor
+
+from directshape_torch.config import PointCloudConfig, RefinerConfig
+from directshape_torch.errors import InputError
+from directshape_torch.problem import TermFactory
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.rows import Blocks
+from directshape_torch.scene import Detections
+from directshape_torch.status import Status
+from directshape_torch.stereo_matching.car_points import car_points
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.point_cloud import PointCloud
+from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior
+
+
+def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResidual]:
+    """The height above the ground, as if the ground were lower by so much."""
+
+    def residual(cars: CarBatch, state: CarState) -> PriorResidual:
+        at = height_prior(cars, state)
+        return at._replace(residual=at.residual - metres)
+
+    return residual
+
+
+def made(kind: type[PriorTerm] = PriorTerm, residual_of: Any = None, weight: float = 1e5) -> TermFactory:
+    return lambda *scene: kind("user", weight, scene[2], residual_of or lower_by(0.3), 1)
+
+
+def refine(
+    *extra: TermFactory, config: RefinerConfig = DEFAULT, detections: Detections | None = None
+) -> RefinementResult:
+    prior, scene = cached_street()
+    detections = disturbed(scene.detections) if detections is None else detections
+    result: RefinementResult = DirectShapeRefiner(prior, config, extra)(scene.frames, detections)
+    return result
+
+
+def test_a_prior_of_ones_own_counts_like_ours() -> None:
+    without = replace(DEFAULT, priors=replace(DEFAULT.priors, height_weight=0.0))
+    result = refine(made(), config=without)
+    assert result.refined.all()
+    assert result.term_names[-1] == "user"
+    lower = result.T_cam_obj[:, 1, 3] - refine(config=DEFAULT).T_cam_obj[:, 1, 3]
+    torch.testing.assert_close(lower, torch.full((2,), 0.3).double(), rtol=0, atol=0.1)
+
+
+def test_points_of_a_lidar_beside_the_images_are_the_combined_method() -> None:
+    prior, scene = measured_street()
+    detections = disturbed(scene.detections, 0.25, 0.08)
+    cloud = PointCloudConfig(weight=1000.0, combined_weight=1000.0, min_points=50)
+
+    def lidar(frames: Any, detections: Any, *_: Any) -> PointCloud:
+        return PointCloud.of_points(cloud, car_points(frames, detections, cloud), "lidar")
+
+    extra = DirectShapeRefiner(prior, DEFAULT, [lidar])(scene.frames, detections)
+    combined = DirectShapeRefiner(prior, replace(DEFAULT, method="combined", point_cloud=cloud))
+    torch.testing.assert_close(extra.T_cam_obj, combined(scene.frames, detections).T_cam_obj, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["implicit", "unroll"])
+def test_a_term_of_ones_own_carries_gradients(mode: str) -> None:
+    inputs = StreetInputs()
+
+    def heights(metres: Tensor | float, config: RefinerConfig) -> Tensor:
+        detections = replace(inputs.detections, mask_left=inputs.mask)
+        refiner = DirectShapeRefiner(inputs.prior, config, [made(residual_of=lower_by(metres), weight=100.0)])
+        result: RefinementResult = refiner(inputs.scene.frames, detections)
+        return result.T_cam_obj[:, 1, 3].sum()
+
+    metres = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(heights(metres, with_mode(mode)), metres)
+    step = 1e-5
+    numeric = float(heights(step, SETTLED) - heights(-step, SETTLED)) / (2 * step)
+    assert float(gradient) == pytest.approx(numeric, rel=1e-3)
+    assert numeric > 0.1
+
+
+def test_no_cars_need_no_rows() -> None:
+    none = select(cached_street()[1].detections, torch.zeros(0, dtype=torch.long))
+    assert refine(made(), detections=none).term_names[-1] == "user"
+
+
+def _with(**members: Any) -> type[PriorTerm]:
+    return type("Broken", (PriorTerm,), members)
+
+
+def _own(name: str) -> Callable[[PriorTerm], Any]:
+    """A property as the intact term has it."""
+    return getattr(PriorTerm, name).fget  # type: ignore[no-any-return]
+
+
+def _linear(**changes: Callable[[Tensor], Tensor]) -> Callable[..., Any]:
+    def linear(self: PriorTerm, *arguments: Any) -> Any:
+        at = PriorTerm.linear(self, *arguments)
+        return at._replace(**{name: change(getattr(at, name)) for name, change in changes.items()})
+
+    return linear
+
+
+def _one_cost_for_all(self: PriorTerm, *arguments: Any) -> Any:
+    term, where, cost = PriorTerm.moving(self, *arguments)
+    return term, where, cost[:, 0]
+
+
+def _blocks(change: Callable[[Blocks], Blocks]) -> property:
+    return property(lambda term: change(_own("blocks")(term)))
+
+
+BROKEN: dict[str, tuple[dict[str, Any], str]] = {
+    "one name": ({"names": "user"}, r"Broken: names: expected a tuple of at least one str, got 'user'"),
+    "a name that is ours": ({"names": ("tilt",)}, r"'tilt': names: expected names that no other column has .*height"),
+    "cars beyond the batch": (
+        {"blocks": _blocks(lambda blocks: blocks._replace(owner=blocks.owner + 1))},
+        r"'user' after begin\(...\): blocks.owner: expected numbers of the 2 cars, got 1..2; number the cars",
+    ),
+    "short numbers": (
+        {"blocks": _blocks(lambda blocks: blocks._replace(owner=blocks.owner.int()))},
+        r"blocks.owner: expected int64, got torch.int32; convert it with .long\(\)",
+    ),
+    "counts of others": (
+        {"blocks": _blocks(lambda blocks: blocks._replace(counts=(2, 0)))},
+        r"blocks.counts: expected the blocks of each car, \[1, 1\], got \[2, 0\]",
+    ),
+    "no Blocks": ({"blocks": property(lambda _: torch.arange(2))}, r"blocks: expected a Blocks, got Tensor"),
+    "a column that is not there": (
+        {"column": property(lambda term: _own("column")(term) + 1)},
+        r"column: expected numbers of the 1 names, got 1..1",
+    ),
+    "one weight for all": (
+        {"block_weight": property(lambda _: torch.tensor(2.0))},
+        r"block_weight: expected shape \(2,\), got \(\); one for each block",
+    ),
+    "information for each row": (
+        {"information": property(lambda _: torch.ones(2, 1))},
+        r"information: expected shape \(2,\), got \(2, 1\)",
+    ),
+    "row weights without an axis": (
+        {"row_weight": property(lambda _: torch.ones(2, 1))},
+        r"row_weight: expected shape \(2, R, N\), got \(2, 1\)",
+    ),
+    "residuals without an axis": (
+        {"linear": _linear(residual=lambda x: x[..., 0])},
+        r"'user': linear\(...\).residual: expected shape \(2, 1, 1\), got \(2, 1\)",
+    ),
+    "a Jacobian of the wrong rows": (
+        {"linear": _linear(J_residual_inner=lambda x: x[:1])},
+        r"linear\(...\).J_residual_inner: expected shape \(2, 1, 1\), got \(1, 1, 1\)",
+    ),
+    "a Jacobian without the code": (
+        {"linear": _linear(J_inner_state=lambda x: x[..., :6])},
+        r"linear\(...\).J_inner_state: expected shape \(2, 1, 9\), got \(2, 1, 6\); by \(v, omega, dcode\)",
+    ),
+    "no Linear": ({"linear": lambda *_: torch.zeros(2)}, r"linear\(...\): expected a Linear, got Tensor"),
+    "another residual": (
+        {"residual": lambda *_: torch.zeros(2, 3, 1)},
+        r"'user': residual\(...\): expected shape \(2, 1, 1\), got \(2, 3, 1\); those of linear",
+    ),
+    "a norm of everything": (
+        {"norm": lambda self, residual: PriorTerm.norm(self, residual.sum())},
+        r"'user': norm\(...\).rho: expected shape \(2, 1, 1\), got \(\)",
+    ),
+    "one cost for all names": ({"moving": _one_cost_for_all}, r"the cost of moving\(...\): expected shape \(2, 1\)"),
+    "cars that do not leave": (
+        {"of_cars": lambda self, *_: self},
+        r"'user' after of_cars\(...\): blocks.owner: expected numbers of the 1 cars, got 0..1",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_mistake_in_a_term_is_named_when_the_problem_is_made(case: str) -> None:
+    members, message = BROKEN[case]
+    prior, scene = cached_street()
+    refiner = DirectShapeRefiner(prior, DEFAULT, [made(_with(**members))])
+    with pytest.raises(InputError, match=r"^extra term .*" + message):
+        refiner.problem(scene.frames, scene.detections)
+
+
+def test_a_member_that_is_missing_is_named() -> None:
+    class Bare:
+        names = ("user",)
+
+    with pytest.raises(InputError, match=r"extra term Bare: expected the members of `Term`, got none called is_prior"):
+        refine(lambda *_: Bare())  # type: ignore[arg-type, return-value]
+
+
+def test_two_terms_of_one_name_are_named() -> None:
+    with pytest.raises(InputError, match=r"extra term 'user': names: expected names that no other column has"):
+        refine(made(), made())
+
+
+def _poisoned(name: str, when: Callable[[CarState], Tensor]) -> Callable[[CarBatch, CarState], PriorResidual]:
+    """The first detection's residual or Jacobian is no number where the condition (B,) on the state holds."""
+
+    def residual(cars: CarBatch, state: CarState) -> PriorResidual:
+        at = lower_by(0.0)(cars, state)
+        sick = ((cars.detection_row == 0) & when(state)).view(-1, *[1] * (getattr(at, name).ndim - 1))
+        return at._replace(**{name: torch.where(sick, torch.nan, getattr(at, name))})
+
+    return residual
+
+
+@pytest.mark.parametrize("what", ["residual", "J_residual_state"])
+def test_rows_that_are_no_numbers_end_their_own_car_alone(what: str) -> None:
+    healthy = refine(made(residual_of=lower_by(0.0)))
+    result = refine(made(residual_of=_poisoned(what, lambda state: torch.ones_like(state.code[:, 0]) > 0)))
+    assert result.status[0] is Status.non_finite
+    assert torch.equal(result.T_cam_obj[0], disturbed(cached_street()[1].detections).T_cam_obj[0])
+    assert result.status[1] is healthy.status[1]
+    torch.testing.assert_close(result.T_cam_obj[1], healthy.T_cam_obj[1], rtol=0, atol=1e-9)
+    torch.testing.assert_close(result.cost_after[1], healthy.cost_after[1], rtol=1e-9, atol=1e-9)
+
+
+def test_a_term_that_breaks_on_the_way_leaves_the_best_state_before() -> None:
+    """No number wherever the shape is not the mean's: no step can be taken, and the input is the best state."""
+    healthy = refine(made(residual_of=lower_by(0.0)))
+    result = refine(made(residual_of=_poisoned("residual", lambda state: (state.code != 0).any(dim=1))))
+    assert (result.code[0] == 0).all()
+    torch.testing.assert_close(result.T_cam_obj[1], healthy.T_cam_obj[1], rtol=0, atol=1e-9)

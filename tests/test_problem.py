@@ -1,0 +1,510 @@
+"""The energy of many cars: one cost, sums, cars apart, stages that hold unknowns, and the way there."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+import torch
+from helpers.derivatives import moved, relative_error
+from helpers.five_cars import begun_stage, five_cars, step_of
+from helpers.problems import CONFIGS, DEFAULT, MARCHED, PAPER, figures_at, photometric_of
+from helpers.problems import begun_stage as begun_at
+from helpers.synthetic_scene import cached_street, disturbed, joined_frames, select
+from helpers.term_cases import CLOUD, COMBINED, case
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig, StageConfig
+from directshape_torch.errors import ConfigError, InputError
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.problem import CarProblem, CarStage, method_stages
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.solver.gauss_newton import Minimum, minimise
+from directshape_torch.status import Status
+from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.terms.term import Figures
+
+DEMO = Path(__file__).parents[1] / "directshape_torch" / "assets" / "demo"
+SETS = {"demo": ("noisy_stereo", 1), "rendered": ("stereo", 2), "kitti": ("noisy_stereo", 2)}
+
+
+@pytest.fixture(autouse=True)
+def no_graph() -> object:
+    """As in the iterations, which differentiate nothing."""
+    with torch.no_grad():
+        yield
+
+
+def _assert_same(found: tuple[Tensor, ...], expected: tuple[Tensor, ...], tolerance: float = 1e-9) -> None:
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=tolerance, atol=tolerance * float(y.abs().max() if y.numel() else 0))
+
+
+# One cost
+
+
+def _gradient_error(stage: CarStage, state: CarState, names: tuple[str, ...]) -> Tensor:
+    """Of the gradient by central differences of the cost, looked at anew at every state; relative, of each car.
+
+    Where a ray changes, within a step, from one of its minima to another the cost jumps, which the narrower of two
+    steps is spared.
+    """
+    of_terms = [number for number, name in enumerate(stage.problem.term_names) if name in names]
+    analytic = figures_at(stage, state).gradient[:, of_terms].sum(dim=1)
+    errors = []
+    for step in (1e-6, 1e-7):
+        numeric = torch.zeros_like(analytic)
+        for unknown in range(analytic.shape[1]):
+            delta = torch.zeros_like(analytic)
+            delta[:, unknown] = step
+            ends = [figures_at(stage, retract(state, sign * delta)).term_costs[:, of_terms].sum(1) for sign in (1, -1)]
+            numeric[:, unknown] = (ends[0] - ends[1]) / (2 * step)
+        errors.append((numeric - analytic).norm(dim=1) / analytic.norm(dim=1).clamp_min(1e-9))
+    return torch.minimum(*errors)
+
+
+def _frames_of(name: str) -> list[tuple[FrameBatch, Detections]]:
+    detector, num_frames = SETS[name]
+    if name != "demo" and "DIRECTSHAPE_DATA" not in os.environ:
+        pytest.skip("DIRECTSHAPE_DATA is not set: real frames needed")
+    root = DEMO if name == "demo" else Path(os.environ["DIRECTSHAPE_DATA"]) / name
+    masks = root / "training" / "masks"
+    dataset = KittiStereoDataset(root, root / "detections" / detector, masks, dtype=torch.float64)
+    loaded = [dataset.load(frame) for frame in dataset.frame_ids[:num_frames]]
+    seen = [(x.frame, x.detections, x.detections.mask_left.flatten(1).sum(dim=1) > 200) for x in loaded]
+    return [(frame, select(found, keep.nonzero()[:, 0])) for frame, found, keep in seen if bool(keep.any())]
+
+
+def _ended(problem: CarProblem, state: CarState, start: CarState | None = None) -> Minimum[CarState]:
+    return minimise(problem, state, problem.config.solver, start)
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_cost_that_accepts_is_the_one_whose_gradient_made_it(name: str) -> None:
+    """At the input and at the end; before, with the vertex of coarse samples: 5 percent in the median, 44 at most."""
+    errors = []
+    for frames, detections in _frames_of(name):
+        problem, state = DirectShapeRefiner(PCAShapePrior.load_bundled().double()).problem(frames, detections)
+        last = problem.begin(problem.stages()[-1], problem.look(state))
+        ended = _ended(problem, state)
+        assert isinstance(ended.stage, CarStage)
+        for stage, at in ((last, state), (ended.stage, ended.end)):
+            errors.append(_gradient_error(stage, at, ("silhouette_left", "silhouette_right")))
+    error = torch.cat(errors)
+    assert error.median() < 1e-7
+    assert error.max() < 1e-2
+
+
+@pytest.mark.parametrize("regime", ["typical", "near", "far", "border"])
+def test_so_it_is_on_the_synthetic_street_for_all_terms(regime: str) -> None:
+    stage, state = case(regime)
+    assert _gradient_error(stage, state, stage.problem.term_names).max() < 1e-4
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_the_sums_are_those_of_the_rows(config: str) -> None:
+    """Cost, gradient, Gauss-Newton and Fisher matrices of every column, one row after the other."""
+    stage, state = case(config=config)
+    sight = stage.problem.look(state)
+    figures, num_cars, column = stage.figures(sight), len(state.code), 0
+    for term in stage.terms:
+        at = term.linear(sight.field, state, term.where(sight))
+        norm, J = term.norm(at.residual), at.J_residual_inner[..., None] * at.J_inner_state[:, :, None]
+        weight = term.row_weight.expand_as(at.residual)
+        for number in range(len(term.names)):
+            for car in range(num_cars):
+                own = ((term.blocks.owner == car) & (term.column == number)).nonzero()[:, 0]
+                cost, gradient = torch.zeros(()).double(), torch.zeros(J.shape[-1]).double()
+                hessian = information = torch.zeros(J.shape[-1], J.shape[-1]).double()
+                for block in own:
+                    lam, info = term.block_weight[block], term.information[block]
+                    w, rows = weight[block].flatten(), J[block].flatten(0, 1)
+                    cost = cost + lam * (w * norm.rho[block].flatten()).sum()
+                    gradient = gradient + lam * ((w * norm.gradient_weight[block].flatten())[:, None] * rows).sum(0)
+                    hessian = hessian + lam * (rows.mT * (w * norm.hessian_weight[block].flatten())) @ rows
+                    of_rows = rows.mT * (w * norm.information_weight[block].flatten())
+                    information = information + info * of_rows @ rows
+                place = car, column + number
+                found = [x[place] for x in (figures.term_costs, figures.gradient, figures.hessian, figures.information)]
+                _assert_same(tuple(found), (cost, gradient, hessian, information), 1e-10)
+        column += len(term.names)
+    _assert_same((figures.cost,), (figures.term_costs.sum(1),))
+    eigenvalues = torch.linalg.eigvalsh(figures.hessian)
+    assert eigenvalues.min() > -1e-9 * figures.hessian.abs().max()
+
+
+def test_single_precision_says_nearly_the_same_in_double() -> None:
+    prior, scene = cached_street()
+    detections = disturbed(scene.detections)
+    stage, state = begun_at(prior, scene.frames, detections)
+    low, low_state = begun_at(
+        prior.__class__.to(cached_street(torch.float32)[0], torch.float32),
+        scene.frames.to(dtype=torch.float32),
+        detections.to(dtype=torch.float32),
+    )
+    exact, found = figures_at(stage, state), figures_at(low, low_state)
+    assert found.cost.dtype == found.gradient.dtype == found.hessian.dtype == torch.float64
+    torch.testing.assert_close(found.cost, exact.cost, rtol=5e-3, atol=1e-3)
+    assert relative_error(found.gradient.sum(1), exact.gradient.sum(1)) < 0.02
+
+
+# Iterations against figures
+
+
+@pytest.mark.parametrize("config", [DEFAULT, MARCHED, COMBINED], ids=["tracked", "marched", "combined"])
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_iterations_begin_at_the_figures(config: RefinerConfig, number: int) -> None:
+    """Rays that are certain are left out, so the gradient lacks what they would add: less than a thousandth."""
+    stage, state = begun_stage(config, number)
+    sight = stage.problem.look(state)
+    (_, at), figures = stage.start(sight), stage.figures(sight)
+    torch.testing.assert_close(at.cost, figures.cost, rtol=1e-10, atol=0)
+    assert relative_error(at.gradient, figures.gradient.sum(1)) < 1e-3
+    assert relative_error(at.hessian, figures.hessian.sum(1)) < 1e-3
+
+
+def test_by_autograd_the_iterations_are_the_same() -> None:
+    """After a step the depth of a tracked surface is one Newton step ahead of where its slope was taken."""
+    evaluations = []
+    for jacobian in ("analytic", "autograd"):
+        stage, state = begun_stage(replace(DEFAULT, solver=replace(DEFAULT.solver, jacobian=jacobian)))
+        iterations, at = stage.start(stage.problem.look(state))
+        evaluations += [(at[:3], iterations.evaluate(moved(state, step_of(5, 0.005, 0.05)), at)[:3])]
+    for by_hand, by_autograd, tolerance in zip(*evaluations, (1e-9, 2e-3), strict=True):
+        _assert_same(by_autograd, by_hand, tolerance)
+
+
+@pytest.mark.parametrize("config", [DEFAULT, MARCHED], ids=["tracked", "marched"])
+@pytest.mark.parametrize("keep", [[0, 1, 2, 3, 4], [1, 4], [2], []])
+def test_cars_that_leave_change_nothing_of_the_others(config: RefinerConfig, keep: list[int]) -> None:
+    """In the middle of a stage, and once more among those that went on."""
+    stage, state = begun_stage(config)
+    iterations, at = stage.start(stage.problem.look(state))
+    kept = torch.zeros(5, dtype=torch.bool)
+    kept[keep] = True
+    fewer, at_fewer = iterations.of_problems(kept, keep, at)
+    _assert_same(at_fewer[:3], tuple(x[kept] for x in at[:3]), 0)
+    for scale in (0.005, 0.02):
+        there = moved(state, step_of(5, scale, 0.1))
+        at, at_fewer = iterations.evaluate(there, at), fewer.evaluate(CarState(*(x[kept] for x in there)), at_fewer)
+        _assert_same(at_fewer[:3], tuple(x[kept] for x in at[:3]), 1e-12)
+        if len(keep) == 2:
+            fewer, at_fewer = fewer.of_problems(torch.tensor([False, True]), [1], at_fewer)
+            kept, keep = torch.arange(5) == keep[1], keep[1:]
+
+
+def test_a_refused_step_leaves_no_trace() -> None:
+    stage, state = begun_stage()
+    iterations, at = stage.start(stage.problem.look(state))
+    far = iterations.evaluate(moved(state, step_of(5, 0.3, 1.0)), at)
+    accepted = torch.tensor([True, False, True, False, False])
+    chosen = iterations.choose(accepted, far, at)
+    there = moved(state, step_of(5, 0.01, 0.1, seed=8))
+    found, as_if_none, as_if_all = (iterations.evaluate(there, near)[:3] for near in (chosen, at, far))
+    for x, none, every in zip(found, as_if_none, as_if_all, strict=True):
+        assert torch.equal(x[~accepted], none[~accepted])
+        assert torch.equal(x[accepted], every[accepted])
+
+
+def test_the_state_moves_within_the_trust_region(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the three components of a rotation may reach its limit; codes stop at their bound."""
+    stage, state = begun_stage()
+    iterations, _ = stage.start(stage.problem.look(state))
+    bounds: list[float] = []
+    exp = se3.exp
+
+    def recorded(twist: Tensor, max_angle: float) -> Tensor:
+        bounds.append(max_angle)
+        return exp(twist, max_angle)
+
+    monkeypatch.setattr(se3, "exp", recorded)
+    after = iterations.retract(state, step_of(5, 0.05, 9.0))
+    assert bounds == [pytest.approx(math.sqrt(3) * DEFAULT.solver.max_step_rotation_rad)]
+    assert after.code.abs().max() == DEFAULT.solver.max_code
+
+
+# Tracked and marched
+
+
+def _apart_mm(a: CarState, b: CarState) -> Tensor:
+    origins = [se3.inverse(state.T_obj_cam)[:, :3, 3] for state in (a, b)]
+    return 1000 * torch.linalg.vector_norm(origins[0] - origins[1], dim=1)
+
+
+def test_tracked_rays_lead_where_marched_rays_lead() -> None:
+    """To the same minimum from the same set of pixels, where every surface can be tracked."""
+    ends = []
+    for rays in ("tracked", "marched"):
+        solver = replace(DEFAULT.solver, rays=rays, cost_tolerance=0.0, step_tolerance=1e-6)
+        config = replace(DEFAULT, stages=(StageConfig(1.0, 0, 40),), solver=solver)
+        prior, scene = cached_street()
+        problem, state = DirectShapeRefiner(prior, config).problem(
+            scene.frames, disturbed(scene.detections, 0.05, 0.02)
+        )
+        ends.append(_ended(problem, state).end)
+    assert _apart_mm(*ends).max() < 1
+
+
+# Cars apart
+
+
+def _figures(frames: FrameBatch, detections: Detections, step: Tensor | None, config: RefinerConfig) -> Figures:
+    stage, state = begun_at(five_cars()[0], frames, detections, config)
+    return figures_at(stage, state if step is None else moved(state, step))
+
+
+def _compared(figures: Figures) -> tuple[Tensor, ...]:
+    return figures.term_costs, figures.gradient, figures.hessian, figures.information
+
+
+@pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])
+def test_permuted_cars_are_permuted_and_a_batch_is_a_loop(config: RefinerConfig) -> None:
+    _, frames, detections = five_cars()
+    # Who is left out of the detections hides nobody.
+    config = replace(config, sampling=replace(config.sampling, occlusion=False))
+    step = step_of(5, 0.01, 0.1)
+    together = _compared(_figures(frames, detections, step, config))
+    order = torch.tensor([3, 0, 4, 2, 1])
+    permuted = _compared(_figures(frames, select(detections, order), step[order], config))
+    _assert_same(permuted, tuple(x[order] for x in together), 1e-12)
+    for car in range(5):
+        alone = _compared(_figures(frames, select(detections, torch.tensor([car])), step[car : car + 1], config))
+        _assert_same(alone, tuple(x[car : car + 1] for x in together))
+
+
+def test_padding_changes_nothing() -> None:
+    _, scene = cached_street()
+    alone = _compared(_figures(scene.frames, scene.detections, None, DEFAULT))
+    height, width = scene.frames.images_left.shape[2:]
+    larger = replace(
+        scene.frames,
+        images_left=torch.nn.functional.pad(scene.frames.images_left, (0, 31, 0, 17), value=0.9),
+        images_right=torch.nn.functional.pad(scene.frames.images_right, (0, 31, 0, 17), value=0.1),
+    )
+    masks: dict[str, Any] = {
+        name: torch.nn.functional.pad(getattr(scene.detections, name), (0, 31, 0, 17))
+        for name in ("mask_left", "mask_right")
+    }
+    padded = _compared(_figures(joined_frames([larger]), replace(scene.detections, **masks), None, DEFAULT))
+    assert (height, width) == tuple(scene.frames.sizes[0].tolist())
+    _assert_same(padded, alone, 1e-12)
+
+
+@pytest.mark.parametrize("what", ["pose", "code"])
+@pytest.mark.parametrize("config", [DEFAULT, MARCHED], ids=["tracked", "marched"])
+def test_a_broken_car_touches_no_other(what: str, config: RefinerConfig) -> None:
+    stage, state = begun_stage(config)
+    broken = CarState(state.T_obj_cam.clone(), state.code.clone())
+    (broken.T_obj_cam if what == "pose" else broken.code)[1] = torch.nan
+    others = torch.arange(5) != 1
+    found, expected = (_compared(figures_at(stage, s)) for s in (broken, state))
+    _assert_same(tuple(x[others] for x in found), tuple(x[others] for x in expected), 0)
+    assert not found[0][1].isfinite().all()
+    iterations, at = stage.start(stage.problem.look(state))
+    tracked = [iterations.evaluate(s, at)[:3] for s in (broken, state)]
+    _assert_same(tuple(x[others] for x in tracked[0]), tuple(x[others] for x in tracked[1]), 0)
+
+
+def test_no_cars_and_cars_without_pixels() -> None:
+    stage, state = begun_stage(cars=[])
+    figures = figures_at(stage, state)
+    assert figures.gradient.shape == (0, 7, 9)
+    assert stage.start(stage.problem.look(state))[1].cost.shape == (0,)
+    _, frames, detections = five_cars()
+    # Its masks are empty, and no part of its box is in the image.
+    unseen = replace(
+        select(detections, torch.tensor([0])),
+        mask_left=torch.zeros_like(detections.mask_left[:1]),
+        mask_right=torch.zeros_like(detections.mask_right[:1]),
+        box_2d=torch.tensor([[-50.0, -50.0, -40.0, -40.0]], dtype=torch.float64),
+        T_cam_obj=detections.T_cam_obj[:1].clone(),
+    )
+    unseen.T_cam_obj[:, 0, 3] += 60
+    alone = _figures(frames, unseen, None, DEFAULT)
+    assert (alone.term_costs[0, :3] == 0).all()
+    assert alone.term_costs.isfinite().all()
+
+
+def test_moving_the_whole_scene_changes_no_residual() -> None:
+    """Camera, ground and cars turned about the y axis and shifted together: the state's frame is the car's own."""
+    stage, state = case()
+    motion = se3.exp(torch.tensor([1.0, -0.4, 3.0, 0.0, 0.7, 0.0], dtype=torch.float64))
+    masks = stage.problem.masks
+    rotated = (motion[:3, :3] @ masks.rays.ray_cam.flatten(1)).view_as(masks.rays.ray_cam)
+    rays = masks.rays._replace(centre_cam=se3.transform(motion, masks.rays.centre_cam), ray_cam=rotated)
+    there = CarState(state.T_obj_cam @ se3.inverse(motion), state.code)
+    silhouettes = stage.terms[0]
+    masks = replace(masks, rays=rays)
+    problem = replace(stage.problem, masks=masks, rays=masks.of_sides())
+    before, after = stage.problem.look(state), problem.look(there)
+    torch.testing.assert_close(after.closest.depth, before.closest.depth, rtol=0, atol=1e-9)
+    moved_term = replace(silhouettes, rows=problem.masks)  # type: ignore[type-var]
+    for term, sight, which in ((silhouettes, before, state), (moved_term, after, there)):
+        at = term.linear(sight.field, which, term.where(sight))
+        if term is silhouettes:
+            expected = at
+    torch.testing.assert_close(at.residual, expected.residual, rtol=0, atol=1e-9)
+    torch.testing.assert_close(at.J_inner_state, expected.J_inner_state, rtol=0, atol=1e-7)
+
+
+# Stages, terms, weights
+
+
+@pytest.mark.parametrize("unknowns", ["pose", "shape"])
+def test_unknowns_that_a_stage_holds_are_constant_in_it(unknowns: Literal["pose", "shape"]) -> None:
+    config = replace(DEFAULT, stages=(replace(DEFAULT.stages[1], unknowns=unknowns),))
+    stage, state = begun_stage(config, 0)
+    _, held = stage.start(stage.problem.look(state))
+    _, free = begun_stage(DEFAULT)[0].start(stage.problem.look(state))
+    moving = torch.arange(9) < 6 if unknowns == "pose" else torch.arange(9) >= 6
+    assert (held.gradient[:, ~moving] == 0).all()
+    torch.testing.assert_close(held.gradient[:, moving], free.gradient[:, moving], rtol=1e-9, atol=1e-9)
+    assert torch.equal(held.hessian[:, ~moving], torch.eye(9, dtype=torch.float64)[~moving].expand(5, -1, -1))
+    assert torch.equal(stage.free_unknowns(state), moving.expand(5, -1))
+    end = _ended(stage.problem, state).end
+    if unknowns == "pose":
+        assert torch.equal(end.code, state.code)
+    else:
+        torch.testing.assert_close(end.T_obj_cam, state.T_obj_cam, rtol=0, atol=1e-12)
+
+
+def test_a_code_at_its_bound_is_not_free() -> None:
+    stage, state = begun_stage()
+    at_bound = CarState(state.T_obj_cam, torch.full_like(state.code, DEFAULT.solver.max_code))
+    assert stage.free_unknowns(at_bound)[0].tolist() == [True] * 6 + [False] * 3
+
+
+def _names(config: RefinerConfig) -> tuple[str, ...]:
+    return (
+        case(config="combined")[0].problem.term_names
+        if config is COMBINED
+        else begun_stage(config)[0].problem.term_names
+    )
+
+
+def test_methods_are_lists_of_terms_and_terms_of_weight_zero_are_left_out() -> None:
+    images, priors = ("silhouette_left", "silhouette_right", "photometric"), ("shape", "height", "tilt", "dimensions")
+    assert _names(DEFAULT) == (*images, *priors)
+    assert _names(PAPER) == (*images, *priors[:3])
+    assert _names(COMBINED) == ("point_cloud", *images, *priors)
+    assert _names(replace(DEFAULT, silhouette=replace(DEFAULT.silhouette, weight=0.0)))[0] == "photometric"
+    assert "photometric" not in _names(replace(DEFAULT, photometric=replace(DEFAULT.photometric, weight=0.0)))
+    nothing = replace(
+        DEFAULT,
+        silhouette=replace(DEFAULT.silhouette, weight=0.0),
+        photometric=replace(DEFAULT.photometric, weight=0.0),
+        priors=replace(DEFAULT.priors, shape_weight=0.0, height_weight=0.0, tilt_weight=0.0, dimensions_weight=0.0),
+    )
+    with pytest.raises(ConfigError, match=r"method direct: expected a term of weight above 0, got none: silhouette"):
+        begun_stage(nothing)
+
+
+def test_stages_of_the_geometric_method_alternate() -> None:
+    geometric = replace(DEFAULT, method="geometric", point_cloud=CLOUD)
+    assert [stage.unknowns for stage in method_stages(geometric)[:3]] == ["pose", "shape", "pose"]
+    joint = replace(geometric, point_cloud=replace(CLOUD, order="joint"))
+    assert [stage.unknowns for stage in method_stages(joint)] == ["both"]
+    with pytest.raises(ConfigError, match=r"point_cloud\.order: backward\.mode implicit needs joint, got alternating"):
+        replace(geometric, backward=replace(DEFAULT.backward, mode="implicit"))
+
+
+def test_factors_of_single_cars_count_in_everything() -> None:
+    factor = torch.tensor([0.0, 0.5, 1.0, 2.0, 3.0], dtype=torch.float64)
+    plain, state = begun_stage()
+    weighted, _ = begun_stage(term_weights={"photometric": factor, "shape": factor})
+    at = moved(state, step_of(5, 0.01, 0.1))
+    expected = torch.ones(5, 7, dtype=torch.float64)
+    expected[:, [2, 3]] = factor[:, None]
+    found, without = (_compared(figures_at(stage, at)) for stage in (weighted, plain))
+    _assert_same(found, tuple(x * expected.view(5, 7, *[1] * (x.ndim - 2)) for x in without), 1e-12)
+    sight = plain.problem.look(state)
+    for stage in (plain, weighted):
+        _, start = stage.start(sight)
+        torch.testing.assert_close(start.cost, stage.figures(sight).cost, rtol=1e-10, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({"photometrics": torch.ones(5)}, r"term_weights: expected names among silhouette_left, .*'photometrics'"),
+        ({"photometric": torch.ones(4)}, r"term_weights\['photometric'\]: .*one factor for each car"),
+        ({"shape": torch.tensor([1.0, 1, -0.5, 1, 1])}, r"factors of at least 0, got -0.5 for car 2"),
+    ],
+)
+def test_wrong_factors_say_so(weights: dict[str, Tensor], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        begun_stage(term_weights=weights)
+
+
+def test_the_photometric_term_needs_a_stage() -> None:
+    problem = begun_stage()[0].problem
+    term = next(t for t in problem.terms if t.names == ("photometric",))
+    with pytest.raises(RuntimeError, match="no pixel set before a stage begins: call `begin` first"):
+        _ = term.blocks
+
+
+# The rig's residual disparity
+
+
+def _biased_street(bias_px: int, rows: int = 0) -> tuple[FrameBatch, Detections]:
+    """The street as a rig would see it whose right image comes out `bias_px` further left and `rows` lower."""
+    scene = cached_street()[1]
+    camera = scene.frames.camera
+    height, width = scene.frames.images_left.shape[2:]
+
+    def shifted(image: Tensor) -> Tensor:
+        return torch.roll(torch.roll(image, -bias_px, dims=-1), rows, dims=-2)
+
+    field = DisparityField.constant(
+        float(bias_px), (width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
+    ).to(dtype=torch.float64)
+    vertical = torch.zeros_like(field.coefficients)
+    vertical[0] = rows
+    field = replace(field, vertical_coefficients=vertical)
+    frames = replace(
+        scene.frames,
+        images_right=shifted(scene.frames.images_right),
+        camera=replace(camera, disparity_field=field),
+    )
+    return frames, replace(scene.detections, mask_right=shifted(scene.detections.mask_right))
+
+
+def test_a_field_that_is_known_brings_the_unbiased_energy_back() -> None:
+    prior, scene = cached_street()
+    plain = _figures(scene.frames, scene.detections, None, DEFAULT)
+    frames, detections = _biased_street(2, 1)
+    known = _figures(frames, detections, None, DEFAULT)
+    camera = replace(frames.camera, disparity_field=None)
+    unknown = _figures(replace(frames, camera=camera), detections, None, DEFAULT)
+    # Columns of pixels are lost at the image's border, and the field's rays are frozen at the input depth.
+    torch.testing.assert_close(known.term_costs[:, :3], plain.term_costs[:, :3], rtol=0.1, atol=0.05)
+    assert (unknown.cost > 2 * known.cost).all()
+    stage, state = begun_at(prior, frames, detections)
+    assert _gradient_error(stage, state, stage.problem.term_names).max() < 1e-4
+    assert (photometric_of(stage).pixels.bias_px == 2).all()
+
+
+def test_a_field_of_another_rig_is_an_error() -> None:
+    frames, _ = _biased_street(2)
+    field = frames.camera.disparity_field
+    assert field is not None
+    other = replace(field, K_left=frames.camera.K_left[0] * 1.1)
+    with pytest.raises(ValueError, match=r"(K_left|intrinsics|rig)"):
+        replace(frames, camera=replace(frames.camera, disparity_field=other))
+
+
+def test_upside_down_is_refused_however_the_prior_sees_it() -> None:
+    prior, scene = cached_street()
+    roll = se3.exp(torch.tensor([0, 0, 0, torch.pi, 0, 0], dtype=torch.float64))
+    upside_down = replace(scene.detections, T_cam_obj=scene.detections.T_cam_obj @ roll)
+    result = DirectShapeRefiner(prior, DEFAULT)(scene.frames, upside_down)
+    assert result.status == [Status.behind_camera] * 2
+    assert torch.equal(result.T_cam_obj, upside_down.T_cam_obj)
