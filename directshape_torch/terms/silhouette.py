@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ from directshape_torch.shape.field import Field
 from directshape_torch.shape.grid_cells import Lookup
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.term import Linear, Sight
+from directshape_torch.terms.term import Linear, Sight, Where
 
 # A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
 IN_PLAY_EXPONENT = 8.0
@@ -173,10 +174,10 @@ class Silhouettes:
     def row_weight(self) -> Tensor:
         return self.rows.filled[..., None]
 
-    def begin(self, stage: StageConfig, sight: Sight) -> Silhouettes:
+    def begin(self, stage: StageConfig, sight: Sight) -> Self:
         return replace(self, zeta=contour_zeta(self.cars, self.config, stage)[self.rows.rays.owner][:, None])
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[Silhouettes, Closest, Tensor]:
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
         """Rays near the contour, or that may come to be: the others are certain, whatever the next steps do."""
         distance = self._least_distance(sight)
         margin = _IN_PLAY_MARGIN_M * self.zeta
@@ -192,10 +193,10 @@ class Silhouettes:
         where = Closest(*(x.flatten(-2)[..., places] for x in sight.closest))
         return replace(self, rows=rows, zeta=zeta), where, at_rest
 
-    def where(self, sight: Sight) -> Closest:
+    def where(self, sight: Sight) -> Where:
         return sight.closest
 
-    def linear(self, field: Field, state: CarState, where: Closest) -> Linear:
+    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         now = tracked_closest(field, self.rows.rays, rays, self.bounds_obj, where)
         constant = nothing_is_differentiated()
@@ -206,7 +207,7 @@ class Silhouettes:
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
-    def residual(self, field: Field, state: CarState, where: Closest) -> Tensor:
+    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         points = rays.at(where.depth)
         across = (where.face_obj * rays.direction_obj).sum(0).detach()
@@ -220,7 +221,7 @@ class Silhouettes:
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.identity(residual, self.config.residual_floor)
 
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Silhouettes:
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
         (rows, kept), cars = self.rows.kept_of_cars(keep, numbers), self.cars.of_cars(keep, numbers)
         return replace(self, cars=cars, rows=rows, zeta=self.zeta.index_select(0, kept))
 

@@ -7,22 +7,18 @@ its interval with the prior's bounds, constants of a linearisation. Derivation: 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import logsigmoid
 
-from directshape_torch.config import SilhouetteConfig, StageConfig
 from directshape_torch.depth import march
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
-from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
-from directshape_torch.terms import robust
-from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.silhouette import MaskRows, contour_zeta, sdf_state_jacobian
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.silhouette import Silhouettes, sdf_state_jacobian
 from directshape_torch.terms.term import Linear, Sight, Where
 
 
@@ -34,40 +30,8 @@ class Samples(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SilhouetteProducts:
-    """The term of both images; see module. Its attributes are those of `Silhouettes`."""
-
-    config: SilhouetteConfig
-    cars: CarBatch
-    rows: MaskRows
-    bounds_obj: Tensor
-    zeta: Tensor
-
-    names = ("silhouette_left", "silhouette_right")
-    is_prior = False
-
-    @property
-    def blocks(self) -> Blocks:
-        return self.rows.blocks
-
-    @property
-    def column(self) -> Tensor:
-        return self.rows.side
-
-    @property
-    def block_weight(self) -> Tensor:
-        return self.rows.weight
-
-    @property
-    def information(self) -> Tensor:
-        return torch.ones_like(self.rows.weight)
-
-    @property
-    def row_weight(self) -> Tensor:
-        return self.rows.filled[..., None]
-
-    def begin(self, stage: StageConfig, sight: Sight) -> SilhouetteProducts:
-        return replace(self, zeta=contour_zeta(self.cars, self.config, stage)[self.rows.rays.owner][:, None])
+class SilhouetteProducts(Silhouettes):
+    """The term of both images; see module. Its rays and weights are those of `Silhouettes`."""
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[SilhouetteProducts, Where, Tensor]:
         return self, (), torch.zeros(len(self.cars), 2, dtype=torch.float64, device=self.zeta.device)
@@ -94,18 +58,11 @@ class SilhouetteProducts:
         residual = torch.where(crosses, residual, self.rows.residual_of_a_miss())
         return Linear(residual[..., None], torch.ones_like(residual)[..., None], J, Samples(marched.depths, crosses))
 
-    def residual(self, field: Field, state: CarState, where: Samples) -> Tensor:
+    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)
         sdf = field.value(rays.at(where.depths), self.rows.rays.owner)
         residual, _ = product_residual(sdf, self.zeta, self.rows.foreground)
         return torch.where(where.crosses, residual, self.rows.residual_of_a_miss())[..., None]
-
-    def norm(self, residual: Tensor) -> robust.RobustValue:
-        return robust.identity(residual, self.config.residual_floor)
-
-    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> SilhouetteProducts:
-        (rows, kept), cars = self.rows.kept_of_cars(keep, numbers), self.cars.of_cars(keep, numbers)
-        return replace(self, cars=cars, rows=rows, zeta=self.zeta.index_select(0, kept))
 
 
 def product_residual(

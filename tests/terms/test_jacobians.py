@@ -49,10 +49,10 @@ def test_by_hand_and_by_autograd(regime: str, config: str) -> None:
 def _reference(begun: CarStage, term: Term, at: Linear, state: CarState) -> Tensor:
     """Residuals (M, R, N) of the reference; photometric ones NaN where no surface is met."""
     prior = begun.problem.prior
-    if isinstance(term, Silhouettes):
-        return reference.silhouette(prior, term, state)[..., None]
     if isinstance(term, SilhouetteProducts):
         return reference.product(prior, term, state, at.where[0], at.where[1])[..., None]
+    if isinstance(term, Silhouettes):
+        return reference.silhouette(prior, term, state)[..., None]
     if isinstance(term, PointCloud):
         return reference.point_cloud(prior, term, state)[..., None]
     assert isinstance(term, Photometric)
