@@ -58,9 +58,12 @@ def _kept(
     like: Tensor,
     make: Callable[[torch.dtype, torch.device], _T],
 ) -> _T:
+    if torch.compiler.is_compiling():
+        # Constants of the compiled code, made without a change of mode, with which PyTorch stores no traces on disk.
+        return make(like.dtype, like.device)
     key = (values, like.dtype, like.device)
     # A tracer's tensors go with its own constants alone; those of `torch.func` with all.
-    known: _T | None = None if torch.compiler.is_compiling() or type(like) is not Tensor else constants.get(key)
+    known: _T | None = constants.get(key) if type(like) is Tensor else None
     if known is not None:
         return known
     with torch.inference_mode(False):
