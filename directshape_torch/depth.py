@@ -149,13 +149,13 @@ def _closest_from(
 ) -> Closest:
     lower, upper = bounds_obj
     inside = rays.interval(torch.stack([lower + _MARGIN_M, upper - _MARGIN_M]))
-    start = torch.minimum(torch.maximum(start, inside.near), inside.far)
-    found = field.minimum_along(owner, rays.centre_obj, rays.direction_obj, start, inside.near, inside.far, max_cells)
+    far = torch.where(inside.hit, inside.far, inside.near)
+    start = torch.minimum(torch.maximum(start, inside.near), far)
+    found = field.minimum_along(owner, rays.centre_obj, rays.direction_obj, start, inside.near, far, max_cells)
     # At an end of the interval the point slides along the plane through which the ray comes or goes.
-    axis = torch.where(found.depth <= inside.near + _AT_END_M, inside.near_axis, -1)
-    axis = torch.where(found.depth >= inside.far - _AT_END_M, inside.far_axis, axis)
-    axes = torch.arange(3, device=axis.device).view(3, 1, 1)
-    face = torch.where(axis >= 0, (axes == axis).to(start.dtype), found.face_obj)
+    comes, goes = ((x == end).to(start.dtype) for x, end in ((inside.enters, inside.near), (inside.leaves, inside.far)))
+    face = torch.where(found.depth <= inside.near + _AT_END_M, comes, found.face_obj)
+    face = torch.where(found.depth >= inside.far - _AT_END_M, goes, face)
     return Closest(rays.at(found.depth), found.depth, inside.hit, face)
 
 

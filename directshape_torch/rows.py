@@ -171,12 +171,12 @@ class ObjectRays(NamedTuple):
         direction = self.direction_obj
         inverse = 1 / torch.where(direction.abs() < _LEAST_DIRECTION, _LEAST_DIRECTION, direction)
         to_lower, to_upper = ((corner.view(3, 1, 1) - self.centre_obj) * inverse for corner in bounds_obj)
-        near, near_axis = torch.minimum(to_lower, to_upper).max(dim=0)
-        far, far_axis = torch.maximum(to_lower, to_upper).min(dim=0)
-        near = near.clamp_min(0)
+        enters, leaves = torch.minimum(to_lower, to_upper), torch.maximum(to_lower, to_upper)
+        near = torch.maximum(torch.maximum(enters[0], enters[1]), enters[2]).clamp_min(0)
+        far = torch.minimum(torch.minimum(leaves[0], leaves[1]), leaves[2])
         hit = far > near
         near = torch.where(hit, near, 1.0)
-        return Interval(near, torch.where(hit, far, near + 1), hit, near_axis, far_axis)
+        return Interval(near, torch.where(hit, far, near + 1), hit, enters, leaves)
 
 
 class Interval(NamedTuple):
@@ -185,5 +185,5 @@ class Interval(NamedTuple):
     near: Tensor  # (M, R) metres of depth
     far: Tensor  # (M, R)
     hit: Tensor  # (M, R) bool
-    near_axis: Tensor  # (M, R) axis 0, 1 or 2 of the face through which the ray enters
-    far_axis: Tensor  # (M, R) and leaves
+    enters: Tensor  # (3, M, R) depth at which the ray comes between the two bounds of each axis
+    leaves: Tensor  # (3, M, R) and goes

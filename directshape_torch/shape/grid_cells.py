@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding
 
 from directshape_torch.geometry.short_axes import length
-from directshape_torch.numerics.device_constants import constant_like
 
 
 class GridField(NamedTuple):
@@ -25,6 +26,12 @@ class GridField(NamedTuple):
     def num_nodes(self) -> int:
         """Of one grid."""
         return math.prod(self.basis.shape[:3])
+
+    def node_at(self, cell: Tensor) -> Tensor:
+        """Flat index (...), within one grid, of nodes (3, ...), whole numbers in floating point."""
+        ny, nz = self.basis.shape[1:3]
+        x, y, z = cell
+        return (x * (ny * nz) + (y * nz + z)).long()
 
     @property
     def corners(self) -> tuple[int, ...]:
@@ -56,20 +63,36 @@ class Cells(NamedTuple):
 def cells_at(field: GridField, points_obj: Tensor) -> Cells:
     """The cells at points (3, ...). A NaN point gets a valid cell, at a distance of NaN: it cannot disturb others."""
     column = (3,) + (1,) * (points_obj.ndim - 1)
-    ny, nz = field.basis.shape[1:3]
     last_node = field.last_node.view(column)
     position = (points_obj - field.origin.view(column)) * (1 / field.spacing_m)
+    # A comparison with NaN is false.
+    clamped = torch.minimum(torch.where(position >= 0, position, 0.0), last_node)
+    lower = torch.minimum(clamped.detach().floor(), last_node - 1)
+    return Cells(field.node_at(lower), clamped - lower, position - clamped)
+
+
+def corner_values(field: GridField, node: Tensor) -> list[Tensor]:
+    """Signed distances (...) at the 8 corners of cells with lower node (...) among those of all grids, x outermost."""
     if torch.compiler.is_compiling():
-        # A comparison with NaN is false; the compiler writes `fmin` as five operations.
-        clamped = torch.minimum(torch.where(position >= 0, position, 0.0), last_node)
-        lower = torch.minimum(clamped.detach().floor(), last_node - 1)
-        flat = lower[0] * (ny * nz) + (lower[1] * nz + lower[2])
-    else:
-        clamped = torch.minimum(position.clamp_min(0), last_node)
-        # `fmin` and not `minimum`: of NaN and a number it is the number.
-        lower = torch.fmin(clamped.detach().floor(), last_node - 1)
-        flat = (lower * constant_like((ny * nz, nz, 1), lower).view(column)).sum(0)
-    return Cells(flat.long(), clamped - lower, position - clamped)
+        # Whose indices are known not to be negative.
+        return [row[..., 0] for row in corner_rows(field, field.values[:, None], node)]
+    flat = node.reshape(-1)
+    return [field.values[corner:].index_select(0, flat).view(node.shape) for corner in field.corners]
+
+
+def corner_rows(field: GridField, table: Tensor, node: Tensor) -> list[Tensor]:
+    """Rows (..., C) of a table of nodes at the 8 corners of cells with lower node (...), x outermost."""
+    return [embedding(node + corner if corner else node, table) for corner in field.corners]
+
+
+def differences(ends: Sequence[Tensor]) -> list[Tensor]:
+    """Between the upper and the lower ends along the innermost axis that is left."""
+    return [high - low for low, high in zip(ends[0::2], ends[1::2], strict=True)]
+
+
+def moved(lower: Sequence[Tensor], fraction: Tensor, differences: Sequence[Tensor]) -> list[Tensor]:
+    """From the lower ends on by fractions of the differences."""
+    return [torch.addcmul(low, fraction, difference) for low, difference in zip(lower, differences, strict=True)]
 
 
 def _safe_norm(vector: Tensor) -> Tensor:

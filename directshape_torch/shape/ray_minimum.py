@@ -16,9 +16,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.short_axes import length
-from directshape_torch.numerics.device_constants import constant_like
-from directshape_torch.numerics.table_lookup import take
-from directshape_torch.shape.grid_cells import GridField
+from directshape_torch.shape.grid_cells import GridField, corner_values, differences, moved
 
 # Distance of the three samples that begin a search where nothing but values is known.
 _FIRST_SAMPLES_M = 0.12
@@ -43,7 +41,7 @@ class RayMinimum(NamedTuple):
 
 
 class _AlongRay(NamedTuple):
-    """Coefficients (M, R) of the derivative by the depth, `first + 2 second t + 3 third t^2`, inside a cell."""
+    """Coefficients (M, R) of the derivative by the distance, `first + 2 second t + 3 third t^2`, inside a cell."""
 
     first: Tensor
     second: Tensor
@@ -60,88 +58,86 @@ def minimum_in_grids(
     far: Tensor,  # (M, R)
     max_cells: int,
 ) -> RayMinimum:
-    """Downhill from cell to cell until the distance grows in both directions, `max_cells` at most.
+    """Downhill from cell to cell until the distance grows again, `max_cells` at most.
 
     A minimum at `near` or `far` counts as smooth here: the caller knows what lies there. What is not found by then
-    waits on the face that it came to, and goes on from there when the ray is tracked next.
+    waits on the face that it came to, and goes on from there when the ray is tracked next. A ray whose `near` is its
+    `far` stays there.
     """
-    step, cell, fraction_at_zero = _cells_along(field, centre_obj, direction_obj, depth)
-    axes = torch.arange(3, device=depth.device).view(3, 1, 1)
-    face = found = torch.zeros_like(step)  # crossed last; on which the minimum is a kink
-    crossed = torch.zeros_like(depth)  # in which direction the last face was crossed
-    running = torch.ones_like(depth, dtype=torch.bool)
+    step, node, fraction = _cells_along(field, owner, centre_obj, direction_obj, depth)
+    along = _derivatives_along(field, node, fraction, step)
+    # From here on a ray is seen the way the distance falls from where it begins, by how far it has come.
+    backwards = along.first > 0
+    sign = torch.where(backwards, -1.0, 1.0)
+    heading, limit = step * sign, torch.where(backwards, depth - near, far - depth)
+    along = _AlongRay(-along.first.abs(), along.second, along.third * sign)
+    upwards, per_cell = heading > 0, 1 / heading
+    to_face = (upwards.to(step.dtype) - fraction) * per_cell
+    per_cell, into_next = per_cell.abs(), torch.where(upwards, 1.0, -1.0)
+    come = torch.zeros_like(depth)
+    face = crossed = torch.zeros_like(step)  # the last one, 1 at its axis; crossed now
+    running = limit > 0
+    is_kink = torch.zeros_like(running)
+    last_node = len(field.values) - 1 - field.corners[-1]
     for number in range(max_cells):
-        fraction = torch.addcmul(fraction_at_zero, depth, step)
-        along = _derivatives_along(field, owner, cell, fraction, step)
-        backwards = along.first > 0
-        sign = torch.where(backwards, -1.0, 1.0)
-        heading = step * sign
-        to_faces = ((heading > 0).to(step.dtype) - fraction) / heading
-        exit_at, axis = to_faces.clamp_min(0).min(dim=0)
-        limit = torch.where(backwards, depth - near, far - depth)
+        if number:
+            into = crossed * into_next
+            # Rounding may lead a ray that ends at the border beyond it, of which nothing is used.
+            node = (node + field.node_at(into)).clamp(0, last_node)
+            fraction = fraction - into
+            to_face = torch.addcmul(to_face, crossed, per_cell)
+            along = _derivatives_along(field, node, torch.addcmul(fraction, come, heading), heading)
+        # Where it grows from the face on through which the ray came, the minimum is a kink on that face.
+        grows = along.first > 0
+        root = come + torch.where(grows, 0.0, _first_root(along))
+        exit_at = torch.minimum(torch.minimum(to_face[0], to_face[1]), to_face[2])
         reach = torch.minimum(exit_at, limit)
-        root = _first_root(along)
-        is_inside = (root >= 0) & (root <= reach)
-        has_turned = sign * crossed < 0
-        going = running & ~has_turned
-        # Back onto the very face: a search that begins next to one has crossed it before it was there.
-        move = torch.where(has_turned, (to_faces * face).sum(0), torch.where(is_inside, root, reach))
-        depth = torch.addcmul(depth, torch.where(running, sign, 0.0), move)
-        found = torch.where(running & has_turned, face, found)
-        running = going & ~is_inside & (limit > exit_at)
-        face = (axes == axis).to(step.dtype)
-        if number + 1 < max_cells:
-            crossed = torch.where(running, sign, 0.0)
-            into_next = torch.where(running, face * heading.sign(), 0.0)
-            cell, fraction_at_zero = cell + into_next, fraction_at_zero - into_next
-    return RayMinimum(depth, torch.where(running, face, found))
+        is_inside = (root >= come) & (root <= reach)
+        come = torch.where(is_inside, root, reach)
+        is_kink = is_kink | (grows & running)
+        running = running & ~is_inside & (limit > exit_at)
+        # Who has arrived stays.
+        limit = torch.where(running, limit, come)
+        crossed = ((to_face == exit_at) & running).to(step.dtype)
+        face = torch.where(running, crossed, face)
+    return RayMinimum(torch.addcmul(depth, sign, come), torch.where(is_kink | running, face, 0.0))
 
 
 def curvature_in_grids(
     field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor
 ) -> Tensor:
     """Second derivative (M, R) of the signed distance by the depth, inside the cells at depths (M, R)."""
-    step, cell, fraction_at_zero = _cells_along(field, centre_obj, direction_obj, depth)
-    fraction = torch.addcmul(fraction_at_zero, depth, step)
-    return 2 * _derivatives_along(field, owner, cell, fraction, step).second
+    step, node, fraction = _cells_along(field, owner, centre_obj, direction_obj, depth)
+    return 2 * _derivatives_along(field, node, fraction, step).second
 
 
 def _cells_along(
-    field: GridField, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor
+    field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells per metre of depth (3, M, R), the cell at a depth, and the position relative to it at depth zero."""
+    """Cells per metre of depth (3, M, R), lower node (M, R) of the cell at a depth, and the place in it (3, M, R)."""
     per_metre = 1 / field.spacing_m
     step = direction_obj * per_metre
     step = torch.where(step.abs() < _NO_STEP, _NO_STEP, step)
-    start = (centre_obj - field.origin.view(3, 1, 1)) * per_metre
+    position = torch.addcmul((centre_obj - field.origin.view(3, 1, 1)) * per_metre, depth, step)
+    # A comparison with NaN is false: a NaN ray has a cell too.
     last_cell = (field.last_node - 1).view(3, 1, 1)
-    # `fmin` and not `minimum`: of NaN and a number it is the number, so that a NaN ray has a cell too.
-    cell = torch.fmin((torch.addcmul(start, depth, step) + _ON_FACE).floor().clamp_min(0), last_cell)
-    return step, cell, start - cell
+    cell = torch.minimum(torch.where(position >= 0, (position + _ON_FACE).floor(), 0.0), last_cell)
+    return step, field.node_at(cell) + owner[:, None] * field.num_nodes, position - cell
 
 
-def _derivatives_along(field: GridField, owner: Tensor, cell: Tensor, fraction: Tensor, step: Tensor) -> _AlongRay:
-    """Of the polynomial that belongs to a cell (3, M, R), at a position (3, M, R) in it."""
-    ny, nz = field.basis.shape[1:3]
-    last_cell = (field.last_node - 1).view(3, 1, 1)
-    # A search that has ended next to the border may point to a cell outside, of which nothing is used.
-    inside = torch.fmin(cell.clamp_min(0), last_cell)
-    node = (inside * constant_like((ny * nz, nz, 1), cell).view(3, 1, 1)).sum(0).long() + owner[
-        :, None
-    ] * field.num_nodes
-    corners = take(field.values, node + constant_like(field.corners, node).view(8, 1, 1))
+def _derivatives_along(field: GridField, node: Tensor, fraction: Tensor, step: Tensor) -> _AlongRay:
+    """Of the polynomial that belongs to a cell with lower node (M, R), at a place (3, M, R) in it."""
     (ux, uy, uz), (dx, dy, dz) = fraction, step
-    # Interpolated along z, then y, then x: each time a polynomial of the depth gains a degree.
-    lower, upper = corners[0::2], corners[1::2]
-    rise = upper - lower
-    a0, a1 = torch.addcmul(lower, uz, rise), dz * rise
-    low0, low1 = a0[0::2], a1[0::2]
-    r0, r1 = a0[1::2] - low0, a1[1::2] - low1
-    b0, b1, b2 = torch.addcmul(low0, uy, r0), torch.addcmul(torch.addcmul(low1, uy, r1), dy, r0), dy * r1
-    (b00, b01), (b10, b11), (b20, b21) = b0, b1, b2
-    r0, r1, r2 = b01 - b00, b11 - b10, b21 - b20
-    first = torch.addcmul(torch.addcmul(b10, ux, r1), dx, r0)
-    second = torch.addcmul(torch.addcmul(b20, ux, r2), dx, r1)
+    corners = corner_values(field, node)
+    # Interpolated along z, then y, then x: each time a polynomial of the distance gains a degree.
+    lower, rises = corners[0::2], differences(corners)
+    a0, a1 = moved(lower, uz, rises), [dz * rise for rise in rises]
+    r0, r1 = differences(a0), differences(a1)
+    b0, b2 = moved(a0[0::2], uy, r0), [dy * r for r in r1]
+    b1 = moved(moved(a1[0::2], uy, r1), dy, r0)
+    (r0,), (r1,), (r2,) = map(differences, (b0, b1, b2))
+    first = torch.addcmul(torch.addcmul(b1[0], ux, r1), dx, r0)
+    second = torch.addcmul(torch.addcmul(b2[0], ux, r2), dx, r1)
     return _AlongRay(first, second, dx * r2)
 
 
@@ -153,7 +149,7 @@ def _first_root(along: _AlongRay) -> Tensor:
     """
     first, second, third = along
     discriminant = torch.addcmul(second * second, third, first, value=-3)
-    return first.abs() / (second + discriminant.sqrt())
+    return -first / (second + discriminant.sqrt())
 
 
 def minimum_by_values(
