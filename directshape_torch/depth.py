@@ -19,9 +19,16 @@ from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.field import Field
 
-# Cells that a ray may cross on its way from a sample, or from the point tracked, to the least distance.
-_CELLS_FROM_SAMPLE = 5
-_CELLS_WHEN_TRACKED = 3
+# Cells looked into for the least distance, from where a parabola through samples has it. Of the rays near a contour one
+# in a thousand is then more than 1 mm from its minimum; of tracked ones 5 % while a car still moves by decimetres.
+_CELLS_OF_MARCH = 3
+_CELLS_WHEN_TRACKED = 2
+# Between the three samples about a point that is tracked.
+_SAMPLE_M = 0.2
+# In distances of samples: about a cell.
+_NEXT_CELL = 0.5
+# Second difference of samples below which their parabola is rounding.
+_LEAST_SECOND_DIFFERENCE_M = 1e-6
 # Within the prior's bounds, where the field has a kink and no derivative.
 _MARGIN_M = 1e-4
 # A depth so near to an end of its interval is there.
@@ -124,12 +131,10 @@ def closest_of_march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: 
     before, here, after = (
         sdf.gather(0, n)[0] for n in ((best - 1).clamp_min(0), best, (best + 1).clamp_max(count - 1))
     )
-    curvature = before - 2 * here + after
-    is_inner = (best[0] > 0) & (best[0] < count - 1) & (curvature > 0)
-    vertex = 0.5 * (before - after) / torch.where(is_inner, curvature, torch.ones_like(curvature))
+    is_inner = (best[0] > 0) & (best[0] < count - 1)
     step = depths[1] - depths[0] if count > 1 else torch.zeros_like(here)
-    start = depths.gather(0, best)[0] + torch.where(is_inner, vertex.clamp(-0.5, 0.5), 0.0) * step
-    closest = _closest_from(field, owner, rays, bounds_obj, start, _CELLS_FROM_SAMPLE)
+    start = depths.gather(0, best)[0] + torch.where(is_inner, _vertex(before, here, after, 0.5), 0.0) * step
+    closest = _closest_from(field, owner, rays, bounds_obj, start, _CELLS_OF_MARCH)
     # A ray that misses the bounds has no closest point yet; should it come in, it will come by the middle.
     by_the_middle = rays.at(rays.depth_next_to(bounds_obj.mean(dim=0).view(3, 1, 1).expand_as(rays.direction_obj)))
     return closest._replace(points_obj=torch.where(closest.crosses, closest.points_obj, by_the_middle))
@@ -138,10 +143,24 @@ def closest_of_march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: 
 @as_constant
 def tracked_closest(field: Field, rays: Rays, in_objects: ObjectRays, bounds_obj: Tensor, before: Closest) -> Closest:
     """The point of closest approach next to where a ray was closest at a state nearby."""
-    start = in_objects.depth_next_to(before.points_obj)
+    next_to = in_objects.depth_next_to(before.points_obj)
+    samples = torch.stack([next_to - _SAMPLE_M, next_to, next_to + _SAMPLE_M])
+    sdf = field.value(in_objects.at(samples), rays.owner, constant=True)
+    vertex = _vertex(sdf[0], sdf[1], sdf[2], 1.0)
+    # A minimum in the next cell is found from here, and one that is here stays the one that is looked at.
+    start = torch.add(next_to, torch.where(vertex.abs() > _NEXT_CELL, vertex, 0.0), alpha=_SAMPLE_M)
     now = _closest_from(field, rays.owner, in_objects, bounds_obj, start, _CELLS_WHEN_TRACKED)
     # A ray that misses the bounds goes on from where it was last.
     return now._replace(points_obj=torch.where(now.crosses, now.points_obj, before.points_obj))
+
+
+def _vertex(before: Tensor, here: Tensor, after: Tensor, reach: float) -> Tensor:
+    """Where the parabola through three samples is least, in their distances; at the lower end if it has no valley."""
+    curvature = before - 2 * here + after
+    is_valley = curvature > _LEAST_SECOND_DIFFERENCE_M
+    downhill = torch.where(after < before, reach, -reach)
+    vertex = 0.5 * (before - after) / torch.where(is_valley, curvature, 1.0)
+    return torch.where(is_valley, vertex.clamp(-reach, reach), downhill)
 
 
 def _closest_from(

@@ -13,11 +13,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.compile import compilable
+from directshape_torch.config import PhotometricConfig
 from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.device_constants import made_once
 from directshape_torch.rows import CarSums, Rays
-from directshape_torch.terms.photometric import Photometric, PhotometricRows, Surface, residuals_at
+from directshape_torch.terms.photometric import Photometric, PhotometricRows, Surface, photometric_norm, residuals_at
 
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
@@ -175,7 +177,20 @@ def disparity_profile(
     if not len(term.blocks.owner):
         return DisparityProfile(offsets, nan, nan, torch.zeros_like(nan[:, 0]))
     rows, place = _thinned(term, max_pixels)
-    costs = [_matching_costs(term, rows, place, surface, offsets) for surface in (before, after)]
+    depth, on_surface = (
+        torch.stack([x.flatten()[place], y.flatten()[place]])
+        for x, y in ((before.depth, after.depth), (before.on_surface, after.on_surface))
+    )
+    per_px = -1 / (term.cars.K_right[:, 0, 0] * term.cars.T_right_cam[:, 0, 3])
+    # A few offsets at a time where the pixels are many, so that memory stays that of the other evaluations.
+    num_parts = -(-rows.neighbour_weight.numel() * 2 * len(offsets) // _RESIDUALS_AT_ONCE)
+    costs = torch.cat(
+        [
+            shifted_costs(rows, term.config, depth, on_surface, per_px, some)
+            for some in offsets.to(depth).tensor_split(num_parts)
+        ],
+        dim=1,
+    )
     weight = (rows.neighbour_weight.sum(dim=0) * (rows.pixel_weight > 0)).sum(dim=1, dtype=torch.float64)
     num_pixels = (rows.pixel_weight > 0).sum(dim=1)
     means = (term.config.weight * cost.mT / weight.clamp_min(1)[:, None] for cost in costs)
@@ -206,24 +221,27 @@ def _thinned(term: Photometric, max_pixels: int) -> tuple[PhotometricRows, Tenso
     return PhotometricRows(rays, along_ray, along_baseline, left, weight, neighbours, rows.right.take(first)), place
 
 
-def _matching_costs(
-    term: Photometric, rows: PhotometricRows, place: Tensor, surface: Surface, offsets_px: Tensor
+@compilable(
+    sizes={
+        "owner": 0, "centre_cam": 0, "ray_cam": 1, "along_ray": 2, "along_baseline": 1, "intensity_left": 1,
+        "pixel_weight": 0, "neighbour_weight": 1, "pixels": 0, "frame": 0, "to_full": 0, "crop": 0, "in_front": 0,
+        "covering": 0, "depth": 1, "on_surface": 1, "per_px": 0, "offsets_px": 0,
+    }
+)  # fmt: skip
+def shifted_costs(
+    rows: PhotometricRows,
+    config: PhotometricConfig,
+    depth: Tensor,  # (S, B, R) of S surfaces, metres
+    on_surface: Tensor,  # (S, B, R) bool
+    per_px: Tensor,  # (B,) inverse depth that a pixel of disparity is worth
+    offsets_px: Tensor,  # (n,)
 ) -> Tensor:
-    """Costs (n, B), float64, of the pixels of a table with the surface moved by offsets (n,) of the disparity."""
-    depth, on_surface = (x.flatten()[place] for x in (surface.depth, surface.on_surface))
-    cars = term.cars
-    per_offset = -1 / (cars.K_right[:, 0, 0] * cars.T_right_cam[:, 0, 3])
-    weight = rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1)
-    # A few offsets at a time where the pixels are many, so that memory stays that of the other evaluations.
-    at_once = max(1, _RESIDUALS_AT_ONCE // max(1, weight.numel()))
-    parts = []
-    for some in torch.split(offsets_px.to(depth), at_once):
-        inverse = 1 / depth + some[:, None, None] * per_offset[:, None]
-        residual, comparable = residuals_at(rows, term.config, 1 / inverse)
-        usable = on_surface & comparable & (inverse > 0)
-        residual = torch.where(usable[..., None], residual, term.config.lost_grey_levels)
-        parts.append((term.norm(residual).rho * weight).sum(dim=(-1, -2), dtype=torch.float64))
-    return torch.cat(parts)
+    """Costs (S, n, B), float64, of a row of pixels of each car, with the surfaces moved by offsets of the disparity."""
+    inverse = 1 / depth[:, None] + offsets_px[:, None, None] * per_px[:, None]
+    residual, comparable = residuals_at(rows, config, 1 / inverse)
+    usable = on_surface[:, None] & comparable & (inverse > 0)
+    rho = photometric_norm(config, torch.where(usable[..., None], residual, config.lost_grey_levels)).rho
+    return (rho * (rows.pixel_weight[..., None] * rows.neighbour_weight.movedim(0, -1))).sum((-1, -2)).to(torch.float64)
 
 
 def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:

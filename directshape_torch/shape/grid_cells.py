@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import embedding
 
-from directshape_torch.geometry.short_axes import length
-
 
 class GridField(NamedTuple):
     """B signed distance grids of one geometry and the basis that they are made of."""
@@ -19,16 +17,20 @@ class GridField(NamedTuple):
     values: Tensor  # (B * nx * ny * nz,) metres
     basis: Tensor  # (nx, ny, nz, K) metres per standard deviation
     origin: Tensor  # (3,) position of node (0, 0, 0), metres
-    last_node: Tensor  # (3,) numbers nx - 1, ny - 1, nz - 1, floating point
     spacing_m: float  # between nodes
+
+    @property
+    def last_node(self) -> tuple[int, ...]:
+        """Number of the last node along each axis."""
+        return tuple(count - 1 for count in self.basis.shape[:3])
 
     @property
     def num_nodes(self) -> int:
         """Of one grid."""
         return math.prod(self.basis.shape[:3])
 
-    def node_at(self, cell: Tensor) -> Tensor:
-        """Flat index (...), within one grid, of nodes (3, ...), whole numbers in floating point."""
+    def node_at(self, cell: Sequence[Tensor]) -> Tensor:
+        """Flat index (...), within one grid, of nodes, three whole numbers in floating point."""
         ny, nz = self.basis.shape[1:3]
         x, y, z = cell
         return (x * (ny * nz) + (y * nz + z)).long()
@@ -52,23 +54,31 @@ class Cells(NamedTuple):
     """The grid cells that hold points (3, ...)."""
 
     lower_node: Tensor  # (...) flat index, within one grid, of the cell's lower corner
-    fraction: Tensor  # (3, ...) position inside the cell, 0..1
-    outward: Tensor  # (3, ...) from the nearest point of the grid to the point, in cells; zero inside
+    fraction: Sequence[Tensor]  # three of (...), position inside the cell, 0..1
+    outward: Sequence[Tensor]  # three of (...), from the nearest point of the grid to the point, in cells; zero inside
 
     def distance(self, constant: bool) -> Tensor:
         """From the grid (...), in cells; zero inside. `constant`: not to be differentiated."""
-        return length(self.outward, dim=0) if constant else _safe_norm(self.outward)
+        x, y, z = self.outward
+        squared = torch.addcmul(torch.addcmul(x * x, y, y), z, z)
+        if constant:
+            return squared.sqrt()
+        # The gradient at zero is zero instead of NaN.
+        positive = squared > 0
+        return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), squared)
 
 
 def cells_at(field: GridField, points_obj: Tensor) -> Cells:
     """The cells at points (3, ...). A NaN point gets a valid cell, at a distance of NaN: it cannot disturb others."""
-    column = (3,) + (1,) * (points_obj.ndim - 1)
-    last_node = field.last_node.view(column)
-    position = (points_obj - field.origin.view(column)) * (1 / field.spacing_m)
-    # A comparison with NaN is false.
-    clamped = torch.minimum(torch.where(position >= 0, position, 0.0), last_node)
-    lower = torch.minimum(clamped.detach().floor(), last_node - 1)
-    return Cells(field.node_at(lower), clamped - lower, position - clamped)
+    lower, fraction, outward = [], [], []
+    for coordinate, origin, last in zip(points_obj, field.origin, field.last_node, strict=True):
+        position = (coordinate - origin) * (1 / field.spacing_m)
+        # A comparison with NaN is false.
+        clamped = torch.where(position >= 0, position, 0.0).clamp_max(last)
+        lower.append(clamped.detach().floor().clamp_max(last - 1))
+        fraction.append(clamped - lower[-1])
+        outward.append(position - clamped)
+    return Cells(field.node_at(lower), fraction, outward)
 
 
 def corner_values(field: GridField, node: Tensor) -> list[Tensor]:
@@ -93,10 +103,3 @@ def differences(ends: Sequence[Tensor]) -> list[Tensor]:
 def moved(lower: Sequence[Tensor], fraction: Tensor, differences: Sequence[Tensor]) -> list[Tensor]:
     """From the lower ends on by fractions of the differences."""
     return [torch.addcmul(low, fraction, difference) for low, difference in zip(lower, differences, strict=True)]
-
-
-def _safe_norm(vector: Tensor) -> Tensor:
-    """Euclidean norm (...) of vectors (3, ...) whose gradient at zero is zero instead of NaN."""
-    squared = (vector * vector).sum(0)
-    positive = squared > 0
-    return torch.where(positive, torch.where(positive, squared, torch.ones_like(squared)).sqrt(), squared)

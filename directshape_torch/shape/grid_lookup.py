@@ -50,7 +50,7 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     table = field.basis.flatten(0, 2)
     if constant and not torch.compiler.is_compiling():
         return Lookup(value, gradient, _summed(field, table, cells))
-    basis = _interpolated(corner_rows(field, table, cells.lower_node), cells.fraction[..., None])
+    basis = _interpolated(corner_rows(field, table, cells.lower_node), [x[..., None] for x in cells.fraction])
     return Lookup(value, gradient, basis)
 
 
@@ -71,13 +71,16 @@ def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor, co
     d_x = upper - lowest
     value = torch.addcmul(lowest, fx, d_x)
     distance = cells.distance(constant)
-    direction = cells.outward / torch.where(distance > 0, distance, 1.0)
-    inside = torch.stack([d_x, d_y, d_z]) * (1 / field.spacing_m)
-    return value + field.spacing_m * distance, torch.where(cells.outward == 0, inside, direction)
+    per_distance = 1 / torch.where(distance > 0, distance, 1.0)
+    gradient = [
+        torch.where(out == 0, slope * (1 / field.spacing_m), out * per_distance)
+        for slope, out in zip((d_x, d_y, d_z), cells.outward, strict=True)
+    ]
+    return value + field.spacing_m * distance, torch.stack(gradient)
 
 
-def _interpolated(corners: Sequence[Tensor], fraction: Tensor) -> Tensor:
-    """Of 8 corners, x outermost, at fractions (3, ...)."""
+def _interpolated(corners: Sequence[Tensor], fraction: Sequence[Tensor]) -> Tensor:
+    """Of 8 corners, x outermost, at fractions along three axes."""
     fx, fy, fz = fraction
     (result,) = _along(fx, _along(fy, _along(fz, corners)))
     return result
@@ -89,11 +92,10 @@ def _along(fraction: Tensor, ends: Sequence[Tensor]) -> list[Tensor]:
 
 def _summed(field: GridField, table: Tensor, cells: Cells) -> Tensor:
     """`_interpolated` as one weighted sum of table rows: one pass instead of three."""
-    upper = cells.fraction[..., None]
-    (x0, y0, z0), (x1, y1, z1) = 1 - upper, upper
+    x1, y1, z1 = cells.fraction
+    x0, y0, z0 = 1 - x1, 1 - y1, 1 - z1
     xy = (x0 * y0, x0 * y1, x1 * y0, x1 * y1)
-    weights = [w * z for w in xy for z in (z0, z1)]
+    weight = torch.stack([w * z for w in xy for z in (z0, z1)], dim=-1).view(-1, 8)
     node = (cells.lower_node[..., None] + constant_like(field.corners, cells.lower_node)).view(-1, 8)
-    weight = torch.cat(weights, dim=-1).view(-1, 8)
     rows = torch.nn.functional.embedding_bag(node, table, mode="sum", per_sample_weights=weight)
     return rows.view(*cells.lower_node.shape, rows.shape[-1])

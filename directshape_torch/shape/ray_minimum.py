@@ -9,7 +9,7 @@ corrects.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,10 +19,10 @@ from directshape_torch.geometry.short_axes import length
 from directshape_torch.shape.grid_cells import GridField, corner_values, differences, moved
 
 # Distance of the three samples that begin a search where nothing but values is known.
-_FIRST_SAMPLES_M = 0.12
+_FIRST_SAMPLES_M = 0.06
 # Each round is so many times as fine as the one before.
 _FINER = 4.0
-_ROUNDS = 4
+_ROUNDS = 3
 # A vertex of a parabola further away, in distances of its samples, is a guess.
 _MAX_SAMPLE_DISTANCES = 1.5
 # A start so near to the face in front of it, in cells, begins behind it: where a search has ended on a face, rounding
@@ -64,29 +64,30 @@ def minimum_in_grids(
     waits on the face that it came to, and goes on from there when the ray is tracked next. A ray whose `near` is its
     `far` stays there.
     """
-    step, node, fraction = _cells_along(field, owner, centre_obj, direction_obj, depth)
-    along = _derivatives_along(field, node, fraction, step)
+    step, node, place = _cells_along(field, owner, centre_obj, direction_obj, depth)
+    along = _derivatives_along(field, node, place, step)
     # From here on a ray is seen the way the distance falls from where it begins, by how far it has come.
     backwards = along.first > 0
     sign = torch.where(backwards, -1.0, 1.0)
-    heading, limit = step * sign, torch.where(backwards, depth - near, far - depth)
+    limit = torch.where(backwards, depth - near, far - depth)
     along = _AlongRay(-along.first.abs(), along.second, along.third * sign)
-    upwards, per_cell = heading > 0, 1 / heading
-    to_face = (upwards.to(step.dtype) - fraction) * per_cell
-    per_cell, into_next = per_cell.abs(), torch.where(upwards, 1.0, -1.0)
-    come = torch.zeros_like(depth)
-    face = crossed = torch.zeros_like(step)  # the last one, 1 at its axis; crossed now
-    running = limit > 0
+    heading = [x * sign for x in step]
+    upwards = [torch.where(x > 0, 1.0, 0.0) for x in heading]
+    to_face = [(up - at) / x for up, at, x in zip(upwards, place, heading, strict=True)]
+    per_cell, into_next = [1 / x.abs() for x in heading], [2 * up - 1 for up in upwards]
+    face = crossed = [torch.zeros_like(depth)] * 3  # the last one, 1 at its axis; crossed now
+    come, running = torch.zeros_like(depth), limit > 0
     is_kink = torch.zeros_like(running)
     last_node = len(field.values) - 1 - field.corners[-1]
     for number in range(max_cells):
         if number:
-            into = crossed * into_next
+            moves = [x * into for x, into in zip(crossed, into_next, strict=True)]
             # Rounding may lead a ray that ends at the border beyond it, of which nothing is used.
-            node = (node + field.node_at(into)).clamp(0, last_node)
-            fraction = fraction - into
-            to_face = torch.addcmul(to_face, crossed, per_cell)
-            along = _derivatives_along(field, node, torch.addcmul(fraction, come, heading), heading)
+            node = (node + field.node_at(moves)).clamp(0, last_node)
+            place = [at - move for at, move in zip(place, moves, strict=True)]
+            to_face = [torch.addcmul(*x) for x in zip(to_face, crossed, per_cell, strict=True)]
+            now = [torch.addcmul(at, come, x) for at, x in zip(place, heading, strict=True)]
+            along = _derivatives_along(field, node, now, heading)
         # Where it grows from the face on through which the ray came, the minimum is a kink on that face.
         grows = along.first > 0
         root = come + torch.where(grows, 0.0, _first_root(along))
@@ -98,36 +99,41 @@ def minimum_in_grids(
         running = running & ~is_inside & (limit > exit_at)
         # Who has arrived stays.
         limit = torch.where(running, limit, come)
-        crossed = ((to_face == exit_at) & running).to(step.dtype)
-        face = torch.where(running, crossed, face)
-    return RayMinimum(torch.addcmul(depth, sign, come), torch.where(is_kink | running, face, 0.0))
+        crossed = [((x == exit_at) & running).to(depth.dtype) for x in to_face]
+        face = [torch.where(running, x, before) for x, before in zip(crossed, face, strict=True)]
+    has_face = is_kink | running
+    return RayMinimum(torch.addcmul(depth, sign, come), torch.stack([torch.where(has_face, x, 0.0) for x in face]))
 
 
 def curvature_in_grids(
     field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor
 ) -> Tensor:
     """Second derivative (M, R) of the signed distance by the depth, inside the cells at depths (M, R)."""
-    step, node, fraction = _cells_along(field, owner, centre_obj, direction_obj, depth)
-    return 2 * _derivatives_along(field, node, fraction, step).second
+    step, node, place = _cells_along(field, owner, centre_obj, direction_obj, depth)
+    return 2 * _derivatives_along(field, node, place, step).second
 
 
 def _cells_along(
     field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Cells per metre of depth (3, M, R), lower node (M, R) of the cell at a depth, and the place in it (3, M, R)."""
+) -> tuple[list[Tensor], Tensor, list[Tensor]]:
+    """Cells per metre of depth, lower node (M, R) of the cell at a depth, and the place in it: along three axes."""
     per_metre = 1 / field.spacing_m
-    step = direction_obj * per_metre
-    step = torch.where(step.abs() < _NO_STEP, _NO_STEP, step)
-    position = torch.addcmul((centre_obj - field.origin.view(3, 1, 1)) * per_metre, depth, step)
-    # A comparison with NaN is false: a NaN ray has a cell too.
-    last_cell = (field.last_node - 1).view(3, 1, 1)
-    cell = torch.minimum(torch.where(position >= 0, (position + _ON_FACE).floor(), 0.0), last_cell)
-    return step, field.node_at(cell) + owner[:, None] * field.num_nodes, position - cell
+    step, cell, place = [], [], []
+    for centre, direction, origin, last in zip(centre_obj, direction_obj, field.origin, field.last_node, strict=True):
+        along = direction * per_metre
+        along = torch.where(along.abs() < _NO_STEP, _NO_STEP, along)
+        position = torch.addcmul((centre - origin) * per_metre, depth, along)
+        # A comparison with NaN is false: a NaN ray has a cell too.
+        lower = torch.where(position >= 0, (position + _ON_FACE).floor(), 0.0).clamp_max(last - 1)
+        step.append(along)
+        cell.append(lower)
+        place.append(position - lower)
+    return step, field.node_at(cell) + owner[:, None] * field.num_nodes, place
 
 
-def _derivatives_along(field: GridField, node: Tensor, fraction: Tensor, step: Tensor) -> _AlongRay:
-    """Of the polynomial that belongs to a cell with lower node (M, R), at a place (3, M, R) in it."""
-    (ux, uy, uz), (dx, dy, dz) = fraction, step
+def _derivatives_along(field: GridField, node: Tensor, place: Sequence[Tensor], step: Sequence[Tensor]) -> _AlongRay:
+    """Of the polynomial that belongs to a cell with lower node (M, R), at a place in it, along three axes each."""
+    (ux, uy, uz), (dx, dy, dz) = place, step
     corners = corner_values(field, node)
     # Interpolated along z, then y, then x: each time a polynomial of the distance gains a degree.
     lower, rises = corners[0::2], differences(corners)
@@ -135,10 +141,10 @@ def _derivatives_along(field: GridField, node: Tensor, fraction: Tensor, step: T
     r0, r1 = differences(a0), differences(a1)
     b0, b2 = moved(a0[0::2], uy, r0), [dy * r for r in r1]
     b1 = moved(moved(a1[0::2], uy, r1), dy, r0)
-    (r0,), (r1,), (r2,) = map(differences, (b0, b1, b2))
-    first = torch.addcmul(torch.addcmul(b1[0], ux, r1), dx, r0)
-    second = torch.addcmul(torch.addcmul(b2[0], ux, r2), dx, r1)
-    return _AlongRay(first, second, dx * r2)
+    rise_0, rise_1, rise_2 = (upper - lower for lower, upper in (b0, b1, b2))
+    first = torch.addcmul(torch.addcmul(b1[0], ux, rise_1), dx, rise_0)
+    second = torch.addcmul(torch.addcmul(b2[0], ux, rise_2), dx, rise_1)
+    return _AlongRay(first, second, dx * rise_2)
 
 
 def _first_root(along: _AlongRay) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from directshape_torch.numerics.device_constants import constant_like
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.shape.grid_cells import GridField
 from directshape_torch.shape.grid_lookup import derivatives_at, gradient_at, value_at
@@ -30,8 +29,7 @@ class GridShape:
 
     def __init__(self, values: Tensor, basis: Tensor, origin: Tensor, spacing_m: float) -> None:
         self.values = values
-        last_node = constant_like(tuple(count - 1 for count in values.shape[1:]), origin)
-        self.field = GridField(values.reshape(-1), basis, origin, last_node, spacing_m)
+        self.field = GridField(values.reshape(-1), basis, origin, spacing_m)
 
     @property
     def basis(self) -> Tensor:

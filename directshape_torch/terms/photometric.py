@@ -270,9 +270,7 @@ class Photometric:
         return torch.where(where.usable[..., None], residual, self.config.lost_grey_levels)
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
-        if self.config.truncated:
-            return robust.truncated_huber(residual, self.config.huber_grey_levels, self.config.lost_grey_levels)
-        return robust.huber(residual, self.config.huber_grey_levels)
+        return photometric_norm(self.config, residual)
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Photometric:
         if self.fixed is None:
@@ -371,6 +369,13 @@ def _frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor
     columns = frame * (height * width), torch.full_like(frame, width), last_column, last_row
     first, step, last_u, last_v = (x.long()[:, None] for x in columns)
     return first, step, last_u, last_v
+
+
+def photometric_norm(config: PhotometricConfig, residual: Tensor) -> robust.RobustValue:
+    """What residuals cost: Huber's norm, beyond the cost of a lost pixel a constant where the configuration says so."""
+    if config.truncated:
+        return robust.truncated_huber(residual, config.huber_grey_levels, config.lost_grey_levels)
+    return robust.huber(residual, config.huber_grey_levels)
 
 
 def is_grazing(normal_obj: Tensor, direction_obj: Tensor, config: PhotometricConfig) -> Tensor:
