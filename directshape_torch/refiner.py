@@ -18,7 +18,7 @@ from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
-from directshape_torch.outcome import Outcome, assemble, outcome_of, without_distrusted
+from directshape_torch.outcome import Outcome, assemble, judged, outcome_of
 from directshape_torch.problem import CarProblem, TermFactory
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -180,9 +180,8 @@ class DirectShapeRefiner(nn.Module):
         with torch.no_grad():
             start = search_start(problem, initial, cars, self.config.search)
             minimum = minimise(problem, initial, self.config.solver, start, record)
-            outcome = outcome_of(problem, initial, minimum, cars)
-            minimum = without_distrusted(minimum, initial, outcome.quality, self.config.acceptance)
-            outcome = replace(outcome, status=minimum.status)
+            outcome = judged(minimum, initial, outcome_of(problem, initial, minimum, cars), self.config.acceptance)
+            minimum = replace(minimum, state=outcome.state, status=outcome.status)
         state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)
         return replace(outcome, state=state)
 

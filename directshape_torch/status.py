@@ -11,7 +11,7 @@ from torch import Tensor
 class Status(enum.Enum):
     """Outcome for one car. `converged` and `max_iterations` carry a refined state; all others the input's."""
 
-    converged = "the cost settled"
+    converged = "the cost settled, or a further step promises less than half a percent of it"
     max_iterations = "the iterations ran out before the cost settled; the state is the best one found"
     no_mask = "no instance mask in either image matches this detection; check masks, boxes and the matching threshold"
     too_few_pixels = "fewer usable pixels than the configured minimum; the car is tiny, cut off or hidden"
@@ -23,6 +23,10 @@ class Status(enum.Enum):
     not_trusted = (
         "the result is too likely to be worse than the input, which is returned instead; check masks and stereo "
         "calibration, or set both probabilities of `acceptance` to 0 to have it all the same"
+    )
+    no_evidence = (
+        "nothing in the images confirms the result, so the input is returned: its shape misses the masks, hardly any "
+        "pixel can be compared, or the depth is unknown by a fifth; check units and frame of boxes, masks, calibration"
     )
 
     @property

@@ -123,3 +123,31 @@ def test_a_rig_known_to_be_off_is_trusted_less_the_further_the_car_and_moves_no_
     depth, camera = sure.T_cam_obj[:, 2, 3], scene.frames.camera
     expected = 0.4 * depth.square() / (camera.K_left[0, 0, 0] * camera.baseline[0])
     torch.testing.assert_close(added, expected, rtol=0.02, atol=0)
+
+
+@pytest.mark.parametrize("wrong", ["millimetres", "beside the mask"])
+def test_a_shape_that_misses_its_mask_is_not_returned_whatever_is_accepted(wrong: str) -> None:
+    _, scene = cached_street()
+    T_cam_obj = disturbed(scene.detections).T_cam_obj.clone()
+    if wrong == "millimetres":
+        T_cam_obj[0, :3, 3] *= 1000
+    else:
+        T_cam_obj[0, 0, 3] += 4
+    detections = replace(disturbed(scene.detections), T_cam_obj=T_cam_obj)
+    result = refine(accepting(0.0), detections)
+    assert result.status[0] is Status.no_evidence
+    assert result.quality.mask_iou_left[0] < 0.3
+    assert torch.equal(result.T_cam_obj[0], T_cam_obj[0])
+    assert result.quality.probability_not_worse[0].isnan()
+    assert result.status[1].is_refined
+
+
+def test_a_car_with_nothing_left_to_gain_has_converged_when_its_iterations_run_out() -> None:
+    _, scene = cached_street()
+    never_settles = replace(DEFAULT.solver, cost_tolerance=1e-12, step_tolerance=1e-12)
+    stages = [tuple(replace(stage, max_iterations=n) for stage in DEFAULT.stages) for n in (1, 12)]
+    few, many = (
+        refine(replace(accepting(0.0), solver=never_settles, stages=one), disturbed(scene.detections)) for one in stages
+    )
+    assert few.status[1] is Status.max_iterations
+    assert many.status == [Status.converged] * 2
