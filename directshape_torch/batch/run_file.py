@@ -6,7 +6,6 @@ While the run goes on it names the frames to do, of which the journals tell thos
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -16,8 +15,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.atomic_files import write_json
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.files.atomic_files import write_json
+from directshape_torch.files.read_files import read_json
 
 RUN_SCHEMA_VERSION = 1
 RunState = Literal["checking", "running", "finished", "stopped"]
@@ -101,12 +100,12 @@ def read_run_file(out_dir: Path) -> RunFile | None:
     if not path.is_file():
         return None
     try:
-        content = json.loads(read_file_bytes(path))
+        content = read_json(path)
         version = content.pop("schema_version")
         if version != RUN_SCHEMA_VERSION:
             raise DataFormatError(path, f"schema version is {version}, this program reads {RUN_SCHEMA_VERSION}")
         return RunFile(**content)
-    except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, AttributeError) as error:
+    except (TypeError, KeyError, AttributeError) as error:
         raise DataFormatError(
             path, f"describes no run ({error!r})", cure="remove it; results do not need it"
         ) from error

@@ -13,7 +13,7 @@ from directshape_torch.batch.frame_outputs import overlay_path
 from directshape_torch.batch.journal import FrameRecord, journal_folder, read_journals, remove_journals
 from directshape_torch.batch.run_results import add_record, summary_path
 from directshape_torch.errors import DataFormatError, ResumeError
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.run_manifest import (
     RunManifest,
@@ -122,7 +122,7 @@ class RunRecord:
         if not file.is_file():
             return False
         expected = entry.get("files", {}).get(file.relative_to(self.out_dir).as_posix())
-        return expected is None or hash_bytes(read_file_bytes(file)) == expected
+        return expected is None or hash_bytes(read_bytes(file)) == expected
 
     def _check_inputs(self, dataset: StereoDataset, frame_id: str) -> None:
         try:

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.text_files import read_lines
 from directshape_torch.scene import StereoCamera
 
 # The name of each matrix in the object, the tracking and the raw layout, and its shape.

@@ -12,7 +12,6 @@ Nothing in it depends on the time, the machine or where the files lie.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -20,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from directshape_torch.errors import DataFormatError, ResumeError
-from directshape_torch.io import atomic_files
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.files import atomic_files
+from directshape_torch.files.read_files import read_bytes, read_json
 
 MANIFEST_SCHEMA_VERSION = 1
 _CURE = "choose another output folder, or remove this one to start again"
@@ -68,7 +67,7 @@ def hash_file(path: Path | str) -> str:
     """
     path = Path(path)
     if not path.is_file():
-        return hash_bytes(read_file_bytes(path))
+        return hash_bytes(read_bytes(path))
     state = path.stat()
     return _hash_in_state(path, state.st_size, state.st_mtime_ns)
 
@@ -76,7 +75,7 @@ def hash_file(path: Path | str) -> str:
 # Mask files of a whole data set serve every frame, and may be large.
 @lru_cache(maxsize=256)
 def _hash_in_state(path: Path, _size_bytes: int, _changed_ns: int) -> str:
-    return hash_bytes(read_file_bytes(path))
+    return hash_bytes(read_bytes(path))
 
 
 def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
@@ -99,7 +98,7 @@ def read_manifest(path: Path | str) -> RunManifest | None:
     if not Path(path).is_file():
         return None
     try:
-        content = json.loads(read_file_bytes(path))
+        content = read_json(path, _CURE)
         version = content.pop("schema_version")
         if version != MANIFEST_SCHEMA_VERSION:
             raise ResumeError(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.text_files import Line, read_lines
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.text_files import Line, read_lines
 
 _COLUMNS = "frame track type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
 _LEADING = 2

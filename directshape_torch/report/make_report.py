@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from typing import IO, Any, cast, get_args
 
@@ -11,6 +12,7 @@ from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver, SilentObserver
 from directshape_torch.batch.run_results import finished_frames
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.observation.occlusion import OcclusionOrder
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, as_json, car_rows
@@ -21,7 +23,6 @@ from directshape_torch.report.frame_inputs import InputReader, InputSources
 from directshape_torch.report.frame_material import DetailSettings, FrameMaterial
 from directshape_torch.report.mesh_data import mesh_data
 from directshape_torch.report.page_assets import data_block, page_frame
-from directshape_torch.report.page_writer import replaced_text_file
 from directshape_torch.report.residual_maps import MapSettings
 from directshape_torch.report.run_facts import problem_notes, run_facts
 from directshape_torch.report.run_folder import FrameResult, RunFolder
@@ -115,7 +116,7 @@ class _PageOfRun:
         rows = [row for number, name in enumerate(frame_ids) for row in self._rows(number, name)]
         detailed = choose_frames(rows, len(frame_ids), options.most_frames)
         frame = page_frame(f"{self._run.out_dir.resolve().name}: refined cars")
-        with replaced_text_file(page) as file:
+        with replaced_file(page) as content, TextIOWrapper(content, encoding="utf-8", newline="\n") as file:
             file.write(frame.head)
             self._write_details(file, frame_ids, detailed, observer)
             notes = self._notes(len(frame_ids), len(detailed))
