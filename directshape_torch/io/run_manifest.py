@@ -15,15 +15,33 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, Required, TypedDict
 
-from directshape_torch.errors import DataFormatError, ResumeError
+from directshape_torch.errors import DataFormatError, ResumeError, shown
 from directshape_torch.files import atomic_files
+from directshape_torch.files.names import is_frame_id
 from directshape_torch.files.read_files import read_bytes, read_json
+from directshape_torch.files.schema import check_type, record_of
 
 MANIFEST_SCHEMA_VERSION = 1
 _CURE = "choose another output folder, or remove this one to start again"
+
+
+class FrameEntry(TypedDict, total=False):
+    """What `frames` says of one frame: of one that is done all but the reason, of a failed one the reason."""
+
+    state: Required[Literal["done", "failed"]]
+    reason: str
+    lines: int
+    cars: int
+    masks_left: int
+    masks_right: int
+    ground_source: str
+    statuses: dict[str, int]
+    outputs: list[str]
+    mesh_files: list[str]
+    files: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -97,16 +115,26 @@ def read_manifest(path: Path | str) -> RunManifest | None:
     """
     if not Path(path).is_file():
         return None
-    try:
-        content = read_json(path, _CURE)
-        version = content.pop("schema_version")
-        if version != MANIFEST_SCHEMA_VERSION:
-            raise ResumeError(
-                f"{path}: schema version is {version}, this program writes {MANIFEST_SCHEMA_VERSION}; {_CURE}"
-            )
-        return RunManifest(**content)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DataFormatError(path, f"is no summary of a run ({error!r})", cure=_CURE) from error
+    content = read_json(path, _CURE)
+    if not isinstance(content, dict) or "schema_version" not in content:
+        raise DataFormatError(path, "is no summary of a run", cure=_CURE)
+    version = content.pop("schema_version")
+    if version != MANIFEST_SCHEMA_VERSION:
+        raise ResumeError(
+            f"{path}: schema version is {shown(version)}, this program writes {MANIFEST_SCHEMA_VERSION}; {_CURE}"
+        )
+    manifest = record_of(path, RunManifest, content, _CURE)
+    check_frames(path, manifest.frames)
+    return manifest
+
+
+def check_frames(path: Path | str, frames: Mapping[str, Any]) -> None:
+    """Raise `DataFormatError` unless these are entries of frames, and lead nowhere out of the output folder."""
+    check_type(path, "frames", frames, dict[str, FrameEntry], _CURE)
+    for frame_id, entry in frames.items():
+        meshes = [PurePosixPath(name) for name in entry.get("mesh_files", ())]
+        if not is_frame_id(frame_id) or not all(is_frame_id(mesh.name) and len(mesh.parts) == 2 for mesh in meshes):
+            raise DataFormatError(path, f"frames: {shown(frame_id)} leads out of the folder", cure=_CURE)
 
 
 def check_resume(previous: RunManifest, current: RunManifest) -> None:
