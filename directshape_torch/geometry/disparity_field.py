@@ -20,6 +20,7 @@ from torch import Tensor
 from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.files.read_files import read_json
+from directshape_torch.numerics.checks import check_shape, check_stored
 from directshape_torch.numerics.gradient_mode import is_plain
 
 SCHEMA = "directshape disparity field"
@@ -122,20 +123,12 @@ class DisparityField:
     vertical_coefficients: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS))
 
     def __post_init__(self) -> None:
-        polynomial = (NUM_COEFFICIENTS,)
-        shapes = {
-            "coefficients": polynomial,
-            "vertical_coefficients": polynomial,
-            "K_left": (3, 3),
-            "K_right": (3, 3),
-            "T_right_cam": (4, 4),
-        }
-        for name, wanted in shapes.items():
-            if tuple(getattr(self, name).shape) != wanted:
-                raise InputError(name, f"shape {wanted}", f"{tuple(getattr(self, name).shape)}")
-        if self.hull_uv.ndim != 2 or self.hull_uv.shape[1] != 2 or len(self.hull_uv) < 3:
+        for name, shape in _TENSOR_SHAPES.items():
+            check_shape(name, getattr(self, name), ["M" if n is None else n for n in shape], kind="floating")
+            check_stored(name, getattr(self, name))
+        if len(self.hull_uv) < 3:
             raise InputError("hull_uv", "shape (M, 2) with at least 3 vertices", f"{tuple(self.hull_uv.shape)}")
-        for name in ("hull_uv", *shapes):
+        for name in _TENSOR_SHAPES:
             if not bool(getattr(self, name).isfinite().all()):
                 raise InputError(name, "finite numbers", str(getattr(self, name).tolist()))
 
