@@ -71,4 +71,4 @@ def finished_frames(out_dir: Path, manifest: RunManifest, wanted: Iterable[str |
 
 def _number(word: str) -> str:
     """A number without leading zeros; other names as they are."""
-    return str(int(word)) if word.isdecimal() else word
+    return word.lstrip("0") or "0" if word.isdecimal() else word
