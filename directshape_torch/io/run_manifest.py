@@ -12,10 +12,11 @@ Nothing in it depends on the time, the machine or where the files lie.
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Literal, Required, TypedDict
 
 from directshape_torch.errors import DataFormatError, ResumeError, shown
@@ -25,7 +26,16 @@ from directshape_torch.files.read_files import read_bytes, read_json
 from directshape_torch.files.schema import check_type, record_of
 
 MANIFEST_SCHEMA_VERSION = 1
+# `meshes/NNNNNN_LINE.ply`: within the folder, whoever has written the name.
+_MESH_FILE = re.compile(r"meshes/[^/\\]+_[0-9]{1,9}\.(ply|glb)")
 _CURE = "choose another output folder, or remove this one to start again"
+
+
+class RunSettings(TypedDict, total=False):
+    """Those of `config` that others than the refiner read."""
+
+    classes: list[str]
+    refiner: dict[str, Any]
 
 
 class FrameEntry(TypedDict, total=False):
@@ -124,6 +134,7 @@ def read_manifest(path: Path | str) -> RunManifest | None:
             f"{path}: schema version is {shown(version)}, this program writes {MANIFEST_SCHEMA_VERSION}; {_CURE}"
         )
     manifest = record_of(path, RunManifest, content, _CURE)
+    check_type(path, "config", manifest.config, RunSettings, _CURE)
     check_frames(path, manifest.frames)
     return manifest
 
@@ -132,9 +143,9 @@ def check_frames(path: Path | str, frames: Mapping[str, Any]) -> None:
     """Raise `DataFormatError` unless these are entries of frames, and lead nowhere out of the output folder."""
     check_type(path, "frames", frames, dict[str, FrameEntry], _CURE)
     for frame_id, entry in frames.items():
-        meshes = [PurePosixPath(name) for name in entry.get("mesh_files", ())]
-        if not is_frame_id(frame_id) or not all(is_frame_id(mesh.name) and len(mesh.parts) == 2 for mesh in meshes):
-            raise DataFormatError(path, f"frames: {shown(frame_id)} leads out of the folder", cure=_CURE)
+        wrong = [name for name in entry.get("mesh_files", ()) if not _MESH_FILE.fullmatch(name)]
+        if wrong or not is_frame_id(frame_id):
+            raise DataFormatError(path, f"frames[{shown(frame_id)}]: no name of a frame, or {shown(wrong)}", cure=_CURE)
 
 
 def check_resume(previous: RunManifest, current: RunManifest) -> None:

@@ -30,6 +30,8 @@ from directshape_torch.io.open_dataset import open_dataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
+from directshape_torch.report.frame_inputs import InputSources
+from directshape_torch.report.make_report import make_report
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 
 ASSETS = Path(load_prior.__code__.co_filename).parents[1] / "assets"
@@ -60,6 +62,9 @@ def samples(kitti: Path, folder: Path) -> dict[str, Sample]:
 
     def status() -> str:
         return format_status(read_status(folder / "out"))
+
+    def report() -> object:
+        return make_report(folder / "out", folder / "page.html", InputSources(), load_prior(root / "prior.npz"))
 
     (folder / "tracking.txt").write_text("".join(f"{n} 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0\n" for n in range(3)))
     (folder / "times.txt").write_text("2011-09-26 13:02:25.964389445\n" * 3)
@@ -97,6 +102,7 @@ def samples(kitti: Path, folder: Path) -> dict[str, Sample]:
         "frame": Sample(folder / "plain" / "frames" / f"{FRAME}.json", plain),
         "summary": Sample(folder / "out" / "summary.json", lambda: refine(root, folder / "out", overlays=True)),
         "results": Sample(folder / "out" / "summary.json", lambda: read_run_results(folder / "out")),
+        "report": Sample(folder / "out" / "summary.json", report),
         "run": Sample(folder / "out" / "run.json", status),
     }
     assert set(BUNDLED_PRIORS) == {"pca", "neural"}

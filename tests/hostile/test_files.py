@@ -13,7 +13,7 @@ from directshape_torch.errors import DirectShapeError, ResumeError
 
 FORMATS = (
     "times", "tracking", "tracks", "shapes", "disparity", "field", "network", "prior", "trust", "settings", "image",
-    "calibration", "plane", "labels", "detections", "masks", "rig", "frame", "summary", "results", "run",
+    "calibration", "plane", "labels", "detections", "masks", "rig", "frame", "summary", "report", "results", "run",
 )  # fmt: skip
 # More of them: DIRECTSHAPE_FUZZ=600 pytest tests/hostile
 TRIES = int(os.environ.get("DIRECTSHAPE_FUZZ", "25"))
@@ -40,7 +40,8 @@ def test_damaged_files(whole: dict[str, Sample], name: str) -> None:
     finally:
         sample.path.write_bytes(content)
     for error in errors:
-        assert sample.path.stem in str(error) or isinstance(error, ResumeError)
+        # Of a whole folder it may be a file that does not fit the damaged one.
+        assert sample.path.stem in str(error) or "/out/" in str(error) or isinstance(error, ResumeError)
         assert len(str(error)) < 2500
     assert len(errors) > TRIES // 5
     assert set(whole) == set(FORMATS)
