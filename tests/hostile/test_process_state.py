@@ -56,7 +56,8 @@ def forward(_: Path, __: Path) -> None:
 
 def run(root: Path, out: Path) -> None:
     options = RefineOptions("ply", overlays=True)
-    refine_dataset(dataset(root), refiner(root), out / "out", options, workers=WorkerOptions(threads=2))
+    one = dataset(root, frames=["000000"])
+    refine_dataset(one, refiner(root), out / "out", options, workers=WorkerOptions(threads=2))
 
 
 def data_options(root: Path) -> list[str]:
