@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from directshape_torch.config import RefinerConfig, Settings, type_hints
-from directshape_torch.errors import ConfigError
+from directshape_torch.errors import ConfigError, shown
+from directshape_torch.files.read_files import read_text
 
 BUNDLED_CONFIGS = ("default", "paper", "fast")
 """Names of the settings that come with the package, for `load_config`."""
@@ -42,7 +43,7 @@ def config_from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: s
 def _from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: str, known: Mapping[str, str]) -> _GroupT:
     """The group whose keys follow `where`; `known`: names of all settings by their paths."""
     if not isinstance(mapping, Mapping):
-        raise ConfigError(f"{where.rstrip('.') or 'configuration'}: expected keys and values, got {mapping!r}")
+        raise ConfigError(f"{where.rstrip('.') or 'configuration'}: expected keys and values, got {shown(mapping)}")
     hints = type_hints(cls)
     for key in mapping:
         if key not in hints:
@@ -90,10 +91,10 @@ def _convert(hint: Any, value: Any, where: str, known: Mapping[str, str]) -> Any
 def _entries(arguments: Sequence[Any], value: Any, where: str) -> list[tuple[Any, Any, str]]:
     """Type, value and name of each entry of a list."""
     if isinstance(value, (str, Mapping)) or not isinstance(value, Sequence):
-        raise ConfigError(f"{where}: expected a list, got {value!r}")
+        raise ConfigError(f"{where}: expected a list, got {shown(value)}")
     kinds = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
     if len(kinds) != len(value):
-        raise ConfigError(f"{where}: expected {len(kinds)} entries, got {value!r}")
+        raise ConfigError(f"{where}: expected {len(kinds)} entries, got {shown(value)}")
     return [(kind, item, f"{where}[{i}]") for i, (kind, item) in enumerate(zip(kinds, value, strict=True))]
 
 
@@ -109,7 +110,7 @@ def _convert_scalar(hint: type[Any], value: Any, where: str) -> Any:
         return int(value)
     if hint in (bool, str) and isinstance(value, hint):
         return value
-    raise ConfigError(f"{where}: expected {_KINDS[hint]}, got {value!r}")
+    raise ConfigError(f"{where}: expected {_KINDS[hint]}, got {shown(value)}")
 
 
 def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> RefinerConfig:
@@ -144,12 +145,13 @@ def _read(path: Path | str) -> dict[str, Any]:
 
     file = _CONFIG_FOLDER / f"{path}.yaml" if str(path) in BUNDLED_CONFIGS else Path(path)
     try:
-        mapping = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        mapping = yaml.safe_load(read_text(file)) or {}
+    # Of dates that are none, deep nesting and the like the parser raises whatever it comes across.
+    except Exception as error:
         names = f"bundled ones are {', '.join(BUNDLED_CONFIGS)}"
         raise ConfigError(f"{path}: cannot be read as a YAML configuration: {error}; {names}") from error
     if not isinstance(mapping, dict):
-        raise ConfigError(f"{path}: expected keys and values, got {mapping!r}")
+        raise ConfigError(f"{path}: expected keys and values, got {shown(mapping)}")
     return mapping
 
 
@@ -167,7 +169,7 @@ def _override(mapping: dict[str, Any], override: str) -> None:
             raise ConfigError(f"--set {override}: {group} holds no keys of its own")
     try:
         mapping[key] = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except Exception as error:
         raise ConfigError(f"--set {override}: the value is not YAML") from error
 
 

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
+
+_LONGEST_MESSAGE = 2000
+_LONGEST_PART = 400
 
 
 class DirectShapeError(Exception):
-    """Base of all errors raised on purpose by this package."""
+    """Base of all errors raised on purpose by this package; what is too long to be read is shortened."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(shortened(message, _LONGEST_MESSAGE))
 
 
 class InputError(DirectShapeError, ValueError):
     """An argument has the wrong shape, type or value: names it, says what was expected, what came, and the cure."""
 
     def __init__(self, name: str, expected: str, got: str, cure: str = "") -> None:
-        super().__init__(f"{name}: expected {expected}, got {got}" + (f"; {cure}" if cure else ""))
+        super().__init__(f"{name}: expected {expected}, got {shortened(got)}" + (f"; {cure}" if cure else ""))
         self.name = name
 
 
@@ -30,8 +37,8 @@ class DataFormatError(DirectShapeError, ValueError):
         cure: str = "",
     ) -> None:
         where = f"{path}" + (f", line {line_number}" if line_number is not None else "")
-        text = f": {line!r}" if line is not None else ""
-        super().__init__(f"{where}: {problem}{text}" + (f"; {cure}" if cure else ""))
+        text = f": {shortened(line)!r}" if line is not None else ""
+        super().__init__(f"{where}: {shortened(problem)}{text}" + (f"; {cure}" if cure else ""))
         self.path = Path(path)
         self.line_number = line_number
 
@@ -64,3 +71,26 @@ class MissingDependencyError(DirectShapeError, ImportError):
         super().__init__(
             f"{purpose} needs the package {package!r}; install it with: {command} 'directshape_torch[{extra}]'"
         )
+
+
+def shortened(text: str, most: int = _LONGEST_PART) -> str:
+    """A text whose middle is left out where it is longer than `most` characters.
+
+    Example:
+        >>> shortened("abcdefghijklmnopqrstuvwxyz", 16)
+        'abcdefgh .. wxyz'
+    """
+    return text if len(text) <= most else f"{text[: most - most // 4 - 4]} .. {text[len(text) - most // 4 :]}"
+
+
+class _Shown(reprlib.Repr):
+    """Also of values that are nested deeply, or that hold the same part over and over."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxstring, self.maxother, self.maxlong = 3, _LONGEST_PART, _LONGEST_PART, 40
+        self.maxlist = self.maxtuple = self.maxdict = 8
+
+
+shown = _Shown().repr
+"""The `repr` of a value that came from a file, short whatever it is."""

@@ -8,8 +8,9 @@ with the centre of the top-left pixel at (0, 0).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from dataclasses import dataclass
+from types import NoneType
+from typing import Annotated
 
 import torch
 from kornia.geometry import camera as kornia_camera
@@ -18,15 +19,8 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.se3 import from_rotation_translation
-from directshape_torch.numerics.checks import (
-    check_flags,
-    check_integer,
-    check_mask_dtype,
-    check_rotation,
-    check_shape,
-    check_sigmas,
-    is_no_rotation,
-)
+from directshape_torch.numerics.checks import check_rotation, check_shape, check_sigmas, is_no_rotation
+from directshape_torch.numerics.tensor_record import Dense, TensorRecord
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
@@ -36,25 +30,8 @@ _LARGEST_TURN = 1e-4
 _LARGEST_OFFSET = 0.05  # of the baseline
 
 
-class _TensorRecord:
-    """Moves every tensor field of a frozen dataclass to a device, and floating ones to a dtype."""
-
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """A copy on another device and, for floating-point fields, of another dtype."""
-
-        def convert(value: Any) -> Any:
-            if isinstance(value, Tensor):
-                return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-            if isinstance(value, (_TensorRecord, DisparityField)):
-                return value.to(device=device, dtype=dtype)
-            return value
-
-        changed = {f.name: convert(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-type]
-        return replace(self, **changed)  # type: ignore[type-var]
-
-
 @dataclass(frozen=True)
-class StereoCamera(_TensorRecord):
+class StereoCamera(TensorRecord):
     """Calibration of the F rectified stereo frames of a call.
 
     Attributes:
@@ -71,18 +48,15 @@ class StereoCamera(_TensorRecord):
             to the right of the left one.
     """
 
-    K_left: Tensor
-    K_right: Tensor
-    T_right_cam: Tensor
-    t_cam_ref: Tensor
+    K_left: Annotated[Tensor, Dense("F", 3, 3)]
+    K_right: Annotated[Tensor, Dense("F", 3, 3)]
+    T_right_cam: Annotated[Tensor, Dense("F", 4, 4)]
+    t_cam_ref: Annotated[Tensor, Dense("F", 3)]
     disparity_field: DisparityField | None = None
 
     def __post_init__(self) -> None:
-        check_shape("K_left", self.K_left, ("F", 3, 3))
-        num_frames = len(self.K_left)
-        check_shape("K_right", self.K_right, (num_frames, 3, 3))
-        check_shape("T_right_cam", self.T_right_cam, (num_frames, 4, 4))
-        check_shape("t_cam_ref", self.t_cam_ref, (num_frames, 3))
+        super().__post_init__()
+        _check_type("disparity_field", self.disparity_field, (DisparityField, NoneType))
         for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref"):
             if not bool(getattr(self, name).isfinite().all()):
                 raise InputError(name, "finite numbers", "NaN or infinity", "check the calibration of every frame")
@@ -183,7 +157,7 @@ class StereoCamera(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class GroundPlane(_TensorRecord):
+class GroundPlane(TensorRecord):
     """One ground plane a frame: `normal . x_cam + offset = 0`, unit normal pointing up (negative y).
 
     Attributes:
@@ -193,15 +167,13 @@ class GroundPlane(_TensorRecord):
         source: where each plane came from, F entries: "file", "stereo", "camera_height", or the caller's own word.
     """
 
-    normal: Tensor
-    offset: Tensor
+    normal: Annotated[Tensor, Dense("F", 3)]
+    offset: Annotated[Tensor, Dense("F")]
     source: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        check_shape("normal", self.normal, ("F", 3))
-        check_shape("offset", self.offset, (len(self.normal),))
-        if len(self.source) != len(self.normal):
-            raise InputError("source", f"{len(self.normal)} entries", f"{len(self.source)}")
+        super().__post_init__()
+        _check_words("source", self.source, len(self.normal), "entries")
         downwards = self.normal[:, 1] >= 0
         not_unit = (self.normal.norm(dim=-1) - 1).abs() > 1e-3
         # One wait for the device for both of them. NaN passes: it fails the cars of its own frame.
@@ -231,7 +203,7 @@ class GroundPlane(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class FrameBatch(_TensorRecord):
+class FrameBatch(TensorRecord):
     """F stereo frames, padded at the right and bottom to one size.
 
     Attributes:
@@ -247,40 +219,23 @@ class FrameBatch(_TensorRecord):
             for `terms.lidar`; None: nobody has measured any.
     """
 
-    images_left: Tensor
-    images_right: Tensor
-    sizes: Tensor
+    images_left: Annotated[Tensor, Dense("F", 3, "H", "W", kind="image", cure="stack images as (F, 3, H, W) in [0, 1]")]
+    images_right: Annotated[Tensor, Dense("F", 3, "H", "W", kind="image")]
+    sizes: Annotated[Tensor, Dense("F", 2, kind="index")]
     camera: StereoCamera
     ground: GroundPlane
     frame_ids: tuple[str, ...]
-    disparity: Tensor | None = None
-    points_cam: Tensor | None = None
+    disparity: Annotated[Tensor | None, Dense("F", "H", "W")] = None
+    points_cam: Annotated[Tensor | None, Dense("F", "P", 3)] = None
 
     def __post_init__(self) -> None:
-        check_shape("images_left", self.images_left, ("F", 3, "H", "W"), "stack images as (F, 3, H, W) in [0, 1]")
-        check_shape("images_right", self.images_right, tuple(self.images_left.shape))
+        super().__post_init__()
         num_frames, _, height, width = self.images_left.shape
-        check_shape("sizes", self.sizes, (num_frames, 2))
-        check_integer("sizes", self.sizes)
-        for name in ("images_left", "images_right"):
-            if not getattr(self, name).is_floating_point():
-                raise InputError(name, "floating point in [0, 1]", str(getattr(self, name).dtype), "divide by 255")
-        for what in ("dtype", "device"):
-            left, right = getattr(self.images_left, what), getattr(self.images_right, what)
-            if left != right:
-                raise InputError("images_right", f"the {what} of images_left ({left})", str(right))
-        if self.disparity is not None:
-            check_shape("disparity", self.disparity, (num_frames, height, width))
-        if self.points_cam is not None:
-            check_shape("points_cam", self.points_cam, (num_frames, "P", 3))
-        for name in ("disparity", "points_cam"):
-            measured, image = getattr(self, name), self.images_left
-            if measured is not None and (measured.dtype != image.dtype or measured.device != image.device):
-                raise InputError(name, f"{image.dtype} on {image.device}", f"{measured.dtype} on {measured.device}")
         _check_brightness("images_left", self.images_left)
         _check_brightness("images_right", self.images_right)
-        if len(self.frame_ids) != num_frames:
-            raise InputError("frame_ids", f"{num_frames} names", f"{len(self.frame_ids)}")
+        _check_words("frame_ids", self.frame_ids, num_frames, "names")
+        _check_type("camera", self.camera, (StereoCamera,))
+        _check_type("ground", self.ground, (GroundPlane,))
         for name, count in (("camera", self.camera.num_frames), ("ground", len(self.ground.normal))):
             if count != num_frames:
                 raise InputError(name, f"{num_frames} frames", f"{count}")
@@ -297,7 +252,7 @@ class FrameBatch(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class Occluders(_TensorRecord):
+class Occluders(TensorRecord):
     """M further instances (any class) that may hide cars; the detections themselves need not be repeated here.
 
     Attributes:
@@ -307,25 +262,15 @@ class Occluders(_TensorRecord):
         bottom_v: (M,) lower edge of the 2D box in the left image, pixels.
     """
 
-    frame_index: Tensor
-    mask_left: Tensor
-    mask_right: Tensor
-    depth_m: Tensor
-    bottom_v: Tensor
-
-    def __post_init__(self) -> None:
-        check_shape("frame_index", self.frame_index, ("M",))
-        check_integer("frame_index", self.frame_index)
-        count = len(self.frame_index)
-        for name in ("mask_left", "mask_right"):
-            check_shape(name, getattr(self, name), (count, "H", "W"))
-            check_mask_dtype(name, getattr(self, name))
-        check_shape("depth_m", self.depth_m, (count,))
-        check_shape("bottom_v", self.bottom_v, (count,))
+    frame_index: Annotated[Tensor, Dense("M", kind="index")]
+    mask_left: Annotated[Tensor, Dense("M", "H", "W", kind="mask")]
+    mask_right: Annotated[Tensor, Dense("M", "H", "W", kind="mask")]
+    depth_m: Annotated[Tensor, Dense("M")]
+    bottom_v: Annotated[Tensor, Dense("M")]
 
 
 @dataclass(frozen=True)
-class Detections(_TensorRecord):
+class Detections(TensorRecord):
     """B rough 3D boxes with instance masks, over all frames of a call, in any order.
 
     Attributes:
@@ -349,46 +294,46 @@ class Detections(_TensorRecord):
             above 0. Masks with values above 1.5 (logits, 0..255) are refused when they are read, in a refinement.
     """
 
-    frame_index: Tensor
-    T_cam_obj: Tensor
-    dimensions_hwl: Tensor
-    box_2d: Tensor
-    score: Tensor
-    mask_left: Tensor
-    mask_right: Tensor
-    has_mask_left: Tensor
-    has_mask_right: Tensor
+    frame_index: Annotated[Tensor, Dense("B", kind="index")]
+    T_cam_obj: Annotated[Tensor, Dense("B", 4, 4)]
+    dimensions_hwl: Annotated[Tensor, Dense("B", 3)]
+    box_2d: Annotated[Tensor, Dense("B", 4)]
+    score: Annotated[Tensor, Dense("B")]
+    mask_left: Annotated[Tensor, Dense("B", "H", "W", kind="mask", cure="absent masks: zeros, and has_mask_left False")]
+    mask_right: Annotated[
+        Tensor, Dense("B", "H", "W", kind="mask", cure="absent masks: zeros, and has_mask_right False")
+    ]
+    has_mask_left: Annotated[Tensor, Dense("B", kind="flags")]
+    has_mask_right: Annotated[Tensor, Dense("B", kind="flags")]
     occluders: Occluders | None = None
-    pose_sigma: Tensor | None = None
+    pose_sigma: Annotated[Tensor | None, Dense("B", 4)] = None
 
     def __post_init__(self) -> None:
-        check_shape("frame_index", self.frame_index, ("B",))
-        check_integer("frame_index", self.frame_index)
-        count = len(self.frame_index)
-        check_shape("T_cam_obj", self.T_cam_obj, (count, 4, 4))
+        super().__post_init__()
+        _check_type("occluders", self.occluders, (Occluders, NoneType))
         has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
         T_known = torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
-        check_shape("dimensions_hwl", self.dimensions_hwl, (count, 3))
         # One wait for the device for both. Dimensions that are NaN pass: they fail their own car.
         if bool((is_no_rotation(T_known) | (self.dimensions_hwl <= 0).any(dim=1).to(T_known.device)).any()):
             check_rotation("T_cam_obj", T_known)
             _raise_not_positive("dimensions_hwl", self.dimensions_hwl)
-        check_shape("box_2d", self.box_2d, (count, 4))
-        check_shape("score", self.score, (count,))
-        for side in ("left", "right"):
-            mask, has_mask = getattr(self, f"mask_{side}"), getattr(self, f"has_mask_{side}")
-            size: tuple[int | str, ...] = (count, "H", "W") if side == "left" else tuple(self.mask_left.shape)
-            cure = f"absent masks: zeros, and has_mask_{side} False" if mask is None else ""
-            check_shape(f"mask_{side}", mask, size, cure)
-            check_mask_dtype(f"mask_{side}", mask)
-            check_shape(f"has_mask_{side}", has_mask, (count,))
-            check_flags(f"has_mask_{side}", has_mask)
         if self.pose_sigma is not None:
-            check_shape("pose_sigma", self.pose_sigma, (count, 4))
             check_sigmas("pose_sigma", self.pose_sigma)
 
     def __len__(self) -> int:
         return len(self.frame_index)
+
+
+def _check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:
+    if not isinstance(value, kinds):
+        raise InputError(name, f"a {kinds[0].__name__}", type(value).__name__)
+
+
+def _check_words(name: str, words: object, count: int, what: str) -> None:
+    if not isinstance(words, (tuple, list)) or not all(isinstance(word, str) for word in words):
+        raise InputError(name, f"a tuple of {count} {what}", type(words).__name__)
+    if len(words) != count:
+        raise InputError(name, f"{count} {what}", f"{len(words)}")
 
 
 def _raise_not_positive(

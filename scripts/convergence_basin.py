@@ -28,8 +28,8 @@ from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
+from directshape_torch.files.atomic_files import write_bytes, write_text
 from directshape_torch.geometry.box3d import rotation_about_y
-from directshape_torch.io.atomic_files import write_bytes, write_text
 from directshape_torch.io.figure_files import figure_png, new_figure
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame

@@ -36,8 +36,8 @@ from label_disparity.measurement import Frame, measure_side, read_frame
 from label_disparity.report import csv_text, report, scatter_png
 
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
+from directshape_torch.files.atomic_files import write_bytes, write_text
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.atomic_files import write_bytes, write_text
 
 # Nearer than this, the 10 cm between a box and its car are more than the disagreement sought.
 NEAREST_M = 15.0

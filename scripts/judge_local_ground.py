@@ -35,11 +35,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
+from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import height_above
 from directshape_torch.geometry.se3 import inverse, transform
-from directshape_torch.io.atomic_files import write_text
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame

@@ -18,8 +18,8 @@ from command_line import run_command
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, write_tracks
+from directshape_torch.files.text_files import Line, read_lines
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, read_objects
-from directshape_torch.io.text_files import Line, read_lines
 
 # Object labels carry two decimals, tracking labels six: half a unit of the last place, and float rounding.
 _TOLERANCE_M = 0.0051

@@ -27,7 +27,7 @@ from directshape_torch.cli.data_options import add_data_options, dataset_of
 from directshape_torch.cli.demo import DEMO_FOLDER
 from directshape_torch.cli.refine import make_refiner
 from directshape_torch.errors import DirectShapeError
-from directshape_torch.io.atomic_files import write_json
+from directshape_torch.files.atomic_files import write_json
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner

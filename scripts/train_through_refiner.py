@@ -26,7 +26,7 @@ from refiner_training.jobs import Job, Options, Outcome, run_jobs
 from refiner_training.report import csv_text, learning_curve_png, markdown
 from refiner_training.training import TrainingSettings
 
-from directshape_torch.io.atomic_files import write_bytes, write_text
+from directshape_torch.files.atomic_files import write_bytes, write_text
 from directshape_torch.shape.tensor_file import write_tensors
 
 SCHEMA = "directshape_torch.trained_correction/1"

@@ -190,7 +190,7 @@ def test_boxes_are_measured_on_the_refined_shape_in_the_reference_frame() -> Non
 def test_wrong_inputs_are_named() -> None:
     scene = cached_street()[1]
     module = refiner()
-    with pytest.raises(InputError, match=r"frames: expected dtype torch\.float64"):
+    with pytest.raises(InputError, match=r"frames\.images_left: expected dtype torch\.float64"):
         module(scene.frames.to(dtype=torch.float32), scene.detections)
     with pytest.raises(InputError, match=r"detections.frame_index: expected 0..0, got 0..3"):
         module(scene.frames, replace(scene.detections, frame_index=torch.tensor([0, 3])))

@@ -187,7 +187,7 @@ def test_detections_of_the_wrong_type_are_named(name: str, wrong: Any, text: str
     [
         ("frame_index", torch.zeros(2), "expected int64 or int32, got torch.float32"),
         ("mask_left", torch.zeros(2, 4, 4, dtype=torch.uint8), "got torch.uint8; divide by 255"),
-        ("mask_right", None, "expected a tensor of shape (2, H, W), got NoneType"),
+        ("mask_right", None, "expected a tensor of shape (2, 4, 4), got NoneType"),
     ],
 )
 def test_occluders_of_the_wrong_type_are_named(name: str, wrong: Any, text: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.io.atomic_files import write_png
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
 from directshape_torch.io.run_manifest import hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame

@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import gc
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -228,6 +229,21 @@ def dump_job(job: RunJob) -> bytes:
         return pickle.dumps(job)
     except (pickle.PicklingError, TypeError, AttributeError) as error:
         raise DirectShapeError(f"the job cannot be sent to other processes: {error}") from error
+
+
+@contextmanager
+def limited_threads(threads: int | None) -> Iterator[None]:
+    """That number of threads while the body runs; None leaves them."""
+    import cv2
+
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    limit_threads(threads)
+    try:
+        yield
+    finally:
+        if threads is not None:
+            torch.set_num_threads(before[0])
+            cv2.setNumThreads(before[1])
 
 
 def limit_threads(threads: int | None) -> None:

@@ -18,7 +18,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.io.run_manifest import hash_bytes
+from directshape_torch.errors import DataFormatError
+from directshape_torch.files.read_files import parse_json
+from directshape_torch.files.schema import record_of
+from directshape_torch.io.run_manifest import check_frames, hash_bytes
 
 _CHECKSUM_DIGITS = 16
 
@@ -90,7 +93,7 @@ class JournalContents:
 
     Attributes:
         records: in the order in which the frames ended.
-        num_damaged: lines that were cut short.
+        num_damaged: lines that were cut short, or that no run has written.
     """
 
     records: list[FrameRecord]
@@ -108,7 +111,7 @@ def read_journals(out_dir: Path, run_id: str | None = None) -> JournalContents:
     for path in sorted(journal_folder(out_dir).glob(f"{'' if run_id is None else run_id}*.jsonl")):
         # A run that ends takes its journals away.
         with suppress(FileNotFoundError):
-            for record in _read(path):
+            for record in _read(path) if path.is_file() else ():
                 if record is None:
                     num_damaged += 1
                 else:
@@ -131,7 +134,17 @@ def _read(path: Path) -> Iterator[FrameRecord | None]:
         for line in file:
             checksum, _, payload = line.removesuffix(b"\n").partition(b" ")
             whole = line.endswith(b"\n") and checksum == _checksum(payload)
-            yield FrameRecord(**json.loads(payload)) if whole else None
+            yield _record(path, payload) if whole else None
+
+
+def _record(path: Path, payload: bytes) -> FrameRecord | None:
+    """None for what no run has written, though its checksum is right."""
+    try:
+        record = record_of(path, FrameRecord, parse_json(path, payload))
+        check_frames(path, {record.frame_id: record.entry})
+    except DataFormatError:
+        return None
+    return record
 
 
 def _checksum(payload: bytes) -> bytes:

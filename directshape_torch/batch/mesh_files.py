@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from directshape_torch.batch.options import MeshFormat
-from directshape_torch.io.atomic_files import write_bytes
+from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 

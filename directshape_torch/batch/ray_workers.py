@@ -23,6 +23,7 @@ from directshape_torch.errors import DirectShapeError, MissingDependencyError
 
 # A processor that has its next group already does not wait for the driver, which may be far away.
 _GROUPS_PER_WORKER = 2
+_REPORTS = "RAY_USAGE_STATS_ENABLED"
 
 # Of this worker process: it keeps one job, its latest.
 _refiners: dict[str, GroupRefiner] = {}
@@ -112,7 +113,8 @@ def _import_ray() -> Any:
 
 def _connect(ray: Any, options: WorkerOptions) -> None:
     # Ray would report its use to its makers; who starts a cluster himself has decided that himself.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    is_decided = _REPORTS in os.environ
+    os.environ.setdefault(_REPORTS, "0")
     quiet = {"log_to_driver": False, "logging_level": "warning"}
     try:
         if options.ray == "local":
@@ -125,3 +127,6 @@ def _connect(ray: Any, options: WorkerOptions) -> None:
             f"no Ray cluster answers at {options.ray!r}: {error}; is it started, and if it asks for a token, is "
             "RAY_AUTH_MODE=token set here too?"
         ) from error
+    finally:
+        if not is_decided:
+            del os.environ[_REPORTS]

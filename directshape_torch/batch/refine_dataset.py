@@ -16,7 +16,7 @@ import torch
 from directshape_torch.batch.content_hashes import hash_field, hash_prior
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.frame_outputs import failed_entry
-from directshape_torch.batch.group_refinement import GroupRefiner, GroupReport, RunJob, limit_threads
+from directshape_torch.batch.group_refinement import GroupRefiner, GroupReport, RunJob, limited_threads
 from directshape_torch.batch.journal import FrameRecord, Journal, read_journals, remove_journals
 from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver, WorkerOptions
 from directshape_torch.batch.run_file import RunFile, digit_warnings, read_run_file, run_path, versions
@@ -68,15 +68,14 @@ def refine_dataset(
         InputError: the folder would overwrite the detections.
         DirectShapeError: the run cannot go on: the disk is full, workers die before they finish anything.
     """
-    out_dir, options = Path(out_dir), options or RefineOptions()
+    out_dir, options, workers = Path(out_dir), options or RefineOptions(), workers or WorkerOptions()
     _check_out_dir(dataset, out_dir)
-    with RunLock(out_dir):
+    with RunLock(out_dir), limited_threads(workers.threads if workers.in_this_process else None):
         remove_unfinished_files(out_dir)
         is_cleared = fresh and remove_results(out_dir, (_TIMINGS, run_path(out_dir).name))
         manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
         record = RunRecord(out_dir, manifest, is_cleared)
-        observer, workers = observer or SilentObserver(), workers or WorkerOptions()
-        return _Run(dataset, refiner, record, options, observer, workers).execute()
+        return _Run(dataset, refiner, record, options, observer or SilentObserver(), workers).execute()
 
 
 class _Run:
@@ -93,8 +92,6 @@ class _Run:
     ) -> None:
         self.dataset, self.record, self.options, self.observer, self.who = dataset, record, options, observer, who
         self.out_dir, manifest = record.out_dir, record.manifest
-        if who.in_this_process:
-            limit_threads(who.threads)
         self.timings = RunTimings(refiner.prior.origin.device)
         # Of all frames, also of those that are finished: after an interruption the decision must be the same.
         num_cars = expected_cars(dataset, dataset.frame_ids)
@@ -178,7 +175,8 @@ class _Run:
 
     def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
         """Write what is known at the end of the run, whatever end that is; only then the journals go."""
-        self.record.take_in_journals()
+        ended = self.dataset.frame_ids if reason is None else ()
+        self.record.take_in_journals(ended, self.options.outputs)
         if self.timings.calls:
             write_timings(self.out_dir / _TIMINGS, self.timings)
         summary = self._summary(resumed)
@@ -190,7 +188,9 @@ class _Run:
     def _summary(self, resumed: Sequence[str]) -> RunSummary:
         entries = self.record.manifest.frames
         frames = {frame_id: entries[frame_id] for frame_id in self.dataset.frame_ids if frame_id in entries}
-        failed = {frame_id: entry["reason"] for frame_id, entry in frames.items() if entry["state"] == "failed"}
+        failed = {
+            frame_id: entry.get("reason", "unknown") for frame_id, entry in frames.items() if entry["state"] == "failed"
+        }
         warnings = (*find_warnings(frames, sorted(self.dataset.classes)), *self._own_warnings())
         return RunSummary(frames, tuple(resumed), failed, warnings, self.timings)
 

@@ -6,7 +6,6 @@ While the run goes on it names the frames to do, of which the journals tell thos
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import platform
 import time
 from collections.abc import Mapping, Sequence
@@ -15,9 +14,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from directshape_torch.errors import DataFormatError
-from directshape_torch.io.atomic_files import write_json
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.errors import DataFormatError, shown
+from directshape_torch.files.atomic_files import write_json
+from directshape_torch.files.read_files import read_json
+from directshape_torch.files.schema import record_of
 
 RUN_SCHEMA_VERSION = 1
 RunState = Literal["checking", "running", "finished", "stopped"]
@@ -100,16 +100,14 @@ def read_run_file(out_dir: Path) -> RunFile | None:
     path = run_path(out_dir)
     if not path.is_file():
         return None
-    try:
-        content = json.loads(read_file_bytes(path))
-        version = content.pop("schema_version")
-        if version != RUN_SCHEMA_VERSION:
-            raise DataFormatError(path, f"schema version is {version}, this program reads {RUN_SCHEMA_VERSION}")
-        return RunFile(**content)
-    except (json.JSONDecodeError, UnicodeDecodeError, TypeError, KeyError, AttributeError) as error:
-        raise DataFormatError(
-            path, f"describes no run ({error!r})", cure="remove it; results do not need it"
-        ) from error
+    cure = "remove it; results do not need it"
+    content = read_json(path, cure)
+    if not isinstance(content, dict) or "schema_version" not in content:
+        raise DataFormatError(path, "describes no run", cure=cure)
+    version = content.pop("schema_version")
+    if version != RUN_SCHEMA_VERSION:
+        raise DataFormatError(path, f"schema version is {shown(version)}, known is {RUN_SCHEMA_VERSION}", cure=cure)
+    return record_of(path, RunFile, content, cure)
 
 
 def versions() -> dict[str, str]:

@@ -11,12 +11,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Self
 
-from directshape_torch.errors import RunInProgressError
+from directshape_torch.errors import DataFormatError, RunInProgressError
+from directshape_torch.files.read_files import read_json
+from directshape_torch.files.schema import record_of
 
 try:
     import fcntl
 except ImportError:  # only Unix has it; elsewhere nothing is locked, but the owner is named
     fcntl = None  # type: ignore[assignment]
+
+
+# Not every system has the last two.
+_LOCK_FLAGS = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,8 @@ class LockOwner:
         try:
             os.kill(self.pid, 0)
         except ProcessLookupError:
+            return False
+        except OverflowError:  # no process has such a number
             return False
         except PermissionError:  # it runs, but is somebody else's
             return True
@@ -72,20 +80,32 @@ class RunLock:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # Removed before it is let go of, so that nobody locks a file that is about to vanish.
-        self.path.unlink(missing_ok=True)
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        if self._file is None:
+            return
+        # Removed before it is let go of, so that nobody locks a file that is about to vanish; of a moved folder it
+        # may be another run's by now.
+        with suppress(FileNotFoundError):
+            if self._is_at_its_place(self._file):
+                self.path.unlink()
+        self._file.close()
+        self._file = None
+
+    def _is_at_its_place(self, file: IO[str]) -> bool:
+        """Whether the path still leads to the file that is held."""
+        return os.path.samestat(os.fstat(file.fileno()), self.path.stat())
 
     def _locked(self) -> IO[str] | None:
         """The file, held; None where its last owner removed it in between."""
-        # Not "w": that would empty the file of a run that holds it.
-        file = self.path.open("a+", encoding="utf-8")
+        # Not "w": that would empty the file of a run that holds it. A link is no lock: it would empty what it leads to.
+        try:
+            file = os.fdopen(os.open(self.path, _LOCK_FLAGS, 0o666), "a+", encoding="utf-8")
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
+            raise DataFormatError(self.path, problem, cure="remove it, or choose another output folder") from error
         try:
             if fcntl is not None:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.fstat(file.fileno()).st_ino == self.path.stat().st_ino:
+            if self._is_at_its_place(file):
                 return file
         except BlockingIOError as error:
             file.close()
@@ -107,6 +127,7 @@ def lock_path(out_dir: Path) -> Path:
 
 def read_lock_owner(out_dir: Path) -> LockOwner | None:
     """Who runs in the folder, or did when it was killed; None where nobody is named."""
-    with suppress(OSError, ValueError, TypeError):
-        return LockOwner(**json.loads(lock_path(out_dir).read_text(encoding="utf-8")))
+    path = lock_path(out_dir)
+    with suppress(DataFormatError):
+        return record_of(path, LockOwner, read_json(path))
     return None

@@ -9,11 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.batch.frame_outputs import overlay_path
+from directshape_torch.batch.frame_outputs import failed_entry, overlay_path
 from directshape_torch.batch.journal import FrameRecord, journal_folder, read_journals, remove_journals
 from directshape_torch.batch.run_results import add_record, summary_path
 from directshape_torch.errors import DataFormatError, ResumeError
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.run_manifest import (
     RunManifest,
@@ -65,6 +65,9 @@ class RunRecord:
             manifest.package_version, manifest.config, manifest.sha256, previous.inputs, previous.frames
         )
         self._add_journals()
+        # Of runs that were cut off: taken in now, so that at the end only this run has a say.
+        self.write()
+        remove_journals(out_dir)
 
     def finished_frames(self, dataset: StereoDataset, outputs: Sequence[str]) -> list[str]:
         """Frames of the data set that need no work: done, with all the outputs whole, from the files as they are now.
@@ -77,19 +80,29 @@ class RunRecord:
             for _ in threads.map(partial(self._check_inputs, dataset), done):
                 pass
             whole = list(threads.map(partial(self._has_outputs, outputs), done))
-        had_outputs = [set(outputs) <= set(self.manifest.frames[frame_id]["outputs"]) for frame_id in done]
+        had_outputs = [set(outputs) <= set(self.manifest.frames[frame_id].get("outputs", ())) for frame_id in done]
         self.remade = [
             frame_id for frame_id, had, is_whole in zip(done, had_outputs, whole, strict=True) if had and not is_whole
         ]
         return [frame_id for frame_id, is_whole in zip(done, whole, strict=True) if is_whole]
 
-    def take_in_journals(self) -> None:
+    def take_in_journals(self, ended: Sequence[str], outputs: Sequence[str]) -> None:
         """Add what was noted since, and write `summary.json`.
+
+        Args:
+            ended: frames that must have come to an end; one without a record or files has failed.
+            outputs: kinds of files that those which are done must have.
 
         Raises:
             OSError: it could not be written.
         """
         self._add_journals()
+        for frame_id in ended:
+            entry = self.manifest.frames.get(frame_id)
+            is_done = self.manifest.is_done(frame_id)
+            if entry is None or (is_done and not all(map(Path.is_file, self._output_files(outputs, frame_id)))):
+                reason = f"its files are not in {self.out_dir}: was the folder moved or emptied during the run?"
+                self.manifest.frames[frame_id] = failed_entry(reason)
         self.write()
 
     def write(self) -> None:
@@ -98,6 +111,8 @@ class RunRecord:
 
     def _add_journals(self) -> None:
         for record in read_journals(self.out_dir).records:
+            if record.failure is not None and record.frame_id in self.remade:
+                del self.manifest.frames[record.frame_id]
             add_record(self.manifest, record)
 
     def _check_empty(self) -> None:
@@ -111,18 +126,23 @@ class RunRecord:
 
     def _has_outputs(self, outputs: Sequence[str], frame_id: str) -> bool:
         """Whether the outputs were written, and nobody has removed or changed them since."""
-        paths = {"data": result_path, "shapes": shapes_path, "overlays": overlay_path}
         entry = self.manifest.frames[frame_id]
+        files = self._output_files(outputs, frame_id)
+        return set(outputs) <= set(entry.get("outputs", ())) and all(self._is_whole(file, entry) for file in files)
+
+    def _output_files(self, outputs: Sequence[str], frame_id: str) -> list[Path]:
+        """The files of these kinds that a finished frame has."""
+        paths = {"data": result_path, "shapes": shapes_path, "overlays": overlay_path}
+        meshes = self.manifest.frames[frame_id].get("mesh_files", ())
         files = [path(self.out_dir, frame_id) for name, path in paths.items() if name in outputs]
-        files += [self.out_dir / name for name in entry.get("mesh_files", ()) if f"meshes_{name[-3:]}" in outputs]
-        return set(outputs) <= set(entry["outputs"]) and all(self._is_whole(file, entry) for file in files)
+        return files + [self.out_dir / name for name in meshes if f"meshes_{name[-3:]}" in outputs]
 
     def _is_whole(self, file: Path, entry: dict[str, Any]) -> bool:
         """Runs of earlier versions left no checksums: of their files only the existence can be told."""
         if not file.is_file():
             return False
         expected = entry.get("files", {}).get(file.relative_to(self.out_dir).as_posix())
-        return expected is None or hash_bytes(read_file_bytes(file)) == expected
+        return expected is None or hash_bytes(read_bytes(file)) == expected
 
     def _check_inputs(self, dataset: StereoDataset, frame_id: str) -> None:
         try:

@@ -35,10 +35,13 @@ def read_run_results(out_dir: Path) -> RunManifest:
 def add_record(manifest: RunManifest, record: FrameRecord) -> None:
     """Note in a manifest how a frame ended; outputs of an earlier run that are still valid stay listed."""
     earlier, entry = manifest.frames.get(record.frame_id, {}), record.entry
-    if entry["state"] == "done" and manifest.is_done(record.frame_id):
+    if manifest.is_done(record.frame_id):
+        # What is finished stays finished, whatever a clock says of the order.
+        if entry["state"] == "failed":
+            return
         lists = ("outputs", "mesh_files")
-        entry = {**entry, **{name: sorted({*earlier.get(name, ()), *entry[name]}) for name in lists}}
-        entry["files"] = {**earlier.get("files", {}), **entry["files"]}
+        entry = {**entry, **{name: sorted({*earlier.get(name, ()), *entry.get(name, ())}) for name in lists}}
+        entry["files"] = {**earlier.get("files", {}), **entry.get("files", {})}
     manifest.inputs[record.frame_id] = record.inputs
     manifest.frames[record.frame_id] = entry
 
@@ -68,4 +71,4 @@ def finished_frames(out_dir: Path, manifest: RunManifest, wanted: Iterable[str |
 
 def _number(word: str) -> str:
     """A number without leading zeros; other names as they are."""
-    return str(int(word)) if word.isdecimal() else word
+    return word.lstrip("0") or "0" if word.isdecimal() else word

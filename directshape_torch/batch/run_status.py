@@ -161,7 +161,8 @@ def _frames_text(status: RunStatus) -> str:
 
 
 def _state_text(status: RunStatus) -> str:
-    who = f"{status.work['workers'] or 'all'} workers with {status.work['threads']} threads, {status.work['where']}"
+    work = status.work
+    who = f"{work.get('workers') or 'all'} workers with {work.get('threads')} threads, {work.get('where')}"
     texts = {
         "checking": f"checking what earlier runs left ({status.owner})",
         "running": f"running ({status.owner}; {who})",

@@ -32,7 +32,7 @@ class RunSummary:
     @property
     def num_cars(self) -> int:
         """Cars of all frames that did not fail, refined or not."""
-        return sum(entry["cars"] for entry in self.frames.values() if entry["state"] == "done")
+        return sum(entry.get("cars", 0) for entry in self.frames.values() if entry["state"] == "done")
 
     @property
     def statuses(self) -> dict[str, int]:
@@ -61,7 +61,7 @@ def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str
         ('none of the 2 input lines is of class Car with a 3D box: nothing was refined',)
     """
     done = [entry for entry in frames.values() if entry["state"] == "done"]
-    num_lines, num_cars = (sum(entry[name] for entry in done) for name in ("lines", "cars"))
+    num_lines, num_cars = (sum(entry.get(name, 0) for entry in done) for name in ("lines", "cars"))
     statuses = count_statuses(frames)
     refined = sum(count for name, count in statuses.items() if Status[name].is_refined)
     no_mask, no_camera = statuses.get("no_mask", 0), statuses.get("behind_camera", 0)
@@ -77,7 +77,7 @@ def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str
     elif num_cars and 2 * refined < num_cars:
         found.append(f"only {refined} of {num_cars} cars were refined: see the statuses")
     for side in ("left", "right"):
-        if num_cars > no_mask and not sum(entry[f"masks_{side}"] for entry in done):
+        if num_cars > no_mask and not sum(entry.get(f"masks_{side}", 0) for entry in done):
             found.append(f"no car has a mask in the {side} image: check the masks of that side")
     guessed = sum(entry.get("ground_source") == "camera_height" for entry in done)
     if num_cars and guessed:

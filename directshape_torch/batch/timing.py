@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from directshape_torch.compile import num_forms
-from directshape_torch.io.atomic_files import write_json
+from directshape_torch.files.atomic_files import write_json
 
 TIMINGS_SCHEMA_VERSION = 1
 

@@ -72,7 +72,7 @@ def depth_of_near_side(
 
     Example:
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.io.text_files import Line
+        >>> from directshape_torch.files.text_files import Line
         >>> car = parse_object("labels", Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 4.0 0 1.6 22 -1.5708", ""))
         >>> P = torch.tensor([[[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]])
         >>> camera = StereoCamera.from_projections(P, P - torch.tensor([[[0.0, 0, 0, 378], [0] * 4, [0] * 4]]))

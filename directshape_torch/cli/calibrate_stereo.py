@@ -138,7 +138,7 @@ def _accuracy(calibrated: SelfCalibration) -> str:
 
 
 def _write(args: argparse.Namespace, field: DisparityField, observations: DisparityObservations) -> None:
-    from directshape_torch.io.atomic_files import write_png
+    from directshape_torch.files.atomic_files import write_png
     from directshape_torch.visualize.disparity_field_picture import draw_disparity_field
 
     picture = args.picture or args.out.with_suffix(".png")

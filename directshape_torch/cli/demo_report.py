@@ -12,7 +12,7 @@ from directshape_torch.batch.mesh_files import scene_bytes
 from directshape_torch.config import SamplingConfig
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
-from directshape_torch.io.atomic_files import write_bytes, write_png
+from directshape_torch.files.atomic_files import write_bytes, write_png
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.result_files import read_shapes

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from directshape_torch.cli.inspect_truth import points_of_car, true_points
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
-from directshape_torch.io.atomic_files import write_png
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame

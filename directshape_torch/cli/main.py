@@ -5,14 +5,18 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from directshape_torch.errors import DirectShapeError
 
 EXIT_WRONG_INPUT = 2
 EXIT_INTERRUPTED = 130
 EXIT_OUTPUT_CLOSED = 141
+EXIT_TERMINATED = 143
 
 # Each module has `add_parser(subparsers)` and `run(args) -> int`, and imports what is heavy inside `run`.
 COMMANDS = (
@@ -44,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     args = make_parser().parse_args(arguments)
     try:
-        code: int = args.run(args)
+        with _terminable():
+            code: int = args.run(args)
         sys.stdout.flush()
     except (DirectShapeError, OSError) as error:
         if isinstance(error, BrokenPipeError) and _output_was_closed():
@@ -52,10 +57,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # OSError: a full disk or a folder that may not be written, for which a traceback helps nobody.
         print(f"directshape: error: {' '.join(str(error).split())}", file=sys.stderr)
         return EXIT_WRONG_INPUT
+    except _TerminatedError:
+        print("directshape: terminated", file=sys.stderr)
+        return EXIT_TERMINATED
     except KeyboardInterrupt:
         print("directshape: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     return code
+
+
+class _TerminatedError(KeyboardInterrupt):
+    """The process was asked to end."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let SIGTERM end the body like Ctrl-C, so that a run says that it has stopped."""
+
+    def end(*_: object) -> None:
+        raise _TerminatedError("SIGTERM")
+
+    # Of other threads nobody may set what a signal does.
+    is_ours = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, end) if is_ours else None
+    try:
+        yield
+    finally:
+        if is_ours:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _output_was_closed() -> bool:

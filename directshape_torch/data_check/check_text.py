@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from directshape_torch.data_check.finding import SEVERITIES, CheckReport, Finding
-from directshape_torch.io.atomic_files import write_json
+from directshape_torch.files.atomic_files import write_json
 
 REPORT_SCHEMA_VERSION = 1
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.read_files import read_json
 from directshape_torch.numerics.device_constants import constant_like
 
 SCHEMA = "directshape_torch.trust_model/1"
@@ -97,8 +98,9 @@ def load_trust_model(path: Path | str) -> TrustModel:
     Raises:
         DataFormatError: it is no such file, or of another schema version.
     """
+    cure = "write it with scripts/calibrate_quality.py"
+    content = read_json(path, cure)
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
         if content["schema"] != SCHEMA:
             raise DataFormatError(path, f"has schema {content['schema']!r}, this version reads {SCHEMA!r}")
         better, not_worse = (_head(content[name]) for name in ("better", "not_worse"))
@@ -107,8 +109,7 @@ def load_trust_model(path: Path | str) -> TrustModel:
         if unknown or len(factors) != 4 or len(floors) != 4:
             raise DataFormatError(path, f"has unknown columns {sorted(unknown)}, or not four sigmas")
         return TrustModel(better, not_worse, factors, floors, content["provenance"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        cure = "write it with scripts/calibrate_quality.py"
+    except (ValueError, KeyError, TypeError) as error:
         raise DataFormatError(path, f"is no model of trust ({error})", cure=cure) from error
 
 

@@ -8,15 +8,14 @@ to the next; without such a file every label counts as a car of its own.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.errors import DataFormatError
-from directshape_torch.io import atomic_files
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.errors import DataFormatError, shown
+from directshape_torch.files import atomic_files
+from directshape_torch.files.read_files import read_json
 
 TRACKS_SCHEMA_VERSION = 1
 _CURE = "write it with scripts/link_kitti_tracks.py"
@@ -56,13 +55,10 @@ def read_tracks(path: Path | str) -> CarTracks:
     Raises:
         DataFormatError: it is missing, no JSON, or not of this schema; names the entry.
     """
-    try:
-        content = json.loads(read_file_bytes(path))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataFormatError(path, f"is not valid JSON ({error})", cure=_CURE) from error
+    content = read_json(path, _CURE)
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != TRACKS_SCHEMA_VERSION or not isinstance(content.get("labels"), dict):
-        problem = f"is no tracks file of schema {TRACKS_SCHEMA_VERSION} (schema_version is {version!r})"
+        problem = f"is no tracks file of schema {TRACKS_SCHEMA_VERSION} (schema_version is {shown(version)})"
         raise DataFormatError(path, problem, cure=_CURE)
     return CarTracks(
         {
@@ -88,7 +84,7 @@ def _entries(path: Path | str, frame_id: str, lines: Any) -> list[tuple[str, Any
 
 
 def _line_number(path: Path | str, frame_id: str, line: str) -> int:
-    if not line.isdecimal() or int(line) < 1:
+    if not line.isdecimal() or len(line) > 18 or int(line) < 1:
         raise DataFormatError(path, f"frame {frame_id}: {line!r} is no label line number, from 1", cure=_CURE)
     return int(line)
 
@@ -96,6 +92,6 @@ def _line_number(path: Path | str, frame_id: str, line: str) -> int:
 def _identity(path: Path | str, frame_id: str, line: str, entry: Any) -> CarIdentity:
     known = isinstance(entry, dict) and isinstance(entry.get("car"), str)
     if not known or not isinstance(entry.get("drive"), (str, type(None))):
-        problem = f'frame {frame_id}, line {line}: expected {{"car": text, "drive": text or null}}, got {entry!r}'
+        problem = f'frame {frame_id}, line {line}: expected {{"car": text, "drive": text or null}}, got {shown(entry)}'
         raise DataFormatError(path, problem, cure=_CURE)
     return CarIdentity(entry["car"], entry.get("drive"))

@@ -20,10 +20,10 @@ from directshape_torch.evaluation.comparison_summary import (
 )
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.io.instance_masks import file_of_frame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import read_shapes
-from directshape_torch.io.text_files import read_lines
 
 # Depth of the label along the optical axis, metres; the last bin is open.
 DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))

@@ -19,7 +19,7 @@ from directshape_torch.evaluation.comparison_summary import (
     Metric,
 )
 from directshape_torch.evaluation.text_table import align, number, with_interval
-from directshape_torch.io import atomic_files
+from directshape_torch.files import atomic_files
 
 COMPARISON_SCHEMA_VERSION = 1
 _GROUP_METRICS = ("bev_iou_mean", "iou_3d_mean", "bev_iou_good_share", "centre_m_median", "yaw_deg_median")

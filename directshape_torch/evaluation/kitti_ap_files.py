@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
-from directshape_torch.io.text_files import read_lines
 
 ObjectsByFrame = Mapping[str, Sequence[KittiObject]]
 

@@ -11,7 +11,7 @@ from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores
 from directshape_torch.evaluation.kitti_curve import NUM_RECALL_POINTS
 from directshape_torch.evaluation.kitti_difficulty import DIFFICULTIES
 from directshape_torch.evaluation.text_table import align
-from directshape_torch.io import atomic_files
+from directshape_torch.files import atomic_files
 
 KITTI_SCORES_SCHEMA_VERSION = 1
 _NAMES = {"2d": "2D box", "bev": "bird's-eye view", "3d": "3D box"}

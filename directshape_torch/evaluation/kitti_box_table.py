@@ -56,7 +56,7 @@ def make_box_table(frames: Sequence[Sequence[KittiObject]]) -> BoxTable:
 
     Example:
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.io.text_files import Line
+        >>> from directshape_torch.files.text_files import Line
         >>> car = parse_object("labels", Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.6 20 0", ""))
         >>> table = make_box_table([[car], [], [car, car]])
         >>> table.frame, table.frame_count, table.height_px

@@ -15,7 +15,7 @@ from directshape_torch.evaluation.shape_error import TAUS_M
 from directshape_torch.evaluation.shape_error_scores import EvaluatedCar, ShapeScores
 from directshape_torch.evaluation.shape_error_summary import METRICS, ShapeCurve, SurfaceSummary
 from directshape_torch.evaluation.text_table import align, number, with_interval
-from directshape_torch.io import atomic_files
+from directshape_torch.files import atomic_files
 
 SHAPE_SCORES_SCHEMA_VERSION = 1
 PRINTED_TAUS_M = (0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0)

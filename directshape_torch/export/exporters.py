@@ -16,8 +16,8 @@ from directshape_torch.export.nuscenes_file import nuscenes_results
 from directshape_torch.export.ply_files import mesh_ply, points_ply
 from directshape_torch.export.run_folder import RefinedFrame, RunFolder
 from directshape_torch.export.stereo_points import stereo_points
-from directshape_torch.io.atomic_files import write_bytes, write_json
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.files.atomic_files import write_bytes, write_json
+from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.refinement_files import result_path
 
 
@@ -149,6 +149,6 @@ def write_points(folder: Path, source: FrameSource) -> None:
 
 def write_kitti(folder: Path, source: FrameSource) -> None:
     """`kitti/data/NNNNNN.txt`, the result file byte for byte, and `kitti/json/NNNNNN.json`."""
-    text = read_file_bytes(result_path(source.run.path, source.frame_id))
+    text = read_bytes(result_path(source.run.path, source.frame_id))
     write_bytes(folder / "kitti" / "data" / f"{source.frame_id}.txt", text)
     write_json(folder / "kitti" / "json" / f"{source.frame_id}.json", kitti_json(source.refined))

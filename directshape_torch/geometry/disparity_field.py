@@ -8,10 +8,7 @@ and Segvic, "Improving the Egomotion Estimation by Correcting the Calibration Bi
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError, InputError, shown
+from directshape_torch.files.atomic_files import write_json
+from directshape_torch.files.read_files import read_json
+from directshape_torch.numerics.checks import check_shape, check_stored
 from directshape_torch.numerics.gradient_mode import is_plain
 
 SCHEMA = "directshape disparity field"
@@ -123,20 +123,12 @@ class DisparityField:
     vertical_coefficients: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS))
 
     def __post_init__(self) -> None:
-        polynomial = (NUM_COEFFICIENTS,)
-        shapes = {
-            "coefficients": polynomial,
-            "vertical_coefficients": polynomial,
-            "K_left": (3, 3),
-            "K_right": (3, 3),
-            "T_right_cam": (4, 4),
-        }
-        for name, wanted in shapes.items():
-            if tuple(getattr(self, name).shape) != wanted:
-                raise InputError(name, f"shape {wanted}", f"{tuple(getattr(self, name).shape)}")
-        if self.hull_uv.ndim != 2 or self.hull_uv.shape[1] != 2 or len(self.hull_uv) < 3:
+        for name, shape in _TENSOR_SHAPES.items():
+            check_shape(name, getattr(self, name), ["M" if n is None else n for n in shape], kind="floating")
+            check_stored(name, getattr(self, name))
+        if len(self.hull_uv) < 3:
             raise InputError("hull_uv", "shape (M, 2) with at least 3 vertices", f"{tuple(self.hull_uv.shape)}")
-        for name in ("hull_uv", *shapes):
+        for name in _TENSOR_SHAPES:
             if not bool(getattr(self, name).isfinite().all()):
                 raise InputError(name, "finite numbers", str(getattr(self, name).tolist()))
 
@@ -254,7 +246,7 @@ class DisparityField:
         """Write the field as JSON; a reader sees the old file or the new one, never half of it.
 
         Raises:
-            OSError: the folder does not exist or cannot be written.
+            OSError: the folder cannot be made or written.
         """
         content = {
             "schema": SCHEMA,
@@ -263,24 +255,23 @@ class DisparityField:
             "provenance": dict(self.provenance),
             **{name: getattr(self, name).double().cpu().tolist() for name in _TENSOR_SHAPES},
         }
-        text = json.dumps(content, indent=2, sort_keys=True, allow_nan=False) + "\n"
-        _replace_file(Path(path), text)
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: Path | str, dtype: torch.dtype = torch.float64) -> DisparityField:
         """Read a field written by `save`.
 
         Raises:
-            DataFormatError: the file is missing, is no JSON, or does not hold what a field needs.
+            DataFormatError: the file is missing, is not valid JSON, or does not hold what a field needs.
         """
         content = _read_json(path)
         tensors = {name: _read_tensor(path, content, name, shape, dtype) for name, shape in _TENSOR_SHAPES.items()}
         size = content.get("size_wh")
         if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)):
-            raise DataFormatError(path, f"'size_wh' must be [width, height], got {size!r}", cure=_CURE)
+            raise DataFormatError(path, f"'size_wh' must be [width, height], got {shown(size)}", cure=_CURE)
         provenance = content.get("provenance", {})
         if not isinstance(provenance, dict):
-            raise DataFormatError(path, f"'provenance' must be an object, got {provenance!r}", cure=_CURE)
+            raise DataFormatError(path, f"'provenance' must be an object, got {shown(provenance)}", cure=_CURE)
         return cls(size_wh=(size[0], size[1]), provenance=provenance, **tensors)
 
 
@@ -299,33 +290,13 @@ def _largest_difference(a: Tensor, b: Tensor) -> float:
     return float((a.detach().double().cpu() - b.detach().double().cpu()).abs().max())
 
 
-def _replace_file(path: Path, text: str) -> None:
-    # The io package has the same in `atomic_files`, but geometry may not import upwards.
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
 def _read_json(path: Path | str) -> dict[str, Any]:
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataFormatError(path, f"cannot be read ({error.strerror})", cure="check the path") from error
-    except ValueError as error:
-        raise DataFormatError(path, f"is no JSON ({error})", cure=_CURE) from error
+    content = read_json(path, _CURE)
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataFormatError(path, f"is no disparity field (its 'schema' is not {SCHEMA!r})", cure=_CURE)
     if content.get("schema_version") != SCHEMA_VERSION:
         version = content.get("schema_version")
-        raise DataFormatError(path, f"has schema version {version!r}, this program reads {SCHEMA_VERSION}", cure=_CURE)
+        raise DataFormatError(path, f"has schema version {shown(version)}, known is {SCHEMA_VERSION}", cure=_CURE)
     return content
 
 
@@ -335,7 +306,7 @@ def _read_tensor(
     wanted = "(" + ", ".join("M" if n is None else str(n) for n in shape) + ")"
     try:
         tensor = torch.tensor(content[name], dtype=torch.float64)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise DataFormatError(path, f"{name!r} must be numbers of shape {wanted}", cure=_CURE) from error
     fits = tensor.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, tensor.shape, strict=False))
     if not fits or (name == "hull_uv" and len(tensor) < 3) or not all(map(math.isfinite, tensor.flatten().tolist())):

@@ -48,7 +48,7 @@ def write_disparity(
     disparity: NDArray[np.floating],  # (H, W)
 ) -> None:
     """Write such a file: NaN and what is not positive as unknown, values rounded to 1/256 pixel, at most 255.996."""
-    from directshape_torch.io.atomic_files import write_png
+    from directshape_torch.files.atomic_files import write_png
 
     known = np.isfinite(disparity) & (disparity > 0)
     units = np.round(np.where(known, disparity, 0) * _UNITS_PER_PIXEL).clip(0, np.iinfo(np.uint16).max)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError, MissingDependencyError
-from directshape_torch.io import atomic_files
+from directshape_torch.files import atomic_files
 
 _DOTS_PER_INCH, _ANIMATION_DOTS_PER_INCH = 110, 80
 _GIF_COLOURS = 255

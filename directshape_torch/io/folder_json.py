@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.errors import DataFormatError, shown
+from directshape_torch.files.read_files import read_json
 
 FOLDER_SCHEMA_VERSION = 1
 _RIG_KEYS = frozenset(
@@ -135,7 +134,7 @@ def _objects(path: Path, content: Mapping[str, Any], key: str) -> tuple[FolderOb
 def _object(path: Path, where: str, entry: Mapping[str, Any]) -> FolderObject:
     _refuse_unknown(path, where, entry, _OBJECT_KEYS)
     if not isinstance(entry.get("class"), str) or not entry["class"] or len(entry["class"].split()) != 1:
-        raise DataFormatError(path, f"{where}: 'class' is {entry.get('class')!r}, expected one word such as 'Car'")
+        raise DataFormatError(path, f"{where}: 'class' is {shown(entry.get('class'))}, expected one word such as 'Car'")
     present = [key for key in _BOX_KEYS if entry.get(key) is not None]
     if present and len(present) < len(_BOX_KEYS):
         missing = ", ".join(key for key in _BOX_KEYS if key not in present)
@@ -157,15 +156,12 @@ def _object(path: Path, where: str, entry: Mapping[str, Any]) -> FolderObject:
 
 
 def _read_object(path: Path, keys: frozenset[str]) -> Mapping[str, Any]:
-    try:
-        content = json.loads(read_file_bytes(path))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataFormatError(path, f"is not valid JSON ({error})") from error
+    content = read_json(path)
     if not isinstance(content, dict):
         raise DataFormatError(path, "is not a JSON object", cure="see docs/inputs.md")
     if content.get("schema_version") != FOLDER_SCHEMA_VERSION:
         got = content.get("schema_version")
-        raise DataFormatError(path, f"'schema_version' is {got!r}, expected {FOLDER_SCHEMA_VERSION}")
+        raise DataFormatError(path, f"'schema_version' is {shown(got)}, expected {FOLDER_SCHEMA_VERSION}")
     _refuse_unknown(path, "the file", content, keys)
     return content
 
@@ -173,7 +169,9 @@ def _read_object(path: Path, keys: frozenset[str]) -> Mapping[str, Any]:
 def _refuse_unknown(path: Path, where: str, entry: Mapping[str, Any], keys: frozenset[str]) -> None:
     unknown = sorted(set(entry) - keys)
     if unknown:
-        raise DataFormatError(path, f"{where}: unknown key {unknown[0]!r}", cure=f"known are {', '.join(sorted(keys))}")
+        raise DataFormatError(
+            path, f"{where}: unknown key {shown(unknown[0])}", cure=f"known are {', '.join(sorted(keys))}"
+        )
 
 
 def _intrinsics(path: Path, content: Mapping[str, Any], key: str) -> NDArray[np.float64]:
@@ -190,11 +188,11 @@ def _numbers(path: Path, entry: Mapping[str, Any], key: str, count: int, where: 
     values = entry.get(key)
     name = f"{where}: {key}" if where else key
     if not isinstance(values, Sequence) or isinstance(values, str) or len(values) != count:
-        raise DataFormatError(path, f"{name} is {values!r}, expected a list of {count} numbers")
+        raise DataFormatError(path, f"{name} is {shown(values)}, expected a list of {count} numbers")
     return tuple(_number(path, name, value) for value in values)
 
 
 def _number(path: Path, name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise DataFormatError(path, f"{name} holds {value!r}, expected a finite number")
+        raise DataFormatError(path, f"{name} holds {shown(value)}, expected a finite number")
     return float(value)

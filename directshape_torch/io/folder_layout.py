@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.coco_segmentation import decode_segmentation
 from directshape_torch.io.folder_json import FolderFrame, FolderObject, FolderRig, read_frame, read_rig
 from directshape_torch.io.frame_detections import GivenMasks
@@ -23,7 +24,7 @@ from directshape_torch.io.instance_masks import (
     InstanceMask,
     MaskSource,
     Side,
-    check_size,
+    check_count,
     read_soft_mask,
     tight_box,
 )
@@ -31,7 +32,6 @@ from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_c
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
 from directshape_torch.io.mask_files import COCO_CAR_IDS, mask_source
 from directshape_torch.io.mask_matching import project_boxes
-from directshape_torch.io.text_files import Line
 
 _CAR = "Car"
 _OTHER_CATEGORY = 0
@@ -193,6 +193,7 @@ class FolderMasks:
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         frame = read_frame(self.frames_dir / f"{frame_id}.json")
+        check_count(frame.path, len(frame.objects), size_hw)
         found = [
             self._mask(frame.path, index, entry, side, size_hw)
             for side in SIDES
@@ -224,9 +225,7 @@ class FolderMasks:
         mask = entry.masks[side]
         if isinstance(mask, str):
             return read_soft_mask(self.root / mask, size_hw)
-        decoded = decode_segmentation(path, index, mask, size_hw)
-        check_size(path, f"mask_{side} of objects[{index}]", decoded.shape, size_hw)
-        return decoded
+        return decode_segmentation(path, f"mask_{side} of objects[{index}]", mask, size_hw)
 
 
 def _words(values: tuple[float, ...]) -> str:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io import atomic_files
-from directshape_torch.io.text_files import Line, read_lines
+from directshape_torch.files import atomic_files
+from directshape_torch.files.text_files import Line, read_lines
 
 _CURE = "write four lines: '# Plane', 'Width 4', 'Height 1', then a b c d with a x + b y + c z + d = 0"
 

@@ -11,10 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.read_files import read_bytes
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIGNATURE = b"\xff\xd8"
 _JPEG_END = b"\xff\xd9"
+_PNG_HEADER_BYTES = 33
+# Start of frame, all but the tables that have numbers between them.
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
+# Eight times an 8-megapixel camera's.
+_MOST_PIXELS = 2**26
 _CURE = "copy or download the file again"
 IMAGE_ENDINGS = ("png", "jpg", "jpeg")
 
@@ -23,7 +30,7 @@ def read_rgb(path: Path | str) -> NDArray[np.uint8]:
     """Read a PNG or JPEG file as RGB, uint8 (H, W, 3).
 
     Raises:
-        DataFormatError: the file is missing, cut short, damaged or no image; says which.
+        DataFormatError: the file is missing, cut short, damaged, no image, or of more than 67 megapixels; says which.
     """
     import cv2
 
@@ -51,24 +58,15 @@ def find_image(folder: Path, stem: str) -> Path:
     return next((path for path in candidates if path.is_file()), candidates[0])
 
 
-def read_file_bytes(path: Path | str) -> bytes:
-    """The content of a file.
-
-    Raises:
-        DataFormatError: it is missing or cannot be read.
-    """
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        raise DataFormatError(path, f"cannot be read ({error.strerror})", cure="check the path") from error
-
-
 def _decode(path: Path | str, flags: int) -> NDArray[Any]:
     import cv2
 
-    content = read_file_bytes(path)
+    content = read_bytes(path)
     _check_complete(path, content)
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error as error:
+        raise DataFormatError(path, f"OpenCV cannot decode this image ({error})", cure=_CURE) from error
     if image is None:
         raise DataFormatError(path, "OpenCV cannot decode this image", cure=_CURE)
     return image
@@ -80,12 +78,15 @@ def _check_complete(path: Path | str, content: bytes) -> None:
     elif content.startswith(_JPEG_SIGNATURE):
         if _JPEG_END not in content[-64:]:
             raise DataFormatError(path, f"JPEG is cut short after {len(content)} bytes", cure=_CURE)
+        _check_pixels(path, *_jpeg_size(content))
     else:
         raise DataFormatError(path, f"neither PNG nor JPEG, begins with {content[:8]!r}", cure=_CURE)
 
 
 def _check_png(path: Path | str, content: bytes) -> None:
-    """Walk the chunks: each is length, type, data and checksum; the last one is IEND."""
+    """Walk the chunks: each is length, type, data and checksum; the first one states the size, the last one is IEND."""
+    if content[12:16] == b"IHDR" and len(content) >= _PNG_HEADER_BYTES:
+        _check_pixels(path, *struct.unpack_from(">II", content, 16))
     position = len(_PNG_SIGNATURE)
     while position + 12 <= len(content):
         (length,) = struct.unpack_from(">I", content, position)
@@ -100,3 +101,24 @@ def _check_png(path: Path | str, content: bytes) -> None:
             return
         position = end
     raise DataFormatError(path, f"PNG is cut short after {len(content)} bytes", cure=_CURE)
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int]:
+    """Width and height from the first frame header; (0, 0) where there is none."""
+    position = len(_JPEG_SIGNATURE)
+    while position + 9 <= len(content) and content[position] == 0xFF:
+        marker = content[position + 1]
+        if marker == 0xFF or marker in _JPEG_WITHOUT_LENGTH:
+            position += 1 if marker == 0xFF else 2
+            continue
+        length, height, width = struct.unpack_from(">HxHH", content, position + 2)
+        if marker in _JPEG_FRAMES:
+            return width, height
+        position += 2 + length
+    return 0, 0
+
+
+def _check_pixels(path: Path | str, width: int, height: int) -> None:
+    """Before anything is allocated for them."""
+    if not 0 < width * height <= _MOST_PIXELS:
+        raise DataFormatError(path, f"states {width} x {height} pixels, expected 1 to {_MOST_PIXELS}", cure=_CURE)

@@ -14,6 +14,8 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.io.image_files import read_single_channel
 
 Side = Literal["left", "right"]
+# All masks of an image together: four bytes each where they are soft.
+_MOST_PIXELS = 2**30
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
@@ -88,6 +90,17 @@ def read_soft_mask(path: Path, size_hw: tuple[int, int]) -> NDArray[np.float32]:
     grey = read_single_channel(path)
     check_size(path, "the soft mask", grey.shape, size_hw)
     return np.asarray(grey.astype(np.float32) / np.float32(np.iinfo(grey.dtype).max))
+
+
+def check_count(path: Path, count: int, size_hw: tuple[int, int]) -> None:
+    """Raise `DataFormatError` where so many masks of one image would not fit into memory."""
+    height, width = size_hw
+    if count * height * width > _MOST_PIXELS:
+        raise DataFormatError(
+            path,
+            f"{count} instances of {width} x {height} pixels, at most {_MOST_PIXELS // (height * width)} are read",
+            cure="keep the likely ones",
+        )
 
 
 def check_size(path: Path, what: str, got_hw: Iterable[int], expected_hw: tuple[int, int]) -> None:

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.text_files import read_lines
 from directshape_torch.scene import StereoCamera
 
 # The name of each matrix in the object, the tracking and the raw layout, and its shape.
@@ -116,7 +116,8 @@ def to_stereo_camera(
         dtype: of the tensors; the arithmetic is float64.
 
     Raises:
-        DataFormatError: the right camera of a file is not to the right of its left one (flipped baseline).
+        DataFormatError: the right camera of a file is not to the right of its left one (flipped baseline), or its
+            matrices have no inverse.
     """
     if not calibrations:
         raise InputError("calibrations", "at least one frame", "none")
@@ -126,11 +127,19 @@ def to_stereo_camera(
         torch.from_numpy(np.stack([getattr(calibration, name) for calibration in calibrations]))
         for name in ("P2", "P3")
     )
-    return StereoCamera.from_projections(P2, P3, disparity_field).to(dtype=dtype)
+    try:
+        return StereoCamera.from_projections(P2, P3, disparity_field).to(dtype=dtype)
+    except InputError as error:
+        # A field of another rig is no fault of the file.
+        if error.name == "disparity_field":
+            raise
+        raise DataFormatError(calibrations[0].path, f"describes no stereo rig ({error})") from error
 
 
 def _check_baseline(calibration: KittiCalibration) -> None:
     """Name the file: `StereoCamera` would only name the tensor."""
+    if not min(calibration.P2[0, 0], calibration.P3[0, 0]) > 0:
+        raise DataFormatError(calibration.path, "P2 and P3 need focal lengths above 0")
     baseline_m = calibration.P2[0, 3] / calibration.P2[0, 0] - calibration.P3[0, 3] / calibration.P3[0, 0]
     if not baseline_m > 0:
         raise DataFormatError(

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.text_files import Line, read_lines
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.io.text_files import Line, read_lines
 
 _COLUMNS = "type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
 # KITTI writes these where a box has no 3D part (DontCare, 2D detectors).

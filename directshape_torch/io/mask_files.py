@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,14 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError, InputError, shown
+from directshape_torch.files.read_files import read_json
 from directshape_torch.io.coco_segmentation import decode_segmentation
-from directshape_torch.io.image_files import find_image, read_file_bytes, read_single_channel
+from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
     SIDES,
     InstanceMask,
     MaskSource,
     Side,
+    check_count,
     check_size,
     file_of_frame,
     read_soft_mask,
@@ -49,11 +50,12 @@ class FrameJsonMasks:
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         path = self._path(frame_id)
-        masks = []
-        for index, entry in enumerate(read_coco_list(path)):
+        masks, entries = [], read_coco_list(path)
+        check_count(path, len(entries), size_hw)
+        for index, entry in enumerate(entries):
             side = entry.get("image")
             if side not in SIDES:
-                raise DataFormatError(path, f"entry {index}: 'image' is {side!r}, expected 'left' or 'right'")
+                raise DataFormatError(path, f"entry {index}: 'image' is {shown(side)}, expected 'left' or 'right'")
             masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))
         return [mask for mask in masks if mask is not None]
 
@@ -88,14 +90,16 @@ class InstancePngMasks:
         for side, path in zip(SIDES, self.files(frame_id), strict=True):
             ids = read_single_channel(path)
             check_size(path, "the instance image", ids.shape, size_hw)
-            masks += self._instances(side, ids)
+            masks += self._instances(path, side, ids)
         return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
         return tuple(find_image(self.directory / folder, frame_id) for folder in self.folders)
 
-    def _instances(self, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask]:
-        for value in np.unique(ids).tolist():
+    def _instances(self, path: Path, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask]:
+        values = np.unique(ids).tolist()
+        check_count(path, len(values), (ids.shape[0], ids.shape[1]))
+        for value in values:
             category = value // _IDS_PER_CLASS
             if category in (0, _MOTS_IGNORE_CLASS):
                 continue
@@ -129,7 +133,9 @@ class CocoFileMasks:
         masks = []
         for side, path in zip(SIDES, (self.left, self.right), strict=True):
             if path is not None:
-                for index, entry in self._entries(side, path).get(_frame_number(frame_id), []):
+                entries = self._entries(side, path).get(_frame_number(frame_id), [])
+                check_count(path, len(entries), size_hw)
+                for index, entry in entries:
                     masks.append(_from_coco(path, index, entry, side, size_hw, self.car_ids))
         return [mask for mask in masks if mask is not None]
 
@@ -146,7 +152,7 @@ class CocoFileMasks:
                 except (KeyError, TypeError, ValueError) as error:
                     raise DataFormatError(
                         path,
-                        f"entry {index}: 'image_id' is {entry.get('image_id')!r}, expected the frame's number",
+                        f"entry {index}: 'image_id' is {shown(entry.get('image_id'))}, expected the frame's number",
                     ) from error
                 frames.setdefault(number, []).append((index, entry))
             self._by_frame[side] = frames
@@ -175,10 +181,7 @@ def read_coco_list(path: Path) -> list[Mapping[str, Any]]:
     Raises:
         DataFormatError: it is missing, no JSON, or no list of objects.
     """
-    try:
-        entries = json.loads(read_file_bytes(path))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataFormatError(path, f"is not valid JSON ({error})") from error
+    entries = read_json(path)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise DataFormatError(
             path, "is not a list of COCO results", cure='write [{"image_id": .., "segmentation": ..}, ..]'
@@ -209,10 +212,17 @@ def _from_coco(
             box=_file_box(entry) or mask_box,
             mask_box=mask_box,
             probability=probability,
-            score=float(entry.get("score", 1.0)),
+            score=_finite(entry.get("score", 1.0)),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise DataFormatError(path, f"entry {index}: bad or missing field ({error!r})") from error
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if not abs(number) < float("inf"):
+        raise ValueError(f"{number} is not finite")
+    return number
 
 
 def _probability(
@@ -221,16 +231,14 @@ def _probability(
     soft = entry.get("soft_probability")
     if soft:
         return read_soft_mask(path.parent / str(soft), size_hw)
-    mask = decode_segmentation(path, index, entry.get("segmentation"), size_hw)
-    check_size(path, f"the mask of entry {index}", mask.shape, size_hw)
-    return mask
+    return decode_segmentation(path, f"entry {index}", entry.get("segmentation"), size_hw)
 
 
 def _file_box(entry: Mapping[str, Any]) -> tuple[float, float, float, float] | None:
     """COCO's [x, y, width, height], whose pixel k spans k .. k + 1, as (u_min, v_min, u_max, v_max) of centres."""
     if entry.get("bbox") is None:
         return None
-    x, y, width, height = (float(value) for value in entry["bbox"])
+    x, y, width, height = (_finite(value) for value in entry["bbox"])
     return x, y, x + width - 1, y + height - 1
 
 

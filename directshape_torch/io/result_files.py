@@ -10,14 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io import atomic_files
+from directshape_torch.errors import DataFormatError, InputError, shown
+from directshape_torch.files import atomic_files
+from directshape_torch.files.npz_files import read_npz
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.npz_files import read_npz
+from directshape_torch.status import Status
 
 SHAPES_SCHEMA_VERSION = 1
+_AGAIN = "refine the frame again"
 
 Floats = NDArray[np.floating[Any]]
+# Of arrays in a file, by the type of the field.
+_KINDS = {"str": "U", "tuple[str, ...]": "U", "Floats": "f", "NDArray[np.int64]": "i", "NDArray[np.bool_]": "b"}
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ def result_line(source: KittiObject, refined: RefinedBox) -> str:
 
     Example:
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.io.text_files import Line
+        >>> from directshape_torch.files.text_files import Line
         >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
         >>> box = RefinedBox((1.4, 1.7, 4.1), (1.1, 1.65, 19.5), 0.02, -0.0363)
         >>> result_line(parse_object("results", Line(1, raw, raw)), box)
@@ -152,8 +156,9 @@ class ShapeArrays:
     profile_costs_after: Floats = field(metadata=_shape("B", "P"))
 
     def __post_init__(self) -> None:
-        B, T, K = len(self.input_lines), len(self.term_names), self.codes.shape[-1]
-        sizes = {"B": B, "K": K, "D": 6 + K, "T": T, "P": len(self.profile_offsets_px)}
+        last = {"B": self.input_lines.shape, "K": self.codes.shape, "P": self.profile_offsets_px.shape}
+        sizes: dict[str | int, int] = {letter: shape[-1] if shape else 0 for letter, shape in last.items()}
+        sizes |= {"D": 6 + sizes["K"], "T": len(self.term_names)}
         for entry in fields(self):
             shape = tuple(sizes.get(size, size) for size in entry.metadata.get("shape", ()))
             got = np.shape(getattr(self, entry.name))
@@ -176,18 +181,26 @@ def read_shapes(path: Path | str) -> ShapeArrays:
     Raises:
         DataFormatError: it is no such file, or of another schema version.
     """
-    arrays = read_npz(path, cure="refine the frame again")
+    arrays = read_npz(path, cure=_AGAIN)
     version = arrays.pop("schema_version", None)
-    if version is None or int(version) != SHAPES_SCHEMA_VERSION:
+    if version is None or version.tolist() != SHAPES_SCHEMA_VERSION:
+        found = None if version is None else version.tolist()
         raise DataFormatError(
-            path,
-            f"has shape schema {version}, this version reads {SHAPES_SCHEMA_VERSION}",
-            cure="refine the frame again",
+            path, f"has shape schema {shown(found)}, this version reads {SHAPES_SCHEMA_VERSION}", cure=_AGAIN
         )
-    names = {entry.name for entry in fields(ShapeArrays)}
-    if set(arrays) != names:
-        raise DataFormatError(path, f"has the fields {sorted(arrays)}, expected {sorted(names)}")
-    return ShapeArrays(**{name: _from_text(array) for name, array in arrays.items()})
+    kinds = {entry.name: _KINDS[str(entry.type)] for entry in fields(ShapeArrays)}
+    if set(arrays) != set(kinds):
+        raise DataFormatError(path, f"has the fields {sorted(arrays)}, expected {sorted(kinds)}", cure=_AGAIN)
+    for name, kind in kinds.items():
+        if arrays[name].dtype.kind != kind:
+            raise DataFormatError(path, f"{name} holds {arrays[name].dtype}, expected kind {kind!r}", cure=_AGAIN)
+    try:
+        shapes = ShapeArrays(**{name: _from_text(array) for name, array in arrays.items()})
+    except InputError as error:
+        raise DataFormatError(path, str(error), cure=_AGAIN) from error
+    if unknown := set(shapes.statuses) - set(Status.__members__):
+        raise DataFormatError(path, f"statuses hold {shown(min(unknown))}", cure=_AGAIN)
+    return shapes
 
 
 def _from_text(array: NDArray[Any]) -> Any:

@@ -12,19 +12,46 @@ Nothing in it depends on the time, the machine or where the files lie.
 from __future__ import annotations
 
 import hashlib
-import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Required, TypedDict
 
-from directshape_torch.errors import DataFormatError, ResumeError
-from directshape_torch.io import atomic_files
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.errors import DataFormatError, ResumeError, shown
+from directshape_torch.files import atomic_files
+from directshape_torch.files.names import is_frame_id
+from directshape_torch.files.read_files import read_bytes, read_json
+from directshape_torch.files.schema import check_type, record_of
 
 MANIFEST_SCHEMA_VERSION = 1
+# `meshes/NNNNNN_LINE.ply`: within the folder, whoever has written the name.
+_MESH_FILE = re.compile(r"meshes/[^/\\]+_[0-9]{1,9}\.(ply|glb)")
 _CURE = "choose another output folder, or remove this one to start again"
+
+
+class RunSettings(TypedDict, total=False):
+    """Those of `config` that others than the refiner read."""
+
+    classes: list[str]
+    refiner: dict[str, Any]
+
+
+class FrameEntry(TypedDict, total=False):
+    """What `frames` says of one frame: of one that is done all but the reason, of a failed one the reason."""
+
+    state: Required[Literal["done", "failed"]]
+    reason: str
+    lines: int
+    cars: int
+    masks_left: int
+    masks_right: int
+    ground_source: str
+    statuses: dict[str, int]
+    outputs: list[str]
+    mesh_files: list[str]
+    files: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -68,7 +95,7 @@ def hash_file(path: Path | str) -> str:
     """
     path = Path(path)
     if not path.is_file():
-        return hash_bytes(read_file_bytes(path))
+        return hash_bytes(read_bytes(path))
     state = path.stat()
     return _hash_in_state(path, state.st_size, state.st_mtime_ns)
 
@@ -76,7 +103,7 @@ def hash_file(path: Path | str) -> str:
 # Mask files of a whole data set serve every frame, and may be large.
 @lru_cache(maxsize=256)
 def _hash_in_state(path: Path, _size_bytes: int, _changed_ns: int) -> str:
-    return hash_bytes(read_file_bytes(path))
+    return hash_bytes(read_bytes(path))
 
 
 def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
@@ -98,16 +125,27 @@ def read_manifest(path: Path | str) -> RunManifest | None:
     """
     if not Path(path).is_file():
         return None
-    try:
-        content = json.loads(read_file_bytes(path))
-        version = content.pop("schema_version")
-        if version != MANIFEST_SCHEMA_VERSION:
-            raise ResumeError(
-                f"{path}: schema version is {version}, this program writes {MANIFEST_SCHEMA_VERSION}; {_CURE}"
-            )
-        return RunManifest(**content)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DataFormatError(path, f"is no summary of a run ({error!r})", cure=_CURE) from error
+    content = read_json(path, _CURE)
+    if not isinstance(content, dict) or "schema_version" not in content:
+        raise DataFormatError(path, "is no summary of a run", cure=_CURE)
+    version = content.pop("schema_version")
+    if version != MANIFEST_SCHEMA_VERSION:
+        raise ResumeError(
+            f"{path}: schema version is {shown(version)}, this program writes {MANIFEST_SCHEMA_VERSION}; {_CURE}"
+        )
+    manifest = record_of(path, RunManifest, content, _CURE)
+    check_type(path, "config", manifest.config, RunSettings, _CURE)
+    check_frames(path, manifest.frames)
+    return manifest
+
+
+def check_frames(path: Path | str, frames: Mapping[str, Any]) -> None:
+    """Raise `DataFormatError` unless these are entries of frames, and lead nowhere out of the output folder."""
+    check_type(path, "frames", frames, dict[str, FrameEntry], _CURE)
+    for frame_id, entry in frames.items():
+        wrong = [name for name in entry.get("mesh_files", ()) if not _MESH_FILE.fullmatch(name)]
+        if wrong or not is_frame_id(frame_id):
+            raise DataFormatError(path, f"frames[{shown(frame_id)}]: no name of a frame, or {shown(wrong)}", cure=_CURE)
 
 
 def check_resume(previous: RunManifest, current: RunManifest) -> None:

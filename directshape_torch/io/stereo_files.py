@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.names import check_frame_id
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.io.disparity_files import read_disparity
@@ -22,7 +24,6 @@ from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
-from directshape_torch.io.text_files import read_lines
 from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene import FrameBatch, GroundPlane, StereoCamera
 
@@ -181,6 +182,8 @@ class FileStereoDataset:
         if not known:
             wanted_file = self.layout.detection_file_name
             raise InputError("frames", f"at least one detection file {wanted_file} in {self.detections_dir}", "none")
+        for frame_id in known:
+            check_frame_id("frames", frame_id)
         return tuple(known)
 
     def _read_images(self, frame_id: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.text_files import Line, read_lines
+from directshape_torch.files.text_files import Line, read_lines
 
 
 def read_timestamps(path: Path) -> list[float]:

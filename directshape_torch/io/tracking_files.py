@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.text_files import Line, read_lines
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.text_files import Line, read_lines
 
 _COLUMNS = "frame track type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
 _LEADING = 2
+_MOST_DIGITS = 9
 
 
 def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
@@ -24,7 +25,7 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
     frames: dict[int, list[KittiObject]] = {}
     for line in read_lines(path):
         words = line.text.split()
-        if len(words) not in (17, 18) or not words[0].isdecimal():
+        if len(words) not in (17, 18) or not words[0].isdecimal() or len(words[0]) > _MOST_DIGITS:
             raise DataFormatError(
                 path,
                 f"expected 17 or 18 columns beginning with the frame's number, got {len(words)}",

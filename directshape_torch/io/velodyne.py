@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.read_files import read_bytes
 from directshape_torch.geometry.pinhole import project
-from directshape_torch.io.image_files import read_file_bytes
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.scene import StereoCamera
 
@@ -35,7 +35,7 @@ def read_scan(path: Path | str, calibration: KittiCalibration, camera: StereoCam
         raise DataFormatError(
             calibration.path, f"has no line {missing}:", cure="LiDAR needs R0_rect and Tr_velo_to_cam"
         )
-    content = read_file_bytes(path)
+    content = read_bytes(path)
     if len(content) == 0 or len(content) % _BYTES_A_POINT:
         raise DataFormatError(path, f"expected 16 bytes a point (x, y, z, reflectance), got {len(content)} bytes")
     points_velo = np.frombuffer(content, dtype="<f4").reshape(-1, 4)[:, :3].astype(np.float64)

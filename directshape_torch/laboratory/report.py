@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.io.atomic_files import write_bytes, write_text
+from directshape_torch.files.atomic_files import write_bytes, write_text
 from directshape_torch.laboratory.comparison import BOUNDS, PAIRS, Comparison
 from directshape_torch.laboratory.plots import v_curves_png
 from directshape_torch.laboratory.regimes import REGIMES

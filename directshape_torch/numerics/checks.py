@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -12,9 +13,31 @@ from directshape_torch.errors import InputError
 # Calibration files have six digits or more, and float32 seven.
 _ROTATION_TOLERANCE = 1e-3
 
+Kind = Literal["number", "floating", "image", "index", "flags", "mask"]
+# Kinds that share one dtype in a call.
+FOLLOWING: frozenset[Kind] = frozenset({"floating", "image"})
+_FLOATING = (torch.float32, torch.float64, torch.float16, torch.bfloat16)
+_INTEGERS = (torch.int32, torch.int64)
+_SMALL = (torch.uint8, torch.int8, torch.int16, torch.bool)
+# Dtypes, in words, and the cure. Bytes do not index: they would be taken for a mask.
+_KINDS: dict[Kind, tuple[tuple[torch.dtype, ...], str, str]] = {
+    "number": (_FLOATING + _INTEGERS + _SMALL, "real numbers", ""),
+    "floating": (_FLOATING, "floating point", "convert it with .float() or .double()"),
+    "image": (_FLOATING, "floating point in [0, 1]", "divide by 255"),
+    "index": (_INTEGERS, "int64 or int32", "convert it with .long()"),
+    "flags": ((torch.bool,), "bool", "convert it with .bool()"),
+    "mask": (
+        (*_FLOATING, torch.bool),
+        "bool, or foreground probabilities in [0, 1] in floating point",
+        "divide by 255 where it holds 0..255, and make 0 and 1 bool with .bool()",
+    ),
+}
 
-def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str], cure: str = "") -> None:
-    """Raise `InputError` unless `tensor` is a tensor of the expected shape; letters stand for any size.
+
+def check_shape(
+    name: str, tensor: Tensor, expected: Sequence[int | str], cure: str = "", kind: Kind = "number"
+) -> None:
+    """Raise `InputError` unless `tensor` is a dense tensor of the expected shape and kind; letters stand for any size.
 
     Example:
         >>> import torch
@@ -23,51 +46,25 @@ def check_shape(name: str, tensor: Tensor, expected: Sequence[int | str], cure: 
     wanted = "(" + ", ".join(str(n) for n in expected) + ("," if len(expected) == 1 else "") + ")"
     if not isinstance(tensor, Tensor):
         # Arrays and lists come from whoever has just read a file.
-        made = "" if tensor is None else "make one with torch.as_tensor or torch.stack"
-        raise InputError(name, f"a tensor of shape {wanted}", type(tensor).__name__, cure or made)
+        made = cure if tensor is None else "make one with torch.as_tensor or torch.stack"
+        raise InputError(name, f"a tensor of shape {wanted}", type(tensor).__name__, made)
+    if tensor.is_nested or tensor.layout != torch.strided:
+        got = "a nested one" if tensor.is_nested else str(tensor.layout)
+        raise InputError(name, "a dense tensor (torch.strided)", got, "convert it with .to_dense()")
     fits = tensor.ndim == len(expected) and all(
         isinstance(want, str) or want == have for want, have in zip(expected, tensor.shape, strict=True)
     )
     if not fits:
         raise InputError(name, f"shape {wanted}", f"{tuple(tensor.shape)}", cure)
+    dtypes, words, conversion = _KINDS[kind]
+    if tensor.dtype not in dtypes:
+        raise InputError(name, words, str(tensor.dtype), conversion)
 
 
-def check_integer(name: str, tensor: Tensor) -> None:
-    """Raise `InputError` unless `tensor` is int32 or int64, which index others; uint8 would be taken for a mask.
-
-    Example:
-        >>> import torch
-        >>> check_integer("frame_index", torch.zeros(7, dtype=torch.int64))
-    """
-    if tensor.dtype not in (torch.int32, torch.int64):
-        raise InputError(name, "int64 or int32", str(tensor.dtype), "convert it with .long()")
-
-
-def check_flags(name: str, tensor: Tensor) -> None:
-    """Raise `InputError` unless `tensor` is bool.
-
-    Example:
-        >>> import torch
-        >>> check_flags("has_mask_left", torch.tensor([True]))
-    """
-    if tensor.dtype != torch.bool:
-        raise InputError(name, "bool", str(tensor.dtype), "convert it with .bool()")
-
-
-def check_mask_dtype(name: str, masks: Tensor) -> None:
-    """Raise `InputError` unless `masks` are bool or floating point.
-
-    Example:
-        >>> import torch
-        >>> check_mask_dtype("mask_left", torch.zeros(1, 4, 6, dtype=torch.bool))
-    """
-    if masks.dtype != torch.bool and not masks.is_floating_point():
-        raise InputError(
-            name,
-            "bool, or foreground probabilities in [0, 1] in floating point",
-            str(masks.dtype),
-            "divide by 255 where it holds 0..255, and make 0 and 1 bool with .bool()",
-        )
+def check_stored(name: str, tensor: Tensor) -> None:
+    """Raise `InputError` for a tensor on the device "meta", which has no numbers."""
+    if tensor.is_meta:
+        raise InputError(name, "a tensor with numbers", "one on the device 'meta'", "make it on a device with memory")
 
 
 def is_no_rotation(

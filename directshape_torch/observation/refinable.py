@@ -12,11 +12,12 @@ from torch.autograd.forward_ad import unpack_dual
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.checks import FOLLOWING
 from directshape_torch.numerics.gradient_mode import is_forward_mode
 from directshape_torch.numerics.table_lookup import occurrences
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.packing import Observation
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
 from directshape_torch.stereo_matching.car_points import PointSamples
@@ -73,27 +74,33 @@ def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> 
             str(frames.images_left.dtype),
             "refine outside of half precision: .to(dtype=torch.float32) of frames, detections and refiner",
         )
-    tensors = {"frames": frames.images_left, "detections": detections.T_cam_obj}
-    if detections.pose_sigma is not None:
-        tensors["detections.pose_sigma"] = detections.pose_sigma
-    for name, tensor in tensors.items():
-        if tensor.dtype != prior.origin.dtype or tensor.device != prior.origin.device:
+    for name, tensor, numbers in (*frames.tensors("frames"), *detections.tensors("detections")):
+        wanted = prior.origin.dtype if numbers in FOLLOWING else tensor.dtype
+        if tensor.dtype != wanted or tensor.device != prior.origin.device:
             raise InputError(
                 name,
-                f"dtype {prior.origin.dtype} on {prior.origin.device}, like the refiner",
+                f"dtype {wanted} on {prior.origin.device}, like the refiner",
                 f"{tensor.dtype} on {tensor.device}",
                 "move them together with .to(device, dtype)",
             )
-    if len(detections):
-        if detections.mask_left.shape[1:] != frames.images_left.shape[2:]:
-            raise InputError(
-                "detections.mask_left",
-                f"masks of the (padded) image size {tuple(frames.images_left.shape[2:])}",
-                f"{tuple(detections.mask_left.shape[1:])}",
-            )
-        lowest, highest = torch.stack(torch.aminmax(detections.frame_index)).tolist()
-        if lowest < 0 or highest >= len(frames):
-            raise InputError("detections.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
+    _check_masks("detections", detections, frames)
+    if detections.occluders is not None:
+        _check_masks("detections.occluders", detections.occluders, frames)
+
+
+def _check_masks(name: str, instances: Detections | Occluders, frames: FrameBatch) -> None:
+    """Raise `InputError` unless masks are those of frames of the call."""
+    if not len(instances.frame_index):
+        return
+    if instances.mask_left.shape[1:] != frames.images_left.shape[2:]:
+        raise InputError(
+            f"{name}.mask_left",
+            f"masks of the (padded) image size {tuple(frames.images_left.shape[2:])}",
+            f"{tuple(instances.mask_left.shape[1:])}",
+        )
+    lowest, highest = torch.stack(torch.aminmax(instances.frame_index)).tolist()
+    if lowest < 0 or highest >= len(frames):
+        raise InputError(f"{name}.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
 
 
 def without_empty_masks(detections: Detections, extents: SceneExtents | None = None) -> Detections:

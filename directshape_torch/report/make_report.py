@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
-from typing import IO, Any, cast, get_args
+from typing import IO, Any, TypedDict, cast, get_args
 
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver, SilentObserver
-from directshape_torch.batch.run_results import finished_frames
+from directshape_torch.batch.run_results import finished_frames, summary_path
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.atomic_files import replaced_file
+from directshape_torch.files.schema import check_type
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.observation.occlusion import OcclusionOrder
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, as_json, car_rows
@@ -21,7 +24,6 @@ from directshape_torch.report.frame_inputs import InputReader, InputSources
 from directshape_torch.report.frame_material import DetailSettings, FrameMaterial
 from directshape_torch.report.mesh_data import mesh_data
 from directshape_torch.report.page_assets import data_block, page_frame
-from directshape_torch.report.page_writer import replaced_text_file
 from directshape_torch.report.residual_maps import MapSettings
 from directshape_torch.report.run_facts import problem_notes, run_facts
 from directshape_torch.report.run_folder import FrameResult, RunFolder
@@ -115,7 +117,7 @@ class _PageOfRun:
         rows = [row for number, name in enumerate(frame_ids) for row in self._rows(number, name)]
         detailed = choose_frames(rows, len(frame_ids), options.most_frames)
         frame = page_frame(f"{self._run.out_dir.resolve().name}: refined cars")
-        with replaced_text_file(page) as file:
+        with replaced_file(page) as content, TextIOWrapper(content, "utf-8", "replace", newline="\n") as file:
             file.write(frame.head)
             self._write_details(file, frame_ids, detailed, observer)
             notes = self._notes(len(frame_ids), len(detailed))
@@ -163,6 +165,7 @@ class _PageOfRun:
     def _detail_settings(self) -> DetailSettings:
         config = self._run.manifest.config
         refiner = config.get("refiner", {})
+        check_type(summary_path(self._run.out_dir), "config['refiner']", refiner, _DrawnSettings)
         mean = None if self._prior is None else decoded_mesh(self._prior, self._prior.initial_code(1)[0].cpu().numpy())
         order = refiner.get("sampling", {}).get("occlusion_order", "depth")
         known = order if order in get_args(OcclusionOrder) else "depth"
@@ -200,6 +203,26 @@ class _PageOfRun:
         file.write(data_block("frames", {"ids": list(frame_ids), "detailed": list(detailed)}))
         file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [as_json(row) for row in rows]}))
         file.write(data_block("run", run_facts(self._run, frame_ids, rows, notes)))
+
+
+class _Silhouette(TypedDict, total=False):
+    min_zeta_per_m: float
+    max_zeta_per_m: float
+    saturation: float
+    probability_floor: float
+
+
+class _Stage(TypedDict, total=False):
+    contour_width_px: float
+
+
+class _DrawnSettings(TypedDict, total=False):
+    """Those of the refiner that pictures need."""
+
+    stages: list[_Stage]
+    silhouette: _Silhouette
+    photometric: dict[str, Any]
+    sampling: dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.shape import kernel_pca_prior_file, neural_prior_file
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -44,6 +44,7 @@ def load_prior(source: Path | str) -> ShapePrior:
     if path.suffix != ".safetensors":
         return PCAShapePrior.load(path)
     schema = read_description(path).get("schema", "none")
-    if schema not in _READERS:
-        raise DataFormatError(path, f"schema {schema!r} is none of {', '.join(_READERS)}")
-    return _READERS[schema](path)
+    reader = _READERS.get(schema) if isinstance(schema, str) else None
+    if reader is None:
+        raise DataFormatError(path, f"schema {shown(schema)} is none of {', '.join(_READERS)}")
+    return reader(path)

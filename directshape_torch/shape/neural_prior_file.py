@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.tensor_file import read_tensors, write_tensors
 
+_MOST_NODES = 2**24
 SCHEMA = "directshape_torch.neural_shape_prior/1"
 CURE = "make one with: python scripts/train_neural_prior.py"
 
@@ -41,20 +42,13 @@ def read_neural_prior(path: Path) -> NeuralShapePrior:
     try:
         settings = {name: description[name] for name in ("layer_widths", "num_codes", "spacing_m")}
         nx, ny, nz = description["grid_shape"]
+        if len(settings["layer_widths"]) > len(tensors) or math.prod((nx, ny, nz)) > _MOST_NODES:
+            raise ValueError(f"more layers than tensors, or more than {_MOST_NODES} nodes")
         provenance = PriorProvenance(**description["provenance"])
-        prior = NeuralShapePrior(origin=torch.zeros(3), grid_shape=(nx, ny, nz), provenance=provenance, **settings)
-    except (InputError, KeyError, TypeError, ValueError) as problem:
-        raise DataFormatError(path, f"it describes no neural prior: {problem!r}", cure=CURE) from problem
-    _fill(path, prior, tensors)
+        # Without memory and random numbers until it is filled: the sizes are those that somebody has written down.
+        with torch.device("meta"):
+            prior = NeuralShapePrior(origin=torch.zeros(3), grid_shape=(nx, ny, nz), provenance=provenance, **settings)
+        prior.load_state_dict(tensors, assign=True)
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError) as problem:
+        raise DataFormatError(path, f"it describes no neural prior: {problem}", cure=CURE) from problem
     return prior
-
-
-def _fill(path: Path, prior: NeuralShapePrior, tensors: dict[str, Tensor]) -> None:
-    places = {**dict(prior.named_parameters()), **dict(prior.named_buffers())}
-    if places.keys() != tensors.keys():
-        different = ", ".join(sorted(places.keys() ^ tensors.keys()))
-        raise DataFormatError(path, f"tensors that are missing or too many: {different}", cure=CURE)
-    for name, place in places.items():
-        if place.shape != tensors[name].shape:
-            raise DataFormatError(path, f"{name}: expected {tuple(place.shape)}, got {tuple(tensors[name].shape)}")
-        place.data.copy_(tensors[name])

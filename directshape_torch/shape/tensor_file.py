@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, shown
+from directshape_torch.files.atomic_files import write_bytes
+from directshape_torch.files.read_files import parse_json, read_bytes
 
 # One key with JSON text, because the order of several keys in the file is not fixed.
 _KEY = "description"
+_MOST_BYTES = 2**29
+_NOT_WHOLE = "not a whole safetensors file"
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> None:
@@ -23,12 +26,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], description: Mappin
 
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     content = save(on_cpu, {_KEY: json.dumps(description, sort_keys=True)})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, content)
 
 
 def read_description(path: Path, cure: str = "") -> dict[str, Any]:
@@ -37,18 +35,7 @@ def read_description(path: Path, cure: str = "") -> dict[str, Any]:
     Raises:
         DataFormatError: no such file, or no safetensors file, or a truncated one.
     """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            description = json.loads((file.metadata() or {}).get(_KEY, "{}"))
-    except FileNotFoundError as problem:
-        raise DataFormatError(path, "no such file", cure=cure) from problem
-    except (OSError, ValueError, SafetensorError) as problem:
-        raise DataFormatError(path, f"not a whole safetensors file ({problem})", cure=cure) from problem
-    if not isinstance(description, dict):
-        raise DataFormatError(path, f"a description that is no JSON object: {description!r}", cure=cure)
-    return description
+    return _description(path, _read(path, cure), cure)
 
 
 def read_tensors(path: Path, schema: str, cure: str = "") -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -57,14 +44,37 @@ def read_tensors(path: Path, schema: str, cure: str = "") -> tuple[dict[str, Ten
     Raises:
         DataFormatError: missing, truncated, of another schema, or with values that are not finite numbers.
     """
-    from safetensors.torch import load_file
+    from safetensors import SafetensorError
+    from safetensors.torch import load
 
-    description = read_description(path, cure)
+    content = _read(path, cure)
+    description = _description(path, content, cure)
     found = description.get("schema", "none")
     if found != schema:
-        raise DataFormatError(path, f"schema {found!r} is not {schema!r}", cure=cure)
-    tensors = load_file(path)
-    for name, tensor in tensors.items():
-        if not tensor.is_floating_point() or not bool(torch.isfinite(tensor).all()):
+        raise DataFormatError(path, f"schema {shown(found)} is not {schema!r}", cure=cure)
+    try:
+        tensors = {name: (tensor.is_floating_point(), tensor.float()) for name, tensor in load(content).items()}
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as problem:
+        raise DataFormatError(path, f"{_NOT_WHOLE} ({problem})", cure=cure) from problem
+    for name, (is_floating, tensor) in tensors.items():
+        if not is_floating or not bool(torch.isfinite(tensor).all()):
             raise DataFormatError(path, f"{name} holds values that are no finite floating-point numbers")
-    return {name: tensor.to(torch.float32) for name, tensor in tensors.items()}, description
+    return {name: tensor for name, (_, tensor) in tensors.items()}, description
+
+
+def _read(path: Path, cure: str) -> bytes:
+    return read_bytes(path, _MOST_BYTES, cure)
+
+
+def _description(path: Path, content: bytes, cure: str) -> dict[str, Any]:
+    """Of the header: eight bytes of its length, then JSON."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = parse_json(path, content[8:end], cure, _NOT_WHOLE)
+    metadata = header.get("__metadata__", {}) if isinstance(header, dict) and end <= len(content) else None
+    text = metadata.get(_KEY, "{}") if isinstance(metadata, dict) else None
+    if not isinstance(text, str):
+        raise DataFormatError(path, _NOT_WHOLE, cure=cure)
+    description = parse_json(path, text, cure)
+    if not isinstance(description, dict):
+        raise DataFormatError(path, f"a description that is no JSON object: {shown(description)}", cure=cure)
+    return description

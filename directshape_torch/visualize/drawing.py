@@ -166,10 +166,12 @@ def draw_text(
 ) -> None:
     """Text with a dark rim, legible on any ground; `position` is its lower left corner."""
     u, v = round(position[0]), round(position[1])
+    # Names of files may hold what is no text, which would end the process.
+    drawable = text.encode("utf-8", "replace").decode()
     # The rim is the same text moved about: in OpenCV 5 bolder letters are also wider.
     rim = [(du, dv, BLACK) for du in (-1, 0, 1) for dv in (-1, 0, 1) if du or dv]
     for du, dv, ink in (*rim, (0, 0, colour)):
-        cv2.putText(picture, text, (u + du, v + dv), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
+        cv2.putText(picture, drawable, (u + du, v + dv), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
 
 
 def draw_legend(

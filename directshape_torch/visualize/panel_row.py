@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from directshape_torch.errors import InputError
-from directshape_torch.io import atomic_files
+from directshape_torch.files import atomic_files
 from directshape_torch.io.figure_files import figure_png, new_figure
 
 Panel = TypeVar("Panel")

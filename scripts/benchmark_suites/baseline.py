@@ -10,7 +10,7 @@ from typing import Literal
 
 from benchmark_suites.figures import Kind, Row, SuiteResult
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.atomic_files import write_json
+from directshape_torch.files.atomic_files import write_json
 
 _SCHEMA_VERSION = 1
 

@@ -12,7 +12,7 @@ from benchmark_suites.figures import Row, SuiteResult
 from benchmark_suites.machine import Machine
 from directshape_torch.config_files import config_to_mapping, load_config
 from directshape_torch.evaluation.text_table import align
-from directshape_torch.io.atomic_files import write_json
+from directshape_torch.files.atomic_files import write_json
 
 
 def format_suite(result: SuiteResult) -> str:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.io.atomic_files import write_json
+from directshape_torch.files.atomic_files import write_json
 from directshape_torch.io.kitti_labels import read_objects
 from paper_tables.average_precision import ap_scores, long_rows, paper_columns, paper_row
 from paper_tables.data_sets import DataSet

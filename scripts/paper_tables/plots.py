@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from directshape_torch.evaluation.bootstrap import Estimate
-from directshape_torch.io.atomic_files import write_bytes
+from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.figure_files import figure_png, new_figure
 
 _ROW_INCHES = 0.24

@@ -18,8 +18,8 @@ from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
 from directshape_torch.cli.refine import find_device
 from directshape_torch.config_files import load_config
+from directshape_torch.files.atomic_files import write_json
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.atomic_files import write_json
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.refinement_files import shapes_path
 from directshape_torch.io.result_files import read_shapes

@@ -16,7 +16,7 @@ import torch
 
 from directshape_torch.batch.refine_dataset import package_version
 from directshape_torch.evaluation.bootstrap import Estimate
-from directshape_torch.io.atomic_files import write_text
+from directshape_torch.files.atomic_files import write_text
 from directshape_torch.io.run_manifest import RunManifest, hash_file, write_manifest
 
 FEW_CARS = 30

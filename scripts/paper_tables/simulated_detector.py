@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from directshape_torch.evaluation.kitti_ap import evaluate_kitti
-from directshape_torch.io.atomic_files import write_text
+from directshape_torch.files.atomic_files import write_text
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.text_files import Line
 
 # One unit of `ground_scale`: a stereo detector's errors.
 DEPTH_SHARE, LATERAL_M, YAW_DEG = 0.025, 0.12, 5.0

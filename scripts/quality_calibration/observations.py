@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.rotated_iou import bev_iou
+from directshape_torch.files.npz_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.npz_files import read_npz
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult

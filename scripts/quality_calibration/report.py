@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.diagnosis.trust_model import LogisticHead
-from directshape_torch.io.atomic_files import write_bytes
+from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.figure_files import figure_png, new_figure
 from quality_calibration.fit import SigmaScales
 from quality_calibration.judgement import (

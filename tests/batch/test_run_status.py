@@ -133,7 +133,7 @@ def test_a_run_file_comes_back(tmp_path: Path) -> None:
     for content, problem in (
         ("[]", "describes no run"),
         ('{"schema_version": 7}', "schema version is 7"),
-        ("{", "no run"),
+        ("{", "is not valid JSON"),
     ):
         run_path(tmp_path).write_text(content)
         with pytest.raises(DataFormatError, match=problem):

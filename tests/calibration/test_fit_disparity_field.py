@@ -17,8 +17,8 @@ from directshape_torch.calibration.fit_disparity_field import fit_disparity_fiel
 from directshape_torch.calibration.observations_labels import known_depth_from_labels
 from directshape_torch.cli import calibrate_stereo
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
-from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.scene import StereoCamera
 

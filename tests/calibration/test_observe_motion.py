@@ -16,8 +16,8 @@ from directshape_torch.calibration.observe_motion import observe_motion
 from directshape_torch.calibration.stereo_sequence import open_sequence
 from directshape_torch.cli import calibrate_stereo
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.atomic_files import write_png
 
 SIZE = (320, 160)
 FOCAL_PX, BASELINE_M, BIAS_PX = 300.0, 0.5, -0.4

@@ -5,8 +5,8 @@ import torch
 
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import CountedLabels, box_iou_2d, match_by_iou, match_to_labels
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.text_files import Line
 
 
 def _object(

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.pose_error import box_centres, boxes_of, pose_errors
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import parse_object
-from directshape_torch.io.text_files import Line
 
 TRUE = torch.tensor([[1.0, 1.6, 20.0, 1.5, 1.7, 4.0, 0.2]], dtype=torch.float64)
 

@@ -24,9 +24,9 @@ from directshape_torch.evaluation.comparison_summary import BootstrapSettings
 from directshape_torch.evaluation.matching import CountedLabels
 from directshape_torch.evaluation.shape_error_cars import evaluate_shapes
 from directshape_torch.evaluation.shape_error_scores import ShapeScores
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
 from directshape_torch.io.mask_files import FrameJsonMasks

@@ -14,8 +14,8 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
 from directshape_torch.evaluation.shape_error_segment import read_disparity, segment_truth
 from directshape_torch.evaluation.shape_error_surface import SceneDepth, SurfaceTruth, read_surface_points
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.io.atomic_files import write_png
 
 T_CAM_OBJ = pose_from_kitti(torch.tensor([[0.5, 1.65, 10.0]], dtype=torch.float64), torch.tensor([0.6]))[0]
 

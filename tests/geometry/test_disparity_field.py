@@ -193,7 +193,7 @@ def test_a_missing_or_cut_file_is_a_format_error(tmp_path: Path) -> None:
     with pytest.raises(DataFormatError, match="cannot be read"):
         DisparityField.load(tmp_path / "none.json")
     (tmp_path / "cut.json").write_text('{"schema": ')
-    with pytest.raises(DataFormatError, match="is no JSON"):
+    with pytest.raises(DataFormatError, match="is not valid JSON"):
         DisparityField.load(tmp_path / "cut.json")
 
 

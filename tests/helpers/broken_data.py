@@ -188,7 +188,7 @@ def _masks(change: Callable[[dict[str, Any], NDArray[Any]], NDArray[Any]]) -> Ca
             entries = json.loads(path.read_text())
             for entry in entries:
                 size = entry["segmentation"]["size"]
-                mask = decode_segmentation(path, 0, entry["segmentation"], (size[0], size[1]))
+                mask = decode_segmentation(path, "", entry["segmentation"], (size[0], size[1]))
                 mask = np.asfortranarray(change(entry, mask.astype(np.uint8)))
                 rle = coco.encode(mask)
                 entry["segmentation"] = {"size": list(rle["size"]), "counts": rle["counts"].decode()}

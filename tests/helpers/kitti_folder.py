@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
-from directshape_torch.io.atomic_files import write_png
 from directshape_torch.scene import Detections
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.ellipsoids import ellipsoid_prior

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores, evaluate_kitti
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.text_files import Line
 
 
 def line(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.atomic_files import write_png
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.disparity_files import read_disparity, write_disparity
 
 

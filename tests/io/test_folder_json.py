@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.atomic_files import write_png
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.folder_json import read_frame, read_rig
 from directshape_torch.io.folder_layout import FolderLayout, FolderMasks
 from directshape_torch.io.instance_masks import MaskSizeError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.atomic_files import write_png
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.image_files import find_image, read_rgb, read_single_channel
 
 

@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.atomic_files import write_png
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.mask_matching import project_boxes

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.atomic_files import write_png
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.coco_segmentation import decode_segmentation
 from directshape_torch.io.instance_masks import tight_box
 from directshape_torch.io.mask_files import CocoFileMasks, FrameJsonMasks, InstancePngMasks, mask_source
@@ -54,7 +54,7 @@ def write_json(path: Path, content: Any) -> Path:
     ids=["list", "text", "bytes", "polygon"],
 )
 def test_segmentation_forms(segmentation: Any) -> None:
-    np.testing.assert_array_equal(decode_segmentation(Path("a.json"), 0, segmentation, SIZE_HW), MASK)
+    np.testing.assert_array_equal(decode_segmentation(Path("a.json"), "entry 0", segmentation, SIZE_HW), MASK)
 
 
 @settings(max_examples=40, deadline=None)
@@ -62,7 +62,7 @@ def test_segmentation_forms(segmentation: Any) -> None:
 def test_compressed_masks_of_any_content_pass_the_check(seed: int, height: int, width: int, share: float) -> None:
     mask = np.random.default_rng(seed).random((height, width)) < share
     segmentation = {"size": [height, width], "counts": encoded(mask)}
-    np.testing.assert_array_equal(decode_segmentation(Path("a.json"), 0, segmentation, (height, width)), mask)
+    np.testing.assert_array_equal(decode_segmentation(Path("a.json"), "entry 0", segmentation, (height, width)), mask)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_compressed_masks_of_any_content_pass_the_check(seed: int, height: int, 
 )
 def test_bad_segmentations(segmentation: Any, message: str) -> None:
     with pytest.raises(DataFormatError, match=rf"a\.json: .*{message}" if "entry" not in message else message):
-        decode_segmentation(Path("a.json"), 7, segmentation, SIZE_HW)
+        decode_segmentation(Path("a.json"), "entry 7", segmentation, SIZE_HW)
 
 
 @pytest.mark.parametrize("folder", ["", "data"])
@@ -126,7 +126,7 @@ def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
         ([entry(image="left", bbox=[1, 2])], "entry 0: bad or missing field"),
         (
             [entry(image="left", segmentation={"size": [9, 6], "counts": RUNS})],
-            r"000000\.json: the mask of entry 0 has 6 x 9 pixels \(width x height\), its image 9 x 6",
+            r"000000\.json: entry 0: the mask has 6 x 9 pixels \(width x height\), its image 9 x 6",
         ),
     ],
 )

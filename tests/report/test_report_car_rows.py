@@ -10,8 +10,8 @@ from helpers.shape_arrays import shape_arrays
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.text_files import Line
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, as_json, car_rows
 from directshape_torch.report.chosen_frames import car_gains, choose_frames
 from directshape_torch.report.run_folder import FrameResult

@@ -12,8 +12,8 @@ import pytest
 import torch
 from label_disparity import judgement, measurement, report
 
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.atomic_files import write_png
 
 SIZE = (400, 160)
 FOCAL_PX, BASELINE_M = 600.0, 0.5

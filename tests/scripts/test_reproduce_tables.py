@@ -28,9 +28,9 @@ from paper_tables import (
 from paper_tables import simulated_detector as simulator
 
 from directshape_torch.config_files import load_config
+from directshape_torch.files.text_files import Line
 from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.text_files import Line
 from directshape_torch.refiner import DirectShapeRefiner
 
 

@@ -56,9 +56,9 @@ def test_names_are_bundled_priors_and_paths_are_files(tmp_path: Path, monkeypatc
     assert isinstance(load_prior("pca"), PCAShapePrior)
     assert isinstance(load_prior("neural"), NeuralShapePrior)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DataFormatError, match="no such file"):
+    with pytest.raises(DataFormatError, match="cannot be read"):
         load_prior("./neural")
-    with pytest.raises(DataFormatError, match="no such file"):
+    with pytest.raises(DataFormatError, match="cannot be read"):
         load_prior(Path("neural"))
 
 
@@ -102,7 +102,7 @@ def test_wrong_files_say_what_is_wrong(kind: str, tmp_path: Path) -> None:
     with pytest.raises(DataFormatError, match=f"{name} holds values that are no finite"):
         load_prior(changed())
     tensors[name] = kept.flatten()[:1]
-    with pytest.raises(DataFormatError, match="expected"):
+    with pytest.raises(DataFormatError, match=r"expected|size mismatch"):
         load_prior(changed())
     wrong_kind = PCAShapePrior.load if kind == "neural" else NeuralShapePrior.load
     with pytest.raises(DataFormatError, match=r"prior\.safetensors"):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.io import atomic_files
+from directshape_torch.files import atomic_files
 from directshape_torch.io.figure_files import figure_png
 from directshape_torch.visualize.drawing import Picture
 from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners

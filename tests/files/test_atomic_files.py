@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from directshape_torch.io import atomic_files
+from directshape_torch.files import atomic_files
 from directshape_torch.io.image_files import read_rgb, read_single_channel
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import io
 import json
 import os
-import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,25 +30,47 @@ def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None
         OSError: the folder cannot be made or written; the old file, if any, is then untouched.
 
     Example:
+        >>> import tempfile
         >>> folder = tempfile.mkdtemp()
         >>> write_bytes(Path(folder) / "a.txt", b"done")
         >>> (Path(folder) / "a.txt").read_bytes()
         b'done'
     """
+    with replaced_file(path) as file:
+        file.write(content)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@contextmanager
+def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
+    """A file that takes the place of `path` when the body ends, and leaves it alone when the body fails.
+
+    Its folder is made where it is missing. A link of that name is replaced and not followed.
+
+    Raises:
+        OSError: the folder cannot be made or written.
+
+    Example:
+        >>> import tempfile
+        >>> target = Path(tempfile.mkdtemp()) / "a.bin"
+        >>> with replaced_file(target) as file:
+        ...     count = file.write(b"done")
+        >>> target.read_bytes()
+        b'done'
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    temporary = path.with_name(f".{path.name}.{os.urandom(6).hex()}.tmp")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            if durable:
-                file.flush()
-                os.fsync(file.fileno())
-        # mkstemp makes files that only the owner can read; results are for whoever may read the folder.
-        os.chmod(temporary, 0o666 & ~_umask())
+        # Readable like any new file: `tempfile` makes them for their owner alone, and asking for the process's mask of
+        # permissions would set it.
+        with open(temporary, "xb") as file:
+            yield file
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
@@ -74,6 +96,7 @@ def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
         ValueError: an array of Python objects, which would need pickle.
 
     Example:
+        >>> import tempfile
         >>> file = Path(tempfile.mkdtemp()) / "a.npz"
         >>> write_npz(file, {"codes": np.zeros((2, 5))})
         >>> np.load(file, allow_pickle=False)["codes"].shape
@@ -104,10 +127,3 @@ def write_png(path: Path | str, image: NDArray[Any]) -> None:
     if not encoded:
         raise OSError(f"{path}: cannot encode an array of shape {image.shape} and type {image.dtype} as PNG")
     write_bytes(path, content.tobytes())
-
-
-def _umask() -> int:
-    """The process's file creation mask, which the operating system only tells when it is set."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from directshape_torch.errors import DataFormatError
-from directshape_torch.io.image_files import read_file_bytes
+from directshape_torch.files.read_files import read_text
 
 
 @dataclass(frozen=True)
@@ -24,9 +23,5 @@ def read_lines(path: Path | str) -> list[Line]:
     Raises:
         DataFormatError: the file cannot be read or is not UTF-8 text.
     """
-    try:
-        content = read_file_bytes(path).decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DataFormatError(path, f"is not UTF-8 text ({error.reason} at byte {error.start})") from error
-    lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(content.split("\n"), start=1))
+    lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(read_text(path).split("\n"), start=1))
     return [line for line in lines if line.text]

@@ -1,0 +1,1 @@
+"""The one place that opens files of users, with budgets, and the one that writes files, atomically."""

@@ -1,0 +1,115 @@
+"""Open what a user names: regular files only, of bounded size, with errors that name the file.
+
+Whatever comes may be hostile: sizes and numbers are checked before a decoder allocates anything for them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+from directshape_torch.errors import DataFormatError
+
+MOST_BYTES = 2**31
+# Parsed JSON takes some twenty times its size.
+MOST_JSON_BYTES = 2**28
+_MOST_DIGITS = 18
+
+
+def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the path") -> bytes:
+    """The content of a regular file.
+
+    Args:
+        path: the file; links are followed.
+        most: bytes that it may have.
+        cure: what to do about a file that cannot be opened, for the message.
+
+    Raises:
+        DataFormatError: it is missing, cannot be read, is a folder, a pipe or a device, or larger than `most`.
+
+    Example:
+        >>> read_bytes("/dev/zero")
+        Traceback (most recent call last):
+        ...
+        directshape_torch.errors.DataFormatError: /dev/zero: is no regular file; check the path
+    """
+    try:
+        with open(path, "rb", opener=_open_at_once) as file:
+            state = os.fstat(file.fileno())
+            if not stat.S_ISREG(state.st_mode):
+                raise DataFormatError(path, "is no regular file", cure=cure)
+            if state.st_size > most:
+                raise DataFormatError(path, f"has {state.st_size} bytes, at most {most} are read")
+            return file.read()
+    except OSError as error:
+        raise DataFormatError(path, f"cannot be read ({error.strerror})", cure=cure) from error
+    except ValueError as error:
+        if isinstance(error, DataFormatError):
+            raise
+        # A NUL, or letters that no file system takes.
+        raise DataFormatError(repr(str(path)), f"is no path ({error})", cure=cure) from error
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """Without waiting, as a pipe would make us until somebody writes to it."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def read_text(path: Path | str, most: int = MOST_BYTES, cure: str = "check the path") -> str:
+    """The content of a UTF-8 text file; arguments and errors as of `read_bytes`.
+
+    Raises:
+        DataFormatError: it is not UTF-8 text, too.
+    """
+    try:
+        return read_bytes(path, most, cure).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DataFormatError(path, f"is not UTF-8 text ({error.reason} at byte {error.start})") from error
+
+
+def read_json(path: Path | str, cure: str = "") -> Any:
+    """The value in a JSON file.
+
+    Raises:
+        DataFormatError: it cannot be read, or see `parse_json`.
+    """
+    return parse_json(path, read_bytes(path, MOST_JSON_BYTES), cure)
+
+
+def parse_json(path: Path | str, text: str | bytes, cure: str = "", problem: str = "is not valid JSON") -> Any:
+    """The value of a JSON text that stands in the file `path`.
+
+    Args:
+        path, cure, problem: for the message.
+        text: the JSON.
+
+    Raises:
+        DataFormatError: it is no JSON, nested too deeply, or holds a number that is not finite or has more than 18
+            digits before its point.
+
+    Example:
+        >>> parse_json("a.json", "[1, 1e999]")
+        Traceback (most recent call last):
+        ...
+        directshape_torch.errors.DataFormatError: a.json: is not valid JSON (the number 1e999 is out of range)
+    """
+    try:
+        return json.loads(text, parse_int=_whole, parse_float=_decimal, parse_constant=_decimal)
+    except (ValueError, RecursionError) as error:
+        raise DataFormatError(path, f"{problem} ({error})", cure=cure) from error
+
+
+def _whole(text: str) -> int:
+    if len(text) > _MOST_DIGITS:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
+
+
+def _decimal(text: str) -> float:
+    number = float(text)
+    if not abs(number) < float("inf"):
+        raise ValueError(f"the number {text} is out of range")
+    return number

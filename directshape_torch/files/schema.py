@@ -1,0 +1,77 @@
+"""Whether what came from a JSON file is what a type says."""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from directshape_torch.errors import DataFormatError, shown
+
+_RecordT = TypeVar("_RecordT")
+
+
+def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "") -> _RecordT:
+    """A dataclass of plain values, lists and mappings from a JSON object that holds its fields.
+
+    Raises:
+        DataFormatError: a field is missing, unknown, or not of its type; names file, field, type and value.
+
+    Example:
+        >>> from directshape_torch.batch.run_lock import LockOwner
+        >>> record_of("a.json", LockOwner, {"host": "here", "pid": 7, "started_at": 0.5}).pid
+        7
+        >>> record_of("a.json", LockOwner, {"host": "here", "pid": "7", "started_at": 0.5})
+        Traceback (most recent call last):
+        ...
+        directshape_torch.errors.DataFormatError: a.json: pid: expected int, got '7'
+    """
+    if not isinstance(content, dict):
+        raise DataFormatError(path, f"expected an object, got {shown(content)}", cure=cure)
+    known = {each.name: each for each in fields(cls)}  # type: ignore[arg-type]
+    needed = {name for name, each in known.items() if each.default is MISSING and each.default_factory is MISSING}
+    for wrong in sorted({*content} - {*known}) + sorted(needed - {*content}):
+        raise DataFormatError(path, f"{shown(wrong)} is {'missing' if wrong in needed else 'unknown'}", cure=cure)
+    hints = typing.get_type_hints(cls)
+    for name, value in content.items():
+        check_type(path, name, value, hints[name], cure)
+    return cls(**content)
+
+
+def check_type(path: Path | str, where: str, value: Any, hint: Any, cure: str = "") -> None:
+    """Raise `DataFormatError` where a value, or one within it, is not of its type."""
+    for place, wrong, expected in _misfits(where, value, hint):
+        words = getattr(expected, "__name__", str(expected)) if isinstance(expected, type) else str(expected)
+        raise DataFormatError(path, f"{place}: expected {words}, got {shown(wrong)}", cure=cure)
+
+
+def _misfits(where: str, value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Place, value and type of whatever does not fit."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return
+    if origin in (typing.Union, types.UnionType):
+        fits = any(not any(_misfits(where, value, each)) for each in arguments)
+    elif origin is Literal:
+        fits = isinstance(value, str) and value in arguments
+    elif origin in (dict, Mapping):
+        fits = isinstance(value, dict)
+        for key, item in value.items() if fits else ():
+            yield from _misfits(f"{where}[{shown(key)}]", item, arguments[1])
+    elif origin in (list, Sequence):
+        fits = isinstance(value, list)
+        for index, item in enumerate(value if fits else ()):
+            yield from _misfits(f"{where}[{index}]", item, arguments[0])
+    elif typing.is_typeddict(hint):
+        fits = isinstance(value, dict) and hint.__required_keys__ <= value.keys()
+        hints = typing.get_type_hints(hint)
+        for key in hints.keys() & value.keys() if fits else ():
+            yield from _misfits(f"{where}[{key!r}]", value[key], hints[key])
+    else:
+        wanted = (int, float) if hint is float else hint
+        fits = isinstance(value, wanted) and (hint is bool or not isinstance(value, bool))
+    if not fits:
+        yield where, value, hint

@@ -1,0 +1,60 @@
+"""Names of frames are names: whatever they hold, nothing is written or overwritten outside of the output folder."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.quick_runs import dataset, refine
+
+from directshape_torch.batch.run_lock import RunLock, lock_path
+from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
+from directshape_torch.io.instance_masks import check_count
+from directshape_torch.visualize.drawing import draw_text
+
+
+@pytest.mark.parametrize("name", ["../foreign", "/tmp/foreign", "..", "a/b", "a\\b", "a\0b", "x" * 300, "\u202e"])
+def test_lists_of_frames(shared_kitti: Path, tmp_path: Path, name: str) -> None:
+    split = tmp_path / "split.txt"
+    split.write_text(f"000000\n{name}\n")
+    with pytest.raises(InputError, match=r"frames: expected names without folders, got "):
+        dataset(shared_kitti, split=split)
+
+
+def test_a_file_whose_name_is_no_text(kitti_copy: Path) -> None:
+    os.rename(kitti_copy / "detections" / "data" / "000001.txt", bytes(kitti_copy) + b"/detections/data/\xff.txt")
+    with pytest.raises(InputError, match="names without folders"):
+        dataset(kitti_copy)
+    assert dataset(kitti_copy, frames=["000000"]).frame_ids == ("000000",)
+    draw_text(np.zeros((20, 20, 3), np.uint8), "\udcff", (1, 9))
+
+
+def test_records_that_climb(shared_kitti: Path, tmp_path: Path) -> None:
+    """A summary from elsewhere cannot make a run, a report or an export touch what lies outside."""
+    out, foreign = tmp_path / "out", tmp_path / "foreign.txt"
+    refine(shared_kitti, out)
+    foreign.write_text("mine")
+    content = json.loads((out / "summary.json").read_text())
+    content["frames"]["../../foreign"] = content["frames"]["000000"]
+    (out / "summary.json").write_text(json.dumps(content))
+    with pytest.raises(DataFormatError, match=r"summary\.json: .*frames.*foreign"):
+        refine(shared_kitti, out)
+    assert foreign.read_text() == "mine"
+
+
+def test_the_lock_follows_no_link(tmp_path: Path) -> None:
+    foreign = tmp_path / "foreign"
+    foreign.write_text("mine")
+    lock_path(tmp_path).symlink_to(foreign)
+    with pytest.raises(DirectShapeError, match=r"\.run\.lock"), RunLock(tmp_path):
+        pass
+    assert foreign.read_text() == "mine"
+
+
+def test_instances_of_an_image_fit_into_memory() -> None:
+    check_count(Path("a.png"), 500, (375, 1242))
+    with pytest.raises(DataFormatError, match="65535 instances of 1242 x 375 pixels, at most 2305 are read"):
+        check_count(Path("a.png"), 65535, (375, 1242))

@@ -1,0 +1,182 @@
+"""Runs that are disturbed from outside end, and account for every frame by its files or by their exit code."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from helpers.faulty_refiners import QuickRefiner
+from helpers.kitti_folder import FRAMES, write_data_set
+from helpers.output_folders import result_files
+from helpers.quick_runs import dataset
+
+import directshape_torch
+from directshape_torch.batch.journal import FrameRecord, Journal, journal_folder
+from directshape_torch.batch.options import SilentObserver, WorkerOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.run_file import run_path
+from directshape_torch.batch.run_lock import lock_path
+from directshape_torch.batch.run_status import read_status
+from directshape_torch.batch.run_summary import RunSummary
+from directshape_torch.errors import DataFormatError
+
+THREADS = WorkerOptions(threads=1)
+
+
+def refine(
+    root: Path, out: Path, workers: WorkerOptions = THREADS, observer: SilentObserver | None = None
+) -> RunSummary:
+    return refine_dataset(dataset(root), QuickRefiner(root), out, observer=observer, workers=workers)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    refine(shared_kitti, out)
+    return out
+
+
+def test_workers_that_are_killed_as_they_start(shared_kitti: Path, tmp_path: Path, undisturbed: Path) -> None:
+    """Before they have read the job, which is larger than a pipe holds."""
+    killed: list[int] = []
+
+    def kill() -> None:
+        for delay_s in (0.0, 0.7):
+            while not (found := [child for child in multiprocessing.active_children() if child.pid not in killed]):
+                time.sleep(0.01)
+            time.sleep(delay_s)
+            assert found[0].pid is not None
+            killed.append(found[0].pid)
+            os.kill(found[0].pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    summary = refine(shared_kitti, tmp_path / "out", WorkerOptions(workers=1, retries=2))
+    killer.join()
+    assert (len(killed), summary.exit_code) == (2, 0)
+    assert result_files(tmp_path / "out") == result_files(undisturbed)
+
+
+class Mover(SilentObserver):
+    """Renames the output folder once a frame has ended."""
+
+    def __init__(self, out: Path, to: Path) -> None:
+        self.out, self.to = out, to
+
+    def finished(self, frame_id: str, failure: str | None) -> None:
+        if not self.to.exists():
+            os.rename(self.out, self.to)
+
+
+def test_a_folder_that_is_moved_away_is_not_success(shared_kitti: Path, tmp_path: Path, undisturbed: Path) -> None:
+    out, moved = tmp_path / "out", tmp_path / "moved"
+    summary = refine(shared_kitti, out, observer=Mover(out, moved))
+    assert summary.exit_code == 1
+    assert list(summary.failed) == [FRAMES[0]]
+    assert "was the folder moved or emptied during the run?" in summary.failed[FRAMES[0]]
+    assert refine(shared_kitti, out).resumed == FRAMES[1:]
+    assert result_files(out) == result_files(undisturbed)
+    # What was moved is a run that was cut off, and the next one goes on with it.
+    assert refine(shared_kitti, moved).exit_code == 0
+    assert result_files(moved) == result_files(undisturbed)
+
+
+class Thief(SilentObserver):
+    """Removes a file of each frame that has ended."""
+
+    def __init__(self, out: Path) -> None:
+        self.out = out
+
+    def finished(self, frame_id: str, failure: str | None) -> None:
+        (self.out / "shapes" / f"{frame_id}.npz").unlink()
+
+
+def test_files_that_vanish_during_the_run_are_missed(shared_kitti: Path, tmp_path: Path) -> None:
+    summary = refine(shared_kitti, tmp_path, observer=Thief(tmp_path))
+    assert (summary.exit_code, tuple(summary.failed)) == (1, FRAMES)
+    assert read_status(tmp_path).num_done == 0
+
+
+def test_a_stale_record_with_a_later_clock_fails_nothing(shared_kitti: Path, tmp_path: Path, undisturbed: Path) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    (out / "data" / f"{FRAMES[1]}.txt").unlink()
+    for frame_id in FRAMES:
+        Journal(out, "stale").add(FrameRecord(frame_id, {}, {"state": "failed", "reason": "old"}, time.time() + 1e6))
+    summary = refine(shared_kitti, out)
+    assert (summary.exit_code, summary.resumed) == (0, (FRAMES[0], FRAMES[2]))
+    assert result_files(out) == result_files(undisturbed)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frame_id": 7},
+        {"frame_id": "../../foreign"},
+        {"inputs": ["a"]},
+        {"entry": {"state": "odd"}},
+        {"entry": {"state": "done", "outputs": 5}},
+        {"entry": {"state": "done", "mesh_files": ["../../foreign"]}},
+        {"finished_at": "now"},
+        {"more": 1},
+    ],
+    ids=str,
+)
+def test_journals_that_no_run_has_written(
+    shared_kitti: Path, tmp_path: Path, undisturbed: Path, change: dict[str, object]
+) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    record = FrameRecord(FRAMES[0], {}, {"state": "failed", "reason": "old"})
+    object.__setattr__(record, "__dict__", {**vars(record), **change})
+    Journal(out, "odd").add(record)
+    assert refine(shared_kitti, out).exit_code == 0
+    assert result_files(out) == result_files(undisturbed)
+
+
+@pytest.mark.parametrize("name", ["run.json", "summary.json"])
+@pytest.mark.parametrize("content", ["7", "[]", '{"schema_version": 1}', '{"schema_version": [[]]}'])
+def test_records_of_other_programs(shared_kitti: Path, tmp_path: Path, name: str, content: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises((DataFormatError, directshape_torch.ResumeError), match=name):
+        refine(shared_kitti, tmp_path)
+
+
+def test_an_owner_of_an_impossible_number_is_not_alive(tmp_path: Path) -> None:
+    import platform
+
+    from directshape_torch.batch.run_lock import read_lock_owner
+
+    lock_path(tmp_path).write_text(json.dumps({"host": platform.node(), "pid": 2**40, "started_at": 0.0}))
+    owner = read_lock_owner(tmp_path)
+    assert owner is not None
+    assert owner.is_alive is False
+
+
+def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
+    root, out = tmp_path / "kitti", tmp_path / "out"
+    write_data_set(root, tuple(f"{number:06d}" for number in range(40)))
+    command = [sys.executable, "-m", "directshape_torch", "refine", "--data", str(root), "--out", str(out)]
+    command += ["--detections", str(root / "detections"), "--masks", str(root / "masks")]
+    command += ["--prior", str(root / "prior.npz"), "--threads", "1"]
+    package = str(Path(directshape_torch.__file__).parent.parent)
+    run = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": package}, stderr=subprocess.PIPE, text=True)
+    try:
+        while run.poll() is None and not list(journal_folder(out).glob("*")):
+            time.sleep(0.02)
+        run.send_signal(signal.SIGTERM)
+        _, said = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert (run.returncode, said.splitlines()[-1]) == (143, "directshape: terminated")
+    status = json.loads(run_path(out).read_text())
+    assert (status["state"], status["reason"]) == ("stopped", "SIGTERM")
+    assert not journal_folder(out).exists()
+    assert not lock_path(out).exists()
