@@ -206,12 +206,12 @@ def test_bad_files_say_what_is_wrong(prior, tmp_path):
         with pytest.raises(DataFormatError, match=message):
             PCAShapePrior.load(bad)
     bad.write_bytes(good.read_bytes()[:200])
-    with pytest.raises(DataFormatError, match=r"bad\.npz: cannot be read"):
+    with pytest.raises(DataFormatError, match=r"bad\.npz: is no readable npz file"):
         PCAShapePrior.load(bad)
     np.savez(bad, schema=np.array([{"pickled": 1}], dtype=object))
-    with pytest.raises(DataFormatError, match="without pickle"):
+    with pytest.raises(DataFormatError, match="allow_pickle=False"):
         PCAShapePrior.load(bad)
-    with pytest.raises(DataFormatError, match="no such file"):
+    with pytest.raises(DataFormatError, match="cannot be read"):
         PCAShapePrior.load(tmp_path / "none.npz")
 
 
