@@ -47,9 +47,9 @@ def draw_disparity_field(
     after = bias_px - field.bias(uv_left)
     before_text, after_text = (_summary(name, data) for name, data in (("before", bias_px), ("after", after)))
     panels = [
-        _titled(f"measured - true disparity [px], colours +-{limit:g}", _field_panel(field, values, limit)),
-        _titled(before_text, _data_panel(field, uv_left, bias_px, limit)),
-        _titled(after_text, _data_panel(field, uv_left, after, limit)),
+        titled(f"measured - true disparity [px], colours +-{limit:g}", _field_panel(field, values, limit)),
+        titled(before_text, _data_panel(field, uv_left, bias_px, limit)),
+        titled(after_text, _data_panel(field, uv_left, after, limit)),
     ]
     return np.concatenate(panels, axis=0)
 
@@ -127,7 +127,8 @@ def _draw_hull(panel: Picture, field: DisparityField) -> None:
     cv2.polylines(panel, [corners], True, _GREY, 2, cv2.LINE_AA)
 
 
-def _titled(title: str, panel: Picture) -> Picture:
+def titled(title: str, panel: Picture) -> Picture:
+    """The panel with a line of text above it."""
     import cv2
 
     bar = np.full((_TITLE_HEIGHT_PX, panel.shape[1], 3), 255, np.uint8)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import directshape_torch
-from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
-from directshape_torch.calibration.kitti_observations import observe_frame, truth_files
+from directshape_torch.rig.fit_disparity_field import fit_disparity_field
+from directshape_torch.rig.frames_with_truth import observe_frame, truth_files
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.frame_collation import collate

@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import KnownDepth, cell_index, observe_disparity
-from directshape_torch.calibration.observations_labels import depth_of_near_side, known_depth_of_car
+from directshape_torch.rig.disparity_observations import KnownDepth, cell_index, observe_disparity
+from directshape_torch.rig.labels import depth_of_near_side, known_depth_of_car
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.instance_masks import file_of_frame

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from directshape_torch.calibration.disparity_observations import concatenate
-from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
-from directshape_torch.calibration.kitti_observations import TruthSource, check_one_rig, observe_frame, truth_files
+from directshape_torch.rig.disparity_observations import concatenate
+from directshape_torch.rig.fit_disparity_field import fit_disparity_field
+from directshape_torch.rig.frames_with_truth import TruthSource, check_one_rig, observe_frame, truth_files
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import read_calibration
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.calibration.observations_lidar import known_depth_from_lidar
+from directshape_torch.rig.lidar import known_depth_from_lidar
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 

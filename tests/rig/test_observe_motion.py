@@ -11,9 +11,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.calibration.motion_constraint import MotionConstraint
-from directshape_torch.calibration.observe_motion import observe_motion
-from directshape_torch.calibration.stereo_sequence import open_sequence
+from directshape_torch.rig.motion_constraint import MotionConstraint
+from directshape_torch.rig.observe_motion import observe_motion
+from directshape_torch.rig.stereo_sequence import open_sequence
 from directshape_torch.cli import calibrate_stereo
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.disparity_field import DisparityField

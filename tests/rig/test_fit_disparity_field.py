@@ -12,9 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import DisparityObservations, concatenate
-from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
-from directshape_torch.calibration.observations_labels import known_depth_from_labels
+from directshape_torch.rig.disparity_observations import DisparityObservations, concatenate
+from directshape_torch.rig.fit_disparity_field import fit_disparity_field
+from directshape_torch.rig.labels import known_depth_from_labels
 from directshape_torch.cli import calibrate_stereo
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
@@ -176,7 +176,7 @@ def test_labels_give_the_near_sides_of_visible_cars(tmp_path: Path) -> None:
     "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
 )
 def test_real_frame_has_the_known_field() -> None:
-    from directshape_torch.calibration.kitti_observations import observe_frame, truth_files
+    from directshape_torch.rig.frames_with_truth import observe_frame, truth_files
 
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
     frame = observe_frame(root, "007322", truth_files(root, "disparity")["007322"], "disparity")

@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.calibration.field_constraint import FieldConstraint, Linearisation
-from directshape_torch.calibration.motion_constraint import MotionConstraint
-from directshape_torch.calibration.motion_tracks import TrackedFeatures
-from directshape_torch.calibration.road_constraint import RoadConstraint
-from directshape_torch.calibration.road_pixels import RoadPixels
-from directshape_torch.calibration.self_calibration import self_calibrate
+from directshape_torch.rig.field_constraint import FieldConstraint, Linearisation
+from directshape_torch.rig.motion_constraint import MotionConstraint
+from directshape_torch.rig.motion_tracks import TrackedFeatures
+from directshape_torch.rig.road_constraint import RoadConstraint
+from directshape_torch.rig.road_pixels import RoadPixels
+from directshape_torch.rig.self_calibration import self_calibrate
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
