@@ -250,6 +250,11 @@ class DisparityField:
                 cure,
             )
 
+    @property
+    def rig(self) -> tuple[tuple[int, int], Tensor, Tensor, Tensor]:
+        """`size_wh`, `K_left`, `K_right`, `T_right_cam`: the arguments of `check_rig`."""
+        return self.size_wh, self.K_left, self.K_right, self.T_right_cam
+
     def save(self, path: Path | str) -> None:
         """Write the field as JSON; a reader sees the old file or the new one, never half of it.
 

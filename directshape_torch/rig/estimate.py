@@ -49,7 +49,7 @@ class RigEstimate(nn.Module):
         >>> T_right_cam[0, 3] = -0.54
         >>> rig = RigEstimate((1242, 375), K, K, T_right_cam)
         >>> [round(float(x), 2) for x in rig.offset_at(torch.tensor([620.0, 180.0]))]  # nothing seen, nothing known
-        [0.0, 0.7]
+        [0.0, 0.4]
     """
 
     def __init__(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> None:
@@ -172,6 +172,10 @@ class RigEstimate(nn.Module):
         known = zip(u.tolist(), mean.tolist(), sigma.tolist(), strict=True)
         return f"  at v = {v:.0f}: " + ", ".join(f"u {at:.0f}: {m:+.2f} +- {s:.2f}" for at, m, s in known)
 
+    def metres_per_pixel(self, depth_m: float) -> float:
+        """By how much a pixel of disparity moves a point of that depth."""
+        return depth_m**2 / self._focal_baseline
+
     def is_of(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> bool:
         """Whether this is the rig of such frames."""
         try:
@@ -193,6 +197,10 @@ class RigEstimate(nn.Module):
         self.rows, self._solved = state["rows"].double().cpu(), None
         self.pixels = {kind: PixelEvidence(**evidence) for kind, evidence in state["pixels"].items()}
 
+    @property
+    def _focal_baseline(self) -> float:
+        return float(self._blank.K_left[0, 0] * -self._blank.T_right_cam[0, 3])
+
     def _posterior(self) -> Posterior:
         return self._solve()[0]
 
@@ -203,8 +211,7 @@ class RigEstimate(nn.Module):
             for e in self.pixels.values():
                 of_field = of_field[0] + e.information, of_field[1] + e.vector
                 of_rows = of_rows[0] + e.row_information, of_rows[1] + e.row_vector
-            focal_baseline = float(blank.K_left[0, 0] * -blank.T_right_cam[0, 3])
-            found = solve_offsets(self.rows, blank.size_wh, focal_baseline, *of_field)
+            found = solve_offsets(self.rows, blank.size_wh, self._focal_baseline, *of_field)
             row_offsets = solve_rows(self.rows, blank.size_wh, *of_rows)
             field = replace(
                 blank,

@@ -12,6 +12,7 @@ from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.scene import FrameBatch
 
 # Half a second each, and an estimate from detections hardly gets better than that.
 _MOST_FRAMES = 60
@@ -78,6 +79,12 @@ def _rig_of_first(dataset: FileStereoDataset, frame_ids: Sequence[str], rigs: li
             camera = to_stereo_camera([dataset.layout.calibration(frame_id)], dtype=torch.float64)
             return rig_among(rigs, (width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
     return None
+
+
+def rig_of_frame(rigs: list[RigEstimate], frame: FrameBatch) -> RigEstimate:
+    """The estimate of the rig of one frame; one that knows nothing yet joins the list where there is none."""
+    camera, (height, width) = frame.camera, frame.sizes[0].tolist()
+    return rig_among(rigs, (width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
 
 
 def _evenly(frame_ids: Sequence[str]) -> list[str]:
