@@ -25,6 +25,8 @@ _FEWEST_POINTS = 20
 _POINTS_OF_ONE_PATCH = 20
 # A side's own relief and a heading that is off spread the offsets of one car; more is another thing in its place.
 _LARGEST_SPREAD_M, _LARGEST_SPREAD_PX = 0.5, 0.7
+# No detector is that far off: units, frames or the car itself are others.
+_LARGEST_OFFSET_PX, _LARGEST_SHARE = 2.0, 0.4
 # How far the side of one car may lie from where its box, whose dimensions are guesses, has it.
 _SURFACE_SIGMA_M = 0.15
 _TO_SIGMA = 1.4826  # of a median absolute deviation
@@ -111,6 +113,8 @@ def _reduced(
     middle = disparity.median()
     pixels_per_m = middle**2 / focal_baseline
     spread, row_spread = (_TO_SIGMA * (x - x.median()).abs().median() for x in (offset, row_offset))
+    if offset.median().abs() > _LARGEST_OFFSET_PX + _LARGEST_SHARE * middle:
+        return None
     if spread > _LARGEST_SPREAD_PX + _LARGEST_SPREAD_M * pixels_per_m:
         return None
     of_median = _MEDIAN_TO_MEAN / max(1.0, len(offset) / _POINTS_OF_ONE_PATCH)
