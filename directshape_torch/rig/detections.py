@@ -9,14 +9,16 @@ from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.pinhole import project
 from directshape_torch.image.gradients import grey_levels
 from directshape_torch.rig.near_side import near_side_depth
+from directshape_torch.rig.silhouette_size import size_error
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.disparity import match_disparity
 from directshape_torch.stereo_matching.points import disparity_of_depth
 from directshape_torch.stereo_matching.subpixel import refine_disparity
 
 # A reduced observation, pixels: place in the left image, measured disparity, the same less the implied one and its
-# standard deviation by the car's own spread, measured less predicted row and its standard deviation.
-COLUMNS = ("u", "v", "disparity", "offset", "sigma", "row_offset", "row_sigma")
+# standard deviation by the car's own spread, measured less predicted row and its standard deviation; and the relative
+# error of the box's depth by the size of its mask, 0 where it is not known.
+COLUMNS = ("u", "v", "disparity", "offset", "sigma", "row_offset", "row_sigma", "size_error")
 
 _NEAREST_M, _FARTHEST_M = 5.0, 70.0
 _POINTS_PER_CAR = 400
@@ -33,7 +35,7 @@ _TO_SIGMA = 1.4826  # of a median absolute deviation
 _MEDIAN_TO_MEAN = 1.57  # variance of a median over that of a mean
 
 
-def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 7)
+def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 8)
     """One row (`COLUMNS`, float64, CPU) for each car 5 to 70 m ahead whose near side is matched consistently.
 
     Args:
@@ -69,7 +71,8 @@ def _row_of_car(
     calibration: tuple[Tensor, ...],  # K_left, K_right, T_right_cam
 ) -> Tensor | None:
     T_cam_obj, hwl = (t[car].detach().double().cpu() for t in (detections.T_cam_obj, detections.dimensions_hwl))
-    uv = _pixels_of_car(detections, car, T_cam_obj, hwl, calibration[0], matched)
+    inside = _pixels_of_car(detections, car, T_cam_obj, hwl, calibration[0], matched)
+    uv = (inside & matched.isfinite()).nonzero().flip(1).double()
     depth = near_side_depth(T_cam_obj, hwl, uv, calibration[0])
     seen = depth.isfinite().nonzero()[:, 0]
     seen = seen[:: max(1, -(-len(seen) // _POINTS_PER_CAR))]
@@ -81,23 +84,24 @@ def _row_of_car(
     found = refine_disparity(*grey, uv, matched[v, u], implied_row)
     kept, (K_left, _, T_right_cam) = found.reliable, calibration
     offset, row_offset = (found.disparity - implied)[kept], (implied_row - found.row_shift)[kept]
-    return _reduced(uv[kept], found.disparity[kept], offset, row_offset, K_left[0, 0] * -T_right_cam[0, 3])
+    reduced = _reduced(uv[kept], found.disparity[kept], offset, row_offset, K_left[0, 0] * -T_right_cam[0, 3])
+    size = size_error(T_cam_obj, hwl, inside, K_left) if bool(detections.has_mask_left[car]) else 0.0
+    return None if reduced is None else torch.cat([reduced, reduced.new_tensor([size])])
 
 
 def _pixels_of_car(
     detections: Detections, car: int, T_cam_obj: Tensor, hwl: Tensor, K_left: Tensor, matched: Tensor
 ) -> Tensor:
-    """(P, 2) matched pixels of the car's mask; without a mask those round its box."""
+    """(H, W) the car's mask; without a mask the pixels round its box."""
     height, width = matched.shape
     if bool(detections.has_mask_left[car]):
-        inside = detections.mask_left[car, :height, :width].detach().cpu() > 0.5
-    else:
-        corners = project(box_corners(T_cam_obj, hwl), K_left)
-        limit = torch.tensor([width, height]).double()
-        low, high = (corners.amin(dim=0).maximum(0 * limit).long(), corners.amax(dim=0).minimum(limit).ceil().long())
-        inside = torch.zeros(height, width, dtype=torch.bool)
-        inside[low[1] : high[1].clamp_min(0), low[0] : high[0].clamp_min(0)] = True
-    return (inside & matched.isfinite()).nonzero().flip(1).double()
+        return detections.mask_left[car, :height, :width].detach().cpu() > 0.5
+    corners = project(box_corners(T_cam_obj, hwl), K_left)
+    limit = torch.tensor([width, height]).double()
+    low, high = corners.amin(dim=0).maximum(0 * limit).long(), corners.amax(dim=0).minimum(limit).ceil().long()
+    inside = torch.zeros(height, width, dtype=torch.bool)
+    inside[low[1] : high[1].clamp_min(0), low[0] : high[0].clamp_min(0)] = True
+    return inside
 
 
 def _reduced(

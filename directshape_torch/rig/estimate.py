@@ -80,7 +80,7 @@ class RigEstimate(nn.Module):
         self.add_rows(observe_detections(frames, detections))
 
     def add_rows(self, rows: Tensor) -> None:
-        """Take in reduced observations of detections, (N, 7) `rig.detections.COLUMNS`."""
+        """Take in reduced observations of detections, (N, 8) `rig.detections.COLUMNS`."""
         rows = torch.cat([self.rows, rows])
         # The same rows are kept, in the same order, however they came.
         key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1

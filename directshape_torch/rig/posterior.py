@@ -9,6 +9,7 @@ over a grid, so that what is not known of them widens the covariance.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -24,6 +25,8 @@ _FIELD_SIGMA_PX = (0.4, 0.4, 0.5, 0.3, 0.5)
 _ROW_SIGMA_PX = (0.4, 0.3, 0.3, 0.2, 0.3)
 _ROW_NOISE_PX = 0.1
 _BIAS_SIGMA = 0.05
+# Dimensions of a detector are off in the mean by as much, and those of one car.
+_DIMENSIONS_SIGMA, _SIZE_SIGMA = 0.04, 0.08
 # Surfaces lie beside the near side of their boxes by a length that the cars of one detector share.
 _SETBACK_SIGMA_M = 0.15
 
@@ -45,7 +48,7 @@ class Posterior(NamedTuple):
 
 
 def solve_offsets(
-    rows: Tensor,  # (N, 7) of `observe_detections`
+    rows: Tensor,  # (N, 8) of `observe_detections`
     size_wh: tuple[int, int],
     focal_baseline: float,  # pixels x metres
     information: Tensor,  # (10, 10) of the field coefficients by other evidence
@@ -55,7 +58,7 @@ def solve_offsets(
 
     Example:
         >>> nothing = torch.zeros(10, 10).double(), torch.zeros(10).double()
-        >>> found = solve_offsets(torch.zeros(0, 7).double(), (1242, 375), 387.0, *nothing)
+        >>> found = solve_offsets(torch.zeros(0, 8).double(), (1242, 375), 387.0, *nothing)
         >>> round(float(found.covariance[0, 0].sqrt()), 3)
         0.4
     """
@@ -64,7 +67,13 @@ def solve_offsets(
     s, s0 = (x.reshape(-1) for x in torch.meshgrid(_DEPTH_NOISE, _CONSTANT_NOISE, indexing="ij"))
     variance = (s[:, None] * d) ** 2 + s0[:, None] ** 2 + sigma**2
     prior_sigma = torch.cat([_by_degree(_FIELD_SIGMA_PX), torch.tensor([_BIAS_SIGMA, _SETBACK_SIGMA_M]).double()])
-    H, mean, likelihood = _student_t(A, offset, variance, prior_sigma, information, vector)
+    H_prior, b_prior = torch.diag(1 / prior_sigma**2), torch.zeros_like(prior_sigma)
+    H_prior[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS] += information
+    b_prior[:NUM_COEFFICIENTS] += vector
+    by_size, its_sigma = _bias_by_size(rows[:, 7])
+    H_prior[BIAS, BIAS] += 1 / its_sigma**2
+    b_prior[BIAS] += by_size / its_sigma**2
+    H, mean, likelihood = _student_t(A, offset, variance, H_prior, b_prior)
     share = (likelihood + _log_prior(s, _DEPTH_NOISE_PRIOR) + _log_prior(s0, _CONSTANT_NOISE_PRIOR)).softmax(dim=0)
     overall = share @ mean
     apart = mean - overall
@@ -73,7 +82,7 @@ def solve_offsets(
 
 
 def solve_rows(
-    rows: Tensor,  # (N, 7)
+    rows: Tensor,  # (N, 8)
     size_wh: tuple[int, int],
     information: Tensor,  # (10, 10)
     vector: Tensor,  # (10,)
@@ -81,22 +90,29 @@ def solve_rows(
     """Coefficients of the row offsets, pixels."""
     variance = (rows[:, 6] ** 2 + _ROW_NOISE_PX**2)[None]
     basis = polynomial_basis(rows[:, :2], size_wh)
-    _, mean, _ = _student_t(basis, rows[:, 5], variance, _by_degree(_ROW_SIGMA_PX), information, vector)
+    H_prior = torch.diag(1 / _by_degree(_ROW_SIGMA_PX) ** 2) + information
+    _, mean, _ = _student_t(basis, rows[:, 5], variance, H_prior, vector)
     return mean[0]
+
+
+def _bias_by_size(
+    size_error: Tensor,  # (N,) 0 where not known
+) -> tuple[float, float]:
+    """The detector's relative depth bias by the sizes of masks, and its standard deviation."""
+    known = size_error[size_error != 0]
+    if not len(known):
+        return 0.0, math.inf
+    return float(known.median()), math.hypot(_DIMENSIONS_SIGMA, _SIZE_SIGMA / math.sqrt(len(known)))
 
 
 def _student_t(
     A: Tensor,  # (N, M)
     y: Tensor,  # (N,)
     variance: Tensor,  # (G, N)
-    prior_sigma: Tensor,  # (M,)
-    information: Tensor,  # (10, 10), vector (10,): of the first ten unknowns
-    vector: Tensor,
+    H_prior: Tensor,  # (M, M)
+    b_prior: Tensor,  # (M,)
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Iteratively reweighted least squares for G noises at once: H (G, M, M), mean (G, M), log evidence (G,)."""
-    H_prior, b_prior = torch.diag(1 / prior_sigma**2), torch.zeros_like(prior_sigma)
-    H_prior[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS] += information
-    b_prior[:NUM_COEFFICIENTS] += vector
     weight = torch.ones_like(variance)
     for _ in range(_NUM_ITERATIONS):
         weighted = (weight / variance)[..., None] * A

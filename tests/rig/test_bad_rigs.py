@@ -17,7 +17,7 @@ from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
 
 # Far more than any rig is off by, and less than ruins a search.
-TAME_PX = 2.5
+TAME_PX = 3.0
 
 
 def changed(rows: Tensor, column: int, change: Callable[[Tensor], Tensor]) -> Tensor:
@@ -80,7 +80,7 @@ BROKEN: dict[str, Callable[[dict[str, Any]], object]] = {
     "a later version": lambda c: c.update(schema_version=2),
     "no rigs": lambda c: c.pop("rigs"),
     "rows too short": lambda c: entry(c).update(rows=[[1.0, 2.0]]),
-    "rows of words": lambda c: entry(c).update(rows=[["a"] * 7]),
+    "rows of words": lambda c: entry(c).update(rows=[["a"] * 8]),
     "not finite": lambda c: entry(c)["rows"][0].__setitem__(0, None),
     "no camera": lambda c: entry(c).pop("K_left"),
     "no size": lambda c: entry(c).update(size_wh=[1242]),
