@@ -17,7 +17,7 @@ from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solv
 from directshape_torch.scene import Detections, FrameBatch
 
 # A service runs for years; so many cars say all that cars can say.
-_MOST_ROWS = 2000
+_MOST_ROWS = 1000
 # Half of a car's image: where it stands the field is seen.
 _CAR_UV_PX = (40.0, 20.0)
 
@@ -49,7 +49,7 @@ class RigEstimate(nn.Module):
         >>> T_right_cam[0, 3] = -0.54
         >>> rig = RigEstimate((1242, 375), K, K, T_right_cam)
         >>> [round(float(x), 2) for x in rig.offset_at(torch.tensor([620.0, 180.0]))]  # nothing seen, nothing known
-        [0.0, 0.4]
+        [0.0, 0.23]
     """
 
     def __init__(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> None:

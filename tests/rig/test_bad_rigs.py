@@ -32,7 +32,7 @@ def alternately(by: float) -> Callable[[Tensor], Tensor]:
 
 RIGHT = rows_of_cars(40, 0)
 EVIDENCE = {
-    "none": (RIGHT[:0], 0.4),
+    "none": (RIGHT[:0], 0.3),
     "one detection": (RIGHT[:1], 0.15),
     "three detections": (RIGHT[:3], 0.15),
     "three of them wrong by 10 px": (changed(RIGHT[:3], 3, lambda x: x + 10), 0.25),
