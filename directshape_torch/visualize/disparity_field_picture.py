@@ -16,7 +16,8 @@ from directshape_torch.geometry.disparity_field import DisparityField
 
 _TITLE_HEIGHT_PX = 34
 _CONTOUR_STEP_PX = 0.25
-_DOT_RADIUS_PX = 2
+# Pixels of known depth are many, cars are few.
+_FEW, _DOT_RADIUS_PX, _DOT_RADIUS_OF_FEW_PX = 500, 2, 6
 _GREY = (150, 150, 150)
 
 Picture = NDArray[np.uint8]
@@ -114,8 +115,9 @@ def _data_panel(field: DisparityField, uv_left: Tensor, values_px: Tensor, limit
     width, height = field.size_wh
     panel = np.full((height, width, 3), 225, np.uint8)
     colours = _colours(values_px.double().cpu().numpy(), limit).tolist()
+    radius = _DOT_RADIUS_PX if len(values_px) > _FEW else _DOT_RADIUS_OF_FEW_PX
     for (u, v), colour in zip(uv_left.round().long().cpu().tolist(), colours, strict=True):
-        cv2.circle(panel, (u, v), _DOT_RADIUS_PX, colour, -1)
+        cv2.circle(panel, (u, v), radius, colour, -1)
     _draw_hull(panel, field)
     return panel
 
