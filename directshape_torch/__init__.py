@@ -17,6 +17,7 @@ from directshape_torch.errors import (
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
+from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -43,6 +44,7 @@ __all__ = [
     "RefinementResult",
     "RefinerConfig",
     "ResumeError",
+    "RigEstimate",
     "ShapePrior",
     "Status",
     "StereoCamera",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +33,14 @@ from directshape_torch.stereo_matching.dense_disparity import with_disparity
 from directshape_torch.terms.cars import CarBatch, CarState
 
 
+class FrameCorrection(Protocol):
+    """What is known of the rig that frames come from, `rig.estimate.RigEstimate`."""
+
+    def corrected(self, frames: FrameBatch) -> FrameBatch:
+        """Frames whose camera has the rig's disparity field."""
+        ...
+
+
 class DirectShapeRefiner(nn.Module):
     """Refines pose and shape of cars in stereo frames (paper: DirectShape).
 
@@ -41,6 +49,8 @@ class DirectShapeRefiner(nn.Module):
             tensors move with `.to(...)` and live in the `state_dict`.
         config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
         extra_terms: make terms of one's own for the cars of a call (docs/extra_terms.md), beside those of the method.
+        rig: corrects frames that bring no disparity field of their own: a `RigEstimate`, which lives in the
+            `state_dict` too.
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
@@ -57,6 +67,7 @@ class DirectShapeRefiner(nn.Module):
         prior: ShapePrior | None = None,
         config: RefinerConfig | None = None,
         extra_terms: Sequence[TermFactory] = (),
+        rig: FrameCorrection | None = None,
     ) -> None:
         super().__init__()
         if isinstance(prior, RefinerConfig):
@@ -66,6 +77,7 @@ class DirectShapeRefiner(nn.Module):
         self.prior: ShapePrior = PCAShapePrior.load_bundled() if prior is None else prior
         self.config = RefinerConfig() if config is None else config
         self.extra_terms = tuple(extra_terms)
+        self.rig = rig
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
         check_prior(self.prior, by_autograd=needs_graph)
 
@@ -102,6 +114,7 @@ class DirectShapeRefiner(nn.Module):
     def _checked_refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
+        frames = self._corrected(frames)
         check_fit(frames, detections, self.prior)
         of_prior = dict((*self.prior.named_buffers(), *self.prior.named_parameters()))
         check_no_tangents(frames, detections, term_weights, of_prior)
@@ -135,10 +148,14 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
     ) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
+        frames = self._corrected(frames)
         check_fit(frames, detections, self.prior)
         cars = CarBatch.from_scene(frames, detections)
         problem = self._problem(frames, detections, cars, self._observe(frames, detections), term_weights)
         return problem, self._input_state(detections.T_cam_obj)
+
+    def _corrected(self, frames: FrameBatch) -> FrameBatch:
+        return frames if self.rig is None else self.rig.corrected(frames)
 
     def _input_state(self, T_cam_obj: Tensor) -> CarState:
         return CarState(se3.inverse(T_cam_obj), self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj))

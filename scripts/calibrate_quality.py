@@ -1,7 +1,7 @@
 """Calibrates the figures of trust on refined cars with truth: probabilities, sigmas, and the acceptance policy.
 
     R=$DIRECTSHAPE_DATA/rendered; K=$DIRECTSHAPE_DATA/kitti
-    directshape calibrate-stereo --data $K --from disparity --frames 007322 --out bias.json
+    directshape calibrate-rig --data $K --from disparity --frames 007322 --out bias.json
     python scripts/calibrate_quality.py --data $R --exact $R/detections/gt --masks $R/training/masks $R/masks_degraded
         --seeds 0 1 2 --other $K --other-detections $K/detections/noisy_stereo --other-masks $K/training/masks
         --stereo-bias bias.json --other-disparity-sigma-px 0 0.1 --detector-says-sigmas
@@ -49,9 +49,9 @@ from directshape_torch.config import AcceptanceConfig, RigConfig
 from directshape_torch.config_files import load_config
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
 from directshape_torch.diagnosis.trust_model import TrustModel
-from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.rig_file import load_fields
 
 EVERYTHING = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
 # The detectors whose share of worse cars the default policy is to bring below the bound: those of the development data.
@@ -87,7 +87,7 @@ def other_cars(args: argparse.Namespace, disparity_sigma_px: float) -> Observati
     name = "_".join([f"cars_other_{disparity_sigma_px:g}px", *args.set])
     kept = args.out / f"{name}.npz"
     if not kept.is_file():
-        field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
+        field = None if args.stereo_bias is None else load_fields(args.stereo_bias)
         dataset = KittiStereoDataset(args.other, args.other_detections, args.other_masks, disparity_field=field)
         observe_dataset(dataset, refiner(args.set, disparity_sigma_px), args.other.name).save(kept)
     return Observations.load(kept)

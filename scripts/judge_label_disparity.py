@@ -37,7 +37,7 @@ from label_disparity.report import csv_text, report, scatter_png
 
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
 from directshape_torch.files.atomic_files import write_bytes, write_text
-from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.rig.rig_file import load_fields
 
 # Nearer than this, the 10 cm between a box and its car are more than the disagreement sought.
 NEAREST_M = 15.0
@@ -46,7 +46,7 @@ FEWEST_PATCHES = 20
 
 def measure_cars(args: argparse.Namespace) -> tuple[list[Measured], int]:
     """Cars matched and counted as `directshape compare` does, measured; and how many had too few patches."""
-    field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
+    field = None if args.stereo_bias is None else load_fields(args.stereo_bias)[0]
     shapes = args.after / "shapes"
     comparison = compare_results(
         args.data / "training" / "label_2",

@@ -37,7 +37,6 @@ from tqdm import tqdm
 from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry.box3d import box_corners
-from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import height_above
 from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -45,6 +44,7 @@ from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes
+from directshape_torch.rig.rig_file import load_fields
 from directshape_torch.stereo_matching.disparity import match_disparity
 from directshape_torch.stereo_matching.points import points_from_disparity
 
@@ -237,7 +237,7 @@ def csv_text(cars: Sequence[JudgedCar]) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print; 1 where no car could be measured."""
-    field = None if args.stereo_bias is None else DisparityField.load(args.stereo_bias)
+    field = None if args.stereo_bias is None else load_fields(args.stereo_bias)
     dataset = KittiStereoDataset(args.data, args.detections, args.masks, frames=args.frames, disparity_field=field)
     cars: list[JudgedCar] = []
     overlaps: list[tuple[float, ...]] = []
@@ -269,7 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/")
     parser.add_argument("--detections", type=Path, required=True, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data")
     parser.add_argument("--masks", type=Path, required=True, metavar="DIR", help="instance masks, as for refine")
-    parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
+    parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-rig'")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all that have detections")
     parser.add_argument("--refine", action="store_true", help="refine at each height too (minutes)")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each car")

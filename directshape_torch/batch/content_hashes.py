@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -34,9 +34,12 @@ def hash_prior(prior: ShapePrior) -> str:
     return hash_tensors({"bounds_obj": prior.bounds_obj, **tensors})
 
 
-def hash_field(field: DisparityField | None) -> str | None:
-    """The sha256 of a residual disparity field, or None without one."""
-    if field is None:
-        return None
-    tensors = {name: value for name, value in vars(field).items() if isinstance(value, Tensor)}
-    return hash_tensors({"size_wh": torch.tensor(field.size_wh), **tensors})
+def hash_fields(fields: Sequence[DisparityField]) -> str | None:
+    """The sha256 of residual disparity fields, or None without any; of one alone, that of its tensors."""
+    hashes = []
+    for field in fields:
+        tensors = {name: value for name, value in vars(field).items() if isinstance(value, Tensor)}
+        hashes.append(hash_tensors({"size_wh": torch.tensor(field.size_wh), **tensors}))
+    if len(hashes) < 2:
+        return hashes[0] if hashes else None
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()

@@ -19,7 +19,7 @@ from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.timing import CallTiming, RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
-from directshape_torch.io.frame_collation import collate
+from directshape_torch.io.frame_collation import collate, split_by_rig
 from directshape_torch.io.run_manifest import hash_files
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
@@ -142,19 +142,23 @@ class _GroupStep:
         """Why these frames cannot be refined together, or None where each of them has ended."""
         try:
             batch = [ready for ready in map(self._read, frame_ids) if ready is not None]
-            result = self._call(batch) if batch else None
+            parts = split_by_rig([ready.loaded for ready in batch])
+            results = [self._call([batch[k] for k in part]) for part in parts]
         except _STOPS_THE_RUN:
             raise
         # Whatever a frame of a hundred thousand brings to light: it is reported, and the others go on.
         except Exception as error:
             return _with_memory_advice(error, len(frame_ids))
+        for part, result in zip(parts, results, strict=True):
+            self._write_all([batch[k] for k in part], result)
+        return None
+
+    def _write_all(self, batch: Sequence[_Ready], result: RefinementResult) -> None:
         first_row = 0
         for ready in batch:
-            assert result is not None, "frames were read and not refined"
             if ready.loaded.frame_id in self.group.wanted:
                 self._write(ready, result, first_row)
             first_row += len(ready.loaded.detections)
-        return None
 
     def _read(self, frame_id: str) -> _Ready | None:
         try:

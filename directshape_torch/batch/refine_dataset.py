@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from directshape_torch.batch.content_hashes import hash_field, hash_prior
+from directshape_torch.batch.content_hashes import hash_fields, hash_prior
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import GroupRefiner, GroupReport, RunJob, limited_threads
@@ -255,7 +255,7 @@ def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha2
     }
     if refiner.extra_terms:
         settings["extra_terms"] = [_described(make) for make in refiner.extra_terms]
-    hashes = {"prior": prior_sha256, "stereo_bias": hash_field(dataset.disparity_field)}
+    hashes = {"prior": prior_sha256, "stereo_bias": hash_fields(dataset.disparity_fields)}
     return RunManifest(package_version(), settings, hashes)
 
 

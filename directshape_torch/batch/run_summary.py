@@ -76,9 +76,8 @@ def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str
         found.append(f"all {num_cars} initial boxes lie behind or at the camera: check the frame of the detections")
     elif num_cars and 2 * refined < num_cars:
         found.append(f"only {refined} of {num_cars} cars were refined: see the statuses")
-    for side in ("left", "right"):
-        if num_cars > no_mask and not sum(entry.get(f"masks_{side}", 0) for entry in done):
-            found.append(f"no car has a mask in the {side} image: check the masks of that side")
+    if num_cars > no_mask and not sum(entry.get("masks_left", 0) for entry in done):
+        found.append("no car has a mask in the left image: check the masks of that side")
     guessed = sum(entry.get("ground_source") == "camera_height" for entry in done)
     if num_cars and guessed:
         found.append(f"the ground of {guessed} of {len(done)} frames is only the camera height's: give plane files")

@@ -34,7 +34,7 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
     group.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
     group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
-    group.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
+    add_rig_option(group, "correct the stereo rig by a file of 'directshape calibrate-rig' or of a run (default: none)")
     if with_disparity:
         group.add_argument(
             "--disparity",
@@ -46,10 +46,15 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
         "--ground",
         choices=("auto", "file", "stereo", "camera_height"),
         default="auto",
-        help="where ground planes come from (default: file, else stereo, else camera height; with --stereo-bias: "
+        help="where ground planes come from (default: file, else stereo, else camera height; with a corrected rig: "
         "stereo, else file, else camera height)",
     )
     group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
+
+
+def add_rig_option(group: argparse._ActionsContainer, words: str) -> None:
+    """`--rig`, and `--stereo-bias`, which it was called."""
+    group.add_argument("--rig", "--stereo-bias", default="none", metavar="FILE|none", help=words)
 
 
 def add_mask_options(group: argparse._ActionsContainer) -> None:
@@ -66,8 +71,8 @@ def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
         DataFormatError: a folder or file is missing or not laid out so.
         InputError: options that contradict each other, or no frames.
     """
-    from directshape_torch.geometry.disparity_field import DisparityField
     from directshape_torch.io.open_dataset import open_dataset
+    from directshape_torch.rig.rig_file import load_fields
 
     masks = mask_source(args)
     if masks is None and args.layout != "folder":
@@ -82,7 +87,7 @@ def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
         classes=args.classes,
         ground=args.ground,
         camera_height_m=args.camera_height,
-        disparity_field=None if args.stereo_bias is None else DisparityField.load(args.stereo_bias),
+        disparity_field=() if args.rig in ("auto", "none") else load_fields(args.rig),
         disparity_dir=getattr(args, "disparity", None),
         lidar_dir=getattr(args, "lidar", None),
     )

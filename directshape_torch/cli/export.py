@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, mask_source
-from directshape_torch.cli.run_inputs import check_data_is_not_needed, field_of_run
+from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, add_rig_option, mask_source
+from directshape_torch.cli.run_inputs import check_data_is_not_needed, fields_of_run
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
@@ -52,9 +52,7 @@ def _add_inputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--disparity", type=Path, metavar="DIR", help="disparity maps, for the stereo points of 'points'"
     )
-    group.add_argument(
-        "--stereo-bias", type=Path, metavar="FILE", help="field of the run, for stereo points and iterations"
-    )
+    add_rig_option(group, "the file of --rig, for stereo points and iterations (default: the run's own estimate)")
     group.add_argument("--prior", metavar="FILE|NAME", help="shape prior of the run, where it was not a bundled one")
 
 
@@ -139,9 +137,9 @@ def _make_dataset(args: argparse.Namespace, folder: RunFolder) -> StereoDataset 
     """The frames of the run, with the results in the place of the detections where nobody says where those are."""
     from directshape_torch.io.open_dataset import open_dataset
 
-    field = _disparity_field(args, folder)
+    fields = _disparity_fields(args, folder)
     if args.data is None:
-        names = ("detections", "masks", "masks_left", "masks_right", "disparity", "stereo_bias")
+        names = ("detections", "masks", "masks_left", "masks_right", "disparity", "rig")
         check_data_is_not_needed(args, *names)
         return None
     # A plain folder keeps its detections beside its images.
@@ -155,21 +153,20 @@ def _make_dataset(args: argparse.Namespace, folder: RunFolder) -> StereoDataset 
         classes=folder.classes,
         ground=folder.setting("ground"),
         camera_height_m=folder.setting("camera_height_m"),
-        disparity_field=field,
+        disparity_field=fields,
         disparity_dir=args.disparity,
     )
 
 
-def _disparity_field(args: argparse.Namespace, folder: RunFolder) -> DisparityField | None:
-    """The field that the run was made with; without it stereo points and iterations would be wrong.
+def _disparity_fields(args: argparse.Namespace, folder: RunFolder) -> tuple[DisparityField, ...]:
+    """The fields that the run was made with; without it stereo points and iterations would be wrong.
 
     Raises:
-        InputError: it is another one, or missing where it is needed.
+        InputError: they are others, or missing where they are needed.
     """
-    if args.stereo_bias is not None:
-        return field_of_run(args.stereo_bias, folder.manifest)
+    fields = fields_of_run(args.rig, folder.path, folder.manifest)
     needs_field = args.data is not None and (args.iterations or "points" in args.format)
-    if needs_field and folder.manifest.sha256.get("stereo_bias") is not None:
+    if needs_field and not fields and folder.manifest.sha256.get("stereo_bias") is not None:
         purpose = "stereo points" if "points" in args.format else "--iterations"
-        raise InputError("--stereo-bias", f"the field that the run was made with, for {purpose}", "nothing")
-    return None
+        raise InputError("--rig", f"the file that the run was made with, for {purpose}", "nothing")
+    return fields

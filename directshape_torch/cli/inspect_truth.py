@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.calibration.disparity_observations import KnownDepth
-from directshape_torch.calibration.observations_disparity import FOLDERS, known_depth_from_disparity_map
-from directshape_torch.calibration.observations_lidar import known_depth_from_lidar
 from directshape_torch.evaluation.shape_error_surface import SurfaceSource
 from directshape_torch.geometry.pinhole import project, rays_from_pixels
 from directshape_torch.io.frame_layout import FrameLayout, first_disparity
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.regions import MASK_THRESHOLD
+from directshape_torch.rig.disparity_maps import FOLDERS, known_depth_from_disparity_map
+from directshape_torch.rig.disparity_observations import KnownDepth
+from directshape_torch.rig.lidar import known_depth_from_lidar
 from directshape_torch.visualize.inspection.car_view import KnownPoints
 
 # Points under the mask's edge may lie far behind the car.

@@ -28,7 +28,7 @@ COMMANDS = (
     "evaluate",
     "evaluate_shape",
     "build_prior",
-    "calibrate_stereo",
+    "calibrate_rig",
     "export",
     "inspect",
     "check_data",

@@ -29,6 +29,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("refine", help="refine the cars of a data set", description=_DESCRIPTION)
     inputs = parser.add_argument_group("input")
     add_data_options(inputs)
+    inputs.set_defaults(rig="auto")
     inputs.add_argument(
         "--lidar", type=Path, metavar="DIR", help="LiDAR scans NNNNNN.bin (KITTI's velodyne) as further evidence"
     )
@@ -117,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.cli.rerun_option import check_rerun, write_recording
+    from directshape_torch.cli.rig_of_run import with_rig_of_run
     from directshape_torch.terms.lidar import LidarPoints
 
     check_rerun(args.rerun)
@@ -126,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
     extra = [] if args.lidar is None else [LidarPoints()]
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)
     _check_disparity_is_used(args.disparity, refiner.config.method)
-    dataset = dataset_of(args)
+    dataset = with_rig_of_run(dataset_of(args), args.out, args.fresh) if args.rig == "auto" else dataset_of(args)
     with ProgressBar() as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, workers, fresh=args.fresh)
     for warning in summary.warnings:

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, mask_source
-from directshape_torch.cli.run_inputs import check_data_is_not_needed, field_of_run
+from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, add_rig_option, mask_source
+from directshape_torch.cli.run_inputs import check_data_is_not_needed, fields_of_run
 
 if TYPE_CHECKING:
     from directshape_torch.report.frame_inputs import InputSources
@@ -32,7 +32,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     inputs.add_argument("--layout", choices=LAYOUTS, default="kitti", help="of that data set (default: kitti)")
     inputs.add_argument("--detections", type=Path, metavar="DIR", help="detections (folder: default those in ROOT)")
     add_mask_options(inputs)
-    inputs.add_argument("--stereo-bias", type=Path, metavar="FILE", help="field of 'directshape calibrate-stereo'")
+    add_rig_option(inputs, "the file of --rig (default: the run's own estimate)")
     inputs.add_argument(
         "--prior", metavar="FILE|NAME", help="the shape prior of the run; default: that bundled one which it used"
     )
@@ -74,7 +74,7 @@ def _sources(args: argparse.Namespace, run: RunFolder) -> InputSources:
     from directshape_torch.report.frame_inputs import InputSources
 
     if args.data is None:
-        check_data_is_not_needed(args, "detections", "masks", "masks_left", "masks_right", "stereo_bias")
+        check_data_is_not_needed(args, "detections", "masks", "masks_left", "masks_right", "rig")
         return InputSources()
     if not run.done:
         return InputSources()
@@ -82,7 +82,7 @@ def _sources(args: argparse.Namespace, run: RunFolder) -> InputSources:
     # Without detections a layout still needs a folder of them; the result files stand in, and are not read as such.
     stand_in = None if is_folder else args.out
     masks = mask_source(args)
-    field = None if args.stereo_bias is None else field_of_run(args.stereo_bias, run.manifest)
+    fields = fields_of_run(args.rig, run.out_dir, run.manifest)
     dataset = open_dataset(
         args.layout,
         args.data,
@@ -90,6 +90,6 @@ def _sources(args: argparse.Namespace, run: RunFolder) -> InputSources:
         masks,
         frames=run.done,
         classes=run.classes,
-        disparity_field=field,
+        disparity_field=fields,
     )
-    return InputSources(dataset.layout, is_folder or args.detections is not None, dataset.masks, masks is None, field)
+    return InputSources(dataset.layout, is_folder or args.detections is not None, dataset.masks, masks is None, fields)

@@ -23,22 +23,26 @@ def check_data_is_not_needed(args: argparse.Namespace, *names: str) -> None:
     Raises:
         InputError: one is given.
     """
-    given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) is not None]
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name) not in (None, "none")]
     if given:
         raise InputError("--data", f"the data set of the run, because of {', '.join(given)}", "nothing")
 
 
-def field_of_run(path: Path, manifest: RunManifest) -> DisparityField:
-    """The disparity field in a file, if a run was made with it.
+def fields_of_run(rig: str, out_dir: Path, manifest: RunManifest) -> tuple[DisparityField, ...]:
+    """The disparity fields that a run was made with: those of its own folder, or of the file that `--rig` names.
 
     Raises:
-        DataFormatError: the file holds no field.
-        InputError: the run was made with another one, or with none.
+        DataFormatError: the file holds none.
+        InputError: the run was made with others, or with none.
     """
-    from directshape_torch.batch.content_hashes import hash_field
-    from directshape_torch.geometry.disparity_field import DisparityField
+    from directshape_torch.batch.content_hashes import hash_fields
+    from directshape_torch.rig.rig_file import RIG_FILE, load_fields
 
-    field = DisparityField.load(path)
-    if hash_field(field) != manifest.sha256.get("stereo_bias"):
-        raise InputError("--stereo-bias", "the field that the run was made with", f"another one in {path}")
-    return field
+    own = out_dir / RIG_FILE
+    if rig == "none" and not own.is_file():
+        return ()
+    path = own if rig == "none" else Path(rig)
+    fields = load_fields(path)
+    if hash_fields(fields) != manifest.sha256.get("stereo_bias"):
+        raise InputError("--rig", "the disparity fields that the run was made with", f"others in {path}")
+    return fields

@@ -13,6 +13,7 @@ from directshape_torch.data_check.check_distances import DistanceRatios, check_d
 from directshape_torch.data_check.check_files import check_files
 from directshape_torch.data_check.check_masks import check_masks
 from directshape_torch.data_check.check_pair import FEW_MATCHES, check_mirrored, check_pair
+from directshape_torch.data_check.check_rig import check_rig
 from directshape_torch.data_check.check_times import check_times
 from directshape_torch.data_check.finding import CheckReport, Finding, by_severity
 from directshape_torch.data_check.frame_parts import FrameParts, read_parts
@@ -52,7 +53,11 @@ def check_dataset(
     for frame_id in chosen:
         findings += _check_frame(dataset, frame_id, seen)
         tell(frame_id)
-    findings += _check_cars(seen)
+    of_cars = _check_cars(seen)
+    # Of boxes or images that are wrong an estimate would only say the same again.
+    if not any(finding.severity == "error" for finding in (*findings, *of_cars)):
+        of_cars += check_rig(dataset, chosen)
+    findings += of_cars
     return CheckReport(by_severity(findings), len(dataset), len(chosen), seen.num_cars)
 
 

@@ -9,7 +9,7 @@ and Segvic, "Improving the Egomotion Estimation by Correcting the Calibration Bi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -214,7 +214,7 @@ class DisparityField:
         Raises:
             InputError: image size, intrinsics or right camera are not those that the field was fitted for.
         """
-        cure = "fit a field for this rig with 'directshape calibrate-stereo', or refine without one"
+        cure = "estimate this rig with 'directshape calibrate-rig', or refine with --rig auto or none"
         if tuple(size_wh) != tuple(self.size_wh):
             raise InputError(
                 "disparity_field",
@@ -241,6 +241,11 @@ class DisparityField:
                 f"a difference of {difference:.4g} {unit}",
                 cure,
             )
+
+    @property
+    def rig(self) -> tuple[tuple[int, int], Tensor, Tensor, Tensor]:
+        """`size_wh`, `K_left`, `K_right`, `T_right_cam`: the arguments of `check_rig`."""
+        return self.size_wh, self.K_left, self.K_right, self.T_right_cam
 
     def save(self, path: Path | str) -> None:
         """Write the field as JSON; a reader sees the old file or the new one, never half of it.
@@ -275,7 +280,32 @@ class DisparityField:
         return cls(size_wh=(size[0], size[1]), provenance=provenance, **tensors)
 
 
-_CURE = "write it again with 'directshape calibrate-stereo'"
+def field_of_rig(
+    fields: Sequence[DisparityField],
+    size_wh: tuple[int, int],
+    K_left: Tensor,  # (3, 3)
+    K_right: Tensor,  # (3, 3)
+    T_right_cam: Tensor,  # (4, 4)
+) -> DisparityField | None:
+    """The first of some fields that is of this rig; None where there are none.
+
+    Raises:
+        InputError: there are fields, and all are of other rigs.
+    """
+    refusal: InputError | None = None
+    for one in fields:
+        try:
+            one.check_rig(size_wh, K_left, K_right, T_right_cam)
+        except InputError as error:
+            refusal = refusal or error
+        else:
+            return one
+    if refusal is not None:
+        raise refusal
+    return None
+
+
+_CURE = "write it again with 'directshape calibrate-rig'"
 _TENSOR_SHAPES: dict[str, tuple[int | None, ...]] = {
     "coefficients": (NUM_COEFFICIENTS,),
     "vertical_coefficients": (NUM_COEFFICIENTS,),

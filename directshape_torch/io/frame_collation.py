@@ -90,6 +90,21 @@ def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:
     return StereoCamera(K_left, K_right, T_right_cam, t_cam_ref, field)
 
 
+def split_by_rig(loaded: Sequence[LoadedFrame]) -> list[list[int]]:
+    """Numbers of the frames that `collate` takes together: those with the same residual disparity field."""
+    parts: list[list[int]] = []
+    fields_of_parts: list[DisparityField | None] = []
+    for number, item in enumerate(loaded):
+        field = item.frame.camera.disparity_field
+        same = [part for part, other in zip(parts, fields_of_parts, strict=True) if _same_field(field, other)]
+        if same:
+            same[0].append(number)
+        else:
+            parts.append([number])
+            fields_of_parts.append(field)
+    return parts
+
+
 def _same_field(a: DisparityField | None, b: DisparityField | None) -> bool:
     if a is None or b is None:
         return a is b

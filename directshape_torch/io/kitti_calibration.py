@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.text_files import read_lines
-from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.disparity_field import DisparityField, field_of_rig
 from directshape_torch.scene import StereoCamera
 
 # The name of each matrix in the object, the tracking and the raw layout, and its shape.
@@ -134,6 +134,23 @@ def to_stereo_camera(
         if error.name == "disparity_field":
             raise
         raise DataFormatError(calibrations[0].path, f"describes no stereo rig ({error})") from error
+
+
+def camera_of_rig(
+    calibration: KittiCalibration,
+    fields: Sequence[DisparityField],
+    size_wh: tuple[int, int],
+    dtype: torch.dtype = torch.float32,
+) -> StereoCamera:
+    """The stereo camera of a frame, with the disparity field of its rig where there are fields.
+
+    Raises:
+        DataFormatError: see `to_stereo_camera`.
+        InputError: all fields are of other rigs.
+    """
+    rig = to_stereo_camera([calibration], dtype=torch.float64)
+    field = field_of_rig(fields, size_wh, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
+    return replace(rig, disparity_field=field).to(dtype=dtype)
 
 
 def _check_baseline(calibration: KittiCalibration) -> None:

@@ -71,12 +71,12 @@ class FrameJsonMasks:
 
 @dataclass(frozen=True)
 class InstancePngMasks:
-    """Folders `instance_2` (left) and `instance_3` (right) of PNG files with `class * 1000 + instance`.
+    """Folders `instance_2` (left) and `instance_3` (right, if any) of PNG files with `class * 1000 + instance`.
 
     KITTI MOTS (1 car, 2 pedestrian, 10000 ignored) and Cityscapes (26 car; values below 1000 are not instances).
 
     Attributes:
-        directory: the folder that holds both.
+        directory: the folder that holds both, or the left one alone.
         car_ids: classes that are cars.
         folders: names of the two; `instance_02` and `instance_03` in the layout of tracking sequences.
     """
@@ -87,14 +87,15 @@ class InstancePngMasks:
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         masks: list[InstanceMask] = []
-        for side, path in zip(SIDES, self.files(frame_id), strict=True):
+        for side, path in zip(SIDES, self.files(frame_id), strict=False):
             ids = read_single_channel(path)
             check_size(path, "the instance image", ids.shape, size_hw)
             masks += self._instances(path, side, ids)
         return masks
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
-        return tuple(find_image(self.directory / folder, frame_id) for folder in self.folders)
+        left, right = (self.directory / folder for folder in self.folders)
+        return tuple(find_image(folder, frame_id) for folder in (left, right) if folder == left or right.is_dir())
 
     def _instances(self, path: Path, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask]:
         values = np.unique(ids).tolist()

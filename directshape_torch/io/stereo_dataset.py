@@ -73,8 +73,8 @@ class StereoDataset(Protocol):
         ...
 
     @property
-    def disparity_field(self) -> DisparityField | None:
-        """Residual disparity of the rig, or None."""
+    def disparity_fields(self) -> tuple[DisparityField, ...]:
+        """Residual disparity of the rigs, none or one a rig."""
         ...
 
     @property

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TypedDict, get_args
+from typing import Self, TypedDict, get_args
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from directshape_torch.io.frame_detections import build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import MaskSource
-from directshape_torch.io.kitti_calibration import to_stereo_camera
+from directshape_torch.io.kitti_calibration import camera_of_rig, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
 from directshape_torch.io.velodyne import in_image, read_scan
@@ -38,7 +39,7 @@ class DatasetOptions(TypedDict, total=False):
     classes: Sequence[str]
     ground: GroundSource
     camera_height_m: float
-    disparity_field: DisparityField | None
+    disparity_field: DisparityField | Sequence[DisparityField] | None
     disparity_dir: Path | str | None
     lidar_dir: Path | str | None
     dtype: torch.dtype
@@ -56,7 +57,7 @@ class FileStereoDataset:
         ground: where ground planes come from: "auto" is file, else stereo, else camera height; with a disparity
             field stereo comes first, for plane files share the bias of the disparities they were made from.
         camera_height_m: height of the camera above a level ground, the last resort.
-        disparity_field: residual disparity of the rig, or None.
+        disparity_field: residual disparity of the rig, of several rigs, or None.
         disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with the disparity maps of any stereo method, for the
             methods that fit a point cloud; None: they match the images themselves.
         lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, which the calibration of the frames places; None: frames
@@ -78,7 +79,7 @@ class FileStereoDataset:
         classes: Sequence[str] = ("Car",),
         ground: GroundSource = "auto",
         camera_height_m: float = DEFAULT_CAMERA_HEIGHT_M,
-        disparity_field: DisparityField | None = None,
+        disparity_field: DisparityField | Sequence[DisparityField] | None = None,
         disparity_dir: Path | str | None = None,
         lidar_dir: Path | str | None = None,
         dtype: torch.dtype = torch.float32,
@@ -95,7 +96,7 @@ class FileStereoDataset:
         self.classes = frozenset(classes)
         self.ground: GroundSource = ground
         self.camera_height_m = camera_height_m
-        self.disparity_field = disparity_field
+        self.disparity_fields = _as_fields(disparity_field)
         self.disparity_dir = (
             None if disparity_dir is None else existing_folder(Path(disparity_dir), "is no folder of disparity maps")
         )
@@ -118,7 +119,8 @@ class FileStereoDataset:
             DataFormatError: a file is missing or damaged; names file and reason.
         """
         left, right = self._read_images(frame_id)
-        camera = to_stereo_camera([self.layout.calibration(frame_id)], self.disparity_field, self.dtype)
+        size_wh = (left.shape[1], left.shape[0])
+        camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, size_wh, self.dtype)
         ground = self._ground(frame_id, left, right, camera)
         height, width = left.shape[:2]
         frame = FrameBatch(
@@ -136,6 +138,14 @@ class FileStereoDataset:
         given = self.layout.given_masks(frame_id) if self._own_masks else None
         detections, rows, matching = build_detections(objects, masks, camera, (height, width), self.classes, given)
         return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), matching)
+
+    def changed(
+        self, *, ground: GroundSource, disparity_field: DisparityField | Sequence[DisparityField] | None
+    ) -> Self:
+        """The same frames with planes from elsewhere and other fields."""
+        other = copy.copy(self)
+        other.ground, other.disparity_fields = ground, _as_fields(disparity_field)
+        return other
 
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The detections of a frame alone, without its images."""
@@ -221,7 +231,7 @@ class FileStereoDataset:
         corrected stereo pair first.
         """
         orders: dict[GroundSource, tuple[GroundSource, ...]] = {
-            "auto": ("file", "stereo") if self.disparity_field is None else ("stereo", "file"),
+            "auto": ("file", "stereo") if not self.disparity_fields else ("stereo", "file"),
             "file": ("file",),
             "stereo": ("stereo",),
             "camera_height": (),
@@ -253,6 +263,12 @@ class FileStereoDataset:
             return None
         normal, offset = (torch.as_tensor(part, dtype=torch.float64).reshape(-1) for part in plane)
         return torch.cat([normal, offset])
+
+
+def _as_fields(fields: DisparityField | Sequence[DisparityField] | None) -> tuple[DisparityField, ...]:
+    if fields is None:
+        return ()
+    return (fields,) if isinstance(fields, DisparityField) else tuple(fields)
 
 
 def _ground_plane(plane_cam: Tensor, source: str, dtype: torch.dtype) -> GroundPlane:

@@ -17,7 +17,7 @@ from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import InstanceMask, MaskSource
-from directshape_torch.io.kitti_calibration import to_stereo_camera
+from directshape_torch.io.kitti_calibration import camera_of_rig
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_manifest import RunManifest, hash_file
 from directshape_torch.scene import GroundPlane, StereoCamera
@@ -32,14 +32,14 @@ class InputSources:
         has_detections: whether the detections of that layout are those that went in.
         masks: instance masks.
         has_own_masks: whether they are the layout's, which may say what detection each belongs to.
-        disparity_field: residual disparity of the rig.
+        disparity_fields: residual disparity of the rigs.
     """
 
     layout: FrameLayout | None = None
     has_detections: bool = False
     masks: MaskSource | None = None
     has_own_masks: bool = False
-    disparity_field: DisparityField | None = None
+    disparity_fields: tuple[DisparityField, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class InputReader:
         if left is not None and right is not None and left.shape != right.shape:
             self.problems["left and right image differ in size"].add(frame_id)
             right = None
-        camera = self._camera(layout, frame_id)
+        camera = self._camera(layout, frame_id, left)
         ground = None if camera is None else self._ground(layout, frame_id, camera, left, right)
         masks = () if left is None else self._masks(frame_id, (left.shape[0], left.shape[1]))
         given = layout.given_masks(frame_id) if self.sources.has_own_masks else None
@@ -119,10 +119,12 @@ class InputReader:
     def _image(self, frame_id: str, role: str, path: Path) -> NDArray[np.uint8] | None:
         return read_rgb(path) if self._is_unchanged(frame_id, role, path) else None
 
-    def _camera(self, layout: FrameLayout, frame_id: str) -> StereoCamera | None:
+    def _camera(self, layout: FrameLayout, frame_id: str, left: NDArray[np.uint8] | None) -> StereoCamera | None:
         if not self._is_unchanged(frame_id, "calibration", layout.calibration_path(frame_id)):
             return None
-        return to_stereo_camera([layout.calibration(frame_id)], self.sources.disparity_field, torch.float32)
+        fields = () if left is None else self.sources.disparity_fields
+        size_wh = (0, 0) if left is None else (left.shape[1], left.shape[0])
+        return camera_of_rig(layout.calibration(frame_id), fields, size_wh, torch.float32)
 
     def _ground(
         self,

@@ -185,8 +185,8 @@ class _PageOfRun:
             reason = "the prior is not that of the run" if self._prior_was_given else "the prior was not given"
             notes.append(f"no residual maps, and no meshes but saved ones: {reason} (--prior)")
         has_field = self._run.manifest.sha256.get("stereo_bias") is not None
-        if has_field and sources.layout is not None and sources.disparity_field is None:
-            notes.append("photometric residuals without the run's disparity field, so biased (--stereo-bias)")
+        if has_field and sources.layout is not None and not sources.disparity_fields:
+            notes.append("photometric residuals without the run's disparity field, so biased (--rig)")
         if num_detailed < num_frames:
             notes.append(f"pictures and 3D views of {num_detailed} of {num_frames} frames (--max-frames)")
         notes += problem_notes(self._reader.problems, num_frames)

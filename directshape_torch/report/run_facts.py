@@ -5,11 +5,15 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_manifest import flatten
 from directshape_torch.report.car_rows import CarRow
+from directshape_torch.report.pictures import data_url
 from directshape_torch.report.run_folder import RunFolder
+from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
 from directshape_torch.status import Status
 
 
@@ -36,7 +40,17 @@ def run_facts(run: RunFolder, frame_ids: Sequence[str], rows: Sequence[CarRow], 
         "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),
         "notes": list(notes),
+        "rig": _rig(run.out_dir),
     }
+
+
+def _rig(out_dir: Path) -> dict[str, Any] | None:
+    """What the run estimated of its rigs, in words and as a picture; None where it did not."""
+    words, picture = out_dir / RIG_FILE, out_dir / RIG_PICTURE
+    if not words.is_file():
+        return None
+    url = data_url(read_rgb(picture)) if picture.is_file() else None
+    return {"words": [str(rig) for rig in load_rigs(words)], "picture": url}
 
 
 def _statuses(rows: Sequence[CarRow]) -> list[dict[str, Any]]:

@@ -16,7 +16,8 @@ from directshape_torch.geometry.disparity_field import DisparityField
 
 _TITLE_HEIGHT_PX = 34
 _CONTOUR_STEP_PX = 0.25
-_DOT_RADIUS_PX = 2
+# Pixels of known depth are many, cars are few.
+_FEW, _DOT_RADIUS_PX, _DOT_RADIUS_OF_FEW_PX = 500, 2, 6
 _GREY = (150, 150, 150)
 
 Picture = NDArray[np.uint8]
@@ -47,9 +48,9 @@ def draw_disparity_field(
     after = bias_px - field.bias(uv_left)
     before_text, after_text = (_summary(name, data) for name, data in (("before", bias_px), ("after", after)))
     panels = [
-        _titled(f"measured - true disparity [px], colours +-{limit:g}", _field_panel(field, values, limit)),
-        _titled(before_text, _data_panel(field, uv_left, bias_px, limit)),
-        _titled(after_text, _data_panel(field, uv_left, after, limit)),
+        titled(f"measured - true disparity [px], colours +-{limit:g}", _field_panel(field, values, limit)),
+        titled(before_text, _data_panel(field, uv_left, bias_px, limit)),
+        titled(after_text, _data_panel(field, uv_left, after, limit)),
     ]
     return np.concatenate(panels, axis=0)
 
@@ -114,8 +115,9 @@ def _data_panel(field: DisparityField, uv_left: Tensor, values_px: Tensor, limit
     width, height = field.size_wh
     panel = np.full((height, width, 3), 225, np.uint8)
     colours = _colours(values_px.double().cpu().numpy(), limit).tolist()
+    radius = _DOT_RADIUS_PX if len(values_px) > _FEW else _DOT_RADIUS_OF_FEW_PX
     for (u, v), colour in zip(uv_left.round().long().cpu().tolist(), colours, strict=True):
-        cv2.circle(panel, (u, v), _DOT_RADIUS_PX, colour, -1)
+        cv2.circle(panel, (u, v), radius, colour, -1)
     _draw_hull(panel, field)
     return panel
 
@@ -127,7 +129,8 @@ def _draw_hull(panel: Picture, field: DisparityField) -> None:
     cv2.polylines(panel, [corners], True, _GREY, 2, cv2.LINE_AA)
 
 
-def _titled(title: str, panel: Picture) -> Picture:
+def titled(title: str, panel: Picture) -> Picture:
+    """The panel with a line of text above it."""
     import cv2
 
     bar = np.full((_TITLE_HEIGHT_PX, panel.shape[1], 3), 255, np.uint8)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import directshape_torch
-from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
-from directshape_torch.calibration.kitti_observations import observe_frame, truth_files
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.frames_with_truth import add_truth, observe_frame, truth_files
 from directshape_torch.scene import Detections, FrameBatch
 
 # The frame that the README fits the rig of the KITTI frames from.
@@ -97,9 +97,11 @@ def _scene(root: Path, detector: str, field: DisparityField | None, max_frames: 
 
 
 def _rig_field(root: Path) -> DisparityField:
-    """As `directshape calibrate-stereo --from disparity --frames 007322` fits it."""
+    """As `directshape calibrate-rig --from disparity --frames 007322` fits it."""
     frame = observe_frame(root, _FRAME_OF_FIELD, truth_files(root, "disparity")[_FRAME_OF_FIELD], "disparity")
-    return fit_disparity_field(frame.observations, frame.size_wh, frame.camera, "disparity", (_FRAME_OF_FIELD,)).field
+    rigs: list[RigEstimate] = []
+    add_truth(rigs, "disparity", [frame])
+    return rigs[0].field
 
 
 def with_cars(frames: Sequence[LoadedFrame], num_cars: int) -> tuple[FrameBatch, Detections]:

@@ -11,13 +11,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import KnownDepth, cell_index, observe_disparity
-from directshape_torch.calibration.observations_labels import depth_of_near_side, known_depth_of_car
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.instance_masks import file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.rig.disparity_observations import KnownDepth, cell_index, observe_disparity
+from directshape_torch.rig.labels import depth_of_near_side, known_depth_of_car
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.points import disparity_of_depth
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from directshape_torch.calibration.disparity_observations import concatenate
-from directshape_torch.calibration.fit_disparity_field import fit_disparity_field
-from directshape_torch.calibration.kitti_observations import TruthSource, check_one_rig, observe_frame, truth_files
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import read_calibration
+from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.frames_with_truth import TruthSource, add_truth, observe_frame, truth_files
+from directshape_torch.rig.rig_file import save_rigs
 
 # One frame fits the field; more cost time only.
 _FRAMES = 5
@@ -36,11 +36,9 @@ def field_file(root: Path, source: TruthSource, out: Path) -> Path | None:
     if not _has_one_rig(root / "training" / "calib"):
         return None
     frames = [observe_frame(root, frame_id, file, source) for frame_id, file in list(files.items())[:_FRAMES]]
-    check_one_rig(frames)
-    observations = concatenate([frame.observations for frame in frames])
-    names = tuple(frame.frame_id for frame in frames)
-    out.mkdir(parents=True, exist_ok=True)
-    fit_disparity_field(observations, frames[0].size_wh, frames[0].camera, source, names).field.save(path)
+    rigs: list[RigEstimate] = []
+    add_truth(rigs, source, frames)
+    save_rigs(path, rigs)
     return path
 
 

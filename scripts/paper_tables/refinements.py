@@ -24,6 +24,7 @@ from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.refinement_files import shapes_path
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.rig_file import load_fields
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
 from paper_tables.data_sets import DataSet
@@ -126,7 +127,7 @@ class Refinery:
 
     def _field(self, data_set: DataSet, settings: Settings) -> DisparityField | None:
         path = self.fields.get(data_set.name) if settings.with_field else None
-        return None if path is None else DisparityField.load(path)
+        return None if path is None else load_fields(path)[0]
 
     def _folder(
         self,

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 
-from directshape_torch.batch.content_hashes import hash_field, hash_prior, hash_tensors
+from directshape_torch.batch.content_hashes import hash_fields, hash_prior, hash_tensors
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -37,7 +37,7 @@ def test_a_prior_has_the_same_hash_however_it_is_stored(tmp_path: Path) -> None:
 
 
 def test_every_tensor_of_a_field_counts() -> None:
-    assert hash_field(None) is None
+    assert hash_fields(()) is None
     field = DisparityField(
         coefficients=torch.zeros(10),
         hull_uv=torch.tensor([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]]),
@@ -48,7 +48,7 @@ def test_every_tensor_of_a_field_counts() -> None:
     )
     names = [name for name, value in vars(field).items() if isinstance(value, torch.Tensor)]
     assert {"coefficients", "hull_uv", "K_left", "K_right", "T_right_cam"} <= set(names)
-    changed = [hash_field(replace(field, **{name: getattr(field, name) + 1})) for name in names]
-    changed += [hash_field(field), hash_field(replace(field, size_wh=(48, 64)))]
-    assert len(set(changed)) == len(names) + 2
-    assert hash_field(replace(field, provenance={"made": "later"})) == hash_field(field)
+    changed = [hash_fields([replace(field, **{name: getattr(field, name) + 1})]) for name in names]
+    changed += [hash_fields([field]), hash_fields([replace(field, size_wh=(48, 64))]), hash_fields([field, field])]
+    assert len(set(changed)) == len(names) + 3
+    assert hash_fields([replace(field, provenance={"made": "later"})]) == hash_fields([field])

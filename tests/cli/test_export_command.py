@@ -115,7 +115,7 @@ def test_what_depends_on_the_runs_field_asks_for_it(
     inputs = ("--data", run.root, "--detections", run.root / "detections", "--masks", run.root / "masks")
     assert main(command(run, tmp_path / "export", "--format", *words, *inputs)) == 2
     said = capsys.readouterr().err
-    assert f"--stereo-bias: expected the field that the run was made with, for {purpose}, got nothing" in said
+    assert f"--rig: expected the file that the run was made with, for {purpose}, got nothing" in said
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -136,4 +136,4 @@ def test_another_rigs_field_is_refused(
     DisparityField(torch.zeros(10), hull_uv=hull, size_wh=(160, 120), **rig).save(tmp_path / "bias.json")
     words = ("--format", "points", "--data", finished.root, "--stereo-bias", tmp_path / "bias.json")
     assert main(command(finished, tmp_path / "out", *words)) == 2
-    assert "--stereo-bias: expected the field that the run was made with" in capsys.readouterr().err
+    assert "--rig: expected the disparity fields that the run was made with, got others in" in capsys.readouterr().err

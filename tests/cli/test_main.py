@@ -18,7 +18,7 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
         program.main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    assert {"refine", "demo", "build_prior", "calibrate_stereo", "export"} < set(program.COMMANDS)
+    assert {"refine", "demo", "build_prior", "calibrate_rig", "export"} < set(program.COMMANDS)
     for command in program.COMMANDS:
         assert re.search(rf"^ {{4}}{command.replace('_', '-')}\s", text, re.MULTILINE)
 
@@ -27,7 +27,7 @@ def test_the_package_is_the_program() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "directshape_torch", "--help"], capture_output=True, text=True, check=True
     )
-    assert "calibrate-stereo" in done.stdout
+    assert "calibrate-rig" in done.stdout
 
 
 @pytest.mark.parametrize("arguments", [[], ["refin"], ["refine"], ["compare", "--labels", "x"]])

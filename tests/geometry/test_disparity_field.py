@@ -153,7 +153,7 @@ def test_a_calibration_with_nan_is_refused() -> None:
 
 
 def test_another_image_size_is_refused() -> None:
-    with pytest.raises(InputError, match=r"1242 x 375.*1224 x 370.*calibrate-stereo"):
+    with pytest.raises(InputError, match=r"1242 x 375.*1224 x 370.*calibrate-rig"):
         smooth_field().check_rig((1224, 370), *rig())
 
 

@@ -42,6 +42,15 @@ def make_run(folder: Path) -> FinishedRun:
     root.mkdir()
     prior = write_data_set(root, FRAMES)
     words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks", "--out", out]
-    options = ["--prior", root / "prior.npz", "--device", "cpu", "--set", "stages=[{max_iterations: 6}]"]
+    options = [
+        "--prior",
+        root / "prior.npz",
+        "--device",
+        "cpu",
+        "--rig",
+        "none",
+        "--set",
+        "stages=[{max_iterations: 6}]",
+    ]
     assert main([str(word) for word in (*words, *options)]) == 0
     return FinishedRun(root, out, prior)

@@ -178,6 +178,13 @@ def test_instance_png_of_another_size(tmp_path: Path) -> None:
         mask_source(tmp_path).read("000000", SIZE_HW)
 
 
+def test_instance_png_of_the_left_images_alone(tmp_path: Path) -> None:
+    write_png(tmp_path / "instance_2" / "000000.png", np.full(SIZE_HW, 1001, np.uint16))
+    source = mask_source(tmp_path)
+    assert [mask.side for mask in source.read("000000", SIZE_HW)] == ["left"]
+    assert source.files("000000") == (tmp_path / "instance_2" / "000000.png",)
+
+
 def test_plain_coco_files_of_a_whole_data_set(tmp_path: Path) -> None:
     left = write_json(tmp_path / "l.json", [entry(image_id=8), entry(image_id=107, score=0.25), entry(image_id="8")])
     right = write_json(tmp_path / "r.json", [entry(image_id=107)])

@@ -10,11 +10,11 @@ import torch
 from helpers.kitti_folder import write_data_set
 from helpers.layouts import DAY, DRIVE, SEQUENCE, put, write, write_folder, write_raw, write_sequence
 
-from directshape_torch.calibration.observations_lidar import known_depth_from_lidar
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.kitti_calibration import read_velo_to_cam, to_stereo_camera
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
+from directshape_torch.rig.lidar import known_depth_from_lidar
 
 FRAME = "000000"
 SIZE_WH = (240, 96)

@@ -9,7 +9,7 @@ export function showSummary() {
   byId("subtitle").textContent = `${counted(run.frames_done, "frame")}, ${counted(run.cars, "car")}, ${run.refined} refined`;
   byId("made-by").textContent =
     `Written by directshape_torch (results of version ${run.package_version}). 3D views by three.js, MIT licence.`;
-  byId("summary").append(...[tiles(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
+  byId("summary").append(...[tiles(), rig(), notes(), failures(), statuses(), settings()].filter((part) => part !== null));
 }
 
 function tiles() {
@@ -42,6 +42,15 @@ function notes() {
   if (!run.notes.length) return null;
   return element("div", { class: "notice", id: "notes" }, element("strong", {}, "What this page lacks"),
     element("ul", {}, ...run.notes.map((note) => element("li", {}, note))));
+}
+
+function rig() {
+  if (run.rig === null) return null;
+  const words = run.rig.words.map((line) => element("p", {}, line));
+  if (run.rig.picture === null) return element("div", { id: "rig" }, ...words);
+  const title = element("summary", {}, "Disparity field of the rig, and the detections behind it");
+  const picture = element("img", { src: run.rig.picture, alt: "", style: "max-width: 100%" });
+  return element("div", { id: "rig" }, ...words, element("details", {}, title, picture));
 }
 
 function failures() {

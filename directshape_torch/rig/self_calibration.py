@@ -20,16 +20,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import DisparityObservations, concatenate
-from directshape_torch.calibration.field_constraint import FieldConstraint, scale_of
-from directshape_torch.calibration.fit_disparity_field import (
-    COEFFICIENT_SIGMA_PX,
-    FieldFit,
-    build_field,
-)
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.scene import StereoCamera
+from directshape_torch.rig.disparity_observations import DisparityObservations, concatenate
+from directshape_torch.rig.field_constraint import FieldConstraint, scale_of
+from directshape_torch.rig.pixels import COEFFICIENT_SIGMA_PX, PixelEvidence, pixel_evidence
 
 _NUM_ITERATIONS = 150
 _FIRST_ITERATIONS = 10
@@ -37,6 +32,7 @@ _SHRINK = 0.85
 _CONVERGED_PX = 1e-4
 # A field less certain than this at its own data is that of the prior, not of the images.
 _LARGEST_SIGMA_PX = 0.5
+_LEAST_SIGMA_PX, _UNKNOWN_SIGMA_PX = 0.05, 0.2
 
 
 @dataclass(frozen=True)
@@ -44,16 +40,14 @@ class SelfCalibration:
     """A field from images alone.
 
     Attributes:
-        fit: field and statistics. `after` is measured against depths that were estimated together with the field.
-        observations: disparities and rows against those depths, at the points that count.
-        sigma_px: standard deviation of the bias at the data, from how far the fields of the first and of the second
-            half of the constraints are apart; what both share (height, baseline) is not in it. None where one of them
-            alone determines no field.
+        evidence: on the field, as sure at its data as the halves of the constraints agree.
+        sigma_px: that standard deviation of the offset at the data, from how far the fields of the first and of the
+            second half of the constraints are apart; what both share (height, baseline) is not in it. None where one
+            of them alone determines no field: 0.2 px are taken then.
         converged: whether the last step was below 1e-4 px.
     """
 
-    fit: FieldFit
-    observations: DisparityObservations
+    evidence: PixelEvidence
     sigma_px: float | None
     converged: bool
 
@@ -78,8 +72,7 @@ class _Solution:
 def self_calibrate(
     constraints: Sequence[FieldConstraint],
     size_wh: tuple[int, int],
-    camera: StereoCamera,
-    frame_ids: tuple[str, ...] = (),
+    num_frames: int,
     on_step: Callable[[], object] | None = None,
 ) -> SelfCalibration:
     """The field that explains all constraints best: robust Gauss-Newton, each constraint's own unknowns eliminated.
@@ -87,8 +80,7 @@ def self_calibrate(
     Args:
         constraints: `MotionConstraint` and `RoadConstraint` of many frames of one rig, in their order in time.
         size_wh: width and height of its images.
-        camera: its calibration.
-        frame_ids: the frames; kept in the file.
+        num_frames: that the constraints are from.
         on_step: called after each step, to show progress.
 
     Raises:
@@ -96,9 +88,13 @@ def self_calibrate(
     """
     solution = _solve(constraints, on_step)
     _check_determined(solution, size_wh)
-    fit = build_field(solution.coefficients, solution.observations, size_wh, camera, "motion", frame_ids)
     sigma_px = _sigma_from_halves(constraints, solution.observations.uv_left, size_wh, on_step)
-    return SelfCalibration(fit, solution.observations, sigma_px, solution.converged)
+    # What the covariance of independent points promises is several times less than what halves differ by.
+    share = (solution.formal_sigma_px(size_wh) / max(sigma_px or _UNKNOWN_SIGMA_PX, _LEAST_SIGMA_PX)) ** 2
+    information = min(share, 1.0) * torch.linalg.inv(solution.covariance)
+    of_pixels = pixel_evidence(solution.observations, size_wh, num_frames)
+    evidence = of_pixels._replace(information=information, vector=information @ solution.coefficients)
+    return SelfCalibration(evidence, sigma_px, solution.converged)
 
 
 def _solve(constraints: Sequence[FieldConstraint], on_step: Callable[[], object] | None) -> _Solution:

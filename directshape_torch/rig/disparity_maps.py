@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from directshape_torch.calibration.disparity_observations import KnownDepth
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.image_files import read_single_channel
+from directshape_torch.rig.disparity_observations import KnownDepth
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.points import depth_from_disparity
 

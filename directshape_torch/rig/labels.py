@@ -1,7 +1,7 @@
 """True depth from 3D box labels, where there is neither LiDAR nor a disparity map.
 
-A box is not a car: only the band of bumpers, doors and boot lid is used, taken to lie 10 cm within the box, of visible
-cars beyond 15 m, where 10 cm are at most 0.17 px. It gives the constant and a slope, hardly more.
+Only visible cars beyond 15 m are used, where the 10 cm by which a car lies within its box are at most 0.17 px. It gives
+the constant and a slope, hardly more.
 """
 
 from __future__ import annotations
@@ -11,21 +11,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import KnownDepth
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.rays import ray_box_interval
-from directshape_torch.geometry.se3 import inverse, transform
+from directshape_torch.geometry.pinhole import project
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.rig.disparity_observations import KnownDepth
+from directshape_torch.rig.near_side import near_side_depth
 from directshape_torch.scene import StereoCamera
 
 CLASSES = ("Car", "Van")
 _NEAREST_M = 15.0
 _FARTHEST_M = 60.0
-_SETBACK_M = 0.1
 _LARGEST_TRUNCATION = 0.05
-# Share of the box's height in which its sides are near the car's.
-_BAND = (0.2, 0.55)
 _POINTS_PER_CAR = 400
 
 
@@ -80,20 +76,8 @@ def depth_of_near_side(
         tensor([20.1000,     nan], dtype=torch.float64)
     """
     location_ref, rotation_y, hwl = _box(car)
-    T_obj_cam = inverse(pose_from_kitti(location_ref + camera.t_cam_ref[0].double(), rotation_y))
-    rays_cam = rays_from_pixels(uv_left, camera.K_left[0].double())
-    height, half_width, half_length = hwl[0], hwl[1] / 2 - _SETBACK_M, hwl[2] / 2 - _SETBACK_M
-    bounds = torch.stack(
-        [
-            torch.stack([-half_length, -height, -half_width]),
-            torch.stack([half_length, torch.zeros_like(height), half_width]),
-        ]
-    )
-    interval = ray_box_interval(T_obj_cam[:3, 3], rays_cam @ T_obj_cam[:3, :3].T, bounds)
-    points_obj = transform(T_obj_cam, interval.near[:, None] * rays_cam)
-    level = -points_obj[:, 1] / height
-    on_band = interval.hit & (level > _BAND[0]) & (level < _BAND[1])
-    return torch.where(on_band, interval.near, torch.nan)
+    T_cam_obj = pose_from_kitti(location_ref + camera.t_cam_ref[0].double(), rotation_y)
+    return near_side_depth(T_cam_obj, hwl, uv_left, camera.K_left[0].double())
 
 
 def _box(car: KittiObject) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from directshape_torch.calibration.compare_fields import compare_fields
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.rig.compare_fields import compare_fields
 
 SIZE = (401, 201)
 

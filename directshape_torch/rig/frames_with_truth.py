@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 import torch
 
-from directshape_torch.calibration.disparity_observations import DisparityObservations, KnownDepth, observe_disparity
-from directshape_torch.calibration.observations_disparity import FOLDERS, known_depth_from_disparity_map
-from directshape_torch.calibration.observations_labels import known_depth_from_labels
-from directshape_torch.calibration.observations_lidar import known_depth_from_lidar
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.rig.disparity_maps import FOLDERS, known_depth_from_disparity_map
+from directshape_torch.rig.disparity_observations import (
+    DisparityObservations,
+    KnownDepth,
+    concatenate,
+    observe_disparity,
+)
+from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.labels import known_depth_from_labels
+from directshape_torch.rig.lidar import known_depth_from_lidar
+from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.scene import StereoCamera
 
 TruthSource = Literal["disparity", "lidar", "labels"]
@@ -63,18 +69,23 @@ def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
     return dict(sorted(files.items()))
 
 
-def choose_frames(files: dict[str, Path], frames: Sequence[str] | None) -> tuple[str, ...]:
-    """The wanted frame ids, all if `frames` is None.
+def chosen_frames(known: Sequence[str], frames: Sequence[int | str] | None) -> list[str]:
+    """The wanted frames among those that are known, a number for a name with leading zeros; all if `frames` is None.
 
     Raises:
-        InputError: one of them has no file.
+        InputError: one of them is not known.
+
+    Example:
+        >>> chosen_frames(["000107", "007322"], [107])
+        ['000107']
     """
     if frames is None:
-        return tuple(files)
-    missing = [frame for frame in frames if frame not in files]
+        return list(known)
+    by_word = {word: name for name in known for word in (name, int(name) if name.isdecimal() else name)}
+    missing = [str(frame) for frame in frames if frame not in by_word]
     if missing:
-        raise InputError("frames", f"ids among {', '.join(list(files)[:5])} ...", ", ".join(missing[:5]))
-    return tuple(dict.fromkeys(frames))
+        raise InputError("frames", f"ids among {', '.join(known[:5])} ...", ", ".join(missing[:5]), "check --frames")
+    return list(dict.fromkeys(by_word[frame] for frame in frames))
 
 
 def observe_frame(root: Path, frame_id: str, truth: Path, source: TruthSource) -> RigFrame:
@@ -96,22 +107,20 @@ def observe_frame(root: Path, frame_id: str, truth: Path, source: TruthSource) -
     return RigFrame(frame_id, size_wh, camera, observe_disparity(left, right, camera, known))
 
 
-def check_one_rig(frames: Iterable[RigFrame]) -> None:
-    """Refuse frames of several rigs or image sizes.
+def add_truth(rigs: list[RigEstimate], source: TruthSource, frames: Sequence[RigFrame]) -> None:
+    """The evidence of observed frames to the estimates of their rigs; new rigs join the list.
 
     Raises:
-        InputError: names the first frame that does not belong to the rig of the first.
+        InputError: fewer than 50 pixels of known and measured disparity for one of the rigs.
     """
-    first: DisparityField | None = None
+    of_rig: dict[RigEstimate, list[RigFrame]] = {}
     for frame in frames:
-        rig = (frame.size_wh, frame.camera.K_left[0], frame.camera.K_right[0], frame.camera.T_right_cam[0])
-        if first is None:
-            first = DisparityField.constant(0.0, *rig)
-        try:
-            first.check_rig(*rig)
-        except InputError as error:
-            cure = "choose frames of one rig with --frames"
-            raise InputError("frames", "frames of one rig", f"{frame.frame_id} of another ({error})", cure) from error
+        camera = frame.camera
+        rig = rig_among(rigs, frame.size_wh, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
+        of_rig.setdefault(rig, []).append(frame)
+    for rig, seen in of_rig.items():
+        observations = concatenate([frame.observations for frame in seen])
+        rig.add_pixels(source, pixel_evidence(observations, seen[0].size_wh, len(seen)))
 
 
 def _known_depth(

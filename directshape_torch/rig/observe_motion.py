@@ -8,13 +8,13 @@ from pathlib import Path
 
 import torch
 
-from directshape_torch.calibration.field_constraint import FieldConstraint
-from directshape_torch.calibration.motion_constraint import MotionConstraint
-from directshape_torch.calibration.motion_tracks import STEPS, StereoFeatures, find_features, track_features
-from directshape_torch.calibration.road_constraint import RoadConstraint
-from directshape_torch.calibration.road_pixels import find_road_pixels
-from directshape_torch.calibration.stereo_sequence import StereoSequence
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.rig.field_constraint import FieldConstraint
+from directshape_torch.rig.motion_constraint import MotionConstraint
+from directshape_torch.rig.motion_tracks import STEPS, StereoFeatures, find_features, track_features
+from directshape_torch.rig.road_constraint import RoadConstraint
+from directshape_torch.rig.road_pixels import find_road_pixels
+from directshape_torch.rig.stereo_sequence import StereoSequence
 from directshape_torch.stereo_matching.disparity import match_disparity
 
 

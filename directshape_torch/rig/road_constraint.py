@@ -14,16 +14,16 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import DisparityObservations
-from directshape_torch.calibration.field_constraint import (
+from directshape_torch.geometry.disparity_field import polynomial_basis
+from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.rig.disparity_observations import DisparityObservations
+from directshape_torch.rig.field_constraint import (
     PATCH_SIGMA_PX,
     Linearisation,
     information_share,
     tukey_weight,
 )
-from directshape_torch.calibration.road_pixels import RoadPixels
-from directshape_torch.geometry.disparity_field import polynomial_basis
-from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.rig.road_pixels import RoadPixels
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.points import disparity_of_depth
 

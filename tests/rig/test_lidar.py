@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.calibration.observations_lidar import known_depth_from_lidar
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
+from directshape_torch.rig.lidar import known_depth_from_lidar
 
 SIZE = (400, 160)
 # x forward, y left, z up becomes x right, y down, z forward.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
+from directshape_torch.rig.frames_with_truth import chosen_frames
 from directshape_torch.scene import StereoCamera
 
 _ENDINGS = (".png", ".jpg", ".jpeg")
@@ -58,7 +59,7 @@ class StereoSequence:
         return left, right
 
 
-def open_sequence(root: Path, frames: Sequence[str] | None = None) -> StereoSequence:
+def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> StereoSequence:
     """The sequence in a folder with `image_02`, `image_03` and `calib.txt` (lines P2 and P3).
 
     Args:
@@ -69,12 +70,8 @@ def open_sequence(root: Path, frames: Sequence[str] | None = None) -> StereoSequ
         DataFormatError: there is no calibration, or no left or right image of a frame.
         InputError: one of `frames` has no image, or fewer than two frames are left.
     """
-    found = _images(root, "image_02")
-    missing = sorted(set(frames or ()) - found, key=_in_time)
-    if missing:
-        known = ", ".join(sorted(found, key=_in_time)[:5])
-        raise InputError("frames", f"ids among {known} ...", ", ".join(missing[:5]), "check --frames")
-    chosen = tuple(sorted(found if frames is None else set(frames), key=_in_time))
+    known = sorted(_images(root, "image_02"), key=_in_time)
+    chosen = tuple(sorted(chosen_frames(known, frames), key=_in_time))
     if len(chosen) < 2:
         raise InputError("frames", "at least two consecutive frames", str(len(chosen)), "give more frames")
     # Now rather than after minutes of work on the frames before it.

@@ -9,8 +9,8 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import DisparityObservations
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS
+from directshape_torch.rig.disparity_observations import DisparityObservations
 
 # Standard deviation of a patch's disparity, pixels.
 PATCH_SIGMA_PX = 0.12

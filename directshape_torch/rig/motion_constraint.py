@@ -17,18 +17,18 @@ import torch
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from directshape_torch.calibration.disparity_observations import DisparityObservations
-from directshape_torch.calibration.field_constraint import (
+from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
+from directshape_torch.geometry.pinhole import project, rays_from_pixels
+from directshape_torch.geometry.se3 import exp
+from directshape_torch.rig.disparity_observations import DisparityObservations
+from directshape_torch.rig.field_constraint import (
     PATCH_SIGMA_PX,
     Linearisation,
     information_share,
     tukey_weight,
 )
-from directshape_torch.calibration.motion_tracks import TrackedFeatures
-from directshape_torch.calibration.road_constraint import disparity_slope
-from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.se3 import exp
+from directshape_torch.rig.motion_tracks import TrackedFeatures
+from directshape_torch.rig.road_constraint import disparity_slope
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.points import depth_from_disparity, disparity_of_depth
 

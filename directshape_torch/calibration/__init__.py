@@ -1,1 +1,0 @@
-"""Fitting the residual disparity of a stereo rig to frames with known depth."""

@@ -1,0 +1,160 @@
+"""`directshape calibrate-rig`: what is known of a stereo rig and of a detector, from every kind of evidence."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from directshape_torch.cli.data_options import add_data_options, dataset_of
+
+if TYPE_CHECKING:
+    from directshape_torch.geometry.disparity_field import DisparityField
+    from directshape_torch.rig.estimate import RigEstimate
+    from directshape_torch.rig.frames_with_truth import TruthSource
+
+_DESCRIPTION = """
+Estimate by how much disparities are off over the images of a stereo rig, and the depths of a detector, for 'directshape
+refine --rig FILE'. 'refine' does this by itself from detections (docs/your_rig.md); here other evidence joins them:
+LiDAR scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), labels (training/label_2), or
+consecutive frames of a car that drives past still things ('motion': ROOT is one sequence with image_02, image_03 and
+calib.txt, as in KITTI's tracking benchmark). All kinds add up, those in the file of --rig too.
+"""
+
+_SOURCES = ("detections", "lidar", "disparity", "labels", "motion")
+
+
+# argparse's own type for this argument is private, hence the generic `_SubParsersAction` in quotes.
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command and its options."""
+    parser = subparsers.add_parser(
+        "calibrate-rig",
+        aliases=["calibrate-stereo"],
+        help="what a stereo rig's disparities and a detector's depths are off by",
+        description=_DESCRIPTION,
+    )
+    add_data_options(parser, with_disparity=False)
+    parser.add_argument(
+        "--from",
+        dest="sources",
+        nargs="+",
+        choices=_SOURCES,
+        default=["detections"],
+        help="kinds of evidence (default: detections); of motion, 0 as --camera-height means that it is not known",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE.json", help="file to write, and a picture .png"
+    )
+    parser.add_argument(
+        "--against", nargs="+", type=Path, default=[], metavar="FILE.json", help="print the difference to other files"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate, write file and picture, report; 0, or 1 where there is no evidence or not all could be compared.
+
+    Raises:
+        DirectShapeError: a missing or damaged file, or too few observations.
+    """
+    # Imported here so that `directshape --help` does not wait for torch.
+    from directshape_torch.files.atomic_files import write_png
+    from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
+    from directshape_torch.visualize.rig_picture import draw_rigs
+
+    # Before the work, which may take minutes.
+    others = {path: load_fields(path) for path in args.against}
+    rigs = [] if args.rig == "none" else load_rigs(args.rig)
+    for source in dict.fromkeys(args.sources):
+        _add(source, args, rigs)
+    if not rigs:
+        print("error: no frame could be read", file=sys.stderr)
+        return 1
+    for rig in rigs:
+        print(rig)
+        print(rig.along_the_width())
+    picture = args.out.with_suffix(".png")
+    save_rigs(args.out, rigs)
+    write_png(picture, draw_rigs(rigs))
+    print(f"wrote {args.out} and {picture}")
+    return _print_differences(rigs, others)
+
+
+def _add(source: str, args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
+    """The evidence of one kind to the estimates that it belongs to."""
+    if source == "detections":
+        _add_detections(args, rigs)
+    elif source == "motion":
+        _add_motion(args, rigs)
+    else:
+        _add_truth(args, source, rigs)  # type: ignore[arg-type]
+
+
+def _add_detections(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
+    from tqdm import tqdm
+
+    from directshape_torch.rig.of_dataset import estimate_rigs
+
+    with tqdm(desc="detections", unit="frame", file=sys.stderr, disable=not sys.stderr.isatty()) as bar:
+        estimate_rigs(dataset_of(args), lambda _: bar.update(), rigs)
+
+
+def _add_truth(args: argparse.Namespace, source: TruthSource, rigs: list[RigEstimate]) -> None:
+    """Every frame that can be read; one that cannot is reported and left out."""
+    from tqdm import tqdm
+
+    from directshape_torch.errors import DataFormatError
+    from directshape_torch.rig.frames_with_truth import add_truth, chosen_frames, observe_frame, truth_files
+
+    files, frames = truth_files(args.data, source), []
+    names = chosen_frames(list(files), args.frames)
+    for frame_id in tqdm(names, desc=source, unit="frame", disable=not sys.stderr.isatty()):
+        try:
+            frames.append(observe_frame(args.data, frame_id, files[frame_id], source))
+        except DataFormatError as error:
+            print(f"frame {frame_id} left out: {error}", file=sys.stderr)
+    add_truth(rigs, source, frames)
+
+
+def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
+    from tqdm import tqdm
+
+    from directshape_torch.errors import InputError
+    from directshape_torch.rig.estimate import rig_among
+    from directshape_torch.rig.observe_motion import observe_motion
+    from directshape_torch.rig.self_calibration import self_calibrate
+    from directshape_torch.rig.stereo_sequence import open_sequence
+
+    if not 0 <= args.camera_height < 10:
+        raise InputError("--camera-height", "metres between 0 (not known) and 10", str(args.camera_height))
+    sequence = open_sequence(args.data, args.frames)
+    for before, after in sequence.gaps():
+        print(f"warning: frames {before} and {after} are not consecutive: few points are found again", file=sys.stderr)
+    hidden = not sys.stderr.isatty()
+    shown = tqdm(sequence.frame_ids, desc="motion", unit="frame", disable=hidden)
+    constraints, size_wh = observe_motion(sequence, args.camera_height or None, shown)
+    with tqdm(desc="fit to all frames, then to halves", unit="step", disable=hidden) as bar:
+        found = self_calibrate(constraints, size_wh, len(sequence.frame_ids), bar.update)
+    if not found.converged:
+        print("warning: the fit was still moving when it was ended", file=sys.stderr)
+    camera = sequence.camera
+    rig_among(rigs, size_wh, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]).add_pixels(
+        "motion", found.evidence
+    )
+
+
+def _print_differences(rigs: list[RigEstimate], others: dict[Path, tuple[DisparityField, ...]]) -> int:
+    """To the fields of other files; 1 where one of them belongs to another rig or another part of the image."""
+    from directshape_torch.errors import InputError
+    from directshape_torch.rig.compare_fields import compare_fields
+
+    exit_code = 0
+    for path, fields in others.items():
+        for rig in rigs:
+            try:
+                print(f"less {path}, where both have data: {compare_fields(rig.field, fields[0])}")
+            except InputError as error:
+                print(f"not compared with {path}: {error}", file=sys.stderr)
+                exit_code = 1
+    return exit_code

@@ -1,0 +1,128 @@
+"""What detections say of the rig: disparities on the near side of each car against those that its box implies."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.box3d import box_corners
+from directshape_torch.geometry.pinhole import project
+from directshape_torch.image.gradients import grey_levels
+from directshape_torch.rig.near_side import near_side_depth
+from directshape_torch.rig.silhouette_size import size_error
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.stereo_matching.disparity import match_disparity
+from directshape_torch.stereo_matching.points import disparity_of_depth
+from directshape_torch.stereo_matching.subpixel import refine_disparity
+
+# A reduced observation, pixels: place in the left image, measured disparity, the same less the implied one and its
+# standard deviation by the car's own spread, measured less predicted row and its standard deviation; and the relative
+# error of the box's depth by the size of its mask, 0 where it is not known.
+COLUMNS = ("u", "v", "disparity", "offset", "sigma", "row_offset", "row_sigma", "size_error")
+
+_NEAREST_M, _FARTHEST_M = 5.0, 70.0
+_POINTS_PER_CAR = 400
+_FEWEST_POINTS = 20
+# Neighbouring patches overlap: so many pixels count as one measurement.
+_POINTS_OF_ONE_PATCH = 20
+# A side's own relief and a heading that is off spread the offsets of one car; more is another thing in its place.
+_LARGEST_SPREAD_M, _LARGEST_SPREAD_PX = 0.5, 0.7
+# No detector is that far off: units, frames or the car itself are others.
+_LARGEST_OFFSET_PX, _LARGEST_SHARE = 2.0, 0.4
+# How far the side of one car may lie from where its box, whose dimensions are guesses, has it.
+_SURFACE_SIGMA_M = 0.15
+_TO_SIGMA = 1.4826  # of a median absolute deviation
+_MEDIAN_TO_MEAN = 1.57  # variance of a median over that of a mean
+
+
+def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 8)
+    """One row (`COLUMNS`, float64, CPU) for each car 5 to 70 m ahead whose near side is matched consistently.
+
+    Args:
+        frames: F frames; a disparity field of their camera is not used.
+        detections: B cars. Of one with a left mask only the pixels of the mask are looked at.
+    """
+    rows = [row for frame in range(len(frames)) for row in _rows_of_frame(frames, detections, frame)]
+    return torch.stack(rows) if rows else torch.zeros(0, len(COLUMNS), dtype=torch.float64)
+
+
+def _rows_of_frame(frames: FrameBatch, detections: Detections, frame: int) -> list[Tensor]:
+    depth = detections.T_cam_obj[:, 2, 3]
+    ahead = (detections.frame_index == frame) & (depth > _NEAREST_M) & (depth < _FARTHEST_M)
+    if not bool(ahead.any()):
+        return []
+    height, width = frames.sizes[frame].tolist()
+    images = [i[frame, :, :height, :width].detach().double().cpu() for i in (frames.images_left, frames.images_right)]
+    left, right = ((255 * i).round().clamp(0, 255).byte().permute(1, 2, 0).numpy() for i in images)
+    matched = torch.from_numpy(match_disparity(left, right)).double()
+    grey_left, grey_right = (grey_levels(i[None])[0] for i in images)
+    camera = frames.camera
+    calibration = tuple(t[frame].detach().double().cpu() for t in (camera.K_left, camera.K_right, camera.T_right_cam))
+    cars = ahead.nonzero()[:, 0].tolist()
+    rows = (_row_of_car(detections, car, matched, (grey_left, grey_right), calibration) for car in cars)
+    return [row for row in rows if row is not None]
+
+
+def _row_of_car(
+    detections: Detections,
+    car: int,
+    matched: Tensor,  # (H, W) pixels
+    grey: tuple[Tensor, Tensor],  # left and right, (H, W)
+    calibration: tuple[Tensor, ...],  # K_left, K_right, T_right_cam
+) -> Tensor | None:
+    T_cam_obj, hwl = (t[car].detach().double().cpu() for t in (detections.T_cam_obj, detections.dimensions_hwl))
+    inside = _pixels_of_car(detections, car, T_cam_obj, hwl, calibration[0], matched)
+    uv = (inside & matched.isfinite()).nonzero().flip(1).double()
+    depth = near_side_depth(T_cam_obj, hwl, uv, calibration[0])
+    seen = depth.isfinite().nonzero()[:, 0]
+    seen = seen[:: max(1, -(-len(seen) // _POINTS_PER_CAR))]
+    if len(seen) < _FEWEST_POINTS:
+        return None
+    uv = uv[seen]
+    implied, implied_row = disparity_of_depth(uv, depth[seen], *calibration).unbind(dim=1)
+    u, v = uv.long().unbind(dim=1)
+    found = refine_disparity(*grey, uv, matched[v, u], implied_row)
+    kept, (K_left, _, T_right_cam) = found.reliable, calibration
+    offset, row_offset = (found.disparity - implied)[kept], (implied_row - found.row_shift)[kept]
+    reduced = _reduced(uv[kept], found.disparity[kept], offset, row_offset, K_left[0, 0] * -T_right_cam[0, 3])
+    size = size_error(T_cam_obj, hwl, inside, K_left) if bool(detections.has_mask_left[car]) else 0.0
+    return None if reduced is None else torch.cat([reduced, reduced.new_tensor([size])])
+
+
+def _pixels_of_car(
+    detections: Detections, car: int, T_cam_obj: Tensor, hwl: Tensor, K_left: Tensor, matched: Tensor
+) -> Tensor:
+    """(H, W) the car's mask; without a mask the pixels round its box."""
+    height, width = matched.shape
+    if bool(detections.has_mask_left[car]):
+        return detections.mask_left[car, :height, :width].detach().cpu() > 0.5
+    corners = project(box_corners(T_cam_obj, hwl), K_left)
+    limit = torch.tensor([width, height]).double()
+    low, high = corners.amin(dim=0).maximum(0 * limit).long(), corners.amax(dim=0).minimum(limit).ceil().long()
+    inside = torch.zeros(height, width, dtype=torch.bool)
+    inside[low[1] : high[1].clamp_min(0), low[0] : high[0].clamp_min(0)] = True
+    return inside
+
+
+def _reduced(
+    uv: Tensor,  # (P, 2)
+    disparity: Tensor,  # (P,) measured
+    offset: Tensor,  # (P,)
+    row_offset: Tensor,  # (P,)
+    focal_baseline: Tensor,  # () pixels x metres
+) -> Tensor | None:
+    """The car's medians, or None where its pixels are few or contradict each other."""
+    if len(uv) < _FEWEST_POINTS:
+        return None
+    middle = disparity.median()
+    pixels_per_m = middle**2 / focal_baseline
+    spread, row_spread = (_TO_SIGMA * (x - x.median()).abs().median() for x in (offset, row_offset))
+    if offset.median().abs() > _LARGEST_OFFSET_PX + _LARGEST_SHARE * middle:
+        return None
+    if spread > _LARGEST_SPREAD_PX + _LARGEST_SPREAD_M * pixels_per_m:
+        return None
+    of_median = _MEDIAN_TO_MEAN / max(1.0, len(offset) / _POINTS_OF_ONE_PATCH)
+    sigma = (of_median * spread**2 + (_SURFACE_SIGMA_M * pixels_per_m) ** 2).sqrt()
+    row_sigma = (of_median * row_spread**2).sqrt()
+    values = (*uv.mean(dim=0), middle, offset.median(), sigma, row_offset.median(), row_sigma)
+    return torch.stack(values)

@@ -1,0 +1,245 @@
+"""`RigEstimate`: what is known of one stereo rig and of the detector behind it, from all evidence so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField, polynomial_basis
+from directshape_torch.rig.detections import COLUMNS, observe_detections
+from directshape_torch.rig.pixels import PixelEvidence, hull
+from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
+from directshape_torch.scene import Detections, FrameBatch
+
+# A service runs for years; so many cars say all that cars can say.
+_MOST_ROWS = 1000
+# Half of a car's image: where it stands the field is seen.
+_CAR_UV_PX = (40.0, 20.0)
+
+
+class Detector(NamedTuple):
+    """How the detections differ from the disparities."""
+
+    bias: float  # of the depth, relative; above 0 where boxes stand too far
+    bias_sigma: float
+    noise: float  # standard deviation of the depth, relative
+    num_cars: int
+
+
+class RigEstimate(nn.Module):
+    """The rig's disparity field and the detector's depth error, estimated from the detections themselves and from
+    whatever else is known (docs/derivations/rig.md).
+
+    It keeps the evidence: one row a car, and sums over pixels of known depth. So it does not matter in which order or
+    in how many portions frames come. All of it stays on the CPU in float64, in the `state_dict` as extra state; fields
+    go to the device of whoever asks them.
+
+    Args:
+        size_wh: width and height of the rig's images.
+        K_left, K_right: (3, 3) intrinsics, pixels.
+        T_right_cam: (4, 4) left to right camera, metres.
+
+    Example:
+        >>> K, T_right_cam = torch.tensor([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]]), torch.eye(4)
+        >>> T_right_cam[0, 3] = -0.54
+        >>> rig = RigEstimate((1242, 375), K, K, T_right_cam)
+        >>> [round(float(x), 2) for x in rig.offset_at(torch.tensor([620.0, 180.0]))]  # nothing seen, nothing known
+        [0.0, 0.23]
+    """
+
+    def __init__(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> None:
+        super().__init__()
+        matrices = (matrix.detach().double().cpu() for matrix in (K_left, K_right, T_right_cam))
+        self._blank = DisparityField.constant(0.0, size_wh, *matrices)
+        self.rows = torch.zeros(0, len(COLUMNS), dtype=torch.float64)
+        self.pixels: dict[str, PixelEvidence] = {}
+        self._solved: tuple[Posterior, DisparityField] | None = None
+
+    @classmethod
+    def of_frames(cls, frames: FrameBatch) -> RigEstimate:
+        """Of the rig of the first of some frames, nothing known yet."""
+        camera, (height, width) = frames.camera, frames.sizes[0].tolist()
+        return cls((width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
+
+    def update(self, frames: FrameBatch, detections: Detections) -> None:
+        """Take in what the detections of further frames say.
+
+        Args:
+            frames: of this rig; each frame once.
+            detections: of any detector, always the same; left masks help.
+
+        Raises:
+            InputError: frames of another rig.
+        """
+        self.check_frames(frames)
+        self.add_rows(observe_detections(frames, detections))
+
+    def add_rows(self, rows: Tensor) -> None:
+        """Take in reduced observations of detections, (N, 8) `rig.detections.COLUMNS`."""
+        rows = torch.cat([self.rows, rows])
+        # The same rows are kept, in the same order, however they came.
+        key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
+        self.rows, self._solved = rows[key.argsort()[:_MOST_ROWS]], None
+
+    def add_pixels(self, kind: str, evidence: PixelEvidence) -> None:
+        """Take in pixels of known depth: `kind` is "lidar", "disparity", "labels" or "motion"."""
+        before = self.pixels.get(kind)
+        self.pixels[kind], self._solved = evidence if before is None else before + evidence, None
+
+    @property
+    def mean(self) -> Tensor:
+        """(12,) coefficients of the field (pixels), relative depth bias of the detector, its setback (metres)."""
+        return self._posterior().mean
+
+    @property
+    def covariance(self) -> Tensor:
+        """(12, 12), of `mean`."""
+        return self._posterior().covariance
+
+    @property
+    def detector(self) -> Detector:
+        """Bias and noise of the detector's depths; without detections those of the prior."""
+        found = self._posterior()
+        sigma = float(found.covariance[BIAS, BIAS].sqrt())
+        return Detector(float(found.mean[BIAS]), sigma, found.depth_noise, len(self.rows))
+
+    @property
+    def field(self) -> DisparityField:
+        """The most probable field, for `StereoCamera`."""
+        return self._solve()[1]
+
+    def offset_at(
+        self,
+        uv_left: Tensor,  # (*, 2) pixels of the left image
+    ) -> tuple[Tensor, Tensor]:  # (*,), (*,)
+        """Measured less true disparity and its standard deviation, pixels, in the dtype of `uv_left`.
+
+        Beyond the data the field's value is that of the nearest data and the standard deviation that of the place.
+        """
+        basis = polynomial_basis(uv_left, self._blank.size_wh)
+        covariance = self.covariance[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS].to(basis)
+        return self.field.bias(uv_left), ((basis @ covariance) * basis).sum(dim=-1).clamp_min(0).sqrt()
+
+    def in_the_middle(self) -> tuple[float, float]:
+        """Offset and its standard deviation, pixels, at the median place of the cars; without any at the centre."""
+        width, height = self._blank.size_wh
+        centre = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=torch.float64)
+        mean, sigma = self.offset_at(self.rows[:, :2].median(dim=0).values if len(self.rows) else centre)
+        return float(mean), float(sigma)
+
+    def corrected(self, frames: FrameBatch) -> FrameBatch:
+        """Frames whose camera has the estimated field; those that bring a field of their own keep it.
+
+        Raises:
+            InputError: frames of another rig.
+        """
+        if frames.camera.disparity_field is not None:
+            return frames
+        return replace(frames, camera=replace(frames.camera, disparity_field=self.field))
+
+    def check_frames(self, frames: FrameBatch) -> None:
+        """Refuse frames of another rig.
+
+        Raises:
+            InputError: image size, intrinsics or right camera differ.
+        """
+        camera = frames.camera
+        for k, (height, width) in enumerate(frames.sizes.tolist()):
+            self._blank.check_rig((width, height), camera.K_left[k], camera.K_right[k], camera.T_right_cam[k])
+
+    def __str__(self) -> str:
+        """One line of what was found and from what."""
+        (offset, sigma), detector = self.in_the_middle(), self.detector
+        sources = [f"{len(self.rows)} detections"] if len(self.rows) else []
+        sources += [f"{kind} ({e.num_frames} frames)" for kind, e in sorted(self.pixels.items())]
+        line = f"rig: {offset:+.2f} +- {sigma:.2f} px in the middle, from {', '.join(sources) or 'nothing'}"
+        if len(self.rows):
+            bias = f"depth {detector.bias:+.1%} +- {detector.bias_sigma:.1%}, noise {detector.noise:.1%}"
+            line += f"; detector: {bias.replace('%', ' %')}"
+        return line
+
+    def along_the_width(self) -> str:
+        """Offsets with their standard deviations across the image, on the row of `in_the_middle`, in one line."""
+        width, height = self._blank.size_wh
+        v = float(self.rows[:, 1].median()) if len(self.rows) else (height - 1) / 2
+        u = torch.linspace(0.05, 0.95, 5, dtype=torch.float64) * (width - 1)
+        mean, sigma = self.offset_at(torch.stack([u, torch.full_like(u, v)], dim=1))
+        known = zip(u.tolist(), mean.tolist(), sigma.tolist(), strict=True)
+        return f"  at v = {v:.0f}: " + ", ".join(f"u {at:.0f}: {m:+.2f} +- {s:.2f}" for at, m, s in known)
+
+    def metres_per_pixel(self, depth_m: float) -> float:
+        """By how much a pixel of disparity moves a point of that depth."""
+        return depth_m**2 / self._focal_baseline
+
+    def is_of(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> bool:
+        """Whether this is the rig of such frames."""
+        try:
+            self._blank.check_rig(size_wh, K_left, K_right, T_right_cam)
+        except InputError:
+            return False
+        return True
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """All that the estimate rests on, as tensors and numbers; `set_extra_state` takes it back."""
+        rig = {name: getattr(self._blank, name) for name in ("K_left", "K_right", "T_right_cam")}
+        pixels = {kind: evidence._asdict() for kind, evidence in self.pixels.items()}
+        return {"size_wh": list(self._blank.size_wh), **rig, "rows": self.rows, "pixels": pixels}
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        """Of `get_extra_state`; nothing of what was known before stays."""
+        matrices = (state[name].double().cpu() for name in ("K_left", "K_right", "T_right_cam"))
+        self._blank = DisparityField.constant(0.0, (state["size_wh"][0], state["size_wh"][1]), *matrices)
+        self.rows, self._solved = state["rows"].double().cpu(), None
+        self.pixels = {kind: PixelEvidence(**evidence) for kind, evidence in state["pixels"].items()}
+
+    @property
+    def _focal_baseline(self) -> float:
+        return float(self._blank.K_left[0, 0] * -self._blank.T_right_cam[0, 3])
+
+    def _posterior(self) -> Posterior:
+        return self._solve()[0]
+
+    def _solve(self) -> tuple[Posterior, DisparityField]:
+        if self._solved is None:
+            blank, nothing = self._blank, torch.zeros(NUM_COEFFICIENTS, dtype=torch.float64)
+            of_field, of_rows = (nothing.diag(), nothing), (nothing.diag(), nothing)
+            for e in self.pixels.values():
+                of_field = of_field[0] + e.information, of_field[1] + e.vector
+                of_rows = of_rows[0] + e.row_information, of_rows[1] + e.row_vector
+            found = solve_offsets(self.rows, blank.size_wh, self._focal_baseline, *of_field)
+            row_offsets = solve_rows(self.rows, blank.size_wh, *of_rows)
+            field = replace(
+                blank,
+                coefficients=found.mean[:NUM_COEFFICIENTS],
+                vertical_coefficients=row_offsets,
+                hull_uv=self._hull(),
+            )
+            self._solved = found, field
+        return self._solved
+
+    def _hull(self) -> Tensor:
+        """Round all data; the whole image where there are none, for the field is level then."""
+        around = torch.tensor([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]]).double() * torch.tensor(_CAR_UV_PX).double()
+        corners = [(self.rows[:, None, :2] + around).reshape(-1, 2), *(e.hull_uv for e in self.pixels.values())]
+        uv = torch.cat(corners)
+        return hull(uv) if len(uv) else self._blank.hull_uv
+
+
+def rig_among(
+    rigs: list[RigEstimate],
+    size_wh: tuple[int, int],
+    K_left: Tensor,  # (3, 3)
+    K_right: Tensor,  # (3, 3)
+    T_right_cam: Tensor,  # (4, 4)
+) -> RigEstimate:
+    """The estimate of that rig; one that knows nothing yet joins the list where there is none."""
+    known = [rig for rig in rigs if rig.is_of(size_wh, K_left, K_right, T_right_cam)]
+    if known:
+        return known[0]
+    rigs.append(RigEstimate(size_wh, K_left, K_right, T_right_cam))
+    return rigs[-1]

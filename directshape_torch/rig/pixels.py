@@ -1,0 +1,132 @@
+"""Pixels of known depth as evidence on a rig's field: LiDAR, disparity maps, labels, and points of a moving rig."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
+from directshape_torch.rig.disparity_observations import DisparityObservations, cell_index
+
+_BALANCE_GRID = (16, 8)
+# Points of one cell share their scene and its errors: they count as this many independent ones at most, and those of
+# one frame, which share its scene and the errors of the model, as that many.
+_INDEPENDENT_PER_CELL = 10
+_INDEPENDENT_PER_FRAME = 60
+_NUM_ITERATIONS = 60
+_TUKEY = 4.685
+_SMALLEST_SCALE_PX = 0.02
+# Aligned patches are good to a tenth of a pixel or two. Wrong ones, on depth edges, err towards the nearer side by a
+# pixel and more: their spread must not become the scale by which they are judged, so it shrinks to the patches' own.
+_FIRST_ITERATIONS = 15
+_SHRINK = 0.93
+_PATCH_SCALE_PX = 0.15
+_SMALLEST_NUMBER = 50
+_TO_SIGMA = 1.4826  # of a median absolute deviation
+# Wide enough to leave the fit to the data, and tame where those are thin; by degree.
+COEFFICIENT_SIGMA_PX = (5.0, 2.0, 1.0, 0.5, 0.5)
+_LARGEST_HULL = 24
+
+
+class PixelEvidence(NamedTuple):
+    """What pixels of known depth say of the coefficients of a field, in information form.
+
+    Of offsets and of rows: `H c = b` at their best coefficients, `H` the inverse of their covariance.
+    """
+
+    num_points: int
+    num_frames: int
+    information: Tensor  # (10, 10) 1/pixels^2
+    vector: Tensor  # (10,) 1/pixels
+    row_information: Tensor  # (10, 10)
+    row_vector: Tensor  # (10,)
+    hull_uv: Tensor  # (M, 2) round the pixels
+
+    def __add__(self, other: PixelEvidence) -> PixelEvidence:  # type: ignore[override]
+        """Both together, as independent."""
+        return PixelEvidence(
+            self.num_points + other.num_points,
+            self.num_frames + other.num_frames,
+            self.information + other.information,
+            self.vector + other.vector,
+            self.row_information + other.row_information,
+            self.row_vector + other.row_vector,
+            hull(torch.cat([self.hull_uv, other.hull_uv])),
+        )
+
+
+def pixel_evidence(observations: DisparityObservations, size_wh: tuple[int, int], num_frames: int = 1) -> PixelEvidence:
+    """Reweighted least squares (Tukey), each part of the image counting alike.
+
+    Args:
+        observations: measured against true disparity, of one rig.
+        size_wh: width and height of its images.
+        num_frames: that they are from.
+
+    Raises:
+        InputError: fewer than 50 observations.
+    """
+    if len(observations) < _SMALLEST_NUMBER:
+        raise InputError(
+            "observations",
+            f"at least {_SMALLEST_NUMBER} pixels of known and measured disparity",
+            str(len(observations)),
+            "give more frames, or check that calibration and ground truth belong to the images",
+        )
+    uv = observations.uv_left
+    basis, balance = polynomial_basis(uv, size_wh), _balance(uv, size_wh)
+    parts = (_information(basis, y, balance, num_frames) for y in (observations.bias_px, observations.vertical_px))
+    (H, b), (H_row, b_row) = parts
+    return PixelEvidence(len(observations), num_frames, H, b, H_row, b_row, hull(uv))
+
+
+def hull(uv: Tensor) -> Tensor:  # (P, 2) -> (M, 2)
+    """Convex polygon of at most 24 corners round pixels, never beyond them.
+
+    Example:
+        >>> len(hull(torch.tensor([[0.0, 0], [9, 0], [9, 9], [5, 5], [0, 9]])))
+        4
+    """
+    import cv2
+
+    corners = cv2.convexHull(uv.numpy().astype(np.float32))
+    tolerance = 1.0
+    while len(corners) > _LARGEST_HULL:
+        corners = cv2.convexHull(cv2.approxPolyDP(corners, tolerance, closed=True))
+        tolerance *= 1.5
+    return torch.from_numpy(np.asarray(corners, dtype=np.float64).reshape(-1, 2))
+
+
+def _information(
+    basis: Tensor,  # (P, 10)
+    offset_px: Tensor,  # (P,)
+    balance: Tensor,  # (P,)
+    num_frames: int,
+) -> tuple[Tensor, Tensor]:
+    """Tukey's biweight from a start that is the median alone; its scale shrinks from the residuals' spread to the
+    accuracy of the patches, because the outliers are one-sided."""
+    sigma = torch.tensor([COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=basis.dtype)
+    coefficients = torch.zeros(NUM_COEFFICIENTS, dtype=basis.dtype)
+    coefficients[0] = offset_px.median()
+    scale, weight = torch.zeros_like(sigma[0]), balance
+    for iteration in range(_NUM_ITERATIONS):
+        residual = offset_px - basis @ coefficients
+        spread = (_TO_SIGMA * residual.abs().median()).clamp_min(_SMALLEST_SCALE_PX)
+        shrunk = torch.minimum(scale, (_SHRINK * scale).clamp_min(_PATCH_SCALE_PX))
+        scale = spread if iteration < _FIRST_ITERATIONS else shrunk
+        weight = balance * (1 - (residual / (_TUKEY * scale)) ** 2).clamp_min(0) ** 2
+        H = basis.T @ (weight[:, None] * basis) + torch.diag(scale**2 / sigma**2)
+        coefficients = torch.linalg.solve(H, basis.T @ (weight * offset_px))
+    share = (_INDEPENDENT_PER_FRAME * num_frames / weight.sum()).clamp_max(1.0) / scale.clamp_min(_PATCH_SCALE_PX) ** 2
+    return share * basis.T @ (weight[:, None] * basis), share * basis.T @ (weight * offset_px)
+
+
+def _balance(uv: Tensor, size_wh: tuple[int, int]) -> Tensor:
+    """Weights that let no part of the image outvote another, as the road would, which has most of the points."""
+    cell = cell_index(uv, size_wh, _BALANCE_GRID)
+    count = torch.bincount(cell, minlength=_BALANCE_GRID[0] * _BALANCE_GRID[1]).double()
+    return (_INDEPENDENT_PER_CELL / count[cell]).clamp_max(1.0)

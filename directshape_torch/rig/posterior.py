@@ -1,0 +1,139 @@
+"""The rig's unknowns given all evidence (docs/derivations/rig.md).
+
+    measured - implied disparity = field(u, v) + bias d + setback d^2 / (f b) + noise
+
+`d` is the measured disparity: the implied one carries the detector's error, and a regressor with the noise of what it
+explains would be bent by it. The noise is Student-t of variance `(s d)^2 + s0^2 + sigma^2`. Noises, and how far rigs of
+this kind are off at all, are summed over a grid, so that what is not known of them widens the covariance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
+
+BIAS, SETBACK = NUM_COEFFICIENTS, NUM_COEFFICIENTS + 1
+NUM_UNKNOWNS = NUM_COEFFICIENTS + 2
+
+# Rectification leaves this much, pixels, by degree: more towards the edges than in the middle; the rows less. A rig may
+# be better than that, or exact: each of these factors is as likely.
+_FIELD_SIGMA_PX = (0.4, 0.4, 0.5, 0.3, 0.5)
+_FIELD_SCALES = torch.tensor([1.0, 0.5, 0.25, 0.05], dtype=torch.float64)
+_ROW_SIGMA_PX = (0.4, 0.3, 0.3, 0.2, 0.3)
+_ROW_NOISE_PX = 0.1
+_BIAS_SIGMA = 0.05
+# Dimensions of a detector are off in the mean by as much, and those of one car.
+_DIMENSIONS_SIGMA, _SIZE_SIGMA = 0.04, 0.08
+# Surfaces lie beside the near side of their boxes by a length that the cars of one detector share.
+_SETBACK_SIGMA_M = 0.15
+
+_DEGREES_OF_FREEDOM = 4
+_NUM_ITERATIONS = 30
+# Standard deviations of a detector's relative depth and of what is left where it is perfect; each with the middle
+# and the spread (of the logarithm) of what detectors have.
+_DEPTH_NOISE, _DEPTH_NOISE_PRIOR = torch.logspace(-2.1, -0.7, 12, dtype=torch.float64), (0.03, 0.8)
+_CONSTANT_NOISE, _CONSTANT_NOISE_PRIOR = torch.tensor([0.15, 0.25, 0.4, 0.7]).double(), (0.2, 0.5)
+
+
+class Posterior(NamedTuple):
+    """What is known of one rig and of the detector that looked through it."""
+
+    mean: Tensor  # (12,) field coefficients (pixels), relative bias of the depth, setback (metres)
+    covariance: Tensor  # (12, 12)
+    depth_noise: float  # standard deviation of the detector's relative depth
+    constant_noise_px: float
+
+
+def solve_offsets(
+    rows: Tensor,  # (N, 8) of `observe_detections`
+    size_wh: tuple[int, int],
+    focal_baseline: float,  # pixels x metres
+    information: Tensor,  # (10, 10) of the field coefficients by other evidence
+    vector: Tensor,  # (10,)
+) -> Posterior:
+    """Mean and covariance of all unknowns; without any evidence those of the priors.
+
+    Example:
+        >>> nothing = torch.zeros(10, 10).double(), torch.zeros(10).double()
+        >>> found = solve_offsets(torch.zeros(0, 8).double(), (1242, 375), 387.0, *nothing)
+        >>> round(float(found.covariance[0, 0].sqrt()), 3)
+        0.229
+    """
+    u_v, d, offset, sigma = rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4]
+    A = torch.cat([polynomial_basis(u_v, size_wh), d[:, None], d[:, None] ** 2 / focal_baseline], dim=1)
+    grid = torch.meshgrid(_DEPTH_NOISE, _CONSTANT_NOISE, _FIELD_SCALES, indexing="ij")
+    s, s0, scale = (x.reshape(-1) for x in grid)
+    variance = (s[:, None] * d) ** 2 + s0[:, None] ** 2 + sigma**2
+    own_sigma = torch.tensor([_BIAS_SIGMA, _SETBACK_SIGMA_M], dtype=torch.float64).expand(len(scale), 2)
+    prior_sigma = torch.cat([scale[:, None] * _by_degree(_FIELD_SIGMA_PX), own_sigma], dim=1)
+    H_prior, b_prior = torch.diag_embed(1 / prior_sigma**2), torch.zeros_like(prior_sigma[0])
+    H_prior[:, :NUM_COEFFICIENTS, :NUM_COEFFICIENTS] += information
+    b_prior[:NUM_COEFFICIENTS] += vector
+    by_size, its_sigma = _bias_by_size(rows[:, 7])
+    H_prior[:, BIAS, BIAS] += 1 / its_sigma**2
+    b_prior[BIAS] += by_size / its_sigma**2
+    H, mean, likelihood = _student_t(A, offset, variance, H_prior, b_prior)
+    of_noise = _log_prior(s, _DEPTH_NOISE_PRIOR) + _log_prior(s0, _CONSTANT_NOISE_PRIOR)
+    share = (likelihood - prior_sigma.log().sum(dim=1) + of_noise).softmax(dim=0)
+    overall = share @ mean
+    apart = mean - overall
+    covariance = (share[:, None, None] * (torch.linalg.inv(H) + apart[:, :, None] * apart[:, None])).sum(dim=0)
+    return Posterior(overall, covariance, *(float((share @ x.log()).exp()) for x in (s, s0)))
+
+
+def solve_rows(
+    rows: Tensor,  # (N, 8)
+    size_wh: tuple[int, int],
+    information: Tensor,  # (10, 10)
+    vector: Tensor,  # (10,)
+) -> Tensor:  # (10,)
+    """Coefficients of the row offsets, pixels."""
+    variance = (rows[:, 6] ** 2 + _ROW_NOISE_PX**2)[None]
+    basis = polynomial_basis(rows[:, :2], size_wh)
+    H_prior = (torch.diag(1 / _by_degree(_ROW_SIGMA_PX) ** 2) + information)[None]
+    _, mean, _ = _student_t(basis, rows[:, 5], variance, H_prior, vector)
+    return mean[0]
+
+
+def _bias_by_size(
+    size_error: Tensor,  # (N,) 0 where not known
+) -> tuple[float, float]:
+    """The detector's relative depth bias by the sizes of masks, and its standard deviation."""
+    known = size_error[size_error != 0]
+    if not len(known):
+        return 0.0, math.inf
+    return float(known.median()), math.hypot(_DIMENSIONS_SIGMA, _SIZE_SIGMA / math.sqrt(len(known)))
+
+
+def _student_t(
+    A: Tensor,  # (N, M)
+    y: Tensor,  # (N,)
+    variance: Tensor,  # (G, N)
+    H_prior: Tensor,  # (G, M, M)
+    b_prior: Tensor,  # (M,)
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Iteratively reweighted least squares for G noises at once: H (G, M, M), mean (G, M), log evidence (G,)."""
+    weight = torch.ones_like(variance)
+    for _ in range(_NUM_ITERATIONS):
+        weighted = (weight / variance)[..., None] * A
+        H = weighted.mT @ A + H_prior
+        mean = torch.linalg.solve(H, weighted.mT @ y + b_prior)
+        squared = (y - mean @ A.T) ** 2 / variance
+        weight = (_DEGREES_OF_FREEDOM + 1) / (_DEGREES_OF_FREEDOM + squared)
+    per_point = variance.log() + (_DEGREES_OF_FREEDOM + 1) * torch.log1p(squared / _DEGREES_OF_FREEDOM)
+    of_prior = ((mean[:, None] @ H_prior)[:, 0] * mean).sum(dim=1) - 2 * mean @ b_prior
+    return H, mean, -0.5 * (per_point.sum(dim=1) + of_prior + torch.linalg.slogdet(H)[1])
+
+
+def _by_degree(sigma: tuple[float, ...]) -> Tensor:
+    return torch.tensor([sigma[i + j] for i, j in EXPONENTS], dtype=torch.float64)
+
+
+def _log_prior(noise: Tensor, middle_and_spread: tuple[float, float]) -> Tensor:
+    middle, spread = middle_and_spread
+    return -0.5 * ((noise / middle).log() / spread) ** 2

@@ -1,0 +1,77 @@
+"""`directshape refine --rig`: estimated once for each calibration, kept, shown, or taken from a file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from helpers.kitti_folder import write_data_set
+from test_refine_command import command
+
+from directshape_torch.cli.main import main
+from directshape_torch.rig.rig_file import load_rigs
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    root = tmp_path / "kitti"
+    root.mkdir()
+    write_data_set(root, ("000000", "000001"))
+    return root
+
+
+def another_rig(root: Path, frame_id: str) -> None:
+    path = root / "training" / "calib" / f"{frame_id}.txt"
+    numbers = [line.split() for line in path.read_text().splitlines()]
+    for row in numbers:
+        row[1] = str(float(row[1]) + 1)
+    path.write_text("\n".join(" ".join(row) for row in numbers) + "\n")
+
+
+def test_is_estimated_kept_and_shown(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(command(source, out, "--frames", "0")) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("rig: "))
+    assert line.endswith("%")
+    (rig,) = load_rigs(out / "rig.json")
+    assert len(rig.rows) > 1
+    assert str(rig) == line
+    assert (out / "rig.png").is_file()
+    content = (out / "rig.json").read_bytes()
+    assert main(command(source, out)) == 0
+    assert f"{line} (kept)" in capsys.readouterr().out
+    assert (out / "rig.json").read_bytes() == content
+    assert json.loads((out / "summary.json").read_text())["sha256"]["stereo_bias"] is not None
+    assert main(["report", str(out), "--data", str(source)]) == 0
+    assert line.partition(";")[0] in (out / "report.html").read_text()
+    assert main(command(source, tmp_path / "none", "--rig", "none")) == 0
+    assert not (tmp_path / "none" / "rig.json").exists()
+
+
+def test_frames_of_two_rigs_are_refined_in_one_run(source: Path, tmp_path: Path) -> None:
+    another_rig(source, "000001")
+    assert main(command(source, tmp_path / "out", "--batch-frames", "2")) == 0
+    assert len(load_rigs(tmp_path / "out" / "rig.json")) == 2
+    file = ("--rig", str(tmp_path / "out" / "rig.json"))
+    assert main(command(source, tmp_path / "by_file", *file)) == 0
+    for name in ("data/000000.txt", "data/000001.txt"):
+        assert (tmp_path / "out" / name).read_text() == (tmp_path / "by_file" / name).read_text()
+
+
+def test_a_file_of_another_rig_fails_its_frames(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command(source, tmp_path / "out")) == 0
+    another_rig(source, "000001")
+    assert main(command(source, tmp_path / "by_file", "--rig", str(tmp_path / "out" / "rig.json"))) == 1
+    assert "a difference of 1 px; estimate this rig with 'directshape calibrate-rig'" in capsys.readouterr().err
+
+
+def test_what_is_no_estimate_is_not_overwritten(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rig.json").write_text("{}")
+    assert main(command(source, tmp_path, "--fresh")) == 2
+    assert "is no file of rigs" in capsys.readouterr().err
+    assert (tmp_path / "rig.json").read_text() == "{}"

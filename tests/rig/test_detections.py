@@ -1,0 +1,92 @@
+"""Detections of a rendered frame see no offset, and the one that its right image is warped by."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+import directshape_torch
+from directshape_torch import DirectShapeRefiner, RigEstimate
+from directshape_torch.errors import InputError
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.rig.detections import observe_detections
+from directshape_torch.scene import Detections, FrameBatch
+
+DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
+OFFSET, ROW_OFFSET = 3, 5
+
+
+@pytest.fixture(scope="module")
+def demo() -> LoadedFrame:
+    """The six cars with their true boxes."""
+    return KittiStereoDataset(DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
+
+
+def warped(frames: FrameBatch, disparity_px: float, rows_px: float) -> FrameBatch:
+    """Everything stands so far to the left and so far down in the right image."""
+    height, width = frames.images_right.shape[-2:]
+    v, u = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    uv = torch.stack([u + disparity_px, v - rows_px], dim=-1)
+    grid = 2 * uv / torch.tensor([width - 1, height - 1]) - 1
+    right = torch.nn.functional.grid_sample(
+        frames.images_right, grid[None], mode="bicubic", align_corners=True, padding_mode="border"
+    )
+    return replace(frames, images_right=right.clamp(0, 1))
+
+
+def closer(detections: Detections, share: float) -> Detections:
+    T_cam_obj = detections.T_cam_obj.clone()
+    T_cam_obj[:, :3, 3] *= 1 - share
+    return replace(detections, T_cam_obj=T_cam_obj)
+
+
+def difference(rows: Tensor, column: int, before: Tensor) -> float:
+    return float((rows[:, column].median() - before[:, column].median()).abs())
+
+
+def test_true_boxes_see_what_the_right_image_is_warped_by(demo: LoadedFrame) -> None:
+    exact = observe_detections(demo.frame, demo.detections)
+    assert len(exact) >= 4
+    assert float(exact[:, OFFSET].median().abs()) < 0.25
+    seen = observe_detections(warped(demo.frame, 0.8, 0.3), demo.detections)
+    assert difference(seen, OFFSET, exact) == pytest.approx(0.8, abs=0.1)
+    assert difference(seen, ROW_OFFSET, exact) == pytest.approx(0.3, abs=0.1)
+
+
+def test_boxes_that_are_far_off_or_not_there_say_nothing(demo: LoadedFrame) -> None:
+    assert len(observe_detections(demo.frame, closer(demo.detections, 0.6))) == 0
+    nothing = replace(demo.detections, T_cam_obj=torch.full_like(demo.detections.T_cam_obj, torch.nan))
+    assert len(observe_detections(demo.frame, nothing)) == 0
+    blank = replace(demo.frame, images_right=torch.full_like(demo.frame.images_right, 0.5))
+    assert len(observe_detections(blank, demo.detections)) == 0
+
+
+def test_without_masks_the_boxes_themselves_are_looked_at(demo: LoadedFrame) -> None:
+    with_masks = observe_detections(demo.frame, demo.detections)
+    blind = replace(demo.detections, has_mask_left=torch.zeros(len(demo.detections), dtype=torch.bool))
+    without = observe_detections(demo.frame, blind)
+    assert len(without) >= 3
+    assert difference(without, OFFSET, with_masks) < 0.3
+
+
+def test_the_refiner_corrects_frames_by_its_rig(demo: LoadedFrame) -> None:
+    rig = RigEstimate.of_frames(demo.frame)
+    rig.update(warped(demo.frame, 0.8, 0.0), demo.detections)
+    corrected = rig.corrected(demo.frame)
+    assert torch.equal(corrected.camera.disparity_field.coefficients, rig.field.coefficients)  # type: ignore[union-attr]
+    assert rig.corrected(corrected) is corrected
+    config = directshape_torch.load_config("fast", ["stages=[{max_iterations: 1}]"])
+    by_rig = DirectShapeRefiner(config=config, rig=rig)(demo.frame, demo.detections)
+    by_camera = DirectShapeRefiner(config=config)(corrected, demo.detections)
+    assert torch.equal(by_rig.T_cam_obj, by_camera.T_cam_obj)
+    K_left = demo.frame.camera.K_left.clone()
+    K_left[:, 0, 0] += 3
+    other = replace(demo.frame, camera=replace(demo.frame.camera, K_left=K_left))
+    for use in (rig.corrected, lambda frames: rig.update(frames, demo.detections)):
+        with pytest.raises(InputError, match="a difference of 3 px; estimate this rig"):
+            use(other)

@@ -1,0 +1,130 @@
+"""An estimate finds field and detector within what it says of itself, however its evidence comes."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.rig_rows import FIELD, SIZE_WH, estimate, rows_of_cars
+from torch import Tensor
+
+from directshape_torch import DirectShapeRefiner, RigEstimate
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
+from directshape_torch.rig.disparity_observations import DisparityObservations
+from directshape_torch.rig.pixels import pixel_evidence
+from directshape_torch.rig.posterior import BIAS
+from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
+
+PLACES = torch.tensor([[200.0, 190], [450, 190], [620, 190], [800, 190], [1050, 190]], dtype=torch.float64)
+
+
+def true_offset(uv: Tensor) -> Tensor:
+    return polynomial_basis(uv, SIZE_WH) @ FIELD
+
+
+def test_errors_are_as_large_as_the_estimate_says_over_a_hundred_draws() -> None:
+    """Standardised errors of offset, bias and noise over draws of 60 detections."""
+    offsets, biases, noises = [], [], []
+    for seed in range(100):
+        rig = estimate(rows_of_cars(60, seed, bias=-0.02))
+        mean, sigma = rig.offset_at(PLACES)
+        offsets.append((mean - true_offset(PLACES)) / sigma)
+        biases.append((rig.detector.bias + 0.02) / rig.detector.bias_sigma)
+        noises.append(rig.detector.noise)
+    z = torch.stack(offsets)
+    assert 0.5 < float(z.square().mean().sqrt()) < 1.3
+    assert float((z.abs() < 2).double().mean()) > 0.9
+    assert 0.4 < float(torch.tensor(biases).square().mean().sqrt()) < 1.3
+    assert float(torch.tensor(noises).mean()) == pytest.approx(0.03, abs=0.008)
+
+
+def test_a_biased_detector_leaves_the_field_unharmed() -> None:
+    rig = estimate(rows_of_cars(400, 0, bias=-0.045))
+    assert rig.detector.bias == pytest.approx(-0.045, abs=2 * rig.detector.bias_sigma)
+    mean, sigma = rig.offset_at(PLACES)
+    assert bool(((mean - true_offset(PLACES)).abs() < 2.5 * sigma).all())
+    assert float(sigma.max()) < 0.25
+    assert float(rig.field.vertical(PLACES).mean()) == pytest.approx(0.2, abs=0.05)
+
+
+def test_more_detections_and_better_ones_make_it_surer() -> None:
+    few, many, good = (
+        estimate(rows_of_cars(count, 1, noise=noise)).in_the_middle()[1]
+        for count, noise in ((30, 0.05), (300, 0.05), (300, 0.02))
+    )
+    assert good < many < 0.9 * few
+
+
+def test_order_and_portions_do_not_matter_to_the_bit() -> None:
+    rows = rows_of_cars(1300, 2)
+    at_once, by_and_by = estimate(rows), estimate()
+    shuffled = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))]
+    for part in shuffled.split(137):
+        by_and_by.add_rows(part)
+    assert torch.equal(at_once.mean, by_and_by.mean)
+    assert torch.equal(at_once.covariance, by_and_by.covariance)
+    assert len(by_and_by.rows) == 1000
+
+
+def true_pixels() -> DisparityObservations:
+    """400 pixels of known depth all over the image."""
+    generator = torch.Generator().manual_seed(3)
+    uv = torch.rand(400, 2, generator=generator, dtype=torch.float64) * (torch.tensor(SIZE_WH) - 1)
+    noise = 0.1 * torch.randn(400, generator=generator, dtype=torch.float64)
+    depth = torch.full_like(noise, 20.0)
+    return DisparityObservations(uv, true_offset(uv) + noise, torch.full_like(noise, 0.2), depth)
+
+
+def test_evidence_of_several_kinds_adds_up() -> None:
+    """Pixels of known depth fix the field, and with it what detections say of the detector."""
+    rig = estimate(rows_of_cars(60, 4, bias=-0.04))
+    alone = rig.detector.bias_sigma
+    rig.add_pixels("lidar", pixel_evidence(true_pixels(), SIZE_WH))
+    mean, sigma = rig.offset_at(PLACES)
+    assert float((mean - true_offset(PLACES)).abs().max()) < 0.08
+    assert rig.detector.bias_sigma < 0.6 * alone
+    assert rig.detector.bias == pytest.approx(-0.04, abs=2 * rig.detector.bias_sigma)
+    assert "60 detections, lidar (1 frames)" in str(rig)
+    once = sigma
+    rig.add_pixels("lidar", pixel_evidence(true_pixels(), SIZE_WH))
+    assert bool((rig.offset_at(PLACES)[1] < once).all())
+
+
+def test_files_and_states_give_it_back(tmp_path: pytest.TempPathFactory) -> None:
+    rig = estimate(rows_of_cars(50, 5))
+    rig.add_pixels("lidar", pixel_evidence(true_pixels(), SIZE_WH))
+    path = f"{tmp_path}/rig.json"
+    save_rigs(path, [rig, estimate(focal_px=700.0)])
+    first, second = load_rigs(path)
+    assert torch.equal(first.mean, rig.mean)
+    assert len(second.rows) == 0
+    assert [field.size_wh for field in load_fields(path)] == [SIZE_WH, SIZE_WH]
+    rig.field.save(path)
+    assert torch.equal(load_fields(path)[0].coefficients, rig.field.coefficients)
+    saved = io.BytesIO()
+    torch.save(DirectShapeRefiner(rig=rig).state_dict(), saved)
+    saved.seek(0)
+    refiner = DirectShapeRefiner(rig=estimate())
+    refiner.load_state_dict(torch.load(saved, weights_only=True))
+    assert isinstance(refiner.rig, RigEstimate)
+    assert torch.equal(refiner.rig.mean, rig.mean)
+    assert str(refiner.rig) == str(rig)
+
+
+def test_covariance_is_that_of_the_unknowns() -> None:
+    rig = estimate(rows_of_cars(60, 6))
+    assert rig.mean.shape == (12,)
+    assert bool((torch.linalg.eigvalsh(rig.covariance) > 0).all())
+    assert rig.detector.bias_sigma == pytest.approx(float(rig.covariance[BIAS, BIAS]) ** 0.5)
+    mean, sigma = rig.offset_at(PLACES.float())
+    assert mean.dtype == sigma.dtype == torch.float32
+
+
+def test_another_rig_is_refused() -> None:
+    field: DisparityField = estimate(rows_of_cars(20, 7)).field
+    with pytest.raises(InputError, match="calibrate-rig"):
+        field.check_rig((1224, 370), *field.rig[1:])
+    assert not estimate().is_of(*replace(field, size_wh=(1224, 370)).rig)
