@@ -120,13 +120,14 @@ class DirectShapeRefiner(nn.Module):
         failure = refusals(frames, detections, seen.pixels, seen.points, self.config)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
-        cars = CarBatch.from_scene(frames, detections).of_cars(usable)
+        cars = self._cars(frames, detections).of_cars(usable)
         problem = self._problem(frames, detections, cars, seen.of_objects(usable), term_weights)
         # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
-        state, status = self._input_state(detections.T_cam_obj.detach()), failure
+        state, status = self._input_state(detections.T_cam_obj.detach(), cars), failure
         outcome = Outcome.nothing(problem, state)
         if len(rows):
-            outcome = self._minimise(problem, self._input_state(detections.T_cam_obj.index_select(0, rows)), cars)
+            initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
+            outcome = self._minimise(problem, initial, cars)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
         return assemble(self.prior, frames, detections, state, status, rows, outcome)
@@ -136,12 +137,16 @@ class DirectShapeRefiner(nn.Module):
     ) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
         check_fit(frames, detections, self.prior)
-        cars = CarBatch.from_scene(frames, detections)
+        cars = self._cars(frames, detections)
         problem = self._problem(frames, detections, cars, self._observe(frames, detections), term_weights)
-        return problem, self._input_state(detections.T_cam_obj)
+        return problem, self._input_state(detections.T_cam_obj, cars)
 
-    def _input_state(self, T_cam_obj: Tensor) -> CarState:
-        return CarState(se3.inverse(T_cam_obj), self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj))
+    def _cars(self, frames: FrameBatch, detections: Detections) -> CarBatch:
+        return CarBatch.from_scene(frames, detections, self.config.rig.disparity_sigma_px)
+
+    def _input_state(self, T_cam_obj: Tensor, cars: CarBatch) -> CarState:
+        code = self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj)
+        return CarState.of(se3.inverse(T_cam_obj), code, cars.num_offsets)
 
     def _observe(self, frames: FrameBatch, detections: Detections) -> _Seen:
         """What the images show of all cars; stereo points for the methods that use them."""

@@ -343,10 +343,14 @@ class Detections(_TensorRecord):
             (in the plane of the camera's x and z axes), across it in that plane, along the camera's y axis (metres),
             and of the heading (radians). Infinity where not known. None: the settings' (`priors.pose_sigma_*`), if any;
             collated with frames that have some, infinity stands for none.
+        offset_sigma_px: (B,) standard deviation of the rig's disparity at each car about its calibration, pixels of
+            full resolution; 0 where it is known. None: the settings' (`rig.disparity_sigma_px`); collated with frames
+            that have some, 0 stands for none.
 
     Raises:
-        InputError: wrong shapes or types, a rotation that is none, or dimensions or standard deviations that are not
-            above 0. Masks with values above 1.5 (logits, 0..255) are refused when they are read, in a refinement.
+        InputError: wrong shapes or types, a rotation that is none, dimensions or standard deviations that are not
+            above 0, or an `offset_sigma_px` that is below 0 or not finite. Masks with values above 1.5 (logits, 0..255)
+            are refused when they are read, in a refinement.
     """
 
     frame_index: Tensor
@@ -360,6 +364,7 @@ class Detections(_TensorRecord):
     has_mask_right: Tensor
     occluders: Occluders | None = None
     pose_sigma: Tensor | None = None
+    offset_sigma_px: Tensor | None = None
 
     def __post_init__(self) -> None:
         check_shape("frame_index", self.frame_index, ("B",))
@@ -386,6 +391,13 @@ class Detections(_TensorRecord):
         if self.pose_sigma is not None:
             check_shape("pose_sigma", self.pose_sigma, (count, 4))
             check_sigmas("pose_sigma", self.pose_sigma)
+        if self.offset_sigma_px is not None:
+            check_shape("offset_sigma_px", self.offset_sigma_px, (count,))
+            wrong = (~((self.offset_sigma_px >= 0) & self.offset_sigma_px.isfinite())).nonzero()[:, 0].tolist()
+            if wrong:
+                got = f"{float(self.offset_sigma_px[wrong[0]]):g} in row {wrong[0]}"
+                cure = "give 0 for cars at which the rig's disparity is known"
+                raise InputError("offset_sigma_px", "finite standard deviations of at least 0, pixels", got, cure)
 
     def __len__(self) -> int:
         return len(self.frame_index)

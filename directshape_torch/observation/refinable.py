@@ -74,8 +74,9 @@ def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> 
             "refine outside of half precision: .to(dtype=torch.float32) of frames, detections and refiner",
         )
     tensors = {"frames": frames.images_left, "detections": detections.T_cam_obj}
-    if detections.pose_sigma is not None:
-        tensors["detections.pose_sigma"] = detections.pose_sigma
+    for name in ("pose_sigma", "offset_sigma_px"):
+        if getattr(detections, name) is not None:
+            tensors[f"detections.{name}"] = getattr(detections, name)
     for name, tensor in tensors.items():
         if tensor.dtype != prior.origin.dtype or tensor.device != prior.origin.device:
             raise InputError(
