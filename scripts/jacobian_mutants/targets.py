@@ -26,6 +26,7 @@ _JACOBIANS = (
 )
 _GRADIENTS = (*_JACOBIANS, f"{_LABORATORY}::test_gradients_can_be_differentiated")
 _FACTORS = (f"{_LABORATORY}::test_factors",)
+_OFFSET = ("tests/terms/test_disparity_offset.py::test_an_offset_does_what_a_constant_field_does",)
 
 TARGETS: dict[str, Target] = {
     "silhouettes": Target(
@@ -46,8 +47,8 @@ TARGETS: dict[str, Target] = {
     ),
     "photometric": Target(
         "directshape_torch/terms/photometric.py",
-        ("Photometric.linear", "Photometric.residual", "compared", "_warped"),
-        _GRADIENTS,
+        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth", "compared", "_warped"),
+        (*_OFFSET, *_GRADIENTS),
     ),
     "photometric_patch": Target(
         "directshape_torch/terms/photometric_patch.py",
@@ -70,6 +71,7 @@ TARGETS: dict[str, Target] = {
             "_by_rotation",
             "dimensions_prior",
             "pose_prior",
+            "rig_prior",
         ),
         _JACOBIANS,
     ),
@@ -108,6 +110,7 @@ TARGETS: dict[str, Target] = {
         "directshape_torch/geometry/se3.py", ("inverse", "transform", "from_kornia", "to_kornia"), _SE3_TESTS
     ),
     "retract": Target("directshape_torch/terms/cars.py", ("retract",), _JACOBIANS),
+    "offset": Target("directshape_torch/terms/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
     "pinhole": Target(
         "directshape_torch/geometry/pinhole.py", ("rays_from_pixels", "project"), ("tests/geometry/test_pinhole.py",)
     ),

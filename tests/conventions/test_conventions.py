@@ -216,6 +216,11 @@ def test_14_tangent_is_v_omega_dcode() -> None:
     torch.testing.assert_close(moved.code[0], vector(1, 2, 3))
     turned = retract(state, vector(0, 0, 0, 0, 0, math.pi / 2, 0, 0, 0)[None])
     torch.testing.assert_close(turned.T_obj_cam[0, :3, 0], vector(0, 1, 0))
+    unsure = CarState.of(*state[:2], num_offsets=1)
+    assert (state.num_unknowns, unsure.num_unknowns) == (9, 10)
+    offset = retract(unsure, vector(0, 0, 0, 0, 0, 0, 1, 2, 3, 0.4)[None])
+    assert torch.equal(offset.code, moved.code)
+    assert offset.offset_px.tolist() == [[0.4]]
 
 
 def test_15_update_is_on_the_left_and_in_one_place() -> None:
