@@ -26,7 +26,10 @@ _JACOBIANS = (
 )
 _GRADIENTS = (*_JACOBIANS, f"{_LABORATORY}::test_gradients_can_be_differentiated")
 _FACTORS = (f"{_LABORATORY}::test_factors",)
-_OFFSET = ("tests/terms/test_disparity_offset.py::test_an_offset_does_what_a_constant_field_does",)
+_OFFSET = tuple(
+    f"tests/terms/test_disparity_offset.py::test_{name}"
+    for name in ("warp_and_prior_by_hand", "an_offset_does_what_a_constant_field_does")
+)
 
 TARGETS: dict[str, Target] = {
     "silhouettes": Target(
@@ -73,7 +76,7 @@ TARGETS: dict[str, Target] = {
             "pose_prior",
             "rig_prior",
         ),
-        _JACOBIANS,
+        (*_OFFSET[:1], *_JACOBIANS),
     ),
     "robust": Target(
         "directshape_torch/terms/robust.py",

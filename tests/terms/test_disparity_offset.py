@@ -17,6 +17,7 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.terms.priors import rig_prior
 
 UNSURE = replace(DEFAULT, rig=RigConfig(disparity_sigma_px=1.0))
 
@@ -61,6 +62,24 @@ def test_an_offset_does_what_a_constant_field_does(level: int) -> None:
     for one, other in zip(*found, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
     assert found[0][3].min() > 50
+
+
+def test_warp_and_prior_by_hand() -> None:
+    """Of 80 px m at 8 m, 10 px: 2 px more come from 80 / 12 m; of 10 px less nothing is left, so nothing is seen."""
+    scene = rectified_street()
+    stage, state = begun_stage(ellipsoid_prior(), scene.frames, scene.detections, UNSURE)
+    term = photometric_of(stage)
+    T_right_cam, sigma_px = term.cars.T_right_cam.clone(), torch.tensor([0.5, 0.0]).double()
+    T_right_cam[:, 0, 3] = -80 / 150
+    cars = replace(term.cars, T_right_cam=T_right_cam, offset_sigma_px=sigma_px)
+    owner, depth = torch.tensor([0, 1]), torch.full((2, 1), 8.0).double()
+    nearer, gone = (state._replace(offset_px=torch.full((2, 1), x).double()) for x in (2.0, -10.0))
+    by_hand = replace(term, cars=cars)
+    torch.testing.assert_close(by_hand.warped_depth(depth, nearer, owner)[0], torch.tensor([[80 / 12], [8.0]]).double())
+    assert (by_hand.warped_depth(depth, gone, owner)[0] < 0).tolist() == [[True], [False]]
+    prior = rig_prior(cars, nearer)
+    assert prior.residual.tolist() == [[4.0], [2.0]]
+    assert prior.J_residual_state.tolist() == [[[0.0] * 9 + [2.0]], [[0.0] * 9 + [1.0]]]
 
 
 def test_a_disparity_that_is_not_believed_gives_way_to_the_detectors_depth() -> None:
