@@ -145,9 +145,10 @@ class RigConfig(Settings):
 
     disparity_sigma_px: float = setting(
         0.0,
-        "standard deviation of the rig's disparity about its calibration, the same for all pixels of a car, so that no "
-        "residual shows it; it enters covariance, sigmas and probabilities, not the estimate. 0 for a perfect rig; "
-        "about 0.1 where a residual disparity field was fitted, 0.5 and more where none was",
+        "standard deviation of the rig's disparity about its calibration, an offset that all pixels of a car share: "
+        "one more unknown of each car, so that depth by disparity is weighed against the silhouettes' size and the "
+        "detector's depth. 0 for a perfect rig, without that unknown; about 0.1 where a residual disparity field was "
+        "fitted, 0.5 and more where none was",
         at_least=0,
     )
 
@@ -316,6 +317,12 @@ class PriorConfig(Settings):
     )
     pose_sigma_vertical_m: float = setting(0.0, "its standard deviation along the camera's y axis", at_least=0)
     pose_sigma_yaw_deg: float = setting(0.0, "standard deviation of the detector's heading", at_least=0)
+
+    @property
+    def pose_sigmas(self) -> tuple[float, float, float, float, float]:
+        """Along the ray as a share of the distance, then metres, metres, metres and radians; 0 for not known."""
+        metres = self.pose_sigma_along_m, self.pose_sigma_across_m, self.pose_sigma_vertical_m
+        return self.pose_sigma_along_share, *metres, math.radians(self.pose_sigma_yaw_deg)
 
 
 @dataclass(frozen=True)

@@ -9,23 +9,24 @@ from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.diagnosis.car_rows import kept, placed
-from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, shared_disparity_covariance
+from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.diagnosis.disparity_profile import DisparityProfile, disparity_profile
 from directshape_torch.diagnosis.evidence import Course
 from directshape_torch.diagnosis.observability import Observability, observability_of
 from directshape_torch.diagnosis.quality import FitQuality, fit_quality
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
-from directshape_torch.problem import CarProblem, CarStage, without_held
+from directshape_torch.problem import CarProblem, CarStage
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum
-from directshape_torch.solver.problem import where_rows
+from directshape_torch.solver.problem import take_rows, where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.term import Evaluation
+from directshape_torch.terms.priors import RIG_WEIGHT
+from directshape_torch.terms.term import Evaluation, Figures
 
 # Nine in ten cars whose cost settled promise less than this share of it.
 _SETTLED_SHARE = 0.005
@@ -57,7 +58,7 @@ class Outcome:
     @classmethod
     def nothing(cls, problem: CarProblem, like: CarState) -> Outcome:
         """The outcome of no cars at all; `like` says dtype and device."""
-        empty = CarState(like.T_obj_cam[:0], like.code[:0])
+        empty = take_rows(like, torch.zeros(0, dtype=torch.long, device=like.code.device))
         nothing = empty.code.new_zeros(0, 0, dtype=torch.float64)
         unknowns = 6 + empty.code.shape[1]
         none = torch.zeros(0, dtype=torch.long, device=nothing.device)
@@ -86,8 +87,9 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     """
     end, refined = minimum.end, is_refined(minimum.status)
     stage: CarStage = minimum.stage
-    before, after = minimum.before, minimum.after
-    covariance = covariance_of(after.information.sum(dim=1)) + _rig_covariance(problem, end, cars)
+    before, after = minimum.before, _of_calibrated_rig(problem, minimum.after)
+    num_kept = 6 + end.code.shape[1]
+    covariance = covariance_of(after.information.sum(dim=1))[:, :num_kept, :num_kept]
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
     course = Course(
         before=initial,
@@ -102,7 +104,8 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         unsettled=minimum.status == Status.max_iterations.code,
         profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
     )
-    unseen = observability_of(problem.prior, end, stage.information_of_measurements(after))
+    seen = stage.information_of_measurements(after)
+    unseen = observability_of(problem.prior, end, None if seen is None else without_offset(seen, num_kept))
     return Outcome(
         state=minimum.state,
         status=minimum.status,
@@ -120,10 +123,13 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     )
 
 
-def _rig_covariance(problem: CarProblem, state: CarState, cars: CarBatch) -> Tensor:
-    """Covariance (B, D, D) of the rig's own error, in the units that the calibration of depth brings to size."""
-    sigma_px = problem.config.rig.disparity_sigma_px / bundled_trust_model().sigma_factors[0]
-    return shared_disparity_covariance(state.T_obj_cam, cars.focal_baseline, sigma_px, 6 + state.code.shape[1])
+def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
+    """The rig's part of the information in units that the calibration of depth brings to the sigma that was given."""
+    if not problem.num_offsets:
+        return figures
+    factor = torch.ones_like(figures.term_costs)
+    factor[:, problem.term_names.index("rig")] = bundled_trust_model().sigma_factors[0] ** 2 / RIG_WEIGHT
+    return figures._replace(information=figures.information * factor[..., None, None])
 
 
 def judged(minimum: Minimum[CarState], initial: CarState, outcome: Outcome, limits: AcceptanceConfig) -> Outcome:
@@ -152,9 +158,9 @@ def judged(minimum: Minimum[CarState], initial: CarState, outcome: Outcome, limi
 
 def promised_decrease(minimum: Minimum[CarState]) -> Tensor:
     """What a Gauss-Newton step from where the iterations ended promises (B,), as a share of the cost there."""
-    after, stage = minimum.after, minimum.stage
+    after = minimum.after
     gradient, hessian = after.gradient.sum(dim=1), after.hessian.sum(dim=1)
-    at = without_held(Evaluation(after.cost, gradient, hessian, ()), stage.config)
+    at = minimum.stage.without_held(Evaluation(after.cost, gradient, hessian, ()))
     step, solvable = damped_step(at.hessian, at.gradient, torch.zeros_like(at.cost))
     promised = -0.5 * (at.gradient * step).sum(dim=1) / at.cost
     return torch.where(solvable, promised, torch.inf)

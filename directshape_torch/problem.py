@@ -44,6 +44,7 @@ from directshape_torch.terms.term import (
     Where,
     by_autograd,
     choose_blocks,
+    linear_of,
     part_of,
     part_of_rows,
     parts_of,
@@ -54,6 +55,9 @@ from directshape_torch.terms.term import (
 
 # Those of "point_cloud" hold for the methods with points, the first two for the others.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
+
+# A rig that is off by more between two iterations than this is another rig.
+_MAX_STEP_OFFSET_PX = 1.0
 
 TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
 """Makes a user's term for some cars of a call: of these frames, all detections, the cars to refine, the shapes."""
@@ -71,6 +75,7 @@ class CarProblem:
         config: stages, trust region, samples per ray.
         factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
         num_extra: how many of the terms, the last ones, are a user's own.
+        num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
     """
 
     prior: ShapePrior
@@ -80,6 +85,7 @@ class CarProblem:
     config: RefinerConfig
     factors: Tensor | None = None
     num_extra: int = 0
+    num_offsets: int = 0
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -141,10 +147,10 @@ class CarProblem:
         terms += extra
         if not terms:
             raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
-        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, num_extra=len(extra))
+        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets)
         if extra:
             code = prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
-            sight = problem.look(CarState(se3.inverse(cars.detector_T_cam_obj), code))
+            sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
             for term in extra:
                 check_term(term, problem.stages()[0], sight, names)
                 names += term.names
@@ -161,7 +167,7 @@ class CarProblem:
         """
         own = len(terms) - self.num_extra
         extra = zip(terms[own:], wheres[own:], strict=True)
-        of_extra = tuple(part_of(term, term.linear(field, state, where)) for term, where in extra)
+        of_extra = tuple(part_of(term, linear_of(term, field, state, where)) for term, where in extra)
         return parts_of(terms[:own], field, state, wheres[:own]) + of_extra
 
     def look(self, state: CarState) -> Sight:
@@ -184,7 +190,7 @@ class CarProblem:
         masks = self.masks.of_cars(keep, numbers)
         terms = tuple(term.of_cars(keep, numbers) for term in self.terms)
         factors = None if self.factors is None else self.factors[keep]
-        return CarProblem(self.prior, terms, masks, masks.of_sides(), self.config, factors, self.num_extra)
+        return replace(self, terms=terms, masks=masks, rays=masks.of_sides(), factors=factors)
 
 
 @dataclass(frozen=True)
@@ -270,13 +276,30 @@ class CarStage:
         layout = _Layout.of(self.terms, self.problem.factors)
         wheres = tuple(term.where(sight) for term in self.terms)
         parts = self.problem.parts(self.terms, field, state, wheres)
-        return without_held(summed(layout.sums(), layout.weight, parts), self.config)
+        return self.without_held(summed(layout.sums(), layout.weight, parts))
+
+    def moving_unknowns(self, like: Tensor) -> Tensor:
+        """Unknowns (D,) that the stage moves, offsets always, on the device of `like`."""
+        num_codes, num_offsets = self.problem.prior.num_codes, self.problem.num_offsets
+        number, unknowns = torch.arange(6 + num_codes + num_offsets, device=like.device), self.config.unknowns
+        is_pose, is_offset = number < 6, number >= 6 + num_codes
+        return is_offset | (is_pose & (unknowns != "shape")) | (~is_pose & (unknowns != "pose"))
+
+    def without_held(self, at: Evaluation) -> Evaluation:
+        """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
+        if self.config.unknowns == "both":
+            return at
+        moving = self.moving_unknowns(at.gradient)
+        identity = torch.eye(len(moving), dtype=at.hessian.dtype, device=at.hessian.device)
+        hessian = torch.where(moving[:, None] & moving, at.hessian, identity)
+        return at._replace(gradient=torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian=hessian)
 
     def free_unknowns(self, state: CarState) -> Tensor:
         """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
         free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
-        free = torch.cat([free_pose, state.code.abs() < self.problem.config.solver.max_code], dim=1)
-        return free & moving_unknowns(self.config, state.code)
+        free_code = state.code.abs() < self.problem.config.solver.max_code
+        free = torch.cat([free_pose, free_code, torch.ones_like(state.offset_px, dtype=torch.bool)], dim=1)
+        return free & self.moving_unknowns(free)
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         """The state moved by tangent vectors (B, D)."""
@@ -284,7 +307,7 @@ class CarStage:
 
     def step_limits(self) -> Tensor:
         """Largest trusted step of each unknown, (D,)."""
-        return step_limits(self.problem.config.solver, self.problem.prior)
+        return step_limits(self.problem.config.solver, self.problem.prior, self.problem.num_offsets)
 
 
 @dataclass(frozen=True)
@@ -363,7 +386,7 @@ class CarIterations:
             parts = tuple(part_of_rows(t, *r, where) for t, r, where in zip(terms, rows, looked, strict=True))
         at = summed(self.sums, self.layout.weight, parts)
         cost = at.cost if self.rest is None else at.cost + self.rest
-        return without_held(at._replace(cost=cost), self.stage.config)
+        return self.stage.without_held(at._replace(cost=cost))
 
     def choose(self, accepted: Tensor, new: Evaluation, old: Evaluation) -> Evaluation:
         """The new evaluation of cars whose step was accepted (B,), the old one of the others."""
@@ -441,26 +464,8 @@ def method_stages(config: RefinerConfig) -> list[StageConfig]:
     return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]
 
 
-def moving_unknowns(stage: StageConfig, code: Tensor) -> Tensor:
-    """Unknowns (D,) that the stage moves."""
-    is_motion = torch.arange(6 + code.shape[1], device=code.device) < 6
-    return (
-        is_motion if stage.unknowns == "pose" else ~is_motion if stage.unknowns == "shape" else is_motion | ~is_motion
-    )
-
-
-def without_held(at: Evaluation, stage: StageConfig) -> Evaluation:
-    """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
-    if stage.unknowns == "both":
-        return at
-    moving = moving_unknowns(stage, at.gradient[:, 6:])
-    identity = torch.eye(len(moving), dtype=at.hessian.dtype, device=at.hessian.device)
-    hessian = torch.where(moving[:, None] & moving, at.hessian, identity)
-    return at._replace(gradient=torch.where(moving, at.gradient, torch.zeros_like(at.gradient)), hessian=hessian)
-
-
-def step_limits(config: SolverConfig, prior: ShapePrior) -> Tensor:
+def step_limits(config: SolverConfig, prior: ShapePrior, num_offsets: int) -> Tensor:
     """Largest trusted step (D,) of each unknown, float64; not to be written to."""
     limits = [config.max_step_translation_m] * 3 + [config.max_step_rotation_rad] * 3
-    limits += [config.max_step_code] * prior.num_codes
+    limits += [config.max_step_code] * prior.num_codes + [_MAX_STEP_OFFSET_PX] * num_offsets
     return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))

@@ -33,11 +33,15 @@ from directshape_torch.stereo_matching.dense_disparity import with_disparity
 from directshape_torch.terms.cars import CarBatch, CarState
 
 
-class FrameCorrection(Protocol):
+class KnownRig(Protocol):
     """What is known of the rig that frames come from, `rig.estimate.RigEstimate`."""
 
     def corrected(self, frames: FrameBatch) -> FrameBatch:
         """Frames whose camera has the rig's disparity field."""
+        ...
+
+    def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
+        """Detections with the standard deviations of their depths, where they have none."""
         ...
 
 
@@ -49,8 +53,8 @@ class DirectShapeRefiner(nn.Module):
             tensors move with `.to(...)` and live in the `state_dict`.
         config: settings; default `RefinerConfig()`, the same as `configs/default.yaml`.
         extra_terms: make terms of one's own for the cars of a call (docs/extra_terms.md), beside those of the method.
-        rig: corrects frames that bring no disparity field of their own: a `RigEstimate`, which lives in the
-            `state_dict` too.
+        rig: corrects frames that bring no disparity field of their own, and says how good the detector's depths are
+            where nobody else does: a `RigEstimate`, which lives in the `state_dict` too.
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
@@ -67,7 +71,7 @@ class DirectShapeRefiner(nn.Module):
         prior: ShapePrior | None = None,
         config: RefinerConfig | None = None,
         extra_terms: Sequence[TermFactory] = (),
-        rig: FrameCorrection | None = None,
+        rig: KnownRig | None = None,
     ) -> None:
         super().__init__()
         if isinstance(prior, RefinerConfig):
@@ -114,8 +118,7 @@ class DirectShapeRefiner(nn.Module):
     def _checked_refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
-        frames = self._corrected(frames)
-        check_fit(frames, detections, self.prior)
+        frames, detections = self._with_rig(frames, detections)
         of_prior = dict((*self.prior.named_buffers(), *self.prior.named_parameters()))
         check_no_tangents(frames, detections, term_weights, of_prior)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
@@ -133,13 +136,14 @@ class DirectShapeRefiner(nn.Module):
         failure = refusals(frames, detections, seen.pixels, seen.points, self.config)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
-        cars = CarBatch.from_scene(frames, detections).of_cars(usable)
+        cars = self._cars(frames, detections).of_cars(usable)
         problem = self._problem(frames, detections, cars, seen.of_objects(usable), term_weights)
         # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
-        state, status = self._input_state(detections.T_cam_obj.detach()), failure
+        state, status = self._input_state(detections.T_cam_obj.detach(), cars), failure
         outcome = Outcome.nothing(problem, state)
         if len(rows):
-            outcome = self._minimise(problem, self._input_state(detections.T_cam_obj.index_select(0, rows)), cars)
+            initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
+            outcome = self._minimise(problem, initial, cars)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
         return assemble(self.prior, frames, detections, state, status, rows, outcome)
@@ -148,17 +152,27 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
     ) -> tuple[CarProblem, CarState]:
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
-        frames = self._corrected(frames)
-        check_fit(frames, detections, self.prior)
-        cars = CarBatch.from_scene(frames, detections)
+        frames, detections = self._with_rig(frames, detections)
+        cars = self._cars(frames, detections)
         problem = self._problem(frames, detections, cars, self._observe(frames, detections), term_weights)
-        return problem, self._input_state(detections.T_cam_obj)
+        return problem, self._input_state(detections.T_cam_obj, cars)
 
-    def _corrected(self, frames: FrameBatch) -> FrameBatch:
-        return frames if self.rig is None else self.rig.corrected(frames)
+    def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
+        """The call's inputs, checked, with what is known of the rig and the detector."""
+        frames = frames if self.rig is None else self.rig.corrected(frames)
+        check_fit(frames, detections, self.prior)
+        if self.rig is None:
+            return frames, detections
+        # What the settings say of the detector wins.
+        is_said = any(self.config.priors.pose_sigmas)
+        return frames, detections if is_said else self.rig.informed(frames, detections)
 
-    def _input_state(self, T_cam_obj: Tensor) -> CarState:
-        return CarState(se3.inverse(T_cam_obj), self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj))
+    def _cars(self, frames: FrameBatch, detections: Detections) -> CarBatch:
+        return CarBatch.from_scene(frames, detections, self.config.rig.disparity_sigma_px)
+
+    def _input_state(self, T_cam_obj: Tensor, cars: CarBatch) -> CarState:
+        code = self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj)
+        return CarState.of(se3.inverse(T_cam_obj), code, cars.num_offsets)
 
     def _observe(self, frames: FrameBatch, detections: Detections) -> _Seen:
         """What the images show of all cars; stereo points for the methods that use them."""

@@ -288,10 +288,14 @@ class Detections(TensorRecord):
             (in the plane of the camera's x and z axes), across it in that plane, along the camera's y axis (metres),
             and of the heading (radians). Infinity where not known. None: the settings' (`priors.pose_sigma_*`), if any;
             collated with frames that have some, infinity stands for none.
+        offset_sigma_px: (B,) standard deviation of the rig's disparity at each car about its calibration, pixels of
+            full resolution; 0 where it is known. None: the settings' (`rig.disparity_sigma_px`); collated with frames
+            that have some, 0 stands for none.
 
     Raises:
-        InputError: wrong shapes or types, a rotation that is none, or dimensions or standard deviations that are not
-            above 0. Masks with values above 1.5 (logits, 0..255) are refused when they are read, in a refinement.
+        InputError: wrong shapes or types, a rotation that is none, dimensions or standard deviations that are not
+            above 0, or an `offset_sigma_px` that is below 0 or not finite. Masks with values above 1.5 (logits, 0..255)
+            are refused when they are read, in a refinement.
     """
 
     frame_index: Annotated[Tensor, Dense("B", kind="index")]
@@ -307,6 +311,7 @@ class Detections(TensorRecord):
     has_mask_right: Annotated[Tensor, Dense("B", kind="flags")]
     occluders: Occluders | None = None
     pose_sigma: Annotated[Tensor | None, Dense("B", 4)] = None
+    offset_sigma_px: Annotated[Tensor | None, Dense("B")] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -319,6 +324,12 @@ class Detections(TensorRecord):
             _raise_not_positive("dimensions_hwl", self.dimensions_hwl)
         if self.pose_sigma is not None:
             check_sigmas("pose_sigma", self.pose_sigma)
+        if self.offset_sigma_px is not None:
+            wrong = (~((self.offset_sigma_px >= 0) & self.offset_sigma_px.isfinite())).nonzero()[:, 0].tolist()
+            if wrong:
+                got = f"{float(self.offset_sigma_px[wrong[0]]):g} in row {wrong[0]}"
+                cure = "give 0 for cars at which the rig's disparity is known"
+                raise InputError("offset_sigma_px", "finite standard deviations of at least 0, pixels", got, cure)
 
     def __len__(self) -> int:
         return len(self.frame_index)

@@ -19,7 +19,7 @@ def _state() -> CarState:
     T = pose_from_kitti(
         torch.tensor([[2.0, 1.6, 20.0], [-4.0, 1.7, 35.0]]).double(), torch.tensor([0.4, -2.0]).double()
     )
-    return CarState(se3.inverse(T), torch.zeros(2, 3).double())
+    return CarState.of(se3.inverse(T), torch.zeros(2, 3).double())
 
 
 def test_disparity_moves_the_origin_along_its_viewing_ray() -> None:
@@ -66,6 +66,6 @@ def test_no_offsets_are_no_search() -> None:
 def test_a_perfect_start_is_kept() -> None:
     scene = cached_street()[1]
     problem, initial = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).problem(scene.frames, scene.detections)
-    exact = CarState(initial.T_obj_cam, scene.code)
+    exact = CarState.of(initial.T_obj_cam, scene.code)
     start = search_start(problem, exact, _cars(scene), SearchConfig((-3.0, 3.0), (-15.0, 15.0)))
     torch.testing.assert_close(start.T_obj_cam, exact.T_obj_cam)

@@ -302,7 +302,7 @@ def test_padding_changes_nothing() -> None:
 @pytest.mark.parametrize("config", [DEFAULT, MARCHED], ids=["tracked", "marched"])
 def test_a_broken_car_touches_no_other(what: str, config: RefinerConfig) -> None:
     stage, state = begun_stage(config)
-    broken = CarState(state.T_obj_cam.clone(), state.code.clone())
+    broken = CarState.of(state.T_obj_cam.clone(), state.code.clone())
     (broken.T_obj_cam if what == "pose" else broken.code)[1] = torch.nan
     others = torch.arange(5) != 1
     found, expected = (_compared(figures_at(stage, s)) for s in (broken, state))
@@ -340,7 +340,7 @@ def test_moving_the_whole_scene_changes_no_residual() -> None:
     masks = stage.problem.masks
     rotated = (motion[:3, :3] @ masks.rays.ray_cam.flatten(1)).view_as(masks.rays.ray_cam)
     rays = masks.rays._replace(centre_cam=se3.transform(motion, masks.rays.centre_cam), ray_cam=rotated)
-    there = CarState(state.T_obj_cam @ se3.inverse(motion), state.code)
+    there = CarState.of(state.T_obj_cam @ se3.inverse(motion), state.code)
     silhouettes = stage.terms[0]
     masks = replace(masks, rays=rays)
     problem = replace(stage.problem, masks=masks, rays=masks.of_sides())
@@ -378,7 +378,7 @@ def test_unknowns_that_a_stage_holds_are_constant_in_it(unknowns: Literal["pose"
 
 def test_a_code_at_its_bound_is_not_free() -> None:
     stage, state = begun_stage()
-    at_bound = CarState(state.T_obj_cam, torch.full_like(state.code, DEFAULT.solver.max_code))
+    at_bound = CarState.of(state.T_obj_cam, torch.full_like(state.code, DEFAULT.solver.max_code))
     assert stage.free_unknowns(at_bound)[0].tolist() == [True] * 6 + [False] * 3
 
 

@@ -118,7 +118,8 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.cli.rerun_option import check_rerun, write_recording
-    from directshape_torch.cli.rig_of_run import with_rig_of_run
+    from directshape_torch.cli.rig_of_run import rigs_of_run
+    from directshape_torch.rig.estimate import RigEstimates
     from directshape_torch.terms.lidar import LidarPoints
 
     check_rerun(args.rerun)
@@ -128,7 +129,11 @@ def run(args: argparse.Namespace) -> int:
     extra = [] if args.lidar is None else [LidarPoints()]
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)
     _check_disparity_is_used(args.disparity, refiner.config.method)
-    dataset = with_rig_of_run(dataset_of(args), args.out, args.fresh) if args.rig == "auto" else dataset_of(args)
+    dataset = dataset_of(args)
+    rigs = rigs_of_run(dataset, args.rig, args.out, args.fresh)
+    if rigs:
+        dataset = dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
+        refiner.rig = RigEstimates(rigs)
     with ProgressBar() as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, workers, fresh=args.fresh)
     for warning in summary.warnings:

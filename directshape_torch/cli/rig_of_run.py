@@ -11,14 +11,16 @@ if TYPE_CHECKING:
     from directshape_torch.rig.estimate import RigEstimate
 
 
-def with_rig_of_run(dataset: FileStereoDataset, out_dir: Path, fresh: bool) -> FileStereoDataset:
-    """The data set with the disparity fields in the run's folder; they are estimated where there are none yet.
+def rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool) -> list[RigEstimate]:
+    """The estimates that `--rig` names: those of a file, or of the run's folder, made first where there are none yet.
 
     Raises:
         DataFormatError: the folder has a file of that name which is no estimate.
     """
-    from directshape_torch.rig.rig_file import RIG_FILE, load_rigs, save_rigs
+    from directshape_torch.rig.rig_file import RIG_FILE, holds_rigs, load_rigs, save_rigs
 
+    if rig != "auto":
+        return load_rigs(rig) if rig != "none" and holds_rigs(rig) else []
     path = out_dir / RIG_FILE
     # Whatever lies there is not overwritten, unless it is an estimate.
     kept = load_rigs(path) if path.is_file() else None
@@ -26,9 +28,9 @@ def with_rig_of_run(dataset: FileStereoDataset, out_dir: Path, fresh: bool) -> F
     if rigs is not kept:
         save_rigs(path, rigs)
         write_rig_picture(out_dir, rigs)
-    for rig in rigs:
-        print(rig if rigs is not kept else f"{rig} (kept)")
-    return dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
+    for estimate in rigs:
+        print(estimate if rigs is not kept else f"{estimate} (kept)")
+    return rigs
 
 
 def _estimate(dataset: FileStereoDataset) -> list[RigEstimate]:

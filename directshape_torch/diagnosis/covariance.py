@@ -20,37 +20,18 @@ def covariance_of(fisher: Tensor) -> Tensor:
     return torch.where(regular, covariance, torch.full_like(covariance, torch.nan))
 
 
-def shared_disparity_covariance(
-    T_obj_cam: Tensor,  # (B, 4, 4)
-    focal_baseline: Tensor,  # (B,) focal length times baseline, pixel metres
-    sigma_px: float,
-    num_unknowns: int,
-) -> Tensor:
-    """What an error of disparity that all pixels of a car share adds to its covariance (B, D, D).
+def without_offset(information: Tensor, num_kept: int) -> Tensor:
+    """The information (B, 6 + K, 6 + K) on pose and shape, whatever the offset is, from that on all unknowns (B, D, D).
 
-    A rig whose disparity is off by `delta` pixels shows a car at depth z about `delta z^2 / (f b)` too near, moved
-    along the viewing ray of its origin. No pixel contradicts, so no residual tells: it has to be known beforehand.
-
-    Args:
-        T_obj_cam: poses.
-        focal_baseline: f b.
-        sigma_px: standard deviation of the rig's disparity about its calibration, pixels.
-        num_unknowns: D = 6 + K.
+    Schur's complement; an offset of which nothing is known has nothing to share.
 
     Example:
-        >>> T = torch.eye(4).double()[None]
-        >>> T[0, 2, 3] = -20.0  # 20 m ahead
-        >>> shared_disparity_covariance(T, torch.tensor([400.0]), 0.1, 6)[0, 2, 2].sqrt()
-        tensor(0.1000, dtype=torch.float64)
+        >>> without_offset(torch.tensor([[[2.0, 1.0], [1.0, 1.0]]]), 1)
+        tensor([[[1.]]])
     """
-    T = T_obj_cam.to(torch.float64)
-    # In the object frame the camera's centre is the translation; the ray from it to the origin is minus that.
-    z_axis_obj, centre_obj = T[:, :3, 2], T[:, :3, 3]
-    depth = -(z_axis_obj * centre_obj).sum(dim=1)
-    # v moves the camera about the car, so the car by -v; of a covariance the sign does not matter.
-    along = centre_obj * (sigma_px * depth / focal_baseline.to(torch.float64))[:, None]
-    direction = torch.cat([along, along.new_zeros(len(T), num_unknowns - 3)], dim=1)
-    return direction[:, :, None] * direction[:, None]
+    of_offset = information.diagonal(dim1=1, dim2=2)[:, None, num_kept:]
+    across = information[:, :num_kept, num_kept:] / torch.where(of_offset > 0, of_offset, 1.0)
+    return information[:, :num_kept, :num_kept] - across @ information[:, num_kept:, :num_kept]
 
 
 def covariance_xyz_yaw(

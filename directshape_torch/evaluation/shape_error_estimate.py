@@ -54,7 +54,7 @@ class EstimatedCar:
         """Depth along the optical axis where the rays of left pixels first meet the surface, NaN where they miss it."""
         like = self.prior.origin
         rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double()).to(like)
-        state = CarState(se3.inverse(self.T_cam_obj.double())[None].to(like), self._code())
+        state = CarState.of(se3.inverse(self.T_cam_obj.double())[None].to(like), self._code())
         return np.asarray(
             cast(self.prior, state, torch.zeros_like(like), rays_cam, _SAMPLES_PER_RAY).depth.double().cpu()
         )

@@ -131,18 +131,17 @@ def _detections(parts: Sequence[Detections], size_hw: tuple[int, int]) -> Detect
         mask_left=_padded([part.mask_left for part in parts], size_hw),
         mask_right=_padded([part.mask_right for part in parts], size_hw),
         occluders=_occluders(occluders, size_hw),
-        pose_sigma=_pose_sigmas(parts),
+        pose_sigma=_sigmas([(p.pose_sigma, p.T_cam_obj.new_full((len(p), 4), torch.inf)) for p in parts]),
+        offset_sigma_px=_sigmas([(p.offset_sigma_px, torch.zeros_like(p.T_cam_obj[:, 0, 0])) for p in parts]),
         **rows,
     )
 
 
-def _pose_sigmas(parts: Sequence[Detections]) -> Tensor | None:
-    """Those of all frames, infinite for the frames without."""
-    if all(part.pose_sigma is None for part in parts):
+def _sigmas(parts: Sequence[tuple[Tensor | None, Tensor]]) -> Tensor | None:
+    """Those of all frames, the second of each pair for the frames without; None without any."""
+    if all(given is None for given, _ in parts):
         return None
-    return torch.cat(
-        [p.T_cam_obj.new_full((len(p), 4), torch.inf) if p.pose_sigma is None else p.pose_sigma for p in parts]
-    )
+    return torch.cat([none if given is None else given for given, none in parts])
 
 
 def _occluders(parts: Sequence[Occluders | None], size_hw: tuple[int, int]) -> Occluders | None:

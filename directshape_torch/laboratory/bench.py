@@ -24,7 +24,7 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.stereo_matching.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.silhouette import contour_zeta
-from directshape_torch.terms.term import Linear, Sight, Term
+from directshape_torch.terms.term import Linear, Sight, Term, linear_of
 
 TERM_NAMES = (
     "silhouettes", "silhouettes_product", "photometric", "photometric_normalised", "point_cloud",
@@ -65,7 +65,7 @@ class Bench:
 
     @property
     def num_unknowns(self) -> int:
-        return 6 + self.state.code.shape[1]
+        return self.state.num_unknowns
 
     @property
     def rays_per_car(self) -> Tensor:
@@ -105,7 +105,7 @@ class Bench:
             priors=replace(config.priors, tilt_form="cosine"),
         )
         # Pixel sets are fixed where a refinement would begin, so that rows get lost on the way to the state.
-        start = CarState(se3.inverse(detections.T_cam_obj), drawn.state.code)
+        start = CarState.of(se3.inverse(detections.T_cam_obj), drawn.state.code, cars.num_offsets)
         stages = []
         for c in (config, other_forms):
             problem = CarProblem.of_scene(c, prior, frame, detections, cars, observation, points, own_terms)
@@ -119,9 +119,9 @@ class Bench:
 @torch.no_grad()
 def rows_at(term: Term, sight: Sight) -> Linear:
     """The rows of a term at a state, its depths as precise as the dtype allows."""
-    at = term.linear(sight.field, sight.state, term.where(sight))
+    at = linear_of(term, sight.field, sight.state, term.where(sight))
     for _ in range(_LOOKS):
-        at = term.linear(sight.field, sight.state, at.where)
+        at = linear_of(term, sight.field, sight.state, at.where)
     return at
 
 

@@ -111,19 +111,21 @@ def pi_product(bench: Bench) -> Experiment:
 
 
 def depth_of_surface(bench: Bench) -> Experiment:
-    """Depth of the surface under the pixels of the photometric term, by the tangent of the state.
+    """Depth with which the pixels of the photometric term are warped, by the tangent of the state.
 
-    The function is that of the two Newton steps which differentiate it, from the depth at the state.
+    The function is that of the two Newton steps which differentiate the surface's, from the depth at the state.
     """
     term, at, where = _photometric(bench)
     rays = term.pixel_set.rows.rays
     usable = where.on_surface & term.pixel_set.filled
+    near = rays.in_objects(bench.state.T_obj_cam).depth_next_to(where.points_obj)
     chosen = usable.flatten().nonzero()[:, 0][_evenly(int(usable.sum()), _MAX_PIXELS)]
 
     def depth(delta: Tensor) -> Tensor:
         moved = bench.moved(delta[0])
         field, in_objects = field_of(bench.problem.prior.bind(moved.code)), rays.in_objects(moved.T_obj_cam)
-        return surface_depth(field, rays.owner, in_objects, where.depth, usable).flatten()[None, chosen]
+        depth = surface_depth(field, rays.owner, in_objects, near, usable)
+        return term.warped_depth(depth, moved, rays.owner)[0].flatten()[None, chosen]
 
     zero = bench.state.code.new_zeros(1, bench.num_unknowns)
     return factor_experiment("surface_depth", depth, zero, at.J_inner_state.flatten(0, 1)[None, chosen], block=1)

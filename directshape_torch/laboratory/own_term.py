@@ -11,7 +11,7 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.table_lookup import occurrences
 from directshape_torch.problem import TermFactory
-from directshape_torch.terms.term import Sight, Term
+from directshape_torch.terms.term import Sight, Term, linear_of
 
 
 def load_factory(name: str) -> TermFactory:
@@ -46,15 +46,14 @@ def checked_term(term: Term, sight: Sight) -> Term:
     for attribute, weight in (("block_weight", term.block_weight), ("information", term.information)):
         _check_shape(name, attribute, weight, (num_blocks,))
         _check(name, f"{attribute}.dtype", weight.dtype, torch.float64, "for sums")
-    at = term.linear(sight.field, sight.state, term.where(sight))
+    at = linear_of(term, sight.field, sight.state, term.where(sight))
     if at.residual.ndim != 3 or len(at.residual) != num_blocks:
         _check(
             name, "linear(...).residual", tuple(at.residual.shape), (num_blocks, "R", "N"), "blocks, rows, residuals"
         )
     shape = tuple(at.residual.shape)
-    num_unknowns = 6 + sight.state.code.shape[1]
     _check_shape(name, "linear(...).J_residual_inner", at.J_residual_inner, shape)
-    _check_shape(name, "linear(...).J_inner_state", at.J_inner_state, (*shape[:2], num_unknowns))
+    _check_shape(name, "linear(...).J_inner_state", at.J_inner_state, (*shape[:2], sight.state.num_unknowns))
     _check_shape(name, "residual(...)", term.residual(sight.field, sight.state, at.where), shape)
     _check_shape(name, "row_weight", term.row_weight, shape)
     for part, values in term.norm(at.residual)._asdict().items():

@@ -75,7 +75,7 @@ def _cycled(detections: Detections, count: int) -> Detections:
 
 def _typical(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
     detections = _cycled(scene.detections, count)
-    start = CarState(se3.inverse(detections.T_cam_obj), prior.initial_code(count))
+    start = CarState.of(se3.inverse(detections.T_cam_obj), prior.initial_code(count))
     return DrawnStates(detections, _disturbed(start, generator, 0.15, 2.0, 0.8))
 
 
@@ -84,7 +84,7 @@ def _near_optimum(scene: LaboratoryScene, prior: PCAShapePrior, count: int, gene
     every_result = replace(RefinerConfig(), acceptance=AcceptanceConfig(0.0, 0.0))
     result = DirectShapeRefiner(prior, every_result)(scene.frame, scene.detections)
     rows = torch.arange(count) % len(scene.detections)
-    refined = CarState(se3.inverse(result.T_cam_obj[rows]), result.code[rows])
+    refined = CarState.of(se3.inverse(result.T_cam_obj[rows]), result.code[rows])
     return DrawnStates(_cycled(scene.detections, count), _disturbed(refined, generator, 0.01, 0.1, 0.05))
 
 
@@ -104,7 +104,7 @@ def _placed(
     if code is None:
         code = torch.randn(count, prior.num_codes, generator=generator, dtype=torch.float64).clamp(-3, 3)
     detections = place_cars(scene, prior, T_cam_obj, code)
-    state = CarState(se3.inverse(T_cam_obj), code)
+    state = CarState.of(se3.inverse(T_cam_obj), code)
     if disturb:
         state = _disturbed(state, generator, 0.05, 1.0, 0.0)
     return DrawnStates(detections, state)
@@ -138,6 +138,12 @@ def _anywhere_placed(
     scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator
 ) -> DrawnStates:
     return _placed(scene, prior, generator, *_anywhere(generator, count))
+
+
+def _with_offset(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
+    drawn = _anywhere_placed(scene, prior, count, generator)
+    detections = replace(drawn.detections, offset_sigma_px=torch.full((count,), 0.5, dtype=torch.float64))
+    return DrawnStates(detections, drawn.state._replace(offset_px=_uniform(generator, count, -1, 1)[:, None]))
 
 
 def _with_code(size: float) -> Callable[..., DrawnStates]:
@@ -177,6 +183,7 @@ REGIMES: Mapping[str, Regime] = {
         Regime("code_three_sigma", "all components of the code at +-3", _with_code(3.0)),
         Regime("grid_border", "points within a cell of the border of the shape's grid", _anywhere_placed,
                pixels="grid_border", stage=0),
+        Regime("disparity_offset", "the rig's disparity off by an unknown of up to 1 px", _with_offset),
     )
 }  # fmt: skip
 

@@ -90,8 +90,8 @@ def select_detections(d: Detections, rows: Tensor) -> Detections:
         "frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right",
         "has_mask_left", "has_mask_right",
     )  # fmt: skip
-    pose_sigma = None if d.pose_sigma is None else d.pose_sigma[rows]
-    return replace(d, pose_sigma=pose_sigma, **{name: getattr(d, name)[rows] for name in names})
+    given = (*names, *(name for name in ("pose_sigma", "offset_sigma_px") if getattr(d, name) is not None))
+    return replace(d, **{name: getattr(d, name)[rows] for name in given})
 
 
 def place_cars(

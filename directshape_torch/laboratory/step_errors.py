@@ -26,7 +26,7 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.damped_solve import damped_step, limit_step
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.priors import prior_terms
-from directshape_torch.terms.term import Evaluation, Linear, Term, part_of, summed
+from directshape_torch.terms.term import Evaluation, Linear, Term, linear_of, part_of, summed
 
 ALL_TERMS = "all terms"
 PAPER = "paper's depth derivative"
@@ -180,7 +180,7 @@ def single_precision_rows(bench: Bench) -> dict[str, Linear]:
     for name in energy_of(bench):
         if name in TERM_NAMES:
             term = cast(Term, priors.get(name) or to_dtype(bench.terms[name], torch.float32))
-            at = term.linear(field, state, to_dtype(bench.rows[name].where, torch.float32))
+            at = linear_of(term, field, state, to_dtype(bench.rows[name].where, torch.float32))
             rows[name] = to_dtype(at, torch.float64)
     return rows
 

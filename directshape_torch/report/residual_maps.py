@@ -106,7 +106,7 @@ def residual_maps(
     uv = grid.reshape(-1, 2)
     T, code_of_car = (torch.from_numpy(np.asarray(x))[None].to(prior.origin) for x in (T_cam_obj, code))
     ray_cam = rays_from_pixels(uv, pair.camera.K_left[0])
-    seen = cast(prior, CarState(se3.inverse(T), code_of_car), torch.zeros_like(ray_cam[0]), ray_cam)
+    seen = cast(prior, CarState.of(se3.inverse(T), code_of_car), torch.zeros_like(ray_cam[0]), ray_cam)
     out = torch.from_numpy(hidden)[uv[:, 1].long(), uv[:, 0].long()]
     photometric = None
     if pair.right is not None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,6 +19,8 @@ from directshape_torch.scene import Detections, FrameBatch
 
 # A service runs for years; so many cars say all that cars can say.
 _MOST_ROWS = 1000
+# Of fewer the noise of a detector is a guess.
+_FEWEST_CARS = 10
 # Half of a car's image: where it stands the field is seen.
 _CAR_UV_PX = (40.0, 20.0)
 
@@ -142,6 +145,21 @@ class RigEstimate(nn.Module):
             return frames
         return replace(frames, camera=replace(frames.camera, disparity_field=self.field))
 
+    def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
+        """Detections that say how far the detector's depths are off, where they do not yet.
+
+        What it is off by in the mean counts as much as its noise: the prior stays where the box is. How sure the field
+        is at a car (`offset_at`) is not said: `Detections.offset_sigma_px` gives depth to the contours, which on KITTI
+        know it less well than a disparity that is off by a quarter of a pixel (docs/your_rig.md).
+        """
+        if detections.pose_sigma is not None or len(self.rows) < _FEWEST_CARS:
+            return detections
+        origin = detections.T_cam_obj.detach()[:, :3, 3]
+        along = math.hypot(*self.detector[:3]) * torch.hypot(origin[:, 0], origin[:, 2])
+        sigma = origin.new_full((len(origin), 4), torch.inf)
+        sigma[:, 0] = torch.where(along > 0, along, torch.inf)
+        return replace(detections, pose_sigma=sigma)
+
     def check_frames(self, frames: FrameBatch) -> None:
         """Refuse frames of another rig.
 
@@ -228,6 +246,28 @@ class RigEstimate(nn.Module):
         corners = [(self.rows[:, None, :2] + around).reshape(-1, 2), *(e.hull_uv for e in self.pixels.values())]
         uv = torch.cat(corners)
         return hull(uv) if len(uv) else self._blank.hull_uv
+
+
+class RigEstimates(nn.ModuleList):
+    """Those of several rigs, for a refiner whose calls have frames of one of them each."""
+
+    def __init__(self, rigs: Sequence[RigEstimate]) -> None:
+        super().__init__(rigs)
+
+    def corrected(self, frames: FrameBatch) -> FrameBatch:
+        """See `RigEstimate`; frames of a rig that nobody knows stay as they are."""
+        rig = self._of(frames)
+        return frames if rig is None else rig.corrected(frames)
+
+    def informed(self, frames: FrameBatch, detections: Detections) -> Detections:
+        """See `RigEstimate`."""
+        rig = self._of(frames)
+        return detections if rig is None else rig.informed(frames, detections)
+
+    def _of(self, frames: FrameBatch) -> RigEstimate | None:
+        camera, (height, width) = frames.camera, frames.sizes[0].tolist()
+        matrices = camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
+        return next((rig for rig in self if rig.is_of((width, height), *matrices)), None)  # type: ignore[operator, return-value]
 
 
 def rig_among(

@@ -65,9 +65,16 @@ def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
     Raises:
         DataFormatError: it is missing, damaged or neither of the two.
     """
-    if _read(path).get("schema") == SCHEMA:
-        return tuple(rig.field for rig in load_rigs(path))
-    return (DisparityField.load(path),)
+    return tuple(rig.field for rig in load_rigs(path)) if holds_rigs(path) else (DisparityField.load(path),)
+
+
+def holds_rigs(path: Path | str) -> bool:
+    """Whether a JSON file is one of estimates, and not a field file of earlier versions.
+
+    Raises:
+        DataFormatError: it is missing or damaged.
+    """
+    return _read(path).get("schema") == SCHEMA
 
 
 def _rig(entry: Mapping[str, Any]) -> RigEstimate:

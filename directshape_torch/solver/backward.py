@@ -63,4 +63,4 @@ def _following(initial: CarState, start: CarState) -> CarState:
     R_obj_cam = initial.T_obj_cam[:, :3, :3]
     turn = (start.T_obj_cam[:, :3, :3] @ R_obj_cam.mT).detach()
     R_moved = turn @ R_obj_cam
-    return CarState(se3.from_rotation_translation(R_moved, -(R_moved @ moved[..., None])[..., 0]), start.code)
+    return start._replace(T_obj_cam=se3.from_rotation_translation(R_moved, -(R_moved @ moved[..., None])[..., 0]))

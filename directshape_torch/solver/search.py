@@ -42,11 +42,11 @@ def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float)
     disparity = focal_baseline / origin[:, 2]
     scale = disparity / (disparity + offset_px).clamp_min(0.1)
     moved = se3.from_rotation_translation(T_cam_obj[:, :3, :3], origin * scale[:, None])
-    return CarState(se3.inverse(moved), state.code)
+    return state._replace(T_obj_cam=se3.inverse(moved))
 
 
 def turn(state: CarState, angle_rad: float) -> CarState:
     """Cars turned about the vertical axis of their own object frame."""
     twist = torch.zeros(6, dtype=state.code.dtype, device=state.code.device)
     twist[4] = angle_rad
-    return CarState(se3.exp(twist) @ state.T_obj_cam, state.code)
+    return state._replace(T_obj_cam=se3.exp(twist) @ state.T_obj_cam)

@@ -14,29 +14,46 @@ from directshape_torch.scene import Detections, FrameBatch
 
 
 class CarState(NamedTuple):
-    """Pose and shape of B cars."""
+    """Pose and shape of B cars, and how far off the rig's disparity is at each of them where that is an unknown."""
 
     T_obj_cam: Tensor  # (B, 4, 4) left camera to object
     code: Tensor  # (B, K) standard deviations
+    offset_px: Tensor  # (B, S) measured minus true disparity, full-resolution pixels; S is 1, or 0 where it is known
+
+    @classmethod
+    def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
+        """Cars of a pose (B, 4, 4) and a shape (B, K), where the rig's disparity is as it is calibrated.
+
+        Example:
+            >>> CarState.of(torch.eye(4)[None], torch.zeros(1, 2), num_offsets=1).offset_px
+            tensor([[0.]])
+        """
+        return cls(T_obj_cam, code, code.new_zeros(len(code), num_offsets))
+
+    @property
+    def num_unknowns(self) -> int:
+        """D = 6 + K + S."""
+        return 6 + self.code.shape[1] + self.offset_px.shape[1]
 
 
 def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_angle: float = torch.inf) -> CarState:
-    """`T_obj_cam <- exp(delta[:6]) T_obj_cam`, `code <- code + delta[6:]`, the code bounded.
+    """`T_obj_cam <- exp(v, omega) T_obj_cam`, `code <- code + dcode`, bounded, `offset_px <- offset_px + doffset`.
 
     Args:
         state: B cars.
-        delta: (B, 6 + K), `(v, omega, dcode)` in metres, radians and standard deviations.
+        delta: (B, 6 + K + S), `(v, omega, dcode, doffset)` in metres, radians, standard deviations and pixels.
         max_code: largest magnitude of a code component.
         max_angle: no rotation is larger, radians (see `se3.exp`).
 
     Example:
-        >>> state = CarState(torch.eye(4)[None], torch.zeros(1, 2))
+        >>> state = CarState.of(torch.eye(4)[None], torch.zeros(1, 2))
         >>> retract(state, torch.tensor([[1.0, 0, 0, 0, 0, 0, 0.5, 9.0]]), max_code=3.0).code
         tensor([[0.5000, 3.0000]])
     """
-    twist, code_step = torch.split_with_sizes(delta.to(state.code.dtype), [6, delta.shape[1] - 6], dim=1)
+    sizes = [6, state.code.shape[1], state.offset_px.shape[1]]
+    twist, code_step, offset_step = torch.split_with_sizes(delta.to(state.code.dtype), sizes, dim=1)
     T_obj_cam = torch.bmm(se3.exp(twist, max_angle), state.T_obj_cam)
-    return CarState(T_obj_cam, (state.code + code_step).clamp(-max_code, max_code))
+    return CarState(T_obj_cam, (state.code + code_step).clamp(-max_code, max_code), state.offset_px + offset_step)
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,7 @@ class CarBatch:
         detector_hwl: (B, 3).
         detector_T_cam_obj: (B, 4, 4) input pose.
         detector_pose_sigma: (B, 4) its standard deviations, see `Detections`, or None.
+        offset_sigma_px: (B,) standard deviation of the unknown offset of the disparity; None where no car has one.
     """
 
     detection_row: Tensor
@@ -68,10 +86,18 @@ class CarBatch:
     detector_hwl: Tensor
     detector_T_cam_obj: Tensor
     detector_pose_sigma: Tensor | None
+    offset_sigma_px: Tensor | None
 
     @classmethod
-    def from_scene(cls, frames: FrameBatch, detections: Detections) -> CarBatch:
-        f = detections.frame_index
+    def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
+        """All cars of a call, with the rig's `disparity_sigma_px` where the detections bring no sigma of their own."""
+        f, offset_sigma_px = detections.frame_index, detections.offset_sigma_px
+        if offset_sigma_px is None:
+            offset_sigma_px = (
+                torch.full_like(detections.T_cam_obj[:, 0, 0], disparity_sigma_px) if disparity_sigma_px else None
+            )
+        elif not bool((offset_sigma_px > 0).any()):
+            offset_sigma_px = None
         return cls(
             detection_row=torch.arange(len(f), device=f.device),
             frame_index=f,
@@ -84,6 +110,7 @@ class CarBatch:
             detector_hwl=detections.dimensions_hwl,
             detector_T_cam_obj=detections.T_cam_obj,
             detector_pose_sigma=detections.pose_sigma,
+            offset_sigma_px=offset_sigma_px,
         )
 
     def __len__(self) -> int:
@@ -102,6 +129,17 @@ class CarBatch:
     def focal_baseline(self) -> Tensor:
         """Focal length times baseline (B,), pixel metres: disparity is this over depth."""
         return -self.K_left[:, 0, 0] * self.T_right_cam[:, 0, 3]
+
+    @property
+    def num_offsets(self) -> int:
+        """S of the cars' states."""
+        return 0 if self.offset_sigma_px is None else 1
+
+    def inverse_depth_of_offset(self, offset_px: Tensor) -> Tensor:
+        """What offsets (B, 1) of the disparity add to the inverse depth (B, 1), per metre; 0 where they are known."""
+        assert self.offset_sigma_px is not None
+        per_px = torch.where(self.offset_sigma_px > 0, 1 / self.focal_baseline, 0.0)
+        return offset_px * per_px[:, None]
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarBatch:
         """Those of the cars where `keep` (B,) holds: `numbers` of them, should the host know it, who waits if not."""

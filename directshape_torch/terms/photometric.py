@@ -3,8 +3,9 @@
 `1 / (|Omega'| N) sum_p sum_p~ w_p ||I_r(warp(p~, d_p)) - I_l(p~)||`: all N neighbours of a pixel are warped with the
 depth d_p of the surface under it, so all its residuals see the state through that one depth, whose derivative is
 exact: `d depth / d sdf = -1 / (grad . ray)` (the paper's `-1 / cos(theta)` assumes |grad| = 1 and depth along the
-ray). Within a stage the pixel set is fixed: a pixel that loses its surface, leaves the right image, grazes the surface
-or comes to lie under a nearer car pays a constant with zero Jacobian instead of vanishing from the mean. Derivation:
+ray). Where the rig's disparity is off by an unknown offset, the depth of the warp is the one that it feigns. Within a
+stage the pixel set is fixed: a pixel that loses its surface, leaves the right image, grazes the surface or comes to lie
+under a nearer car pays a constant with zero Jacobian instead of vanishing from the mean. Derivation:
 docs/derivations/photometric.md.
 """
 
@@ -40,6 +41,8 @@ DSO_PATTERN: tuple[tuple[int, int], ...] = ((0, -2), (-1, -1), (1, -1), (-2, 0),
 _CENTRE = DSO_PATTERN.index((0, 0))
 # What is not so far in front of the right camera is not seen by it.
 _LEAST_DEPTH_M = 1e-6
+# Of a disparity, that an offset must leave of it: beyond infinity nothing is seen.
+_LEAST_SHARE = 1e-3
 
 
 @made_once
@@ -106,7 +109,7 @@ class Surface(NamedTuple):
 
     points_obj: Tensor  # (3, M, 64) metres, next to the surface
     normal_obj: Tensor  # (3, M, 64) gradient of the signed distance there
-    depth: Tensor  # (M, 64) of the surface, metres
+    depth: Tensor  # (M, 64) with which the pixels are warped, metres
     on_surface: Tensor  # (M, 64) bool: there is one, and it is not grazing
     usable: Tensor  # (M, 64) bool: and it can be compared with the right image
 
@@ -205,7 +208,7 @@ class Photometric:
         place = self.all_rows.places[row]
         rows = self._fixed(packed, row, self.pyramid[stage.image_level])
         depth = sight.hits.depth.flatten()[place]
-        warped = _warped(rows, depth)
+        warped = _warped(rows, self.warped_depth(depth, sight.state, packed.blocks.owner)[0])
         right, counted = warped.at.value, (packed.filled & warped.is_comparable(rows.right)).to(depth.dtype)
         neighbours, owner = counted * rows.neighbour_weight, packed.blocks.owner
         form = self.config.brightness
@@ -226,7 +229,19 @@ class Photometric:
         place = self.pixel_set.sight_place
         points, normal = (x.flatten(1)[:, place] for x in (sight.hits.points_obj, sight.hits.normal_obj))
         depth, found = (x.flatten()[place] for x in (sight.hits.depth, sight.hits.found))
-        return Surface(points, normal, depth, found, found)
+        return Surface(points, normal, self.warped_depth(depth, sight.state, self.blocks.owner)[0], found, found)
+
+    def warped_depth(self, depth: Tensor, state: CarState, owner: Tensor) -> tuple[Tensor, Tensor | None]:
+        """The depth (M, 64) with which pixels are warped whose surface has a depth (M, 64), and surface over warp.
+
+        `1 / warp = 1 / depth + offset / (f B)`; without an unknown offset it is the surface's, and there is no ratio.
+        """
+        if not state.offset_px.shape[1]:
+            return depth, None
+        ratio = 1 + depth * self.cars.inverse_depth_of_offset(state.offset_px)[owner]
+        # What has no disparity left goes behind the camera, where it is lost.
+        ratio = torch.where(ratio > _LEAST_SHARE, ratio, -1.0)
+        return depth / ratio, ratio
 
     def linear(self, field: Field, state: CarState, where: Surface) -> Linear:
         rows = self.pixel_set.rows
@@ -244,6 +259,10 @@ class Photometric:
         per_sdf = -1 / torch.where(found, slope, torch.full_like(slope, -1.0))
         depth = near + torch.where(found, at.value * per_sdf, torch.zeros_like(slope))
         J_depth_state = torch.where(found, per_sdf, 0.0)[..., None] * sdf_state_jacobian(points, at.gradient, at)
+        depth, ratio = self.warped_depth(depth, state, owner)
+        if ratio is not None:
+            J_depth_offset = -depth * depth * self.cars.inverse_depth_of_offset(torch.ones_like(state.offset_px))[owner]
+            J_depth_state = torch.cat([J_depth_state / (ratio * ratio)[..., None], J_depth_offset[..., None]], dim=-1)
         compare = compared(rows, self.config, depth)
         usable = found & compare.comparable
         residual = torch.where(usable[..., None], compare.residual, self.config.lost_grey_levels)
@@ -266,6 +285,7 @@ class Photometric:
         slope = (where.normal_obj * rays.direction_obj).sum(0).detach()
         step = field.value(rays.at(near), rows.rays.owner) / torch.where(where.usable, slope, -1.0)
         depth = near - torch.where(where.usable, step, torch.zeros_like(step))
+        depth, _ = self.warped_depth(depth, state, rows.rays.owner)
         residual, _ = residuals_at(rows, self.config, depth)
         return torch.where(where.usable[..., None], residual, self.config.lost_grey_levels)
 

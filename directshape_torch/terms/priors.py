@@ -1,4 +1,4 @@
-"""Priors, `lambda r^2 / 2`: shape code, height above the ground, tilt against it, the detector's dimensions and pose.
+"""Priors, `lambda r^2 / 2`: shape code, height above the ground, tilt against it, the detector's box, the rig.
 
 Each residual is a function of the cars and a state that returns it with its Jacobian by `(v, omega, dcode)`; a prior of
 one's own is such a function in a `PriorTerm` (docs/extra_terms.md). Derivations: docs/derivations/priors.md.
@@ -24,12 +24,15 @@ from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.term import Linear, Sight, Where
 
+RIG_WEIGHT = 0.2
+"""Of the offset of the disparity, in its standard deviations: that of the detector's pose, with which it is weighed."""
+
 
 class PriorResidual(NamedTuple):
     """Residual of a prior for B cars, with its Jacobian."""
 
     residual: Tensor  # (B, R)
-    J_residual_state: Tensor  # (B, R, 6 + K)
+    J_residual_state: Tensor  # (B, R, 6 + K), or (B, R, D)
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class PriorTerm:
         cars: constants of the cars.
         residual_of: the residual with its Jacobian, from the constants and a state.
         num_rows: R.
+        is_prior: False for what belongs to the measurements.
     """
 
     name: str
@@ -49,8 +53,7 @@ class PriorTerm:
     cars: CarBatch
     residual_of: Callable[[CarBatch, CarState], PriorResidual]
     num_rows: int
-
-    is_prior = True
+    is_prior: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -101,7 +104,7 @@ class PriorTerm:
 
 
 def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[PriorTerm]:
-    """Shape, height, tilt, dimensions, and pose where its sigma is known; those of weight zero left out."""
+    """Shape, height, tilt, dimensions, pose where its sigma is known, and the rig where its disparity is not."""
 
     def of_dimensions(cars: CarBatch, state: CarState) -> PriorResidual:
         sigma = constant_like(config.dimensions_sigma_m, state.code)
@@ -118,8 +121,11 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
         PriorTerm("tilt", config.tilt_weight, cars, tilt, num_tilts),
         PriorTerm("dimensions", config.dimensions_weight, cars, of_dimensions, 3),
     ]
-    if cars.detector_pose_sigma is not None or any(_pose_sigmas(config)):
+    if cars.detector_pose_sigma is not None or any(config.pose_sigmas):
         all_terms.append(PriorTerm("pose", config.pose_weight, cars, of_pose, 4))
+    if cars.num_offsets:
+        # How well a disparity is measured: what the images say of a car holds no more than that.
+        all_terms.append(PriorTerm("rig", RIG_WEIGHT, cars, rig_prior, 1, is_prior=False))
     return [term for term in all_terms if term.weight > 0]
 
 
@@ -127,7 +133,7 @@ def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
     """Standard deviations (B, 4) of the input poses, see `Detections.pose_sigma`; infinite where nobody knows them."""
     if cars.detector_pose_sigma is not None:
         return cars.detector_pose_sigma
-    along_share, *constant = _pose_sigmas(config)
+    along_share, *constant = config.pose_sigmas
     origin = cars.detector_T_cam_obj[:, :3, 3]
     sigma = constant_like(tuple(s if s > 0 else math.inf for s in constant), origin).repeat(len(origin), 1)
     if along_share > 0:
@@ -135,12 +141,6 @@ def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
         distance = torch.hypot(origin[:, 0], origin[:, 2])
         sigma[:, 0] = torch.sqrt((along_share * distance) ** 2 + constant[0] ** 2)
     return sigma
-
-
-def _pose_sigmas(p: PriorConfig) -> tuple[float, float, float, float, float]:
-    """Along the ray as a share of the distance, then metres, metres, metres and radians; 0 for not known."""
-    metres = p.pose_sigma_along_m, p.pose_sigma_across_m, p.pose_sigma_vertical_m
-    return p.pose_sigma_along_share, *metres, math.radians(p.pose_sigma_yaw_deg)
 
 
 def shape_prior(code: Tensor) -> PriorResidual:
@@ -247,6 +247,15 @@ def pose_prior(
     J[:, :3, :3] = -axes @ R_cam_obj
     J[:, 3, 3:6] = J_yaw_omega
     return PriorResidual(torch.cat([moved, turned[:, None]], dim=-1) / sigma, J / sigma[..., None])
+
+
+def rig_prior(cars: CarBatch, state: CarState) -> PriorResidual:
+    """Offset of the disparity in its standard deviations; pixels for a car that has none, whose offset stays 0."""
+    assert cars.offset_sigma_px is not None
+    sigma = torch.where(cars.offset_sigma_px > 0, cars.offset_sigma_px, 1.0)[:, None]
+    return PriorResidual(
+        state.offset_px / sigma, torch.nn.functional.pad(1 / sigma, (6 + state.code.shape[1], 0))[:, None]
+    )
 
 
 def viewing_axes(origin_cam: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ class Linear(NamedTuple):
 
     residual: Tensor  # (M, R, N)
     J_residual_inner: Tensor  # (M, R, N)
-    J_inner_state: Tensor  # (M, R, D)
+    J_inner_state: Tensor  # (M, R, D), or (M, R, 6 + K) of terms that do not look at disparities
     where: Where  # the points at which they were taken
 
 
@@ -118,6 +118,14 @@ class Part(NamedTuple):
     where: Where  # the points at which they were taken
 
 
+def linear_of(term: Term, field: Field, state: CarState, where: Where) -> Linear:
+    """`term.linear` with a column for each unknown of the state."""
+    at, num_offsets = term.linear(field, state, where), state.offset_px.shape[1]
+    if not num_offsets or at.J_inner_state.shape[-1] == state.num_unknowns:
+        return at
+    return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, num_offsets)))
+
+
 def part_of(term: Term, at: Linear) -> Part:
     """The sums over the rows of each block, from residuals and their Jacobian in factors."""
     norm = term.norm(at.residual)
@@ -150,6 +158,7 @@ def _block_costs(weight: Tensor, norm: RobustValue) -> Tensor:
 _SIZES = {
     "T_obj_cam": 0,
     "code": 0,
+    "offset_px": 0,
     "values": 0,
     "points_obj": 1,
     "normal_obj": 1,
@@ -179,7 +188,7 @@ def with_varying_blocks(term: Term) -> Term:
 @compilable(sizes=_SIZES)
 def parts_of(terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...]) -> tuple[Part, ...]:
     """All terms at a state, looking near the points given, with their hand-derived Jacobians."""
-    return tuple(part_of(term, term.linear(field, state, where)) for term, where in zip(terms, wheres, strict=True))
+    return tuple(part_of(term, linear_of(term, field, state, where)) for term, where in zip(terms, wheres, strict=True))
 
 
 def weighted_products(
@@ -234,15 +243,14 @@ def by_autograd(
     Each residual depends on one car only, so one tangent of `retract` moves all cars at once: D tangents, batched,
     share one evaluation of the values. Where the rows look is a constant, as in the hand-derived form.
     """
-    unknowns = 6 + state.code.shape[1]
 
     def residuals(delta: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        moved = retract(state, delta.expand(len(state.code), unknowns))
+        moved = retract(state, delta.expand(len(state.code), state.num_unknowns))
         field = field_of(prior.bind(moved.code))
         of_terms = [term.residual(field, moved, where) for term, where in zip(terms, wheres, strict=True)]
         return of_terms, of_terms
 
-    zero = torch.zeros(unknowns, dtype=state.code.dtype, device=state.code.device)
+    zero = torch.zeros(state.num_unknowns, dtype=state.code.dtype, device=state.code.device)
     jacobians, values = torch.func.jacfwd(residuals, has_aux=True)(zero)
     return list(zip(values, jacobians, strict=True))
 

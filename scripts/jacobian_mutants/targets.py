@@ -26,6 +26,10 @@ _JACOBIANS = (
 )
 _GRADIENTS = (*_JACOBIANS, f"{_LABORATORY}::test_gradients_can_be_differentiated")
 _FACTORS = (f"{_LABORATORY}::test_factors",)
+_OFFSET = tuple(
+    f"tests/terms/test_disparity_offset.py::test_{name}"
+    for name in ("warp_and_prior_by_hand", "an_offset_does_what_a_constant_field_does")
+)
 
 TARGETS: dict[str, Target] = {
     "silhouettes": Target(
@@ -46,8 +50,8 @@ TARGETS: dict[str, Target] = {
     ),
     "photometric": Target(
         "directshape_torch/terms/photometric.py",
-        ("Photometric.linear", "Photometric.residual", "compared", "_warped"),
-        _GRADIENTS,
+        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth", "compared", "_warped"),
+        (*_OFFSET, *_GRADIENTS),
     ),
     "photometric_patch": Target(
         "directshape_torch/terms/photometric_patch.py",
@@ -70,8 +74,9 @@ TARGETS: dict[str, Target] = {
             "_by_rotation",
             "dimensions_prior",
             "pose_prior",
+            "rig_prior",
         ),
-        _JACOBIANS,
+        (*_OFFSET[:1], *_JACOBIANS),
     ),
     "robust": Target(
         "directshape_torch/terms/robust.py",
@@ -108,6 +113,7 @@ TARGETS: dict[str, Target] = {
         "directshape_torch/geometry/se3.py", ("inverse", "transform", "from_kornia", "to_kornia"), _SE3_TESTS
     ),
     "retract": Target("directshape_torch/terms/cars.py", ("retract",), _JACOBIANS),
+    "offset": Target("directshape_torch/terms/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
     "pinhole": Target(
         "directshape_torch/geometry/pinhole.py", ("rays_from_pixels", "project"), ("tests/geometry/test_pinhole.py",)
     ),

@@ -210,17 +210,22 @@ def test_13_result_files_keep_what_is_not_refined(tmp_path: Path) -> None:
 
 
 def test_14_tangent_is_v_omega_dcode() -> None:
-    state = CarState(torch.eye(4).double()[None], torch.zeros(1, 3).double())
+    state = CarState.of(torch.eye(4).double()[None], torch.zeros(1, 3).double())
     moved = retract(state, vector(0.1, 0.2, 0.3, 0, 0, 0, 1, 2, 3)[None])
     torch.testing.assert_close(moved.T_obj_cam[0, :3, 3], vector(0.1, 0.2, 0.3))
     torch.testing.assert_close(moved.code[0], vector(1, 2, 3))
     turned = retract(state, vector(0, 0, 0, 0, 0, math.pi / 2, 0, 0, 0)[None])
     torch.testing.assert_close(turned.T_obj_cam[0, :3, 0], vector(0, 1, 0))
+    unsure = CarState.of(*state[:2], num_offsets=1)
+    assert (state.num_unknowns, unsure.num_unknowns) == (9, 10)
+    offset = retract(unsure, vector(0, 0, 0, 0, 0, 0, 1, 2, 3, 0.4)[None])
+    assert torch.equal(offset.code, moved.code)
+    assert offset.offset_px.tolist() == [[0.4]]
 
 
 def test_15_update_is_on_the_left_and_in_one_place() -> None:
     T_cam_obj = box3d.pose_from_kitti(vector(3, 1.6, 25), torch.tensor(0.7).double())
-    state = CarState(se3.inverse(T_cam_obj)[None], torch.zeros(1, 2).double())
+    state = CarState.of(se3.inverse(T_cam_obj)[None], torch.zeros(1, 2).double())
     delta = vector(0.2, 0.0, -0.1, 0.01, 0.3, 0.02, 0, 0)
     after = retract(state, delta[None]).T_obj_cam[0]
     torch.testing.assert_close(after, se3.exp(delta[:6]) @ state.T_obj_cam[0])
@@ -304,12 +309,12 @@ def test_23_residuals_are_predicted_minus_observed() -> None:
     assert (shape_is_larger.residual > 0).all()
     # A car predicted lower (greater y) than the ground: positive.
     T = se3.inverse(box3d.pose_from_kitti(vector(0, 1.9, 10), torch.tensor(0.0).double()))[None]
-    assert height_prior(cars_on(vector(0, -1, 0), vector(1.65), 1), CarState(T, torch.zeros(1, 0))).residual > 0
+    assert height_prior(cars_on(vector(0, -1, 0), vector(1.65), 1), CarState.of(T, torch.zeros(1, 0))).residual > 0
     prior, scene = cached_street()
     darker_left = replace(scene.frames, images_left=scene.frames.images_left - 0.1)
     config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, brightness="none"))
     stage, state = begun_stage(prior, darker_left, scene.detections, config)
-    part = stage.photometric_part(figures_at(stage, CarState(state.T_obj_cam, scene.code)))
+    part = stage.photometric_part(figures_at(stage, CarState.of(state.T_obj_cam, scene.code)))
     assert part is not None
     counted = photometric_of(stage).row_weight > 0
     assert float(part.residual[counted].median()) == pytest.approx(25.5, abs=3)  # right minus left

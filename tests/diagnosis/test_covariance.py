@@ -9,7 +9,7 @@ from helpers.derivatives import central_differences, moved, tangent_of
 from helpers.problems import DEFAULT, begun_stage, figures_at
 from helpers.synthetic_scene import cached_street
 
-from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, shared_disparity_covariance
+from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.problem import CarStage
@@ -55,7 +55,7 @@ def test_far_cars_are_less_certain() -> None:
 
 def test_xyz_yaw_is_the_derivative_of_location_and_heading() -> None:
     T_cam_obj = pose_from_kitti(torch.tensor([2.0, 1.6, 15.0]).double(), torch.tensor(0.8).double())
-    state = CarState(se3.inverse(T_cam_obj)[None], torch.zeros(1, 3).double())
+    state = CarState.of(se3.inverse(T_cam_obj)[None], torch.zeros(1, 3).double())
 
     def xyz_yaw(delta: torch.Tensor) -> torch.Tensor:
         T = se3.inverse(moved(state, delta).T_obj_cam)[0]
@@ -79,18 +79,16 @@ def test_singular_and_broken_systems_give_nan() -> None:
     stage, state = begun_stage(prior, scene.frames, scene.detections, blind)
     far = state.T_obj_cam.clone()
     far[0, 0, 3] += 500.0  # the first car is nowhere near its pixels
-    covariance = tangent_covariance(stage, CarState(far, state.code))
+    covariance = tangent_covariance(stage, CarState.of(far, state.code))
     assert covariance[0].isnan().all()
-    assert tangent_covariance(stage, CarState(far * torch.nan, state.code)).isnan().all()
+    assert tangent_covariance(stage, CarState.of(far * torch.nan, state.code)).isnan().all()
 
 
-def test_an_error_that_all_pixels_share_moves_the_car_along_its_ray_by_the_depth_that_it_feigns() -> None:
-    location = torch.tensor([-6.0, 1.6, 30.0]).double()
-    T_obj_cam = se3.inverse(pose_from_kitti(location, torch.tensor(0.8).double()))[None]
-    focal_baseline, sigma_px = 721.5 * 0.54, 0.1
-    shared = shared_disparity_covariance(T_obj_cam, torch.tensor([focal_baseline]).double(), sigma_px, 9)
-    disparity = focal_baseline / location[2]
-    feigned = location * (focal_baseline / (disparity - 1e-4) / location[2] - 1) / 1e-4 * sigma_px
-    expected = torch.zeros(4, 4).double()
-    expected[:3, :3] = torch.outer(feigned, feigned)
-    torch.testing.assert_close(covariance_xyz_yaw(shared, T_obj_cam)[0], expected, rtol=1e-4, atol=1e-12)
+def test_what_is_known_whatever_the_offset_is_has_the_covariance_of_all_unknowns_without_its_row() -> None:
+    A = torch.randn(3, 12, 10, dtype=torch.float64)
+    information = A.mT @ A
+    marginal = covariance_of(without_offset(information, 9))
+    torch.testing.assert_close(marginal, covariance_of(information)[:, :9, :9], rtol=1e-9, atol=1e-9)
+    information[0, 9] = information[0, :, 9] = 0
+    assert torch.equal(without_offset(information, 9)[0], information[0, :9, :9])
+    assert torch.equal(without_offset(information, 10), information)

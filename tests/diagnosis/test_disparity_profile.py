@@ -254,7 +254,7 @@ def test_all_pixels_cost_what_the_term_says_on_the_surface_and_beside_it(config:
     stage, state = begun_stage(ellipsoid_prior(), scene.frames, disturbed(scene.detections), CONFIGS[config])
     T = state.T_obj_cam.clone()
     T[:, 0, 3] += 0.5  # where part of the pixel set has no surface any more
-    beside = CarState(T, state.code)
+    beside = CarState.of(T, state.code)
     surface = surface_at(stage, beside)
     assert surface is not None
     of_set = surface.on_surface[photometric_of(stage).pixel_set.filled]

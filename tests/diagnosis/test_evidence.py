@@ -74,7 +74,7 @@ def test_a_motion_along_the_ray_is_one_of_depth() -> None:
     T = se3.inverse(course.after.T_obj_cam)
     ray = T[:, :3, 3] * torch.tensor([1.0, 0.0, 1.0]).double()
     T[:, :3, 3] -= 0.4 * ray / ray.norm(dim=1, keepdim=True)
-    moved = replace(course, before=CarState(se3.inverse(T), course.after.code))
+    moved = replace(course, before=CarState.of(se3.inverse(T), course.after.code))
     found, still = columns(moved), columns(course)
     torch.testing.assert_close(found["moved_depth"], torch.full((2,), 0.4).double())
     assert (found["log_expected_gain"] > still["log_expected_gain"]).all()

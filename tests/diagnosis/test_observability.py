@@ -79,7 +79,7 @@ def test_jacobian_is_the_derivative_of_the_quantities() -> None:
     prior = ellipsoid_prior()
     location = torch.tensor([2.0, 1.6, 15.0]).double()
     T_cam_obj = pose_from_kitti(location, torch.tensor(0.8).double())
-    state = CarState(se3.inverse(T_cam_obj)[None], torch.tensor([[0.3, -0.2, 0.1]]).double())
+    state = CarState.of(se3.inverse(T_cam_obj)[None], torch.tensor([[0.3, -0.2, 0.1]]).double())
     ray = location * torch.tensor([1.0, 0.0, 1.0]).double()
     ray = ray / ray.norm()
 

@@ -53,7 +53,7 @@ def test_a_mask_of_nothing_on_a_shape_beside_all_pixels_has_no_overlap() -> None
     masks = stage.problem.masks
     empty = ((masks.rays.owner == 0) & (masks.side == 0))[:, None]
     masks = replace(masks, foreground=torch.where(empty, 0.0, masks.foreground))
-    found = mask_ious(masks, stage.problem.look(CarState(T, state.code)))
+    found = mask_ious(masks, stage.problem.look(CarState.of(T, state.code)))
     assert found[0, 0].isnan()
     assert found[1, 0] == 0
     assert (found[:, 1] > 0.8).all()
@@ -65,7 +65,7 @@ def test_photometric_agreement_is_the_mean_over_the_usable_pixels_car_by_car() -
     fixed = term.pixel_set
     T = state.T_obj_cam.clone()
     T[:, 0, 3] += 0.5  # where part of the pixel set has no surface any more
-    for at in (state, CarState(T, state.code)):
+    for at in (state, CarState.of(T, state.code)):
         rows = stage.photometric_part(figures_at(stage, at))
         assert rows is not None
         error, share = photometric_agreement(term, rows)
@@ -104,7 +104,7 @@ def test_what_is_hidden_in_the_right_image_is_not_compared() -> None:
 def test_no_cars_agree_with_nothing() -> None:
     stage, state = begun()
     none = stage.problem.of_cars(torch.zeros(2, dtype=torch.bool))
-    seen = none.look(CarState(state.T_obj_cam[:0], state.code[:0]))
+    seen = none.look(CarState.of(state.T_obj_cam[:0], state.code[:0]))
     empty = none.begin(none.stages()[1], seen)
     rows = empty.photometric_part(empty.figures(seen))
     assert rows is not None
@@ -116,7 +116,7 @@ def test_no_cars_agree_with_nothing() -> None:
 def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
     stage, initial = begun()
     problem = stage.problem
-    end = CarState(initial.T_obj_cam.clone(), initial.code + 0.5)
+    end = CarState.of(initial.T_obj_cam.clone(), initial.code + 0.5)
     seen_initial, seen_end = problem.look(initial), problem.look(end)
     minimum = Minimum(
         state=CarState(*(torch.stack([a[0], b[1]]) for a, b in zip(initial, end, strict=True))),

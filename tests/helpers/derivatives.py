@@ -12,13 +12,15 @@ from directshape_torch.terms.cars import CarState
 
 
 def moved(state: CarState, delta: Tensor) -> CarState:
-    """The state at `delta` (B, 6 + K) of its own tangent, by the definition of CONVENTIONS.md; differentiable."""
-    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, state.code + delta[:, 6:])
+    """The state at `delta` (B, D) of its own tangent, by the definition of CONVENTIONS.md; differentiable."""
+    num_codes = state.code.shape[1]
+    code, offset_px = state.code + delta[:, 6 : 6 + num_codes], state.offset_px + delta[:, 6 + num_codes :]
+    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, code, offset_px)
 
 
 def tangent_of(state: CarState) -> Tensor:
-    """Zero tangent vectors (B, 6 + K)."""
-    return state.code.new_zeros(len(state.code), 6 + state.code.shape[1])
+    """Zero tangent vectors (B, D)."""
+    return state.code.new_zeros(len(state.code), state.num_unknowns)
 
 
 def central_differences(function: Callable[[Tensor], Tensor], at: Tensor, step: float = 1e-6) -> Tensor:

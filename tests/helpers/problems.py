@@ -69,4 +69,4 @@ def photometric_of(stage: CarStage) -> Photometric:
 def with_code(state: CarState, code: Any) -> CarState:
     """The state with another code for all cars."""
     values: Tensor = torch.as_tensor(code, dtype=state.code.dtype)
-    return CarState(state.T_obj_cam, values.expand_as(state.code).contiguous())
+    return state._replace(code=values.expand_as(state.code).contiguous())

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from helpers.rig_rows import FIELD, SIZE_WH, estimate, rows_of_cars
+from helpers.synthetic_scene import cached_street
 from torch import Tensor
 
 from directshape_torch import DirectShapeRefiner, RigEstimate
@@ -121,6 +123,21 @@ def test_covariance_is_that_of_the_unknowns() -> None:
     assert rig.detector.bias_sigma == pytest.approx(float(rig.covariance[BIAS, BIAS]) ** 0.5)
     mean, sigma = rig.offset_at(PLACES.float())
     assert mean.dtype == sigma.dtype == torch.float32
+
+
+def test_the_detectors_depth_error_becomes_its_prior_where_nobody_says_another() -> None:
+    _, scene = cached_street()
+    rig, few = estimate(rows_of_cars(60, 6)), estimate(rows_of_cars(5, 6))
+    informed = rig.informed(scene.frames, scene.detections)
+    assert informed.pose_sigma is not None
+    distance = scene.detections.T_cam_obj[:, 0:3:2, 3].norm(dim=1)
+    torch.testing.assert_close(
+        informed.pose_sigma[:, 0] / distance, torch.full_like(distance, math.hypot(*rig.detector[:3]))
+    )
+    assert informed.pose_sigma[:, 1:].isinf().all()
+    own = replace(scene.detections, pose_sigma=torch.ones_like(informed.pose_sigma))
+    assert rig.informed(scene.frames, own) is own
+    assert few.informed(scene.frames, scene.detections) is scene.detections
 
 
 def test_another_rig_is_refused() -> None:

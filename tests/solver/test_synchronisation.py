@@ -93,7 +93,7 @@ def test_the_number_of_operations_of_an_iteration() -> None:
 
 
 def test_the_state_of_cars_moves_without_the_host() -> None:
-    state = CarState(torch.eye(4).expand(3, 4, 4).clone(), torch.zeros(3, 5))
+    state = CarState.of(torch.eye(4).expand(3, 4, 4).clone(), torch.zeros(3, 5))
     step = torch.full((3, 11), 0.1, dtype=torch.float64)
     retract(state, step, 3.0)  # makes its constants, once
     assert host_traffic(lambda: retract(state, step, 3.0)).found == []

@@ -11,7 +11,7 @@ from directshape_torch.terms.cars import CarState, retract
 
 
 def _state() -> CarState:
-    return CarState(se3.exp(twists("uniform", 3)), torch.tensor([[0.1, -0.2]]).double().repeat(3, 1))
+    return CarState.of(se3.exp(twists("uniform", 3)), torch.tensor([[0.1, -0.2]]).double().repeat(3, 1))
 
 
 def test_update_is_on_the_left_of_object_from_camera() -> None:
@@ -38,12 +38,12 @@ def test_translations_are_metres_along_the_cars_axes() -> None:
 
 
 def test_the_code_is_bounded_and_keeps_the_dtype_of_the_state() -> None:
-    low = CarState(torch.eye(4)[None], torch.zeros(1, 2))
+    low = CarState.of(torch.eye(4)[None], torch.zeros(1, 2))
     after = retract(low, torch.tensor([[0, 0, 0, 0, 0, 0, 9.0, -9.0]], dtype=torch.float64), max_code=3.0)
     assert after.code.tolist() == [[3.0, -3.0]]
     assert after.code.dtype == after.T_obj_cam.dtype == torch.float32
 
 
 def test_no_cars() -> None:
-    empty = CarState(torch.zeros(0, 4, 4), torch.zeros(0, 2))
+    empty = CarState.of(torch.zeros(0, 4, 4), torch.zeros(0, 2))
     assert retract(empty, torch.zeros(0, 8)).T_obj_cam.shape == (0, 4, 4)

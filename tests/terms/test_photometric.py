@@ -31,7 +31,7 @@ def _translated(state: CarState, metres: list[float]) -> CarState:
     shift = -(state.T_obj_cam[:, :3, :3] @ torch.tensor(metres, dtype=torch.float64)[:, None])[..., 0]
     T = state.T_obj_cam.clone()
     T[:, :3, 3] += shift
-    return CarState(T, state.code)
+    return CarState.of(T, state.code)
 
 
 def test_dso_pattern_has_eight_pixels_and_its_centre() -> None:

@@ -32,7 +32,7 @@ def _at(points_cam: Tensor, T_cam_obj: Tensor = T_CAM_OBJ) -> Linear:
     """The term of one car and its points (P, 3)."""
     points = PointSamples(torch.zeros(len(points_cam), dtype=torch.long), points_cam, torch.tensor([len(points_cam)]))
     term = PointCloud.of_points(PointCloudConfig(min_points=1), points)
-    state = CarState(se3.inverse(T_cam_obj), PRIOR.initial_code(1))
+    state = CarState.of(se3.inverse(T_cam_obj), PRIOR.initial_code(1))
     return term.linear(field_of(PRIOR.bind(state.code)), state, ())
 
 

@@ -76,7 +76,7 @@ def states(regime: str) -> CarState:
     depth = {"typical": 15.0, "near": 3.0, "far": 80.0, "three_sigma": 15.0}[regime]
     T_cam_obj[:, :3, 3] = torch.tensor([2.0, 1.6, depth], dtype=torch.float64)
     code = 3.0 * torch.ones(4, NUM_CODES, dtype=torch.float64) if regime == "three_sigma" else torch.zeros(4, NUM_CODES)
-    return CarState(se3.inverse(T_cam_obj), code.double())
+    return CarState.of(se3.inverse(T_cam_obj), code.double())
 
 
 @pytest.mark.parametrize("regime", ["typical", "near", "far", "three_sigma"])
@@ -99,7 +99,7 @@ def test_jacobian_three_ways(name: str, regime: str) -> None:
 @pytest.mark.parametrize("name", PRIORS)
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_shapes(name: str, count: int) -> None:
-    state = CarState(torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, NUM_CODES).double())
+    state = CarState.of(torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, NUM_CODES).double())
     result = PRIORS[name](state)
     assert len(result.residual) == count
     assert result.J_residual_state.shape == (*result.residual.shape, 6 + NUM_CODES)
@@ -109,7 +109,7 @@ def _standing(height_m: float, roll_rad: float = 0.0) -> CarState:
     """A car whose origin is `height_m` above a level ground 1.65 m below the camera, rolled about its own x axis."""
     T = pose_from_kitti(torch.tensor([3.0, 1.65 - height_m, 20.0]).double(), torch.tensor(0.6).double())
     T = T @ se3.exp(torch.tensor([0, 0, 0, roll_rad, 0, 0], dtype=torch.float64))
-    return CarState(se3.inverse(T)[None], torch.zeros(1, NUM_CODES).double())
+    return CarState.of(se3.inverse(T)[None], torch.zeros(1, NUM_CODES).double())
 
 
 LEVEL = cars_on(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), torch.tensor(1.65).double(), 1)
@@ -153,7 +153,7 @@ def test_neither_tilt_prior_minds_position_or_heading() -> None:
         assert (J[..., :3] == 0).all()
         assert (J[..., 6:] == 0).all()
         turned = se3.exp(torch.tensor([0, 0, 0, 0, 0.8, 0], dtype=torch.float64)) @ _standing(0.0).T_obj_cam
-        assert form(LEVEL, CarState(turned, torch.zeros(1, NUM_CODES).double())).residual.abs().max() < 1e-14
+        assert form(LEVEL, CarState.of(turned, torch.zeros(1, NUM_CODES).double())).residual.abs().max() < 1e-14
 
 
 def test_dimensions_by_hand() -> None:
@@ -209,6 +209,6 @@ def test_moving_the_whole_scene_changes_no_prior() -> None:
     motion = se3.exp(torch.tensor([1.0, -0.4, 3.0, 0.0, 0.7, 0.0], dtype=torch.float64))
     normal = motion[:3, :3] @ NORMAL
     there = cars_on(normal, OFFSET - normal @ motion[:3, 3], 4)
-    moved = CarState(state.T_obj_cam @ se3.inverse(motion), state.code)
+    moved = CarState.of(state.T_obj_cam @ se3.inverse(motion), state.code)
     for form in (height_prior, tilt_prior_normal, tilt_prior_cosine):
         torch.testing.assert_close(form(there, moved).residual, _on_ground(form)(state).residual)

@@ -127,7 +127,7 @@ def test_a_ray_that_misses_the_bounds_counts_as_background(form: Literal["closes
     config = replace(DEFAULT, silhouette=replace(SOFT, form=form))
     stage, state = begun_stage(prior, scene.frames, disturbed(scene.detections), config)
     away = se3.exp(vector(40.0, 0, 0, 0, 0, 0))
-    at = figures_at(stage, CarState(away @ state.T_obj_cam, state.code))
+    at = figures_at(stage, CarState.of(away @ state.T_obj_cam, state.code))
     term = stage.terms[0]
     assert isinstance(term, (Silhouettes, SilhouetteProducts))
     torch.testing.assert_close(at.parts[0].residual[..., 0], -torch.log(1 - term.rows.foreground))
@@ -142,7 +142,7 @@ def test_zeta_comes_from_the_input_depth_and_not_from_the_state() -> None:
     assert isinstance(term, Silhouettes)
     expected = (150.0 / (detections.T_cam_obj[:, 2, 3] * 0.5)).clamp(4.0, 400.0)
     torch.testing.assert_close(term.zeta[:, 0], expected[term.blocks.owner])
-    nearer = CarState(se3.exp(vector(0, 0, 2.0, 0, 0, 0)) @ state.T_obj_cam, state.code)
+    nearer = CarState.of(se3.exp(vector(0, 0, 2.0, 0, 0, 0)) @ state.T_obj_cam, state.code)
     problem = stage.problem
     again, softer = (problem.begin(x, problem.look(nearer)).terms[0] for x in problem.stages()[::-1])
     assert isinstance(again, Silhouettes)

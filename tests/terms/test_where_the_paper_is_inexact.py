@@ -276,7 +276,7 @@ def test_height_is_taken_along_the_cameras_y_axis_not_across_the_plane() -> None
     T_cam_obj = torch.eye(4, dtype=torch.float64)
     T_cam_obj[:3, 3] = torch.tensor([2.0, 1.0, 12.0])
     offset = torch.tensor([1.65], dtype=torch.float64)
-    state = CarState(se3.inverse(T_cam_obj)[None], torch.zeros(1, 0).double())
+    state = CarState.of(se3.inverse(T_cam_obj)[None], torch.zeros(1, 0).double())
     residual = height_prior(cars_on(normal, offset, 1), state).residual[0, 0]
     across = normal[0] @ T_cam_obj[:3, 3] + offset[0]
     torch.testing.assert_close(residual * normal[0, 1], across)

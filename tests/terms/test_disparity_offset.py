@@ -1,0 +1,133 @@
+"""The unknown offset of a car's disparity: what it does to the warp, what it gives way to, and where it is held."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT, begun_stage, photometric_of
+from helpers.synthetic_scene import TWO_CARS, Street, disturbed, select, street
+
+from directshape_torch.config import RefinerConfig, RigConfig
+from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.terms.priors import rig_prior
+
+UNSURE = replace(DEFAULT, rig=RigConfig(disparity_sigma_px=1.0))
+
+
+@cache
+def rectified_street() -> Street:
+    """The right camera beside the left one: there a constant field of disparities is exactly an offset."""
+    T_right_cam = torch.eye(4, dtype=torch.float64)
+    T_right_cam[0, 3] = -0.53
+    return street(ellipsoid_prior(), *TWO_CARS, T_right_cam=T_right_cam)
+
+
+def _with_field(frames: FrameBatch, value_px: float) -> FrameBatch:
+    camera, (height, width) = frames.camera, frames.sizes[0].tolist()
+    rig = camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
+    field = DisparityField.constant(value_px, (width, height), *rig)
+    return replace(frames, camera=replace(camera, disparity_field=field))
+
+
+def _refine(config: RefinerConfig, frames: FrameBatch, detections: Detections) -> RefinementResult:
+    result: RefinementResult = DirectShapeRefiner(ellipsoid_prior(), config)(frames, detections)
+    return result
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_an_offset_does_what_a_constant_field_does(level: int) -> None:
+    """Both are measured minus true disparity; in the residuals, and in the depth that the profile starts from."""
+    scene, found = rectified_street(), []
+    for field_px, offset_px in ((0.3, 0.7), (1.0, 0.0)):
+        frames = _with_field(scene.frames, field_px)
+        stage, state = begun_stage(
+            ellipsoid_prior(), frames, disturbed(scene.detections, 0.05, 0.02), UNSURE, 1 - level
+        )
+        state = state._replace(offset_px=torch.full_like(state.offset_px, offset_px))
+        stage = stage.problem.begin(stage.config, stage.problem.look(state))
+        term, sight = photometric_of(stage), stage.problem.look(state)
+        at = term.linear(sight.field, state, term.where(sight))
+        again = term.residual(sight.field, state, at.where)
+        found.append((at.residual, again, at.where.usable, term.pixel_set.support))
+        depth, surface = at.where.depth, term.where(sight).depth
+        torch.testing.assert_close(depth[at.where.usable], surface[at.where.usable], rtol=1e-6, atol=0)
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-9)
+    assert found[0][3].min() > 50
+
+
+def test_warp_and_prior_by_hand() -> None:
+    """Of 80 px m at 8 m, 10 px: 2 px more come from 80 / 12 m; of 10 px less nothing is left, so nothing is seen."""
+    scene = rectified_street()
+    stage, state = begun_stage(ellipsoid_prior(), scene.frames, scene.detections, UNSURE)
+    term = photometric_of(stage)
+    T_right_cam, sigma_px = term.cars.T_right_cam.clone(), torch.tensor([0.5, 0.0]).double()
+    T_right_cam[:, 0, 3] = -80 / 150
+    cars = replace(term.cars, T_right_cam=T_right_cam, offset_sigma_px=sigma_px)
+    owner, depth = torch.tensor([0, 1]), torch.full((2, 1), 8.0).double()
+    nearer, gone = (state._replace(offset_px=torch.full((2, 1), x).double()) for x in (2.0, -10.0))
+    by_hand = replace(term, cars=cars)
+    torch.testing.assert_close(by_hand.warped_depth(depth, nearer, owner)[0], torch.tensor([[80 / 12], [8.0]]).double())
+    assert (by_hand.warped_depth(depth, gone, owner)[0] < 0).tolist() == [[True], [False]]
+    prior = rig_prior(cars, nearer)
+    assert prior.residual.tolist() == [[4.0], [2.0]]
+    assert prior.J_residual_state.tolist() == [[[0.0] * 9 + [2.0]], [[0.0] * 9 + [1.0]]]
+
+
+def test_a_disparity_that_is_not_believed_gives_way_to_the_detectors_depth() -> None:
+    """The field is wrong by a pixel, 0.9 m and 2.1 m; the detector is right and knows its depth to 5 cm."""
+    scene = rectified_street()
+    frames, given = _with_field(scene.frames, 1.0), scene.detections
+    sigma = torch.tensor([0.05, 0.1, 0.1, 0.05], dtype=torch.float64).expand(2, 4)
+    sure = _refine(DEFAULT, frames, given)
+    unsure = _refine(UNSURE, frames, replace(given, pose_sigma=sigma))
+    too_far, apart = ((result.T_cam_obj - given.T_cam_obj)[:, 2, 3] for result in (sure, unsure))
+    assert (too_far > torch.tensor([0.6, 1.4])).all()
+    assert (apart.abs() < 0.05).all()
+    # Without a prior of the pose it is the size of the silhouettes that says so, and not as surely.
+    unsure = _refine(UNSURE, frames, given)
+    assert ((unsure.T_cam_obj - given.T_cam_obj)[:, 2, 3].abs() < 0.15).all()
+    assert (unsure.sigma_xyz_yaw[:, 2] > 2 * sure.sigma_xyz_yaw[:, 2]).all()
+    assert (unsure.observability.sigmas_m[:, 0] > sure.observability.sigmas_m[:, 0]).all()
+    assert unsure.covariance.shape == sure.covariance.shape == (2, 9, 9)
+
+
+def test_a_sigma_of_zero_is_no_unknown_and_beside_other_cars_it_is_held() -> None:
+    scene = rectified_street()
+    given = disturbed(scene.detections)
+    # Cars hide one another, and a car by itself is not hidden.
+    config, unsure = (replace(c, sampling=replace(c.sampling, occlusion=False)) for c in (DEFAULT, UNSURE))
+    known, none, mixed = (
+        _refine(config, scene.frames, replace(given, offset_sigma_px=x))
+        for x in (None, torch.zeros(2).double(), torch.tensor([0.0, 0.5]).double())
+    )
+    assert torch.equal(known.T_cam_obj, none.T_cam_obj)
+    assert known.term_names == none.term_names
+    assert "rig" in mixed.term_names
+    torch.testing.assert_close(mixed.T_cam_obj[0], known.T_cam_obj[0], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(mixed.covariance[0], known.covariance[0], rtol=1e-7, atol=1e-9)
+    assert (mixed.T_cam_obj[1] - known.T_cam_obj[1]).abs().max() > 1e-3
+    # The sigmas of the detections win; by themselves cars come to the same.
+    alone = [
+        replace(select(given, torch.tensor([i])), offset_sigma_px=torch.tensor([s]).double())
+        for i, s in ((0, 0.0), (1, 0.5))
+    ]
+    for i, one in enumerate(alone):
+        result = _refine(unsure, scene.frames, one.to(dtype=torch.float64))
+        torch.testing.assert_close(result.T_cam_obj[0], mixed.T_cam_obj[i], rtol=1e-9, atol=1e-9)
+
+
+def test_sigmas_that_are_none_are_refused() -> None:
+    given = rectified_street().detections
+    with pytest.raises(InputError, match=r"offset_sigma_px: expected finite .* at least 0, pixels, got -1 in row 1"):
+        replace(given, offset_sigma_px=torch.tensor([0.5, -1.0]))
+    with pytest.raises(InputError, match="offset_sigma_px"):
+        replace(given, offset_sigma_px=torch.ones(3))
