@@ -387,9 +387,10 @@ class AcceptanceConfig(Settings):
 class RefinerConfig(Settings):
     """Everything `DirectShapeRefiner` can be told."""
 
-    method: Literal["direct", "geometric", "combined"] = setting(
+    method: Literal["direct", "geometric", "combined", "box_alignment"] = setting(
         "direct",
-        'terms of the energy: "direct" (images), "geometric" (the rival\'s: point cloud) or "combined" (both)',
+        'terms of the energy: "direct" (images), "geometric" (the rival\'s: point cloud) or "combined" (both); or '
+        "\"box_alignment\" (Stereo R-CNN's: the detector's boxes moved in depth, by photometry)",
     )
     compile: Literal["auto", "on", "off"] = setting(
         "auto",
@@ -420,5 +421,7 @@ class RefinerConfig(Settings):
         key, value, needed = "stages[-1].unknowns", str(self.stages[-1].unknowns), "both"
         if self.method == "geometric":
             key, value, needed = "point_cloud.order", self.point_cloud.order, "joint"
+        if self.backward.mode != "none" and self.method == "box_alignment":
+            raise ConfigError(f"backward.mode: method box_alignment needs none, got {self.backward.mode}")
         if self.backward.mode.startswith("implicit") and value != needed:
             raise ConfigError(f"{key}: backward.mode {self.backward.mode} needs {needed}, got {value}")

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
+from directshape_torch.diagnosis.box_alignment import ROUNDS_PX, BoxAlignment
 from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.diagnosis.disparity_profile import DisparityProfile, disparity_profile
@@ -22,7 +23,7 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum
-from directshape_torch.solver.problem import take_rows, where_rows
+from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.priors import RIG_WEIGHT
@@ -54,28 +55,28 @@ class Outcome:
     quality: FitQuality
     observability: Observability
     profile: DisparityProfile
+    has_shape: bool = True
 
     @classmethod
-    def nothing(cls, problem: CarProblem, like: CarState) -> Outcome:
-        """The outcome of no cars at all; `like` says dtype and device."""
-        empty = take_rows(like, torch.zeros(0, dtype=torch.long, device=like.code.device))
-        nothing = empty.code.new_zeros(0, 0, dtype=torch.float64)
-        unknowns = 6 + empty.code.shape[1]
-        none = torch.zeros(0, dtype=torch.long, device=nothing.device)
+    def nothing(cls, problem: CarProblem, state: CarState) -> Outcome:
+        """The outcome of B cars of which nothing is known but their state."""
+        count, unknowns = len(state.code), 6 + state.code.shape[1]
+        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=state.code.device)
+        none = torch.zeros_like(nan, dtype=torch.long)
         names = problem.term_names
         return cls(
-            state=empty,
+            state=state,
             status=none,
             iterations=none,
-            cost_history=nothing,
+            cost_history=nan[:, None][:, :0],
             term_names=names,
-            cost_before=nothing.reshape(0, len(names)),
-            cost_after=nothing.reshape(0, len(names)),
-            covariance=nothing.reshape(0, unknowns, unknowns),
-            covariance_xyz_yaw=nothing.reshape(0, 4, 4),
-            quality=FitQuality.nothing(nothing, 0),
-            observability=Observability.nothing(nothing, 0),
-            profile=DisparityProfile.nothing(nothing, 0),
+            cost_before=nan[:, None].expand(-1, len(names)),
+            cost_after=nan[:, None].expand(-1, len(names)),
+            covariance=nan[:, None, None].expand(-1, unknowns, unknowns),
+            covariance_xyz_yaw=nan[:, None, None].expand(-1, 4, 4),
+            quality=FitQuality.nothing(nan, count),
+            observability=Observability.nothing(nan, count),
+            profile=DisparityProfile.nothing(nan, count),
         )
 
 
@@ -130,6 +131,20 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
     factor = torch.ones_like(figures.term_costs)
     factor[:, problem.term_names.index("rig")] = bundled_trust_model().sigma_factors[0] ** 2 / RIG_WEIGHT
     return figures._replace(information=figures.information * factor[..., None, None])
+
+
+def outcome_of_boxes(problem: CarProblem, aligned: BoxAlignment) -> Outcome:
+    """What there is to say of boxes that were moved: their costs and profiles."""
+    before, after = (cost[:, None] for cost in aligned.profile.cost_at(0.0))
+    return replace(
+        Outcome.nothing(problem, aligned.state),
+        status=aligned.status,
+        iterations=torch.full_like(aligned.status, len(ROUNDS_PX)),
+        cost_before=before,
+        cost_after=after,
+        profile=aligned.profile,
+        has_shape=False,
+    )
 
 
 def judged(minimum: Minimum[CarState], initial: CarState, outcome: Outcome, limits: AcceptanceConfig) -> Outcome:
@@ -230,6 +245,7 @@ def assemble(
         ground_source=_ground_sources(frames, detections),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
         prior=prior,
+        has_shape=outcome.has_shape,
     )
 
 

@@ -117,7 +117,7 @@ class CarProblem:
             detections: all detections of the call, which `cars.detection_row` points into.
             cars: the B cars to refine.
             observation: packed pixels of these cars.
-            points: stereo points of these cars; None for the method "direct".
+            points: stereo points of these cars; None for the methods without.
             extra_terms: make further terms.
             term_weights: (detections,) factors of named terms.
 
@@ -134,14 +134,14 @@ class CarProblem:
             cloud, weight = config.point_cloud, config.point_cloud.combined_weight
             cloud = cloud if config.method == "geometric" else replace(cloud, weight=weight)
             terms += [PointCloud.of_points(cloud, points)] if cloud.weight > 0 else []
-        if config.method != "geometric" and config.silhouette.weight > 0:
+        if config.method in ("direct", "combined") and config.silhouette.weight > 0:
             form = SilhouetteProducts if config.silhouette.form == "product" else Silhouettes
             terms.append(form(config.silhouette, cars, masks, prior.bounds_obj, torch.ones_like(masks.filled[:, :1])))
         if config.method != "geometric" and config.photometric.weight > 0:
             pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
             of_images = pyramid, observation.hidden_right, detections.mask_left
             terms.append(Photometric.of_pixels(config.photometric, cars, pixels[0], sides[0], *of_images))
-        terms += prior_terms(config.priors, prior, cars)
+        terms += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
         names = [name for term in terms for name in term.names]
         extra = [make(frames, detections, cars, prior) for make in extra_terms]
         terms += extra

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
+from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.packing import Observation, pack_pixels
@@ -87,8 +88,10 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
         detections: B cars.
 
     Raises:
-        InputError: frames, detections and prior do not fit together.
+        InputError: frames, detections and prior do not fit together; the method "box_alignment", which has no steps.
     """
+    if refiner.config.method == "box_alignment":
+        raise InputError("method", "one that iterates", "box_alignment", "trace direct, geometric or combined")
     result = refiner(frames, detections)
     took_part = result.cost_before.isfinite().all(dim=1)
     rows = took_part.nonzero()[:, 0]

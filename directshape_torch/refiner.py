@@ -12,13 +12,14 @@ from torch import Tensor, nn
 
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
+from directshape_torch.diagnosis.box_alignment import align_boxes
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
-from directshape_torch.outcome import Outcome, assemble, judged, outcome_of
+from directshape_torch.outcome import Outcome, assemble, judged, outcome_of, outcome_of_boxes
 from directshape_torch.problem import CarProblem, TermFactory
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -58,7 +59,7 @@ class DirectShapeRefiner(nn.Module):
 
     Raises:
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
-            `RefinerConfig`.
+            `RefinerConfig`; extra terms for the method "box_alignment".
 
     Example:
         >>> refiner = DirectShapeRefiner()
@@ -82,6 +83,8 @@ class DirectShapeRefiner(nn.Module):
         self.config = RefinerConfig() if config is None else config
         self.extra_terms = tuple(extra_terms)
         self.rig = rig
+        if self.extra_terms and self.config.method == "box_alignment":
+            raise InputError("extra_terms", "none with method box_alignment", f"{len(extra_terms)}", "choose direct")
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
         check_prior(self.prior, by_autograd=needs_graph)
 
@@ -140,7 +143,7 @@ class DirectShapeRefiner(nn.Module):
         problem = self._problem(frames, detections, cars, seen.of_objects(usable), term_weights)
         # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
         state, status = self._input_state(detections.T_cam_obj.detach(), cars), failure
-        outcome = Outcome.nothing(problem, state)
+        outcome = Outcome.nothing(problem, CarState(*(part[:0] for part in state)))
         if len(rows):
             initial = self._input_state(detections.T_cam_obj.index_select(0, rows), cars)
             outcome = self._minimise(problem, initial, cars)
@@ -179,7 +182,7 @@ class DirectShapeRefiner(nn.Module):
         extents = scene_extents(detections)
         detections = without_empty_masks(detections, extents)
         pixels = pack_pixels(frames, detections, self.config.sampling, extents)
-        if self.config.method == "direct":
+        if self.config.method in ("direct", "box_alignment"):
             return _Seen(pixels, None)
         cloud = self.config.point_cloud
         matched = with_disparity(frames, cloud.matcher, needed=detections.frame_index)
@@ -207,6 +210,8 @@ class DirectShapeRefiner(nn.Module):
         )
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
+        if self.config.method == "box_alignment":
+            return outcome_of_boxes(problem, align_boxes(problem, initial, cars))
         record = torch.is_grad_enabled() and self.config.backward.mode == "unroll"
         with torch.no_grad():
             start = search_start(problem, initial, cars, self.config.search)

@@ -66,6 +66,7 @@ class RefinementResult:
         ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
         prior: the shapes.
+        has_shape: the shape was refined, so that boxes are measured on it; False for the method "box_alignment".
     """
 
     T_cam_obj: Tensor
@@ -85,6 +86,7 @@ class RefinementResult:
     ground_source: tuple[str, ...]
     t_cam_ref: Tensor
     prior: ShapePrior
+    has_shape: bool = True
 
     def __len__(self) -> int:
         return len(self.T_cam_obj)
@@ -109,7 +111,7 @@ class RefinementResult:
     def boxes(self) -> KittiBoxes:
         """KITTI boxes of the refined zero level, sub-voxel; the location is the level's own bottom centre.
 
-        Cars that were not refined have the detector's box.
+        Cars that were not refined have the detector's box, boxes that were moved alone its dimensions.
 
         Location is `T_ref_obj` of (mid x, max y, mid z) of the level, not the object origin.
         """
@@ -123,8 +125,8 @@ class RefinementResult:
         location = se3.transform(T_ref_obj, bottom_obj)
         rotation_y = rotation_y_from_pose(T_ref_obj)
         dimensions = torch.stack([height, width, length], dim=-1)
-        # A car that was not refined keeps the detector's box, not one of the mean shape.
-        refined = self.refined[:, None]
+        # A car whose shape was not refined keeps the detector's box, not one of the mean shape.
+        refined = self.refined[:, None] & self.has_shape
         dimensions = torch.where(refined, dimensions, self.input_dimensions_hwl)
         location = torch.where(refined, location, T_ref_obj[:, :3, 3])
         return KittiBoxes(dimensions, location, rotation_y, alpha_from_kitti(location, rotation_y))

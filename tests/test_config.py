@@ -95,7 +95,7 @@ def test_a_value_of_the_wrong_kind_is_named(mapping: dict[str, Any], text: str) 
             "point_cloud.max_height_m: expected a finite number, at least min_height_m = 0.1 and at most 100, got 0.0",
         ),
         ("point_cloud.huber_m=0", "point_cloud.huber_m: expected a finite number, above 0, got 0.0"),
-        ("method=geometry", "method: expected one of direct, geometric, combined, got 'geometry'"),
+        ("method=geometry", "method: expected one of direct, geometric, combined, box_alignment, got 'geometry'"),
         ("sampling.density=1.5", "sampling.density: expected a finite number, above 0 and at most 1, got 1.5"),
     ],
 )
@@ -110,7 +110,7 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
     [
         (
             lambda: RefinerConfig(method="geometry"),
-            "method: expected one of direct, geometric, combined, got 'geometry'",
+            "method: expected one of direct, geometric, combined, box_alignment, got 'geometry'",
         ),  # type: ignore[arg-type]
         (lambda: RefinerConfig(compile=True), "compile: expected one of auto, on, off, got True"),  # type: ignore[arg-type]
         (lambda: RefinerConfig(stages=()), "stages: expected at least one stage, got none"),

@@ -63,8 +63,9 @@ def _add_settings(group: argparse._ArgumentGroup) -> None:
     add_config_option(group)
     group.add_argument(
         "--method",
-        choices=("direct", "geometric", "combined"),
-        help="images (default), the stereo point cloud (Engelmann et al., GCPR 2016), or both",
+        choices=("direct", "geometric", "combined", "box_alignment"),
+        help="images (default), the stereo point cloud (Engelmann et al., GCPR 2016), both, or boxes aligned in "
+        "depth alone (Stereo R-CNN)",
     )
     group.add_argument(
         "--set",
@@ -146,8 +147,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_disparity_is_used(folder: Path | None, method: str) -> None:
-    if folder is not None and method == "direct":
-        raise InputError("--disparity", "a method that uses it", "direct", "add --method geometric or combined")
+    if folder is not None and method in ("direct", "box_alignment"):
+        raise InputError("--disparity", "a method that uses it", method, "add --method geometric or combined")
 
 
 def make_refiner(

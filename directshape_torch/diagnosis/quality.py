@@ -29,7 +29,7 @@ class FitQuality:
         matched_share: (B,) share of the photometric pixel set that could be compared at the end.
         evidence: (B, E) what is known of the refinement's course, columns `evidence.EVIDENCE_NAMES`.
         probability_better: (B,) calibrated probability that the refined box overlaps the true one more than the input
-            does, seen from above; NaN for the methods "geometric" and "combined".
+            does, seen from above; NaN for all methods but "direct".
         probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Figures of cars whose status is
             `not_trusted` speak of the refinement that was not returned.
     """

@@ -35,8 +35,8 @@ def search_start(problem: CarProblem, initial: CarState, cars: CarBatch, config:
     return best
 
 
-def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float) -> CarState:
-    """Cars moved along the viewing ray of their origin so that its disparity grows by `offset_px`."""
+def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float | Tensor) -> CarState:
+    """Cars moved along the viewing ray of their origin so that its disparity grows by `offset_px`, (B,) or one."""
     T_cam_obj = se3.inverse(state.T_obj_cam)
     origin = T_cam_obj[:, :3, 3]
     disparity = focal_baseline / origin[:, 2]

@@ -115,7 +115,7 @@ def test_standard_deviations_are_above_zero(wrong: float) -> None:
 
 
 def test_standard_deviations_are_of_the_refiners_dtype() -> None:
-    with pytest.raises(InputError, match=r"detections.pose_sigma: expected dtype torch.float64 .*got torch.float32"):
+    with pytest.raises(InputError, match=r"pose_sigma: expected the dtype of T_cam_obj .*got torch.float32"):
         _refined(_start(SIGMA.float().expand(2, 4)))
 
 

@@ -1,0 +1,144 @@
+"""Boxes aligned in depth: box-shaped cars come back to where they were rendered, and nothing else of a box changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import pytest
+import torch
+from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import TWO_CARS, Street, joined_detections, joined_frames, select, street
+
+from directshape_torch.diagnosis.box_alignment import box_hits
+from directshape_torch.errors import ConfigError, InputError
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.rays import ray_box_interval
+from directshape_torch.refinement_trace import trace_refinement
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.rows import Rays
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.status import Status
+from directshape_torch.terms.lidar import LidarPoints
+
+ALIGNED = replace(DEFAULT, method="box_alignment")
+
+
+@lru_cache
+def box_street(dtype: torch.dtype = torch.float64) -> tuple[PCAShapePrior, Street]:
+    """Two cars that are boxes of the mean dimensions."""
+    prior = ellipsoid_prior()
+    steps = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in prior.mean.shape), indexing="ij")
+    points = prior.origin + prior.spacing_m * torch.stack(steps, dim=-1)
+    q = (points - torch.tensor(CENTRE_OBJ).double()).abs() - torch.tensor(HALF_AXES).double()
+    prior.mean.copy_(q.clamp_min(0).norm(dim=-1) + q.amax(dim=-1).clamp_max(0))
+    prior = prior.to(dtype)
+    return prior, street(prior, *TWO_CARS)
+
+
+def aligned(frames: FrameBatch, detections: Detections) -> RefinementResult:
+    return DirectShapeRefiner(box_street(frames.images_left.dtype)[0], ALIGNED)(frames, detections)
+
+
+def moved(detections: Detections, *factors: float) -> Detections:
+    """Cars whose depth, along the viewing rays of their origins, is multiplied."""
+    T_cam_obj = detections.T_cam_obj.clone()
+    T_cam_obj[:, :3, 3] *= torch.tensor(factors, dtype=T_cam_obj.dtype)[:, None]
+    return replace(detections, T_cam_obj=T_cam_obj)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("factors", [(1.1, 0.85), (0.92, 1.15), (1.0, 1.0)])
+def test_boxes_come_back_to_their_depth(dtype: torch.dtype, factors: tuple[float, float]) -> None:
+    scene = box_street(dtype)[1]
+    detections = moved(scene.detections, *factors)
+    detections = replace(detections, dimensions_hwl=detections.dimensions_hwl * 1.01)
+    result = aligned(scene.frames, detections)
+    assert result.status == [Status.converged] * 2
+    # A tenth of a pixel: the cars have disparities of 10 and 6 px.
+    ratio = result.T_cam_obj[:, :3, 3] / detections.T_cam_obj[:, :3, 3]
+    torch.testing.assert_close(ratio, ratio[:, :1].expand(-1, 3))
+    torch.testing.assert_close(
+        ratio[:, 0] * torch.tensor(factors).to(ratio), torch.ones_like(ratio[:, 0]), rtol=0, atol=0.01
+    )
+    torch.testing.assert_close(result.T_cam_obj[:, :3, :3], detections.T_cam_obj[:, :3, :3])
+    boxes = result.boxes()
+    assert torch.equal(boxes.dimensions_hwl, detections.dimensions_hwl)
+    assert torch.equal(boxes.location_ref, result.T_ref_obj[:, :3, 3])
+    assert (result.code == 0).all()
+    assert result.term_names == ("photometric",)
+    assert result.quality.mask_iou_left.isnan().all()
+    assert result.covariance.isnan().all()
+    if factors != (1.0, 1.0):
+        assert (result.cost_after < 0.5 * result.cost_before).all()
+
+
+def test_a_batch_equals_a_loop() -> None:
+    scene = box_street()[1]
+    parts = moved(scene.detections, 1.1, 0.9), moved(scene.detections, 0.95, 1.1)
+    together = aligned(joined_frames([scene.frames] * 2), joined_detections(list(parts), (120, 160)))
+    alone = [aligned(scene.frames, select(part, torch.tensor([row]))) for part in parts for row in range(2)]
+    torch.testing.assert_close(together.T_cam_obj, torch.cat([x.T_cam_obj for x in alone]), rtol=0, atol=1e-9)
+
+
+def test_a_car_that_cannot_be_aligned_keeps_its_input_and_touches_no_other() -> None:
+    scene = box_street()[1]
+    frames, detections = scene.frames, moved(scene.detections, 1.1, 0.9)
+    healthy = aligned(frames, detections)
+    grey = torch.full_like(frames.images_left, 0.5)
+    assert aligned(replace(frames, images_left=grey, images_right=grey), detections).status == [Status.no_evidence] * 2
+    # Not up to its contour, where the neighbourhoods of the other car's pixels end.
+    inner = 1 - torch.nn.functional.max_pool2d(1 - detections.mask_left[1:], 9, 1, 4)
+    spoilt = replace(frames, images_left=torch.where(inner > 0.5, torch.nan, frames.images_left))
+    first = torch.tensor([True, False])
+    for some_frames, some, status in (
+        (spoilt, detections, Status.non_finite),
+        (frames, replace(detections, has_mask_left=first, has_mask_right=first), Status.no_mask),
+    ):
+        result = aligned(some_frames, some)
+        assert result.status == [Status.converged, status]
+        assert torch.equal(result.T_cam_obj[1], detections.T_cam_obj[1])
+        torch.testing.assert_close(result.T_cam_obj[0], healthy.T_cam_obj[0], rtol=0, atol=1e-9)
+    assert len(aligned(frames, select(detections, torch.arange(0)))) == 0
+
+
+def test_hits_are_where_rays_enter_the_lower_half_of_the_box() -> None:
+    detections = box_street()[1].detections
+    generator = torch.Generator().manual_seed(2)
+    ray_cam = torch.randn(3, 2, 64, generator=generator, dtype=torch.float64) * 0.1
+    ray_cam = ray_cam + (detections.T_cam_obj[:, :3, 3] / detections.T_cam_obj[:, 2:3, 3]).mT[..., None]
+    T_obj_cam = se3.inverse(detections.T_cam_obj)
+    hits = box_hits(Rays(torch.arange(2), torch.zeros(2, 3).double(), ray_cam), T_obj_cam, detections.dimensions_hwl)
+    for car, (height, width, length) in enumerate(detections.dimensions_hwl.tolist()):
+        corner = torch.tensor([length / 2, 0.0, width / 2]).double()
+        bounds = torch.stack([-corner - torch.tensor([0, height, 0]), corner])
+        T, rays = T_obj_cam[car], ray_cam[:, car].T
+        entered = ray_box_interval(T[:3, 3], rays @ T[:3, :3].T, bounds)
+        points = se3.transform(T, entered.near[:, None] * rays)
+        found = entered.hit & (points[:, 1] > -height / 2)
+        assert 5 < found.sum() < 60
+        assert torch.equal(hits.found[car], found)
+        torch.testing.assert_close(hits.depth[car][found], entered.near[found])
+        torch.testing.assert_close(hits.points_obj[:, car].T[found], points[found])
+        # A face's normal is against the ray, and the point lies on that face.
+        normal = hits.normal_obj[:, car].T[found]
+        assert (normal.abs().sum(1) == 1).all()
+        assert ((normal * (rays @ T[:3, :3].T)[found]).sum(1) < 0).all()
+        face = torch.where(normal > 0, bounds[1], bounds[0])
+        torch.testing.assert_close((points[found] - face)[normal != 0], torch.zeros(int(found.sum())).double())
+
+
+def test_what_does_not_go_with_it_is_named() -> None:
+    prior, scene = box_street()
+    with pytest.raises(ConfigError, match=r"backward\.mode: method box_alignment needs none, got unroll"):
+        replace(ALIGNED, backward=replace(ALIGNED.backward, mode="unroll"))
+    with pytest.raises(InputError, match="extra_terms: expected none with method box_alignment, got 1"):
+        DirectShapeRefiner(prior, ALIGNED, [LidarPoints()])
+    with pytest.raises(InputError, match="method: expected one that iterates, got box_alignment"):
+        trace_refinement(DirectShapeRefiner(prior, ALIGNED), scene.frames, scene.detections)
+    blind = DirectShapeRefiner(prior, replace(ALIGNED, photometric=replace(ALIGNED.photometric, weight=0.0)))
+    with pytest.raises(ConfigError, match="method box_alignment: expected a term of weight above 0"):
+        blind(scene.frames, scene.detections)
