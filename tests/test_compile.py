@@ -29,6 +29,7 @@ from directshape_torch import compile as compile_module
 from directshape_torch.compile import CARS_WORTH_COMPILING, Compilable, cars_ahead, compiling, num_forms, will_compile
 from directshape_torch.config_files import load_config
 from directshape_torch.depth import marched_views
+from directshape_torch.diagnosis.disparity_profile import shifted_costs
 from directshape_torch.errors import CompilationError
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.terms.term import parts_of
@@ -136,7 +137,7 @@ class TestForms:
         assert graphs() == 1
 
     def test_other_numbers_of_cars_and_pixels_compile_nothing_anew(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        functions = (marched_views, parts_of)
+        functions = (marched_views, parts_of, shifted_costs)
         for function in functions:
             monkeypatch.setattr(function, "_compiled", None)
             monkeypatch.setattr(function, "_has_worked", False)

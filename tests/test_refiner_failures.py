@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import MISSING, fields, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -386,5 +386,5 @@ def _at_depth(T_cam_obj: Tensor, depth_m: float) -> Tensor:
 
 
 def joined_cars(parts: list[Detections]) -> Detections:
-    names = [f.name for f in fields(Detections) if f.name not in ("occluders", "pose_sigma")]
+    names = [f.name for f in fields(Detections) if f.default is MISSING]
     return Detections(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names})
