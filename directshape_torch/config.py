@@ -369,14 +369,14 @@ class AcceptanceConfig(Settings):
     """Which results are returned; the input stands in for the others (status not_trusted)."""
 
     min_probability_better: float = setting(
-        0.0,
+        0.7,
         "least probability of overlapping the true box more than the input does, seen from above, as far as the course "
         'of the refinement tells (docs/results.md, "When to trust a result")',
         at_least=0,
         at_most=1,
     )
     min_probability_not_worse: float = setting(
-        0.8,
+        0.0,
         "least probability of not overlapping it less by more than 0.05; 0 and 0 return every result",
         at_least=0,
         at_most=1,

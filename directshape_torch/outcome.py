@@ -26,7 +26,7 @@ from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.priors import RIG_WEIGHT
+from directshape_torch.terms.priors import RIG_WEIGHT, detector_pose_sigma
 from directshape_torch.terms.term import Evaluation, Figures
 
 # Nine in ten cars whose cost settled promise less than this share of it.
@@ -90,7 +90,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     stage: CarStage = minimum.stage
     before, after = minimum.before, _of_calibrated_rig(problem, minimum.after)
     num_kept = 6 + end.code.shape[1]
-    covariance = covariance_of(after.information.sum(dim=1))[:, :num_kept, :num_kept]
+    covariance = covariance_of(after.information.sum(dim=1))[:, :num_kept, :num_kept] + _of_field(end, cars)
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
     course = Course(
         before=initial,
@@ -104,6 +104,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
         profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
+        detector_sigma=detector_pose_sigma(problem.config.priors, cars)[:, 0].detach(),
     )
     seen = stage.information_of_measurements(after)
     unseen = observability_of(problem.prior, end, None if seen is None else without_offset(seen, num_kept))
@@ -122,6 +123,17 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         observability=unseen.scaled(bundled_trust_model().sigma_factors[0]),
         profile=course.profile,
     )
+
+
+def _of_field(end: CarState, cars: CarBatch) -> Tensor:
+    """What the covariance (B, 6 + K, 6 + K) owes to the field, whose error moves a car along its viewing ray."""
+    origin = se3.inverse(end.T_obj_cam)[:, :3, 3]
+    disparity = cars.focal_baseline / origin[:, 2]
+    shift_cam = origin * (cars.field_sigma_px / disparity)[:, None]
+    # The origin moves by -R_cam_obj v.
+    v = -(end.T_obj_cam[:, :3, :3] @ shift_cam[..., None])[..., 0].to(torch.float64)
+    moved_obj = torch.nn.functional.pad(v, (0, 3 + end.code.shape[1]))
+    return moved_obj[:, :, None] * moved_obj[:, None]
 
 
 def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:

@@ -1,18 +1,17 @@
 """Calibrates the figures of trust on refined cars with truth: probabilities, sigmas, and the acceptance policy.
 
     R=$DIRECTSHAPE_DATA/rendered; K=$DIRECTSHAPE_DATA/kitti
-    directshape calibrate-rig --data $K --from disparity --frames 007322 --out bias.json
     python scripts/calibrate_quality.py --data $R --exact $R/detections/gt --masks $R/training/masks $R/masks_degraded
-        --seeds 0 1 2 --other $K --other-detections $K/detections/noisy_stereo --other-masks $K/training/masks
-        --stereo-bias bias.json --other-disparity-sigma-px 0 0.1 --detector-says-sigmas
-        --out out/trust --model directshape_torch/assets/trust_model.json
+        --other $K $K/detections/noisy_stereo $K/training/masks --other $K $K/detections/noisy_mono $K/training/masks
+        --set compile=on --out out/trust --model directshape_torch/assets/trust_model.json
 
-Detections of three noise levels are drawn around exact ones and refined with each kind of masks, every result being
-returned. Outcome: did the bird's-eye overlap of the box with the label grow, and did it not fall by more than 0.05. Two
-logistic regressions read a few columns of `result.quality.evidence`; factors and floors bring the covariance into true
-units. Every figure of the report is of cars whose frame the fit has not seen (12 folds of frames); the model that is
-written is fitted to all of them. `--other` names real frames that are judged and never fitted. The refined cars are
-kept in OUT, so that a second call only fits.
+Each seed is a run of each of four detectors, whose detections are drawn around exact ones: through an exact rig, and
+through two whose disparities and rows are off, one of them with left masks alone. The run estimates rig and detector
+and refines, every result being returned. Outcome: did the bird's-eye overlap of the box with the label grow, and did it
+not fall by more than 0.05. Two logistic regressions read a few columns of `result.quality.evidence`; factors and floors
+bring the covariance into true units. Every figure of the report is of cars whose frame the fit has not seen (12 folds
+of frames); the model that is written is fitted to all of them. `--other` names real frames that are judged and never
+fitted. The refined cars are kept in OUT, so that a second call only fits.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,13 +45,14 @@ from quality_calibration.report import (
     sigma_line,
 )
 
-from directshape_torch.config import AcceptanceConfig, RigConfig
+from directshape_torch.config import AcceptanceConfig
 from directshape_torch.config_files import load_config
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
 from directshape_torch.diagnosis.trust_model import TrustModel
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.rig.rig_file import load_fields
+from directshape_torch.refiner import DirectShapeRefiner, KnownRig
+from directshape_torch.rig.estimate import RigEstimates
+from directshape_torch.rig.of_dataset import estimate_rigs
 
 EVERYTHING = AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0)
 # The detectors whose share of worse cars the default policy is to bring below the bound: those of the development data.
@@ -60,37 +61,33 @@ USUAL_LEVELS = ("stereo", "mono")
 STRICT = Thresholds(0.8, 0.9)
 
 
-def refiner(overrides: Sequence[str], disparity_sigma_px: float = 0.0) -> DirectShapeRefiner:
-    """The default settings but for `overrides`, every result returned, for a rig that is off by so much."""
-    config = load_config(None, overrides)
-    return DirectShapeRefiner(config=replace(config, acceptance=EVERYTHING, rig=RigConfig(disparity_sigma_px)))
+def refiner(overrides: Sequence[str], rig: KnownRig) -> DirectShapeRefiner:
+    """The default settings but for `overrides`, every result returned."""
+    return DirectShapeRefiner(config=replace(load_config(None, overrides), acceptance=EVERYTHING), rig=rig)
 
 
-def development_cars(args: argparse.Namespace, *, says_sigmas: bool = False) -> Observations:
-    """Refined cars of drawn detections, from OUT where they are there already; does the detector say its sigmas?"""
+def development_cars(args: argparse.Namespace) -> Observations:
+    """Refined cars of drawn detections, from OUT where they are there already."""
     parts = []
     for masks in args.masks:
-        says = ["sigmas"] if says_sigmas else []
-        name = "_".join(["cars", masks.name, *map(str, args.seeds), *says, *args.set])
-        kept = args.out / f"{name}.npz"
+        kept = args.out / f"{'_'.join(['cars', masks.name, *map(str, args.seeds), *args.set])}.npz"
         if not kept.is_file():
             dataset = KittiStereoDataset(args.data, args.exact, masks, frames=args.frames)
-            refine = refiner(args.set)
-            drawn = observe_noisy(dataset, refine, LEVELS, args.seeds, masks.name, _tell, says_sigmas=says_sigmas)
-            drawn.save(kept)
+            make = partial(refiner, args.set)
+            observe_noisy(dataset, make, LEVELS, args.seeds, masks.name, _tell).save(kept)
         parts.append(Observations.load(kept))
     return Observations.joined(parts)
 
 
-def other_cars(args: argparse.Namespace, disparity_sigma_px: float) -> Observations:
-    """Refined cars of the real frames, judged as those of a rig that is off by so much."""
-    name = "_".join([f"cars_other_{disparity_sigma_px:g}px", *args.set])
-    kept = args.out / f"{name}.npz"
+def other_cars(args: argparse.Namespace, root: Path, detections: Path, masks: Path) -> tuple[str, Observations]:
+    """Refined cars of real frames."""
+    name = f"{root.name} {detections.name}"
+    kept = args.out / f"{'_'.join(['cars', root.name, detections.name, *args.set])}.npz"
     if not kept.is_file():
-        field = None if args.stereo_bias is None else load_fields(args.stereo_bias)
-        dataset = KittiStereoDataset(args.other, args.other_detections, args.other_masks, disparity_field=field)
-        observe_dataset(dataset, refiner(args.set, disparity_sigma_px), args.other.name).save(kept)
-    return Observations.load(kept)
+        dataset = KittiStereoDataset(root, detections, masks)
+        rigs = RigEstimates(estimate_rigs(dataset, lambda frame: _tell(f"{name}: {frame} looked at")))
+        observe_dataset(dataset, refiner(args.set, rigs), name).save(kept)
+    return name, Observations.load(kept)
 
 
 class HeadColumns(NamedTuple):
@@ -125,13 +122,9 @@ def judged(name: str, cars: Observations, predicted: Array) -> Judged:
 
 
 def judged_others(args: argparse.Namespace, model: TrustModel) -> list[Judged]:
-    """The real frames, once for each disparity error that the rig may be known to have."""
-    entries = []
-    for sigma_px in args.other_disparity_sigma_px:
-        cars = other_cars(args, sigma_px)
-        name = args.other.name + (f", rig off by {sigma_px:g} px" if sigma_px else "")
-        entries.append(judged(name, cars, predictions(model, cars)))
-    return entries
+    """The real frames."""
+    found = (other_cars(args, *paths) for paths in args.other)
+    return [judged(name, cars, predictions(model, cars)) for name, cars in found]
 
 
 def levels_of(everything: Judged, name: str) -> list[Judged]:
@@ -140,17 +133,6 @@ def levels_of(everything: Judged, name: str) -> list[Judged]:
     usual = everything.where(np.isin(levels, USUAL_LEVELS), f"{name}, {' and '.join(USUAL_LEVELS)}")
     drawn = [level.name for level in LEVELS if (levels == level.name).any()]
     return [everything, usual, *(everything.where(levels == level, f"{name}, {level}") for level in drawn)]
-
-
-def judged_with_sigmas(args: argparse.Namespace, cars: Observations, read: HeadColumns) -> list[Judged]:
-    """The same draws refined with the detector's sigmas, judged by models of cars of other frames without them."""
-
-    def fitted_elsewhere(_: Observations, test: Observations) -> Array:
-        seen = ~np.isin(cars.group, test.group)
-        return predictions(fitted(cars.where(seen), {}, read), test)
-
-    said = development_cars(args, says_sigmas=True)
-    return levels_of(judged("sigmas said, all", said, cross_validated(said, fitted_elsewhere)), "sigmas said")
 
 
 def run(args: argparse.Namespace) -> None:
@@ -162,15 +144,14 @@ def run(args: argparse.Namespace) -> None:
     model = fitted(cars, _provenance(cars, args.set), read)
     held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}, read), test))
     drawn = levels_of(judged("rendered, all", cars, held_out), "rendered")
-    said = judged_with_sigmas(args, cars, read) if args.detector_says_sigmas else []
-    real = judged_others(args, model) if args.other else []
+    real = judged_others(args, model)
     model.save(args.model or args.out / "trust_model.json")
     chosen = choose_thresholds(drawn[1].observations, drawn[1].probabilities)
-    report = _report(model, drawn, [*said, *real], chosen)
+    report = _report(model, drawn, real, chosen)
     (args.out / "report.md").write_text(report + "\n", encoding="utf-8")
-    shown = [*drawn[:1], *said[:1], *real]
+    shown = [*drawn[:1], *real]
     plot_reliability(args.out / "trust_reliability.png", shown, [*(8 for _ in shown[len(real) :]), *(3 for _ in real)])
-    plot_policy(args.out / "trust_policy.png", [*drawn[:1], *drawn[2:], *said[1:2], *real], chosen)
+    plot_policy(args.out / "trust_policy.png", [*drawn[:1], *drawn[2:], *real], chosen)
     print(report)
 
 
@@ -232,19 +213,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--masks", type=Path, nargs="+", required=True, metavar="DIR")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    says = "judge the same draws as well where the detector says the standard deviations of its poses"
-    parser.add_argument("--detector-says-sigmas", action="store_true", help=says)
-    parser.add_argument("--other", type=Path, metavar="ROOT", help="real frames, judged and never fitted")
-    parser.add_argument("--other-detections", type=Path, metavar="DIR")
-    parser.add_argument("--other-masks", type=Path, metavar="DIR")
-    parser.add_argument("--stereo-bias", type=Path, metavar="FILE", help="of the rig of --other")
     parser.add_argument(
-        "--other-disparity-sigma-px",
-        type=float,
-        nargs="+",
-        default=[0.0],
-        metavar="PX",
-        help="rig.disparity_sigma_px of --other, judged with each (default 0)",
+        "--other",
+        type=Path,
+        nargs=3,
+        action="append",
+        default=[],
+        metavar=("ROOT", "DETECTIONS", "MASKS"),
+        help="real frames, judged and never fitted; may be repeated",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--model", type=Path, metavar="FILE", help="default OUT/trust_model.json")

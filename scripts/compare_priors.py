@@ -157,7 +157,7 @@ def refined(prior: ShapePrior, args: argparse.Namespace, out: Path) -> tuple[Gro
     dataset = KittiStereoDataset(args.data, args.detections, args.masks, frames=args.frames)
     start = time.process_time()
     # The model of trust was fitted to the bundled prior.
-    every_result = load_config(None, ["acceptance.min_probability_not_worse=0"])
+    every_result = load_config(None, ["acceptance.min_probability_better=0"])
     summary = refine_dataset(dataset, DirectShapeRefiner(prior, every_result), out)
     spent_s = time.process_time() - start
     comparison = compare_results(

@@ -191,7 +191,7 @@ def plot_png(table: NDArray[np.float64], positions_m: Sequence[float], yaws_deg:
 
 
 # Where the iterations end is asked, not what is made of it.
-EVERY_RESULT = "acceptance.min_probability_not_worse=0"
+EVERY_RESULT = "acceptance.min_probability_better=0"
 
 
 def run(args: argparse.Namespace) -> None:

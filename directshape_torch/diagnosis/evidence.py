@@ -48,6 +48,7 @@ EVIDENCE_NAMES = (
     "profile_offset_before",
     "log_profile_fall_before",
     "outside_basin",
+    "log_detector_sigma",
 )
 """Columns of the evidence; `docs/results.md` says which of them the bundled model reads.
 
@@ -61,6 +62,7 @@ metres; `mask_misfit_*` one minus the overlap with the mask; `*_decrease` log of
 `log_profile_offset` of its minimum, pixels, `log_profile_contrast`, how much more a pixel of disparity to the better
 side costs, `outside_basin` 1 where a ridge lies between the state and the minimum. Of the one at the input:
 `profile_offset_before` of its minimum, pixels, and `log_profile_fall_before`, cost there over that at the minimum.
+`log_detector_sigma` of what the detector's depth is known to be off by, as a share of the depth.
 """
 
 _TINY = 1e-9
@@ -83,6 +85,7 @@ class Course:
         covariance_xyz_yaw: (B, 4, 4), uncalibrated.
         unsettled: (B,) bool, the iterations ran out.
         profile: photometric cost over the disparity.
+        detector_sigma: (B,) metres, of the input along the viewing ray; not finite where nobody knows it.
     """
 
     before: CarState
@@ -96,6 +99,7 @@ class Course:
     covariance_xyz_yaw: Tensor
     unsettled: Tensor
     profile: DisparityProfile
+    detector_sigma: Tensor
 
 
 class Agreement(NamedTuple):
@@ -149,7 +153,14 @@ def _motion(stage: CarStage, course: Course) -> dict[str, Tensor]:
         "log_moved_sigmas": torch.log1p(_mahalanobis(in_view, covariance)),
         "length_change": change_hwl[:, 2].abs(),
         "code_size": course.after.code.square().mean(1).sqrt(),
+        "log_detector_sigma": _detector_sigma(course.detector_sigma, T_before[:, 2, 3]),
     }
+
+
+def _detector_sigma(sigma: Tensor, depth: Tensor) -> Tensor:
+    """Logarithm of the share (B,) of the depth; NaN where nobody knows it."""
+    known = sigma.isfinite() & (sigma > 0)
+    return torch.where(known, (sigma.to(depth) / depth.clamp_min(1.0)).log(), torch.nan)
 
 
 def _footprint_sigmas(course: Course, dimensions: DimensionsDerivative) -> Tensor:

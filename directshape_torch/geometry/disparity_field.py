@@ -111,6 +111,7 @@ class DisparityField:
         K_left, K_right: (3, 3) intrinsics of the rig, pixels.
         T_right_cam: (4, 4) left to right camera, metres.
         provenance: where the field came from and how well it fitted; kept in the file, not used.
+        covariance: (10, 10), of the coefficients, pixels^2: how well they are known. 0: exactly.
     """
 
     coefficients: Tensor
@@ -121,6 +122,7 @@ class DisparityField:
     T_right_cam: Tensor
     provenance: Mapping[str, str | int | float] = field(default_factory=dict)
     vertical_coefficients: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS))
+    covariance: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS, NUM_COEFFICIENTS))
 
     def __post_init__(self) -> None:
         for name, shape in _TENSOR_SHAPES.items():
@@ -156,8 +158,7 @@ class DisparityField:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> DisparityField:
         """A copy on another device and of another floating-point type."""
-        names = ("coefficients", "vertical_coefficients", "hull_uv", "K_left", "K_right", "T_right_cam")
-        return replace(self, **{name: getattr(self, name).to(device=device, dtype=dtype) for name in names})
+        return replace(self, **{name: getattr(self, name).to(device=device, dtype=dtype) for name in _TENSOR_SHAPES})
 
     def bias(
         self,
@@ -201,6 +202,20 @@ class DisparityField:
         coefficients = torch.stack([x.to(uv_left) for x in both], dim=1)
         bias, vertical = (polynomial_basis(inside, self.size_wh) @ coefficients).unbind(dim=-1)
         return bias, vertical
+
+    def sigma(
+        self,
+        uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
+    ) -> Tensor:  # (*,)
+        """Standard deviation of `bias`, pixels; beyond the hull that of the place itself, for nobody has looked there.
+
+        Example:
+            >>> K, T = torch.eye(3), torch.eye(4)
+            >>> DisparityField.constant(0.25, (640, 480), K, K, T).sigma(torch.zeros(1, 2))
+            tensor([0.])
+        """
+        basis = polynomial_basis(uv_left, self.size_wh)
+        return ((basis @ self.covariance.to(basis)) * basis).sum(dim=-1).clamp_min(0).sqrt()
 
     def check_rig(
         self,
@@ -269,7 +284,7 @@ class DisparityField:
         Raises:
             DataFormatError: the file is missing, is not valid JSON, or does not hold what a field needs.
         """
-        content = _read_json(path)
+        content = _NOT_KNOWN | _read_json(path)
         tensors = {name: _read_tensor(path, content, name, shape, dtype) for name, shape in _TENSOR_SHAPES.items()}
         size = content.get("size_wh")
         if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)):
@@ -313,7 +328,10 @@ _TENSOR_SHAPES: dict[str, tuple[int | None, ...]] = {
     "K_left": (3, 3),
     "K_right": (3, 3),
     "T_right_cam": (4, 4),
+    "covariance": (NUM_COEFFICIENTS, NUM_COEFFICIENTS),
 }
+_NOT_KNOWN = {"covariance": [[0.0] * NUM_COEFFICIENTS] * NUM_COEFFICIENTS}
+"""What files of earlier versions lack."""
 
 
 def _largest_difference(a: Tensor, b: Tensor) -> float:

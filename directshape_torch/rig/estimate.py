@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField, polynomial_basis
+from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField
 from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.pixels import PixelEvidence, hull
 from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
@@ -124,9 +124,7 @@ class RigEstimate(nn.Module):
 
         Beyond the data the field's value is that of the nearest data and the standard deviation that of the place.
         """
-        basis = polynomial_basis(uv_left, self._blank.size_wh)
-        covariance = self.covariance[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS].to(basis)
-        return self.field.bias(uv_left), ((basis @ covariance) * basis).sum(dim=-1).clamp_min(0).sqrt()
+        return self.field.bias(uv_left), self.field.sigma(uv_left)
 
     def in_the_middle(self) -> tuple[float, float]:
         """Offset and its standard deviation, pixels, at the median place of the cars; without any at the centre."""
@@ -149,8 +147,9 @@ class RigEstimate(nn.Module):
         """Detections that say how far the detector's depths are off, where they do not yet.
 
         What it is off by in the mean counts as much as its noise: the prior stays where the box is. How sure the field
-        is at a car (`offset_at`) is not said: `Detections.offset_sigma_px` gives depth to the contours, which on KITTI
-        know it less well than a disparity that is off by a quarter of a pixel (docs/your_rig.md).
+        is at a car widens what the result says of its depth and does not move it: `Detections.offset_sigma_px` gives
+        depth to the contours, which on KITTI know it less well than a disparity that is off by a quarter of a pixel
+        (docs/your_rig.md).
         """
         if detections.pose_sigma is not None or len(self.rows) < _FEWEST_CARS:
             return detections
@@ -235,6 +234,7 @@ class RigEstimate(nn.Module):
                 blank,
                 coefficients=found.mean[:NUM_COEFFICIENTS],
                 vertical_coefficients=row_offsets,
+                covariance=found.covariance[:NUM_COEFFICIENTS, :NUM_COEFFICIENTS],
                 hull_uv=self._hull(),
             )
             self._solved = found, field

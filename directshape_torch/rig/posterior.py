@@ -26,7 +26,8 @@ _FIELD_SIGMA_PX = (0.4, 0.4, 0.5, 0.3, 0.5)
 _FIELD_SCALES = torch.tensor([1.0, 0.5, 0.25, 0.05], dtype=torch.float64)
 _ROW_SIGMA_PX = (0.4, 0.3, 0.3, 0.2, 0.3)
 _ROW_NOISE_PX = 0.1
-_BIAS_SIGMA = 0.05
+# A detector is off in the mean by as much as it scatters, more or less.
+_BIAS_OVER_NOISE = 1.5
 # Dimensions of a detector are off in the mean by as much, and those of one car.
 _DIMENSIONS_SIGMA, _SIZE_SIGMA = 0.04, 0.08
 # Surfaces lie beside the near side of their boxes by a length that the cars of one detector share.
@@ -35,8 +36,8 @@ _SETBACK_SIGMA_M = 0.15
 _DEGREES_OF_FREEDOM = 4
 _NUM_ITERATIONS = 30
 # Standard deviations of a detector's relative depth and of what is left where it is perfect; each with the middle
-# and the spread (of the logarithm) of what detectors have.
-_DEPTH_NOISE, _DEPTH_NOISE_PRIOR = torch.logspace(-2.1, -0.7, 12, dtype=torch.float64), (0.03, 0.8)
+# and the spread (of the logarithm) of what detectors have, from LiDAR to one camera.
+_DEPTH_NOISE, _DEPTH_NOISE_PRIOR = torch.logspace(-2.7, -0.7, 15, dtype=torch.float64), (0.02, 1.2)
 _CONSTANT_NOISE, _CONSTANT_NOISE_PRIOR = torch.tensor([0.15, 0.25, 0.4, 0.7]).double(), (0.2, 0.5)
 
 
@@ -69,7 +70,7 @@ def solve_offsets(
     grid = torch.meshgrid(_DEPTH_NOISE, _CONSTANT_NOISE, _FIELD_SCALES, indexing="ij")
     s, s0, scale = (x.reshape(-1) for x in grid)
     variance = (s[:, None] * d) ** 2 + s0[:, None] ** 2 + sigma**2
-    own_sigma = torch.tensor([_BIAS_SIGMA, _SETBACK_SIGMA_M], dtype=torch.float64).expand(len(scale), 2)
+    own_sigma = torch.stack([_BIAS_OVER_NOISE * s, torch.full_like(s, _SETBACK_SIGMA_M)], dim=1)
     prior_sigma = torch.cat([scale[:, None] * _by_degree(_FIELD_SIGMA_PX), own_sigma], dim=1)
     H_prior, b_prior = torch.diag_embed(1 / prior_sigma**2), torch.zeros_like(prior_sigma[0])
     H_prior[:, :NUM_COEFFICIENTS, :NUM_COEFFICIENTS] += information

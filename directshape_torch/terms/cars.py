@@ -36,6 +36,17 @@ class CarState(NamedTuple):
         return 6 + self.code.shape[1] + self.offset_px.shape[1]
 
 
+@torch.no_grad()
+def _field_sigma_px(frames: FrameBatch, detections: Detections, offset_sigma_px: Tensor | None) -> Tensor:
+    """Of the disparity field (B,) where the boxes stand, unless an unknown offset stands for it."""
+    origin, field = detections.T_cam_obj[:, :3, 3], frames.camera.disparity_field
+    if field is None:
+        return torch.zeros_like(origin[:, 0])
+    in_image = (frames.camera.K_left[detections.frame_index] @ origin[..., None])[..., 0]
+    sigma = field.sigma(in_image[:, :2] / in_image[:, 2:].clamp_min(1e-3))
+    return sigma if offset_sigma_px is None else sigma.masked_fill(offset_sigma_px > 0, 0.0)
+
+
 def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_angle: float = torch.inf) -> CarState:
     """`T_obj_cam <- exp(v, omega) T_obj_cam`, `code <- code + dcode`, bounded, `offset_px <- offset_px + doffset`.
 
@@ -73,6 +84,7 @@ class CarBatch:
         detector_T_cam_obj: (B, 4, 4) input pose.
         detector_pose_sigma: (B, 4) its standard deviations, see `Detections`, or None.
         offset_sigma_px: (B,) standard deviation of the unknown offset of the disparity; None where no car has one.
+        field_sigma_px: (B,) that of the rig's disparity field at the car; 0 where the offset is an unknown.
     """
 
     detection_row: Tensor
@@ -87,6 +99,7 @@ class CarBatch:
     detector_T_cam_obj: Tensor
     detector_pose_sigma: Tensor | None
     offset_sigma_px: Tensor | None
+    field_sigma_px: Tensor
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
@@ -111,6 +124,7 @@ class CarBatch:
             detector_T_cam_obj=detections.T_cam_obj,
             detector_pose_sigma=detections.pose_sigma,
             offset_sigma_px=offset_sigma_px,
+            field_sigma_px=_field_sigma_px(frames, detections, offset_sigma_px),
         )
 
     def __len__(self) -> int:

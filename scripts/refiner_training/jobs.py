@@ -29,7 +29,7 @@ Kind = Literal["fixed", "constant", "network"]
 
 # Beside `fast.yaml`, whatever that one has of these. Costs are means over pixels, so weights keep their meaning.
 # A result that is not returned has no gradient and says nothing of what a network has learnt.
-EVERY_RESULT = "acceptance.min_probability_not_worse=0"
+EVERY_RESULT = "acceptance.min_probability_better=0"
 TRAINING_OVERRIDES = (
     "sampling.min_pixels=200",
     "sampling.max_pixels=200",

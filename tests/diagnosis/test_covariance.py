@@ -7,12 +7,15 @@ from dataclasses import replace
 import torch
 from helpers.derivatives import central_differences, moved, tangent_of
 from helpers.problems import DEFAULT, begun_stage, figures_at
-from helpers.synthetic_scene import cached_street
+from helpers.synthetic_scene import Street, cached_street
 
 from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
+from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.problem import CarStage
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.cars import CarState
 
 
@@ -92,3 +95,27 @@ def test_what_is_known_whatever_the_offset_is_has_the_covariance_of_all_unknowns
     information[0, 9] = information[0, :, 9] = 0
     assert torch.equal(without_offset(information, 9)[0], information[0, :9, :9])
     assert torch.equal(without_offset(information, 10), information)
+
+
+def test_what_is_not_known_of_the_field_widens_depth_alone() -> None:
+    prior, scene = cached_street()
+    K, T = scene.frames.camera.K_left[0], scene.frames.camera.T_right_cam[0]
+    height, width = scene.frames.sizes[0].tolist()
+    exact = DisparityField.constant(0.0, (width, height), K, scene.frames.camera.K_right[0], T)
+    covariance = torch.zeros(10, 10, dtype=torch.float64)
+    covariance[0, 0] = 0.2**2
+    known, guessed = (
+        refined_covariance(prior, scene, field) for field in (exact, replace(exact, covariance=covariance))
+    )
+    location = scene.detections.T_cam_obj[:, :3, 3]
+    ray = location / location[:, 2:]
+    # A pixel of disparity moves a point of depth z by z^2 / (f b) along its ray.
+    shift = ray * (0.2 * location[:, 2:] ** 2 / float(K[0, 0] * -T[0, 3]))
+    added = (guessed - known)[:, :3, :3]
+    torch.testing.assert_close(added, shift[:, :, None] * shift[:, None], rtol=0.05, atol=1e-4)
+
+
+def refined_covariance(prior: PCAShapePrior, scene: Street, field: DisparityField) -> torch.Tensor:
+    """Uncalibrated covariance (B, 4, 4) of the street's cars, refined from where they are."""
+    frames = replace(scene.frames, camera=replace(scene.frames.camera, disparity_field=field))
+    return DirectShapeRefiner(prior, DEFAULT)(frames, scene.detections).covariance_xyz_yaw

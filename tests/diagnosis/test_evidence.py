@@ -42,6 +42,7 @@ def course_at_truth() -> tuple[CarStage, Course]:
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, state.T_obj_cam),
         unsettled=torch.tensor([False, True]),
         profile=disparity_profile(stage.photometric, surface, surface, 2, state.code),
+        detector_sigma=torch.tensor([0.5, 0.25], dtype=torch.float64),
     )
     return stage, course
 
@@ -131,6 +132,10 @@ def test_what_does_not_exist_is_nan_and_touches_no_other_column() -> None:
     blank = columns(course, agreement(mask_iou_right=math.nan))
     assert blank["mask_misfit_right"].isnan().all()
     assert all(x.isfinite().all() for name, x in blank.items() if name != "mask_misfit_right")
+    unknown = columns(replace(course, detector_sigma=torch.tensor([torch.inf, 0.5], dtype=torch.float64)))
+    assert unknown["log_detector_sigma"].isnan().tolist() == [True, False]
+    depth = float(se3.inverse(course.before.T_obj_cam)[1, 2, 3])
+    assert float(unknown["log_detector_sigma"][1]) == pytest.approx(math.log(0.5 / depth))
     singular = columns(replace(course, covariance_xyz_yaw=torch.full((2, 4, 4), torch.nan).double()))
     assert singular["log_moved_sigmas"].isnan().all()
     assert singular["relative_decrease"].isfinite().all()

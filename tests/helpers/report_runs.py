@@ -19,7 +19,7 @@ from helpers.kitti_folder import write_data_set
 # The model of trust does not know toys that have not converged.
 FEW_STEPS = (
     "stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 4}]",
-    "acceptance.min_probability_not_worse=0",
+    "acceptance.min_probability_better=0",
 )
 
 

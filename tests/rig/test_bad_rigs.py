@@ -17,7 +17,7 @@ from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
 
 # Far more than any rig is off by, and less than ruins a search.
-TAME_PX = 3.0
+TAME_PX = 3.5
 
 
 def changed(rows: Tensor, column: int, change: Callable[[Tensor], Tensor]) -> Tensor:
