@@ -15,8 +15,8 @@ def halve(
 ) -> Tensor:
     """The next coarser pyramid level: each pixel is the mean of a 2x2 block.
 
-    An odd last row or column has no partner and is dropped, so that every coarse pixel is a true 2x2 mean and
-    `halve_intrinsics` holds exactly.
+    An odd last row or column has no partner and is dropped, so that every coarse pixel is a true 2x2 mean, with its
+    centre at pixel `2 u + 0.5` of the finer level.
 
     Args:
         images: (F, C, H, W), H and W at least 2.
@@ -51,29 +51,6 @@ def halve_sizes(
         tensor([[187, 621]])
     """
     return torch.div(sizes, 2, rounding_mode="floor").clamp_min(1)
-
-
-def halve_intrinsics(
-    K: Tensor,  # (..., 3, 3)
-) -> Tensor:
-    """Intrinsics of the next coarser level: focal lengths and skew halved, centre `(c + 0.5) / 2 - 0.5`.
-
-    Args:
-        K: (..., 3, 3), pixels, pixel centres at integers.
-
-    Raises:
-        InputError: not (..., 3, 3).
-
-    Example:
-        >>> halve_intrinsics(torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]]))
-        tensor([[350.0000,   0.0000, 299.7500],
-                [  0.0000, 350.0000,  89.7500],
-                [  0.0000,   0.0000,   1.0000]])
-    """
-    if K.shape[-2:] != (3, 3):
-        raise InputError("K", "shape (..., 3, 3)", f"{tuple(K.shape)}")
-    level_from_full = K.new_tensor([[0.5, 0.0, -0.25], [0.0, 0.5, -0.25], [0.0, 0.0, 1.0]])
-    return level_from_full @ K
 
 
 @dataclass(frozen=True)

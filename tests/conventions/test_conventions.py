@@ -27,7 +27,7 @@ from directshape_torch.geometry.pinhole import project, rays_from_pixels
 from directshape_torch.geometry.stereo import right_rays, warp_to_right
 from directshape_torch.image.gradients import grey_levels
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.image.pyramid import halve, halve_intrinsics
+from directshape_torch.image.pyramid import halve
 from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
@@ -277,11 +277,16 @@ def test_19_photometry_is_in_grey_levels() -> None:
 def test_20_pyramid_is_the_2x2_mean_with_its_intrinsics() -> None:
     image = torch.tensor([[1.0, 3.0], [5.0, 7.0]]).reshape(1, 1, 2, 2)
     assert halve(image).item() == 4.0
-    coarse = halve_intrinsics(K)
-    torch.testing.assert_close(coarse[:2, 2], (K[:2, 2] + 0.5) / 2 - 0.5)
-    # A point's pixels on both levels: the coarse pixel 0 covers fine pixels 0 and 1, so its centre is at 0.5.
+    # Where a point appears, by an image whose values are its own columns: the coarse pixel 0 covers the fine ones 0 and
+    # 1, so its centre is at 0.5.
+    coarse = torch.diag(vector(0.5, 0.5, 1)) @ K
+    coarse[:2, 2] = (K[:2, 2] + 0.5) / 2 - 0.5
     point = vector(1.0, -0.5, 9.0)
-    torch.testing.assert_close(project(point, coarse), (project(point, K) + 0.5) / 2 - 0.5)
+    columns = torch.arange(1242.0, dtype=torch.float64).repeat(1, 1, 2, 1)
+    level = halve(columns)[0, :, 0]
+    u = project(point, coarse)[0]
+    left = int(u)
+    torch.testing.assert_close(torch.lerp(level[0, left], level[0, left + 1], u - left), project(point, K)[0])
 
 
 def test_21_bias_is_measured_minus_true_disparity() -> None:

@@ -18,7 +18,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.problem import CarStage
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import DSO_PATTERN, compared, is_grazing, residuals_at
-from directshape_torch.terms.robust import huber_cost
+from directshape_torch.terms.robust import huber
 
 
 def _stage(config: RefinerConfig = PAPER) -> tuple[CarStage, CarState]:
@@ -80,7 +80,7 @@ def test_a_pixel_that_loses_its_surface_pays_the_constant(config: RefinerConfig)
     stage, state = _stage(config)
     term, column = photometric_of(stage), 2
     gone, still = (figures_at(stage, s) for s in (_translated(state, [30.0, 0.0, 0.0]), state))
-    lost = huber_cost(term.config.lost_grey_levels, term.config.huber_grey_levels)
+    lost = huber(torch.tensor(term.config.lost_grey_levels), term.config.huber_grey_levels).rho
     weight = term.row_weight * term.block_weight[:, None, None]
     expected = torch.stack([lost * weight[term.blocks.owner == car].sum() for car in range(2)])
     torch.testing.assert_close(gone.term_costs[:, column], expected)
