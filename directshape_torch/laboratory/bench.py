@@ -12,7 +12,6 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.depth import closest_of_march, first_hits, march
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.short_axes import length
-from directshape_torch.laboratory.own_term import checked_term
 from directshape_torch.laboratory.regimes import Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.table_lookup import occurrences
@@ -112,7 +111,7 @@ class Bench:
             stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
         terms = _named(*stages)
         sight = stages[0].problem.look(drawn.state)
-        rows = {name: rows_at(checked_term(term, sight), sight) for name, term in terms.items()}
+        rows = {name: rows_at(term, sight) for name, term in terms.items()}
         return cls(regime, stages[0], terms, drawn.state, sight, rows)
 
 
