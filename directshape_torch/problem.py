@@ -14,7 +14,7 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig, SolverConfig, StageConfig
+from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.depth import marched_views
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
@@ -31,6 +31,7 @@ from directshape_torch.stereo_matching.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.check_term import check_term
 from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.silhouette import MaskRows, Silhouettes
@@ -56,8 +57,9 @@ from directshape_torch.terms.term import (
 # Those of "point_cloud" hold for the methods with points, the first two for the others.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
 
-# A rig that is off by more between two iterations than this is another rig.
-_MAX_STEP_OFFSET_PX = 1.0
+# Trust region: the largest step of each unknown; a larger one is scaled as a whole. A rig that is off by a pixel more
+# between two iterations is another rig.
+_MAX_STEP_M, _MAX_STEP_RAD, _MAX_STEP_CODE, _MAX_STEP_OFFSET_PX = 0.5, 0.15, 1.0, 1.0
 
 TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
 """Makes a user's term for some cars of a call: of these frames, all detections, the cars to refine, the shapes."""
@@ -139,8 +141,8 @@ class CarProblem:
             terms.append(form(config.silhouette, cars, masks, prior.bounds_obj, torch.ones_like(masks.filled[:, :1])))
         if config.method != "geometric" and config.photometric.weight > 0:
             pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
-            of_images = pyramid, observation.hidden_right, detections.mask_left
-            terms.append(Photometric.of_pixels(config.photometric, cars, pixels[0], sides[0], *of_images))
+            left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
+            terms.append(Photometric(config.photometric, cars, left))
         terms += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
         names = [name for term in terms for name in term.names]
         extra = [make(frames, detections, cars, prior) for make in extra_terms]
@@ -306,8 +308,11 @@ class CarStage:
         return retract(state, step, self.problem.config.solver.max_code)
 
     def step_limits(self) -> Tensor:
-        """Largest trusted step of each unknown, (D,)."""
-        return step_limits(self.problem.config.solver, self.problem.prior, self.problem.num_offsets)
+        """Largest trusted step of each unknown, (D,) float64; not to be written to."""
+        prior, num_offsets = self.problem.prior, self.problem.num_offsets
+        limits = [_MAX_STEP_M] * 3 + [_MAX_STEP_RAD] * 3 + [_MAX_STEP_CODE] * prior.num_codes
+        limits += [_MAX_STEP_OFFSET_PX] * num_offsets
+        return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))
 
 
 @dataclass(frozen=True)
@@ -399,9 +404,8 @@ class CarIterations:
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         """The state moved by tangent vectors (B, D) within the trust region."""
-        config = self.stage.problem.config.solver
         # No component of the rotation is larger than its limit.
-        return retract(state, step, config.max_code, math.sqrt(3) * config.max_step_rotation_rad)
+        return retract(state, step, self.stage.problem.config.solver.max_code, math.sqrt(3) * _MAX_STEP_RAD)
 
     def step_limits(self) -> Tensor:
         """Largest trusted step of each unknown, (D,)."""
@@ -462,10 +466,3 @@ def method_stages(config: RefinerConfig) -> list[StageConfig]:
         for unknowns in ("pose", "shape", "both")
     )
     return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]
-
-
-def step_limits(config: SolverConfig, prior: ShapePrior, num_offsets: int) -> Tensor:
-    """Largest trusted step (D,) of each unknown, float64; not to be written to."""
-    limits = [config.max_step_translation_m] * 3 + [config.max_step_rotation_rad] * 3
-    limits += [config.max_step_code] * prior.num_codes + [_MAX_STEP_OFFSET_PX] * num_offsets
-    return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))

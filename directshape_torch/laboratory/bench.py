@@ -175,7 +175,7 @@ def _chosen(
 ) -> Observation:
     """The pixels that a regime is about, at most so many per car and side."""
     field, bounds = field_of(prior.bind(state.code)), prior.bounds_obj
-    zeta = contour_zeta(cars, config.silhouette, config.stages[regime.stage])
+    zeta = contour_zeta(cars, config.stages[regime.stage])
     chosen = []
     for pixels in (observation.left, observation.right):
         rows = Rows.of_sorted(pixels.object_index, len(cars))

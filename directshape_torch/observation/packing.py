@@ -105,7 +105,7 @@ def pack_pixels(
         extents: of the masks of these detections, where they are known already.
     """
     extents = scene_extents(detections) if extents is None else extents
-    regions = car_regions(frames, detections, config, extents)
+    regions = car_regions(frames, detections, extents)
     both, hidden = torch.cat(regions), None
     if config.occlusion:
         hidden = crops_of_sides(detections, ("left", "right"), extents, both, len(frames), config.occlusion_order)
@@ -142,9 +142,7 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
     return field.offsets(uv_left)
 
 
-def car_regions(
-    frames: FrameBatch, d: Detections, config: SamplingConfig, extents: SceneExtents | None = None
-) -> tuple[Tensor, Tensor]:
+def car_regions(frames: FrameBatch, d: Detections, extents: SceneExtents | None = None) -> tuple[Tensor, Tensor]:
     """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
     extents = scene_extents(d) if extents is None else extents
     # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
@@ -153,8 +151,6 @@ def car_regions(
         torch.cat([extents.left.boxes, extents.right.boxes]),
         frames.sizes[d.frame_index].repeat(2, 1),
         join=True,
-        margin_px=config.region_margin_px,
-        margin_share=config.region_margin_share,
     ).tensor_split(2)
     return left * d.has_mask_left[:, None], right
 

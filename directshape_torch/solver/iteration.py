@@ -16,6 +16,10 @@ from directshape_torch.status import Status
 
 # Of a problem that goes on; else the code of the status with which it ended.
 RUNNING = -1
+# Factors of Marquardt's mu after an accepted and after a refused step, and its bounds; a problem whose step is refused
+# at the upper one has converged.
+_DAMPING_DECREASE, _DAMPING_INCREASE = 0.3, 8.0
+_LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e5
 # Of tolerances: where a step promises and changes no more, its refusal is no overshoot that damping could mend, but the
 # roughness of a cost at its lowest.
 _FLAT = 10.0
@@ -116,7 +120,7 @@ def iterate(
     downhill = takeable & (at_candidate.cost <= p.at_state.cost)
     accepted = takeable if config.accept_every_step else downhill
     # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.
-    at_limit = p.damping >= config.max_damping
+    at_limit = p.damping >= _MOST_DAMPING
     p.iterations = p.iterations + running
     small_decrease = decrease <= config.cost_tolerance * p.at_state.cost.abs()
     if config.accept_every_step:
@@ -158,8 +162,8 @@ def _move(
     p.state = where_rows(accepted, candidate, p.state)
     p.at_state = problem.choose(accepted, at_candidate, p.at_state)
     if config.initial_damping > 0:
-        smaller = (p.damping * config.damping_decrease).clamp_min(config.min_damping)
-        larger = (p.damping * config.damping_increase).clamp_max(config.max_damping)
+        smaller = (p.damping * _DAMPING_DECREASE).clamp_min(_LEAST_DAMPING)
+        larger = (p.damping * _DAMPING_INCREASE).clamp_max(_MOST_DAMPING)
         p.damping = torch.where(accepted, smaller, larger)
     if not config.accept_every_step:
         # Nothing uphill is taken: the present state is the best one.

@@ -26,6 +26,12 @@ from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.term import Linear, Sight, Where
 
+# Of zeta, per metre.
+ZETA_BOUNDS = (4.0, 400.0)
+# |zeta sdf| from which the projection is certain and has no gradient (closest approach only).
+SATURATION = 16.0
+# The smallest residual in the reweighting 1/r.
+_RESIDUAL_FLOOR = 0.01
 # A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
 IN_PLAY_EXPONENT = 8.0
 # And as far again as the contour may move during a stage, beyond which the next stage picks it up.
@@ -127,10 +133,10 @@ class MaskRows:
         return -torch.log1p(-self.foreground)
 
 
-def contour_zeta(cars: CarBatch, config: SilhouetteConfig, stage: StageConfig) -> Tensor:
+def contour_zeta(cars: CarBatch, stage: StageConfig) -> Tensor:
     """Steepness (B,) of the projection per metre: a contour as wide as the stage says, in pixels at the input depth."""
     zeta = cars.focal_over_depth / stage.contour_width_px
-    return zeta.clamp(config.min_zeta_per_m, config.max_zeta_per_m)
+    return zeta.clamp(*ZETA_BOUNDS)
 
 
 @dataclass(frozen=True)
@@ -175,7 +181,7 @@ class Silhouettes:
         return self.rows.filled[..., None]
 
     def begin(self, stage: StageConfig, sight: Sight) -> Self:
-        return replace(self, zeta=contour_zeta(self.cars, self.config, stage)[self.rows.rays.owner][:, None])
+        return replace(self, zeta=contour_zeta(self.cars, stage)[self.rows.rays.owner][:, None])
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
         """Rays near the contour, or that may come to be: the others are certain, whatever the next steps do."""
@@ -219,7 +225,7 @@ class Silhouettes:
         return self._of_distance(sdf, where.crosses)[0][..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
-        return robust.identity(residual, self.config.residual_floor)
+        return robust.identity(residual, _RESIDUAL_FLOOR)
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
         (rows, kept), cars = self.rows.kept_of_cars(keep, numbers), self.cars.of_cars(keep, numbers)
@@ -230,7 +236,7 @@ class Silhouettes:
 
     def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (M, R) of least distances and its derivative by them; rays that miss the bounds have a constant."""
-        of_closest = closest_approach_residual(sdf, self.zeta, self.config.saturation, self.rows.foreground)
+        of_closest = closest_approach_residual(sdf, self.zeta, self.rows.foreground)
         elsewhere = self.rows.residual_of_a_miss(), torch.zeros_like(sdf)
         residual, slope = (torch.where(crosses, x, y) for x, y in zip(of_closest, elsewhere, strict=True))
         return residual, slope
@@ -239,17 +245,16 @@ class Silhouettes:
 def closest_approach_residual(
     closest_sdf: Tensor,  # (..., P) least signed distance along each ray, metres
     zeta: Tensor,  # broadcastable to (..., P), per metre
-    saturation: float,
     foreground: Tensor,  # (..., P)
 ) -> tuple[Tensor, Tensor]:
     """Residual and `J_residual_sdf` (..., P) at the point of closest approach, zero where saturated.
 
-    `pi = sigmoid(-zeta m)`; beyond `|zeta m| = saturation` the projection is certain. Without logarithms: of pi and
+    `pi = sigmoid(-zeta m)`; beyond `|zeta m| = SATURATION` the projection is certain. Without logarithms: of pi and
     1 - pi the smaller one is a quotient and no difference, so the likelihood `A = pi p_fg + (1 - pi) p_bg` loses no
     digit. `d r / d sdf = zeta pi (1 - pi) (p_fg - p_bg) / A`.
 
     Example:
-        >>> on_contour = (torch.zeros(1), torch.full((1,), 2.0), 16.0, torch.full((1,), 0.75))
+        >>> on_contour = (torch.zeros(1), torch.full((1,), 2.0), torch.full((1,), 0.75))
         >>> closest_approach_residual(*on_contour)
         (tensor([0.6931]), tensor([0.5000]))
     """
@@ -257,13 +262,13 @@ def closest_approach_residual(
     is_outside = x > 0
     # Not `abs`, whose derivative at zero is zero: on the contour itself the residual has one.
     distance = torch.where(is_outside, x, -x)
-    decay = torch.exp(-distance.clamp_max(saturation))
+    decay = torch.exp(-distance.clamp_max(SATURATION))
     larger = 1 / (1 + decay)
     smaller = decay * larger
     hit, miss = torch.where(is_outside, smaller, larger), torch.where(is_outside, larger, smaller)
     likelihood = hit * foreground + miss * (1 - foreground)
     derivative = zeta * smaller * larger * (2 * foreground - 1) / likelihood
-    return -likelihood.log(), torch.where(distance < saturation, derivative, torch.zeros_like(derivative))
+    return -likelihood.log(), torch.where(distance < SATURATION, derivative, torch.zeros_like(derivative))
 
 
 def sdf_state_jacobian(

@@ -35,7 +35,7 @@ def observation_sheet(
         InputError: no such car, or one without pixels in the left image.
     """
     config = SamplingConfig() if config is None else config
-    left, _ = car_regions(frames, detections, config)
+    left, _ = car_regions(frames, detections)
     magnitude = gradient_magnitude(frames.images_left, frames.sizes)
     chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, left, sampling_settings(config, "left"))
     order = config.occlusion_order

@@ -229,14 +229,14 @@ class _Kernel(nn.Module):
 
 
 def make_optimizer(model: TangentModel, config: SolverConfig) -> Any:
-    """Levenberg-Marquardt with the damping of our own solver, and reweighting ("FastTriggs"), PyPose's advice."""
+    """Levenberg-Marquardt, reweighted as PyPose advises ("FastTriggs"), with our damping (`solver/iteration.py`)."""
     pypose = importlib.import_module("pypose")
     strategy = pypose.optim.strategy.Adaptive(
         damping=config.initial_damping,
-        up=config.damping_increase,
-        down=config.damping_decrease,
-        min=config.min_damping,
-        max=config.max_damping,
+        up=8.0,
+        down=0.3,
+        min=1e-7,
+        max=1e5,
     )
     optimizer = pypose.optim.LM(model, strategy=strategy, kernel=_Kernel(model.energy))
     optimizer.jackwargs["strategy"] = "forward-mode"

@@ -50,13 +50,13 @@ TARGETS: dict[str, Target] = {
     ),
     "photometric": Target(
         "directshape_torch/terms/photometric.py",
-        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth", "compared", "_warped"),
+        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth"),
         (*_OFFSET, *_GRADIENTS),
     ),
-    "photometric_patch": Target(
-        "directshape_torch/terms/photometric_patch.py",
-        ("patch_derivative",),
-        _JACOBIANS,
+    "photometric_rows": Target(
+        "directshape_torch/terms/photometric_rows.py",
+        ("compared", "warped_pixels", "patch_derivative"),
+        (*_OFFSET, *_GRADIENTS),
     ),
     "point_cloud": Target(
         "directshape_torch/terms/point_cloud.py",

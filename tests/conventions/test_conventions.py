@@ -38,7 +38,7 @@ from directshape_torch.shape.grid_cells import Lookup
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.terms.cars import CarState, retract
-from directshape_torch.terms.photometric import DSO_PATTERN
+from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from directshape_torch.terms.priors import dimensions_prior, height_prior, shape_prior
 from directshape_torch.terms.silhouette import sdf_state_jacobian
 from directshape_torch.terms.silhouette_product import product_residual

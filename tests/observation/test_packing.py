@@ -95,9 +95,7 @@ def random_scene(seed: int, count: int, num_frames: int = 3, others: int = 4) ->
 
 def assert_equal_to_whole_frames(frames: FrameBatch, d: Detections, config: SamplingConfig) -> Observation:
     seen = pack_pixels(frames, d, config)
-    for side, pixels, regions in zip(
-        ("left", "right"), (seen.left, seen.right), car_regions(frames, d, config), strict=True
-    ):
+    for side, pixels, regions in zip(("left", "right"), (seen.left, seen.right), car_regions(frames, d), strict=True):
         object_index, uv, foreground, magnitude = whole_frame_side(frames, d, side, regions, config)
         assert torch.equal(pixels.object_index, object_index)
         assert torch.equal(pixels.uv, uv.to(pixels.uv.dtype))

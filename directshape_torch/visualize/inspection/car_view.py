@@ -109,9 +109,8 @@ class CarView:
     @cached_property
     def regions(self) -> tuple[Window, Window]:
         """Regions of the left and the right image whose pixels speak about the car."""
-        config = self.trace.config.sampling
         detections = without_empty_masks(self.loaded.detections)
-        left, right = (r[self.car].tolist() for r in car_regions(self.loaded.frame, detections, config))
+        left, right = (r[self.car].tolist() for r in car_regions(self.loaded.frame, detections))
         return (left[0], left[1], left[2], left[3]), (right[0], right[1], right[2], right[3])
 
     def window(self, side: Side) -> Window:

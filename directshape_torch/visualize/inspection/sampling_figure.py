@@ -57,7 +57,7 @@ def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
     """The pixels as the refinement chose them, with the round that each comes from."""
     config = view.trace.config.sampling
     frames, detections = view.loaded.frame, without_empty_masks(view.loaded.detections)
-    left, right = car_regions(frames, detections, config)
+    left, right = car_regions(frames, detections)
     images, regions = (frames.images_left, left) if side == "left" else (frames.images_right, right)
     magnitude = gradient_magnitude(images, frames.sizes)
     chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config, side))
@@ -93,7 +93,7 @@ def write_occlusion_picture(path: Path | str, view: CarView) -> None:
     """Write, as PNG, image, masks and occlusion mask, the left image above the right one where it has a region too."""
     detections = without_empty_masks(view.loaded.detections)
     config = view.trace.config.sampling
-    regions = car_regions(view.loaded.frame, detections, config)
+    regions = car_regions(view.loaded.frame, detections)
     # One scale for both images, or the car would seem to change its size.
     scale = max(2, round(_LEAST_HEIGHT_PX / max(v1 - v0 for _, v0, _, v1 in view.regions)))
     rows = []
