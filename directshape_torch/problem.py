@@ -22,6 +22,7 @@ from directshape_torch.image.gradients import grey_levels
 from directshape_torch.image.pyramid import GreyPair
 from directshape_torch.numerics.checks import check_shape, check_stored
 from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.observation.packing import Observation
 from directshape_torch.rows import CarSums, Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
@@ -44,13 +45,11 @@ from directshape_torch.terms.term import (
     Term,
     Where,
     by_autograd,
-    choose_blocks,
     linear_of,
     part_of,
     part_of_rows,
     parts_of,
     summed,
-    take_blocks,
     with_varying_blocks,
 )
 
@@ -78,6 +77,7 @@ class CarProblem:
         factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
         num_extra: how many of the terms, the last ones, are a user's own.
         num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
+        marches: every ray is marched at every state of the iterations, not tracked.
     """
 
     prior: ShapePrior
@@ -88,6 +88,7 @@ class CarProblem:
     factors: Tensor | None = None
     num_extra: int = 0
     num_offsets: int = 0
+    marches: bool = False
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -149,7 +150,10 @@ class CarProblem:
         terms += extra
         if not terms:
             raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
-        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets)
+        # What is differentiated afterwards is the marched energy, so its minimum must be found.
+        is_differentiated = config.backward.mode != "none" and torch.is_grad_enabled()
+        marches = config.solver.rays == "marched" or is_differentiated
+        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets, marches)
         if extra:
             code = prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
             sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
@@ -259,8 +263,7 @@ class CarStage:
     def start(self, sight: Sight) -> tuple[CarIterations, Evaluation]:
         """What the iterations work on, and the energy where they begin."""
         problem = self.problem
-        # What is differentiated afterwards is the marched energy, so its minimum must be found.
-        if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
+        if problem.marches:
             terms, rest = self.terms, None
             wheres = tuple(term.where(sight) for term in terms)
         else:
@@ -397,10 +400,11 @@ class CarIterations:
         """The new evaluation of cars whose step was accepted (B,), the old one of the others."""
         conditions = accepted, accepted[:, None], accepted[:, None, None]
         cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
-        pairs = zip(self.terms, new.wheres, old.wheres, strict=True)
-        return Evaluation(
-            cost, gradient, hessian, tuple(choose_blocks(accepted[term.blocks.owner], *pair) for term, *pair in pairs)
-        )
+        wheres = []
+        for term, *where in zip(self.terms, new.wheres, old.wheres, strict=True):
+            in_blocks = accepted[term.blocks.owner][:, None]
+            wheres.append(map_tensors(lambda x, y, chosen=in_blocks: torch.where(chosen, x, y), *where))
+        return Evaluation(cost, gradient, hessian, tuple(wheres))
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         """The state moved by tangent vectors (B, D) within the trust region."""
@@ -414,8 +418,11 @@ class CarIterations:
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
         """Those of the cars where `keep` (B,) holds, `numbers` of them, with their evaluation."""
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        kept = (term.blocks.of_cars(keep, numbers)[1] for term in self.terms)
-        wheres = tuple(take_blocks(where, blocks) for where, blocks in zip(at.wheres, kept, strict=True))
+        kept = [term.blocks.of_cars(keep, numbers)[1] for term in self.terms]
+        wheres = tuple(
+            map_tensors(lambda x, blocks=blocks: x.index_select(-2, blocks), where)
+            for where, blocks in zip(at.wheres, kept, strict=True)
+        )
         rest, factors = (None if x is None else x.index_select(0, index) for x in (self.rest, self.factors))
         masks = self.masks if self.rest is not None else self.masks.of_cars(keep, numbers)
         terms = tuple(term.of_cars(keep, numbers) for term in self.terms)

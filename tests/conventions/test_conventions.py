@@ -338,9 +338,9 @@ def test_25_letters() -> None:
     B, K_, F = len(scene.detections), prior.num_codes, len(scene.frames)
     D, S, N = 6 + K_, DEFAULT.silhouette.samples_per_ray, len(DSO_PATTERN)
     term, sight = photometric_of(stage), stage.problem.look(state)
-    P = len(term.pixels)
+    P = len(term.left.pixels)
     H, W = scene.frames.images_left.shape[2:]
-    assert term.pixels.uv.shape == (P, 2)
+    assert term.left.pixels.uv.shape == (P, 2)
     owner, rays = stage.problem.rays[0].owner, stage.problem.rays[0].in_objects(state.T_obj_cam)
     assert march(sight.field, owner, rays, prior.bounds_obj, S).sdf.shape == (S, len(owner), 64)
     assert len(term.pixel_set.rows.intensity_left) == N == 8
@@ -357,7 +357,7 @@ def test_26_systems_are_float64() -> None:
     )
     _, at = stage.start(stage.problem.look(state))
     assert at.cost.dtype == at.gradient.dtype == at.hessian.dtype == torch.float64
-    assert photometric_of(stage).pixels.uv.dtype == state.code.dtype == torch.float32
+    assert photometric_of(stage).left.pixels.uv.dtype == state.code.dtype == torch.float32
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
