@@ -9,20 +9,25 @@ from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.diagnosis.box_alignment import ROUNDS_PX, BoxAlignment
-from directshape_torch.diagnosis.car_rows import kept, placed
-from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.diagnosis.disparity_profile import DisparityProfile, disparity_profile
 from directshape_torch.diagnosis.evidence import Course
-from directshape_torch.diagnosis.observability import Observability, observability_of
+from directshape_torch.diagnosis.observability import (
+    Observability,
+    covariance_of,
+    covariance_xyz_yaw,
+    observability_of,
+    without_offset,
+)
 from directshape_torch.diagnosis.quality import FitQuality, fit_quality
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
+from directshape_torch.numerics.tensors import kept, placed
 from directshape_torch.problem import CarProblem, CarStage
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.solver.iteration import damped_step
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState

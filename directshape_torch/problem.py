@@ -18,25 +18,23 @@ from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.depth import marched_views
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
-from directshape_torch.image.gradients import grey_levels
-from directshape_torch.image.pyramid import GreyPair
+from directshape_torch.image.grey_levels import GreyPair, grey_levels
 from directshape_torch.numerics.checks import check_shape, check_stored
-from directshape_torch.numerics.device_constants import constant_like
 from directshape_torch.numerics.gradient_mode import map_tensors
+from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.packing import Observation
 from directshape_torch.rows import CarSums, Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.stereo_matching.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.check_term import check_term
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import prior_terms
-from directshape_torch.terms.silhouette import MaskRows, Silhouettes
-from directshape_torch.terms.silhouette_product import SilhouetteProducts
+from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import (
     Evaluation,
     Figures,

@@ -16,6 +16,7 @@ from directshape_torch.diagnosis.box_alignment import align_boxes
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.observation.car_points import PointSamples, car_points
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
@@ -29,8 +30,7 @@ from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.backward import attached_state
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.solver.search import search_start
-from directshape_torch.stereo_matching.car_points import PointSamples, car_points
-from directshape_torch.stereo_matching.dense_disparity import with_disparity
+from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.terms.cars import CarBatch, CarState
 
 

@@ -22,7 +22,7 @@ from directshape_torch.diagnosis.disparity_profile import (
     shifted_costs,
 )
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.problem import CarProblem
 from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import where_rows

@@ -21,8 +21,13 @@ from directshape_torch.terms import robust
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.photometric_rows import Comparison, compared
 from directshape_torch.terms.point_cloud import PointCloud
-from directshape_torch.terms.silhouette import Silhouettes, closest_approach_residual
-from directshape_torch.terms.silhouette_product import Samples, SilhouetteProducts, product_residual
+from directshape_torch.terms.silhouette import (
+    Samples,
+    SilhouetteProducts,
+    Silhouettes,
+    closest_approach_residual,
+    product_residual,
+)
 from directshape_torch.terms.term import Linear
 
 # Each point of the trilinear lookup binds a grid of its own.

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.image.frame_parts import gradient_magnitude_at
+from directshape_torch.image.grey_levels import gradient_magnitude_at
+from directshape_torch.numerics.tensors import pixels_at_once, portions
 from directshape_torch.observation.even_pixels import even_pixels
 from directshape_torch.observation.gradient_cells import GradientCells, ImageRegion, gradient_cells
 from directshape_torch.observation.occlusion import OcclusionCrops, Side
 from directshape_torch.observation.pixel_sampling import candidate_pixels
-from directshape_torch.observation.portions import pixels_at_once, portions
 from directshape_torch.observation.regions import RegionPixels
 from directshape_torch.observation.small_cells import CellPixels
 from directshape_torch.observation.strongest_pixels import strongest_pixels

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.image.frame_parts import gradient_magnitude_of_part
+from directshape_torch.image.grey_levels import gradient_magnitude_of_part
+from directshape_torch.numerics.tensors import pixels_at_once
 from directshape_torch.observation.gradient_thresholds import THRESHOLD_CELL_PX, smoothed_thresholds
 from directshape_torch.observation.lower_median import lower_medians
-from directshape_torch.observation.portions import pixels_at_once
 
 Box = tuple[int, int, int, int]
 

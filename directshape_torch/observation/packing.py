@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.geometry.stereo import right_rays
+from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.observation.chosen_pixels import ChosenPixels, chosen_pixels
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides

@@ -12,10 +12,9 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
-from directshape_torch.numerics.device_constants import constant_like
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.shape.sdf_grid import GridShape, zero_level_extents
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.shape.zero_level import zero_level_extents
 
 # Codes within this many standard deviations of the mean are 'in use': the Lipschitz bound covers them.
 CODE_NORM_IN_USE = 3.0

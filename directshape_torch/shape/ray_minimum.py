@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.short_axes import length
-from directshape_torch.shape.grid_cells import GridField, corner_values, differences, moved
+from directshape_torch.numerics.tensors import length
+from directshape_torch.shape.sdf_grid import GridField, corner_values, differences, moved
 
 # Distance of the three samples that begin a search where nothing but values is known.
 _FIRST_SAMPLES_M = 0.06

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
-from directshape_torch.solver.damped_solve import step_lengths
-from directshape_torch.solver.iteration import RUNNING, Outcome, begin, has_failed, iterate
+from directshape_torch.solver.iteration import RUNNING, Outcome, begin, has_failed, iterate, step_lengths
 from directshape_torch.solver.problem import (
     BegunStage,
     Problem,

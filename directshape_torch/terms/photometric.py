@@ -20,8 +20,8 @@ from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig, StageConfig
 from directshape_torch.depth import NEAR_SURFACE_M, Hits, surface_depth, tracked_depth
-from directshape_torch.geometry.short_axes import length
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.numerics.tensors import length
 from directshape_torch.rows import BLOCK, Blocks, CarSums, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust

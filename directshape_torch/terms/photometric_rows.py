@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig
-from directshape_torch.geometry.short_axes import all_along
+from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
-from directshape_torch.image.pyramid import GreyPair
-from directshape_torch.numerics.device_constants import made_once
+from directshape_torch.numerics.tensors import all_along, made_once
 from directshape_torch.observation.occlusion import OcclusionCrops
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.rows import Rays, Rows

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.image.frame_parts import gradient_magnitude
+from directshape_torch.image.grey_levels import gradient_magnitude
 from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.pixel_sampling import select_pixels

@@ -27,8 +27,7 @@ from directshape_torch.outcome import outcome_of
 from directshape_torch.problem import CarIterations, CarProblem, CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.solver.damped_solve import damped_step
-from directshape_torch.solver.iteration import iterate
+from directshape_torch.solver.iteration import damped_step, iterate
 from directshape_torch.terms import cars, term
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.priors import PriorTerm

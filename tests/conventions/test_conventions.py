@@ -22,26 +22,23 @@ from torch import Tensor
 
 from directshape_torch.depth import march
 from directshape_torch.geometry import box3d, se3
+from directshape_torch.geometry.camera import project, rays_from_pixels, right_rays, warp_to_right
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
-from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.stereo import right_rays, warp_to_right
-from directshape_torch.image.gradients import grey_levels
+from directshape_torch.image.grey_levels import grey_levels, halve
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.image.pyramid import halve
 from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import RefinedBox, write_result_text
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
-from directshape_torch.shape.grid_cells import Lookup
+from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.iteration import damped_step
 from directshape_torch.terms.cars import CarState, retract
 from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from directshape_torch.terms.priors import dimensions_prior, height_prior, shape_prior
-from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.silhouette_product import product_residual
+from directshape_torch.terms.silhouette import product_residual, sdf_state_jacobian
 
 ROOT = Path(__file__).parents[2]
 K = torch.tensor([[720.0, 0.0, 610.0], [0.0, 720.0, 172.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from directshape_torch.errors import InputError
-from directshape_torch.image.pyramid import halve, halve_sizes
+from directshape_torch.image.grey_levels import halve, halve_sizes
 
 
 def test_halve_is_the_mean_of_each_block() -> None:

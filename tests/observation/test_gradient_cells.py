@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.image.frame_parts import gradient_magnitude
+from directshape_torch.image.grey_levels import gradient_magnitude
 from directshape_torch.observation.gradient_cells import Box, ImageRegion, gradient_cells
 from directshape_torch.observation.gradient_thresholds import cell_thresholds
 

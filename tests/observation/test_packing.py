@@ -12,7 +12,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.image.frame_parts import gradient_magnitude
+from directshape_torch.image.grey_levels import gradient_magnitude
 from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.occlusion import Side, hidden_pixels

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.image.frame_parts import gradient_magnitude
+from directshape_torch.image.grey_levels import gradient_magnitude
 from directshape_torch.observation.gradient_cells import ImageRegion, gradient_cells
 from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.observation.strongest_pixels import strongest_pixels

@@ -10,8 +10,7 @@ from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from directshape_torch.terms.point_cloud import PointCloud
-from directshape_torch.terms.silhouette import SATURATION, MaskRows, Silhouettes
-from directshape_torch.terms.silhouette_product import SilhouetteProducts
+from directshape_torch.terms.silhouette import SATURATION, MaskRows, SilhouetteProducts, Silhouettes
 from reference.rays import RaysObj, first_entry, least
 
 # From the prior's bounds: so far away the closest approach stays of them, where the field has a kink.

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance
+from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.shape.zero_level import zero_level_extents
 
 MADE = PriorProvenance("a test", "Apache-2.0", 40)
 SPACING_M = 0.2

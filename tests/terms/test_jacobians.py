@@ -17,8 +17,7 @@ from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.photometric_rows import CONTRAST_FLOOR, DSO_PATTERN, patch_residual
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorTerm
-from directshape_torch.terms.silhouette import Silhouettes
-from directshape_torch.terms.silhouette_product import SilhouetteProducts
+from directshape_torch.terms.silhouette import SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import Linear, Term, by_autograd
 
 CASES = [("typical", config) for config in ALL_CONFIGS] + [(regime, "default") for regime in REGIMES[1:]]

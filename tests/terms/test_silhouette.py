@@ -21,8 +21,14 @@ from directshape_torch.rows import ObjectRays
 from directshape_torch.shape.field import PackedField
 from directshape_torch.terms import silhouette
 from directshape_torch.terms.cars import CarState
-from directshape_torch.terms.silhouette import SATURATION, Silhouettes, closest_approach_residual
-from directshape_torch.terms.silhouette_product import SilhouetteProducts, log_one_minus_exp, product_residual
+from directshape_torch.terms.silhouette import (
+    SATURATION,
+    SilhouetteProducts,
+    Silhouettes,
+    closest_approach_residual,
+    log_one_minus_exp,
+    product_residual,
+)
 
 ZETAS = {"far": 9.0, "typical": 90.0, "near": 400.0}
 

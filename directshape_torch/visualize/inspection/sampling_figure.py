@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.image.frame_parts import gradient_magnitude
+from directshape_torch.image.grey_levels import gradient_magnitude
 from directshape_torch.io.figure_files import new_figure
 from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.observation.chosen_pixels import sampling_settings
