@@ -1,8 +1,7 @@
 """Pixels, rays and depths of a rectified stereo pair: pinhole cameras, the crossing to the right one, disparity.
 
-Pixel centres lie at integer (u, v). Right pixels and rays pass here, so the residual disparity field of a rig is applied
-here: an image point lies at `u_right = pinhole - bias`, `v_right = pinhole + vertical`. The right camera's rows need
-only nearly be aligned with the left one's.
+Pixel centres lie at integer (u, v). Where a rig has a residual disparity field an image point lies at `u_right =
+pinhole - bias`, `v_right = pinhole + vertical`. The rows of the two cameras need only nearly be aligned.
 """
 
 from __future__ import annotations

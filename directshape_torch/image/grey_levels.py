@@ -96,25 +96,6 @@ def gradient_magnitude_of_part(
     return length_2d(d_u, d_v).mul_(0.5)
 
 
-def gradient_magnitude(
-    images: Tensor,  # (F, 3, H, W)
-    sizes: Tensor,  # (F, 2)
-) -> Tensor:
-    """`gradient_magnitude_of_part` of whole frames (F, H, W), 0 in their padding: for figures.
-
-    Example:
-        >>> ramp = torch.arange(4.0).expand(1, 3, 2, 4) / 255
-        >>> gradient_magnitude(ramp, torch.tensor([[1, 4]]))
-        tensor([[[0.5000, 1.0000, 1.0000, 0.5000],
-                 [0.0000, 0.0000, 0.0000, 0.0000]]])
-    """
-    magnitude = torch.zeros_like(images[:, 0])
-    for frame, (height, width) in enumerate(sizes.tolist()):
-        whole = gradient_magnitude_of_part(images[frame], (height, width), (0, 0, width, height))
-        magnitude[frame, :height, :width] = whole
-    return magnitude
-
-
 def gradient_magnitude_at(
     images: Tensor,  # (F, 3, H, W)
     sizes: Tensor,  # (F, 2)

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
-from directshape_torch.observation.chosen_pixels import ChosenPixels, chosen_pixels
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides
 from directshape_torch.observation.regions import region_boxes
+from directshape_torch.observation.sampling import ChosenPixels, chosen_pixels
 from directshape_torch.scene import Detections, FrameBatch
 
 # Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
@@ -149,7 +149,6 @@ def car_regions(frames: FrameBatch, d: Detections, extents: SceneExtents | None 
         torch.cat([d.box_2d, torch.full_like(d.box_2d, torch.nan)]),
         torch.cat([extents.left.boxes, extents.right.boxes]),
         frames.sizes[d.frame_index].repeat(2, 1),
-        join=True,
     ).tensor_split(2)
     return left * d.has_mask_left[:, None], right
 

@@ -4,8 +4,9 @@
 distance m along it. By the envelope theorem the Jacobian of m is that of the point where it is taken. Derivation:
 docs/derivations/silhouette_closest_approach.md.
 
-The paper's projection is a product over the samples of each ray, `pi = 1 - prod_s 1 / (exp(Phi_s zeta) + 1)`: it dilates
-the contour and is there to be faithful to the paper (`SilhouetteProducts`, docs/derivations/silhouette_product.md).
+The paper's projection is a product over the samples of each ray, `pi = 1 - prod_s 1 / (exp(Phi_s zeta) + 1)`. It
+dilates the contour and is there to be faithful to the paper (`SilhouetteProducts`,
+docs/derivations/silhouette_product.md).
 """
 
 from __future__ import annotations

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from kornia.filters import spatial_gradient
+from reference.pixel_sampling import gradient_magnitude
 from torch import Tensor
 
 from directshape_torch.image.grey_levels import (
-    gradient_magnitude,
     gradient_magnitude_at,
     gradient_magnitude_of_part,
     grey_levels,

@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 import torch
+from reference.occlusion import hidden_pixels
+from reference.pixel_sampling import gradient_magnitude, select_pixels
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.image.grey_levels import gradient_magnitude
-from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.mask_extents import scene_extents
-from directshape_torch.observation.occlusion import Side, hidden_pixels
+from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import Observation, car_regions, pack_pixels
-from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.observation.sampling import sampling_settings
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
 from tests.helpers.synthetic_scene import stereo_camera
 

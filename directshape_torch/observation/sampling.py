@@ -1,8 +1,14 @@
-"""Which pixels of the two images speak about the cars: those of their regions that a mode chooses and nothing hides."""
+"""Which pixels of the two images speak about the cars: those of their regions that a mode chooses and nothing hides.
+
+The paper's mode ("adaptive", section "Adaptive Point Sampling") has two rounds: a threshold of the gradient magnitude
+in each cell of 32 px (`gradient_cells`), then in each small cell, whose size follows the region's, the strongest pixel
+above its threshold, else the strongest (`strongest_pixels`). The mode "uniform" takes the pixel nearest to the middle
+of each small cell, without a look at any other (`even_pixels`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import NamedTuple
 
@@ -12,12 +18,9 @@ from torch import Tensor
 from directshape_torch.config import SamplingConfig
 from directshape_torch.image.grey_levels import gradient_magnitude_at
 from directshape_torch.numerics.tensors import pixels_at_once, portions
-from directshape_torch.observation.even_pixels import even_pixels
 from directshape_torch.observation.gradient_cells import GradientCells, ImageRegion, gradient_cells
 from directshape_torch.observation.occlusion import OcclusionCrops, Side
-from directshape_torch.observation.pixel_sampling import candidate_pixels
-from directshape_torch.observation.regions import RegionPixels
-from directshape_torch.observation.small_cells import CellPixels
+from directshape_torch.observation.regions import CellPixels, region_pixels, small_cell_side
 from directshape_torch.observation.strongest_pixels import strongest_pixels
 from directshape_torch.scene import Detections, FrameBatch
 
@@ -37,7 +40,7 @@ def chosen_pixels(
     hidden: OcclusionCrops | None,
     config: SamplingConfig,
 ) -> tuple[ChosenPixels, ChosenPixels]:
-    """The visible ones of the pixels that `select_pixels` chooses, of the left and of the right image.
+    """The chosen pixels that nothing hides, of the left and of the right image.
 
     Args:
         frames: F frames.
@@ -145,11 +148,129 @@ def _unhidden(found: CellPixels, object_index: Tensor, hidden: OcclusionCrops | 
 
 
 def _candidates(regions: Tensor, cells: GradientCells, image_width: int, settings: SamplingConfig) -> CellPixels:
+    """One pixel of each small cell, or every pixel in the mode "dense"; those that are hidden among them."""
     if settings.mode in ("adaptive", "round_one"):
         return strongest_pixels(cells, regions, image_width, settings)
-    # The mode "dense" does not look at the image.
-    pixels = RegionPixels.of(regions)
-    unseen = torch.zeros(len(pixels), device=regions.device)
-    chosen = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
-    object_index, uv = pixels.uv_of(chosen.pixel)
-    return CellPixels(object_index, uv[:, 0], uv[:, 1], chosen.exists)
+    if settings.mode == "uniform":
+        return even_pixels(regions, settings)
+    object_index, uv = region_pixels(regions)
+    return CellPixels(object_index, uv[:, 0], uv[:, 1], torch.ones_like(object_index, dtype=torch.bool))
+
+
+@dataclass(frozen=True)
+class PixelSelection:
+    """Chosen pixels of B objects, sorted by object, hidden ones among them.
+
+    Attributes:
+        object_index: (P,) integer.
+        uv: (P, 2) integer (column, row).
+        above_threshold: (P,) bool, the pixel's gradient exceeds its threshold ("green" in the paper's figure).
+    """
+
+    object_index: Tensor
+    uv: Tensor
+    above_threshold: Tensor
+
+
+def selected_pixels(
+    images: Tensor,  # (F, 3, H, W)
+    sizes: Tensor,  # (F, 2)
+    frame_index: Tensor,  # (B,)
+    regions: Tensor,  # (B, 4)
+    settings: SamplingConfig,
+) -> PixelSelection:
+    """The pixels of one image before hidden ones leave, with the round that each comes from: for figures.
+
+    Example:
+        >>> ramp = (torch.arange(40.0) / 20).square().expand(1, 3, 40, 40)
+        >>> frame, region = torch.tensor([0]), torch.tensor([[5, 5, 25, 25]])
+        >>> settings = SamplingConfig(min_pixels=100, max_pixels=100)
+        >>> selected_pixels(ramp, torch.tensor([[40, 40]]), frame, region, settings).uv.shape
+        torch.Size([100, 2])
+    """
+    boxes = [ImageRegion(0, *place) for place in zip(frame_index.tolist(), regions.tolist(), strict=True)]
+    cells = gradient_cells([images], sizes.tolist(), boxes)
+    found = _candidates(regions, cells, images.shape[3], settings)
+    kept = found.exists.nonzero()[:, 0]
+    object_index, uv = found.object_index[kept], torch.stack([found.u, found.v], dim=1)[kept]
+    above = cells.magnitude_at(object_index, uv).float() > cells.threshold_at(object_index, uv).float()
+    return PixelSelection(object_index, uv, above)
+
+
+# Pixels: what rounding makes of distances that are equal.
+_ROUNDING_PX = 1e-6
+
+
+def even_pixels(
+    regions: Tensor,  # (B, 4)
+    settings: SamplingConfig,
+) -> CellPixels:
+    """The pixel nearest to the middle of each small cell; of those that differ by rounding the first, row-major.
+
+    Args:
+        regions: (B, 4) integer (u0, v0, u1, v1), half open.
+        settings: density; its mode is not asked for.
+
+    Example:
+        >>> chosen = even_pixels(torch.tensor([[5, 2, 11, 6]]), SamplingConfig(min_pixels=6, max_pixels=6))
+        >>> chosen.u.tolist(), chosen.v.tolist()
+        ([5, 7, 9, 5, 7, 9], [2, 2, 2, 4, 4, 4])
+    """
+    side = small_cell_side(regions, settings)
+    lengths = regions[:, 2:] - regions[:, :2]
+    cells = (lengths / side[:, None]).ceil().long()
+    columns, count = cells[:, 0], cells[:, 0] * cells[:, 1]
+    on_axes, total = torch.stack([cells.sum(), count.sum()]).tolist()
+    # Columns of cells of all regions, then rows of cells of all regions.
+    line = _Runs.of(cells.mT.flatten(), on_axes)
+    sides, edges, ends = (
+        x.index_select(0, line.run) for x in (side.repeat(2), regions[:, :2].mT.flatten(), lengths.mT.flatten())
+    )
+    nearest, exists = _nearest(line.place, sides, ends)
+    nearest = nearest + edges
+    cell = _Runs.of(count, total)
+    in_row = columns.index_select(0, cell.run)
+    row = torch.div(cell.place, in_row, rounding_mode="floor")
+    of_column = line.first.index_select(0, cell.run) + cell.place - row * in_row
+    of_row = line.first.index_select(0, cell.run + len(regions)) + row
+    u, v = nearest.index_select(0, of_column), nearest.index_select(0, of_row)
+    return CellPixels(cell.run, u, v, exists.index_select(0, of_column) & exists.index_select(0, of_row))
+
+
+class _Runs(NamedTuple):
+    """Entries of several runs one after the other."""
+
+    run: Tensor  # (N,) of each entry
+    place: Tensor  # (N,) within its run
+    first: Tensor  # (R,) number of the first entry of each run
+
+    @classmethod
+    def of(cls, lengths: Tensor, total: int) -> _Runs:
+        """Of so many entries (R,) each, in all `total`."""
+        number = torch.arange(len(lengths), device=lengths.device)
+        run = number.repeat_interleave(lengths, output_size=total)
+        first = lengths.cumsum(0) - lengths
+        return cls(run, torch.arange(total, device=lengths.device) - first.index_select(0, run), first)
+
+
+def _nearest(
+    cell: Tensor,  # (N,) number on its axis
+    side: Tensor,  # (N,) float64, pixels, at least one
+    length: Tensor,  # (N,) of the region, pixels
+) -> tuple[Tensor, Tensor]:
+    """The pixel (N,) of each cell whose middle is nearest to the cell's, from the region's border; whether any is."""
+    begin, end = _first_pixel(cell, side), torch.minimum(_first_pixel(cell + 1, side), length)
+    # The middle of a pixel lies half a pixel into it.
+    middle = (cell + 0.5) * side - 0.5
+    nearest = (middle - 0.5 - _ROUNDING_PX).ceil()
+    return torch.minimum(torch.maximum(nearest, begin), end - 1).long(), end > begin
+
+
+def _first_pixel(
+    cell: Tensor,  # (N,)
+    side: Tensor,  # (N,)
+) -> Tensor:
+    """The first pixel (N,) whose number over the side is at least that of the cell, as it is rounded."""
+    near = (cell * side).ceil()
+    too_early, too_late = torch.floor(near / side) < cell, torch.floor((near - 1) / side) >= cell
+    return near + too_early.to(side.dtype) - too_late.to(side.dtype)
