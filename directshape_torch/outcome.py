@@ -9,6 +9,7 @@ from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.diagnosis.box_alignment import ROUNDS_PX, BoxAlignment
+from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.diagnosis.disparity_profile import DisparityProfile, disparity_profile
 from directshape_torch.diagnosis.evidence import Course
 from directshape_torch.diagnosis.observability import (
@@ -21,7 +22,6 @@ from directshape_torch.diagnosis.observability import (
 from directshape_torch.diagnosis.quality import FitQuality, fit_quality
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.tensors import kept, placed
 from directshape_torch.problem import CarProblem, CarStage
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch

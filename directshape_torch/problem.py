@@ -188,7 +188,7 @@ class CarProblem:
         after_wider = any(other.contour_width_px > stage.contour_width_px for other in earlier)
         return CarStage(self, stage, tuple(term.begin(stage, sight) for term in self.terms), after_wider)
 
-    def of_cars(self, keep: Tensor) -> CarProblem:
+    def of_problems(self, keep: Tensor) -> CarProblem:
         """The problem of the cars where `keep` (B,) holds."""
         numbers = keep.nonzero()[:, 0].tolist()
         masks = self.masks.of_cars(keep, numbers)

@@ -31,7 +31,7 @@ from directshape_torch.solver.backward import attached_state
 from directshape_torch.solver.gauss_newton import minimise
 from directshape_torch.solver.search import search_start
 from directshape_torch.stereo_matching.disparity import with_disparity
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.cars import CarBatch, CarState, following
 
 
 class KnownRig(Protocol):
@@ -214,11 +214,13 @@ class DirectShapeRefiner(nn.Module):
             return outcome_of_boxes(problem, align_boxes(problem, initial, cars))
         record = torch.is_grad_enabled() and self.config.backward.mode == "unroll"
         with torch.no_grad():
-            start = search_start(problem, initial, cars, self.config.search)
+            start = search_start(problem, initial, cars.search_moves(self.config.search))
             minimum = minimise(problem, initial, self.config.solver, start, record)
             outcome = judged(minimum, initial, outcome_of(problem, initial, minimum, cars), self.config.acceptance)
             minimum = replace(minimum, state=outcome.state, status=outcome.status)
-        state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)
+        if record:
+            start = following(initial, start)
+        state = attached_state(problem, start, minimum, self.config.backward, cars.detection_row)
         return replace(outcome, state=state)
 
 

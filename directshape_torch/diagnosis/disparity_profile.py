@@ -15,8 +15,9 @@ from torch import Tensor
 
 from directshape_torch.compile import compilable
 from directshape_torch.config import PhotometricConfig
+from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.tensors import kept, made_once, placed
+from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
 from directshape_torch.terms.photometric import Photometric, Surface, photometric_norm
 from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_at

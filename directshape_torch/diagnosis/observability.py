@@ -9,9 +9,9 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
-from directshape_torch.numerics.tensors import kept, placed
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
-from directshape_torch.numerics.tensors import kept, placed
 from directshape_torch.problem import CarStage
 from directshape_torch.rows import CarSums
 from directshape_torch.terms.photometric import Photometric

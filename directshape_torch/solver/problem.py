@@ -111,6 +111,10 @@ class DifferentiableProblem(Problem[StateT], Protocol):
 
     def begin(self, stage: StageConfig, seen: Any) -> DifferentiableStage[StateT]: ...
 
+    def of_problems(self, keep: Tensor) -> DifferentiableProblem[StateT]:
+        """The same without the problems where `keep` (B,) is false."""
+        ...
+
 
 def take_rows(state: StateT, index: Tensor) -> StateT:
     """Rows of every tensor of a state."""

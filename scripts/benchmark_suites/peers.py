@@ -102,7 +102,7 @@ def stage_tasks(loaded: LoadedFrame) -> list[StageTask]:
     problem, state = refiner.problem(loaded.frame, loaded.detections)
     # Cars that are refused at the door are left out.
     keep = refiner(loaded.frame, loaded.detections).iterations > 0
-    problem, state = problem.of_cars(keep), CarState(*(x[keep] for x in state))
+    problem, state = problem.of_problems(keep), CarState(*(x[keep] for x in state))
     tasks = []
     for stage in problem.stages():
         alone = replace(problem, config=replace(problem.config, stages=(stage,)))
@@ -186,7 +186,7 @@ def single_car_energies(task: StageTask) -> list[CarEnergy]:
     """The energy of each car by itself."""
     number = torch.arange(len(task.start.code), device=task.start.code.device)
     starts = [CarState(*(x[car : car + 1] for x in task.start)) for car in number.tolist()]
-    return [CarEnergy.of(task.problem.of_cars(number == n), task.stage, start) for n, start in enumerate(starts)]
+    return [CarEnergy.of(task.problem.of_problems(number == n), task.stage, start) for n, start in enumerate(starts)]
 
 
 class TangentModel(nn.Module):

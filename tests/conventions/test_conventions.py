@@ -233,8 +233,8 @@ def test_15_update_is_on_the_left_and_in_one_place() -> None:
         for path in (ROOT / "directshape_torch").rglob("*.py")
         if re.search(r"se3\.exp\([^)]*\) @ \w+\.T_obj_cam", path.read_text(encoding="utf-8"))
     ]
-    # `search` makes start states by turning the input; all iterations go through `retract`.
-    assert set(callers) <= {"cars.py", "search.py"}
+    # `turn` makes start states of a search there; all iterations go through `retract`.
+    assert set(callers) <= {"cars.py"}
 
 
 def test_16_the_code_is_whitened() -> None:
