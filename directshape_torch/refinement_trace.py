@@ -18,9 +18,8 @@ from directshape_torch.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.solver.gauss_newton import Minimum, minimise
+from directshape_torch.solver.gauss_newton import Minimum, minimise, search_start
 from directshape_torch.solver.problem import put_rows, where_rows
-from directshape_torch.solver.search import search_start
 from directshape_torch.terms.cars import CarBatch, CarState
 
 

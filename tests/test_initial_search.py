@@ -11,7 +11,7 @@ from directshape_torch.config import SearchConfig
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.solver.search import search_start
+from directshape_torch.solver.gauss_newton import search_start
 from directshape_torch.terms.cars import CarBatch, CarState, move_by_disparity, turn
 
 

@@ -11,8 +11,8 @@ from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.outcome import outcome_of
 from directshape_torch.diagnosis.quality import _probabilities, mask_ious, photometric_agreement
-from directshape_torch.outcome import outcome_of
 from directshape_torch.problem import CarStage
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.status import Status
