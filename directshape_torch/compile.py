@@ -193,26 +193,40 @@ def _mark(tensor: Tensor, axis: int) -> None:
 def with_varying(value: _T, axes_of: Callable[[Tensor], Iterable[int]]) -> _T:
     """The same tensor, named tuple or dataclass with the sizes marked that vary from call to call.
 
-    Tensors come out contiguous, without gradient and as objects of their own, for a mark must not stay on the caller's.
-
     Args:
         value: anything; what holds no tensors is returned as it is.
         axes_of: the axes of a tensor whose sizes may vary.
     """
-    if isinstance(value, Tensor):
-        marked = (value.clone() if value.is_inference() else value.detach()).contiguous()
-        for axis in axes_of(marked):
-            _mark(marked, axis)
-        return marked  # type: ignore[return-value]
-    if isinstance(value, tuple):
-        parts = [with_varying(part, axes_of) for part in value]
-        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
-    if is_dataclass(value) and not isinstance(value, type):
-        copy = object.__new__(type(value))
-        for part in fields(value):
-            object.__setattr__(copy, part.name, with_varying(getattr(value, part.name), axes_of))
+
+    def of_record(record: Any) -> Any:
+        if not is_dataclass(record) or isinstance(record, type):
+            return record
+        copy = object.__new__(type(record))
+        for part in fields(record):
+            object.__setattr__(copy, part.name, with_varying(getattr(record, part.name), axes_of))
         return copy
-    return value
+
+    return _walked(value, "", lambda tensor, _: _with_marks(tensor, axes_of(tensor)), of_record)  # type: ignore[no-any-return]
+
+
+def _walked(value: Any, name: str, of_tensor: Callable[[Tensor, str], Any], of_other: Callable[[Any], Any]) -> Any:
+    """The same tuple or named tuple, nested or not, with what becomes of each tensor, by its name, and of the rest."""
+    if isinstance(value, Tensor):
+        return of_tensor(value, name)
+    if not isinstance(value, tuple):
+        return of_other(value)
+    own_names = getattr(value, "_fields", None)
+    names = [name] * len(value) if own_names is None else own_names
+    parts = [_walked(part, called, of_tensor, of_other) for called, part in zip(names, value, strict=True)]
+    return type(value)(parts) if own_names is None else type(value)(*parts)
+
+
+def _with_marks(tensor: Tensor, axes: Iterable[int]) -> Tensor:
+    """A contiguous tensor without gradient, and an object of its own: a mark must not stay on the caller's."""
+    tensor = (tensor.clone() if tensor.is_inference() else tensor.detach()).contiguous()
+    for axis in axes:
+        _mark(tensor, axis)
+    return tensor
 
 
 def compilable(sizes: Mapping[str, int]) -> Callable[[Callable[_P, _R]], Compilable[_P, _R]]:
@@ -301,22 +315,20 @@ class _StaysPlainError(Exception):
 
 def _prepared(value: Any, name: str, sizes: Mapping[str, int]) -> Any:
     """An argument as compiled code takes it: contiguous, without gradient, with its varying size marked."""
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*(_prepared(part, field, sizes) for field, part in zip(value._fields, value, strict=True)))
-    if type(value) is tuple:
-        return tuple(_prepared(part, name, sizes) for part in value)
-    if not isinstance(value, Tensor):
-        if value is None or isinstance(value, (int, float, str)) or is_dataclass(value):
-            return value
+
+    def of_tensor(tensor: Tensor, called: str) -> Tensor:
+        varies = called in sizes
+        if not _is_fit(tensor) or (varies and tensor.shape[sizes[called]] < 2):
+            raise _StaysPlainError
+        return _with_marks(tensor, [sizes[called]] if varies else [])
+
+    def of_other(other: Any) -> Any:
+        if other is None or isinstance(other, (int, float, str)) or is_dataclass(other):
+            return other
         # What the compiler cannot look into is another one at each call.
         raise _StaysPlainError
-    if not _is_fit(value) or (name in sizes and value.shape[sizes[name]] < 2):
-        raise _StaysPlainError
-    # A tensor object of its own, for the mark must not stay on the caller's.
-    value = (value.clone() if value.is_inference() else value.detach()).contiguous()
-    if name in sizes:
-        _mark(value, sizes[name])
-    return value
+
+    return _walked(value, name, of_tensor, of_other)
 
 
 def _compiled(function: Callable[_P, _R], on_compilation: Callable[[int], None]) -> Callable[_P, _R]:

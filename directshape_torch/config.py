@@ -109,33 +109,21 @@ class SolverConfig(Settings):
     """Damping, acceptance and convergence of the Gauss-Newton loop."""
 
     initial_damping: float = setting(1e-2, "Marquardt's mu at the start of a stage; 0 is pure Gauss-Newton", at_least=0)
-    damping_decrease: float = setting(0.3, "factor of mu after an accepted step", above=0, at_most=1)
-    damping_increase: float = setting(8.0, "factor of mu after a refused step", at_least=1)
-    min_damping: float = setting(1e-7, "lower bound of mu", at_least=0)
-    max_damping: float = setting(
-        1e5, "upper bound of mu; a car refused there has converged", above=0, at_least="min_damping"
-    )
     accept_every_step: bool = setting(False, "accept uphill steps too and return the best state seen (the paper's way)")
     cost_tolerance: float = setting(1e-3, "relative decrease of the cost below which a car has converged", at_least=0)
     step_tolerance: float = setting(
         1e-3, "largest step, as a share of the trust region, below which a car has converged", at_least=0
     )
     block_iterations: int = setting(4, "iterations between two looks at which cars go on", at_least=1)
-    max_step_translation_m: float = setting(
-        0.5, "trust region: largest translation of a step; a larger step is scaled as a whole", above=0
-    )
-    max_step_rotation_rad: float = setting(0.15, "trust region: largest rotation of a step", above=0)
-    max_step_code: float = setting(1.0, "trust region: largest step of the shape code, in standard deviations", above=0)
     max_code: float = setting(3.0, "bound of |code|, in standard deviations", above=0)
     jacobian: Literal["analytic", "autograd"] = setting(
         "analytic",
-        '"analytic" (hand-derived) or "autograd" (forward mode, several times slower; but for the priors beside '
-        "followed rays, which stay hand-derived): the same steps",
+        '"analytic" (hand-derived) or "autograd" (forward mode, several times slower): the same steps',
     )
     rays: Literal["tracked", "marched"] = setting(
         "tracked",
-        '"tracked" (each ray follows its closest point and its surface from iteration to iteration) or "marched" (each '
-        "ray is sampled anew at each state: the slow reference)",
+        '"tracked" (each ray goes on from its closest point and its surface of the iteration before) or "marched" '
+        "(each ray is sampled anew at each state: the slow reference)",
     )
 
 
@@ -182,14 +170,6 @@ class SilhouetteConfig(Settings):
     probability_floor: float = setting(
         0.01, "foreground probabilities are clamped to [floor, 1 - floor]", at_least=1e-6, at_most=0.49
     )
-    residual_floor: float = setting(0.01, "smallest residual in the reweighting 1/r", above=0)
-    min_zeta_per_m: float = setting(4.0, "lower bound of zeta", above=0)
-    max_zeta_per_m: float = setting(400.0, "upper bound of zeta", at_least="min_zeta_per_m")
-    saturation: float = setting(
-        16.0,
-        "|zeta * sdf| from which the projection is certain and has no gradient (closest approach only)",
-        above=0,
-    )
 
 
 @dataclass(frozen=True)
@@ -198,7 +178,6 @@ class PhotometricConfig(Settings):
 
     weight: float = setting(1.0, "factor of the term (the paper: 1)", at_least=0)
     huber_grey_levels: float = setting(9.0, "corner of the Huber norm (gamma)", above=0)
-    gradient_constant_grey_levels: float = setting(50.0, "c of the gradient weight c^2 / (c^2 + |grad I_l|^2)", above=0)
     lost_grey_levels: float = setting(
         15.0, "a pixel of the set that loses its hit or leaves the right image pays the Huber norm of this", above=0
     )
@@ -207,9 +186,6 @@ class PhotometricConfig(Settings):
     )
     pixel_set: Literal["hit", "hit_and_mask"] = setting(
         "hit_and_mask", '"hit" (the paper) or "hit_and_mask" (hit and p_fg > 0.5)'
-    )
-    min_ray_cosine: float = setting(
-        0.1, "rays closer to the surface's tangent are grazing and lost", at_least=0, at_most=0.999
     )
     brightness: Literal["none", "gain", "affine"] = setting(
         "gain",
@@ -220,9 +196,6 @@ class PhotometricConfig(Settings):
         "plain",
         'residuals of a neighbourhood of eight pixels as they are ("plain", the paper), without its brightness '
         '("zero_mean") or without its brightness and contrast ("normalised"), wherever in the image they change',
-    )
-    contrast_floor_grey_levels: float = setting(
-        5.0, 'standard deviation that a neighbourhood has at least for "normalised"', at_least=1e-3
     )
 
 
@@ -341,12 +314,6 @@ class SamplingConfig(Settings):
     density: float = setting(0.05, "wanted pixels per pixel of the region", above=0, at_most=1)
     min_pixels: int = setting(400, "fewest wanted pixels; a region of fewer gives all it has", at_least=1)
     max_pixels: int = setting(1000, "most wanted pixels", at_least="min_pixels")
-    region_margin_px: float = setting(
-        4.0, "the region is grown by this or by region_margin_share, whichever is more", at_least=0
-    )
-    region_margin_share: float = setting(
-        0.1, "margin of the region as a share of its size; see region_margin_px", at_least=0
-    )
     occlusion_order: Literal["depth", "box_bottom"] = setting(
         "depth", 'which instance is nearer: by "depth" (default) or "box_bottom" (the paper)'
     )
@@ -389,7 +356,7 @@ class RefinerConfig(Settings):
 
     method: Literal["direct", "geometric", "combined", "box_alignment"] = setting(
         "direct",
-        'terms of the energy: "direct" (images), "geometric" (the rival\'s: point cloud) or "combined" (both); or '
+        'terms of the energy: "direct" (images), "geometric" (a baseline: point cloud) or "combined" (both); or '
         "\"box_alignment\" (Stereo R-CNN's: the detector's boxes moved in depth, by photometry)",
     )
     compile: Literal["auto", "on", "off"] = setting(

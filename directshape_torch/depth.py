@@ -16,11 +16,10 @@ from torch import Tensor
 from directshape_torch.compile import compilable
 from directshape_torch.numerics.gradient_mode import as_constant
 from directshape_torch.rows import ObjectRays, Rays
-from directshape_torch.shape.bracket import Bracket
 from directshape_torch.shape.field import Field
 
-# Cells looked into for the least distance, from where a parabola through samples has it. Of the rays near a contour one
-# in a thousand is then more than 1 mm from its minimum; of tracked ones 5 % while a car still moves by decimetres.
+# Cells looked into for the least distance, from where a parabola through samples has it. Of marched rays 0.2 % need
+# more; of tracked ones a fifth in the first iterations, while a car moves by decimetres, and next to none at last.
 _CELLS_OF_MARCH = 3
 _CELLS_WHEN_TRACKED = 2
 # Between the three samples about a point that is tracked.
@@ -61,6 +60,7 @@ class Closest(NamedTuple):
     points_obj: Tensor  # (3, M, R) metres
     depth: Tensor  # (M, R) metres
     crosses: Tensor  # (M, R) bool: the ray crosses the prior's bounds; if not the rest means nothing
+    found: Tensor  # (M, R) bool: this is the minimum; if not a search goes on from here when the ray is tracked next
     face_obj: Tensor  # (3, M, R) see `RayMinimum`
 
 
@@ -175,7 +175,7 @@ def _closest_from(
     comes, goes = ((x == end).to(start.dtype) for x, end in ((inside.enters, inside.near), (inside.leaves, inside.far)))
     face = torch.where(found.depth <= inside.near + _AT_END_M, comes, found.face_obj)
     face = torch.where(found.depth >= inside.far - _AT_END_M, goes, face)
-    return Closest(rays.at(found.depth), found.depth, inside.hit, face)
+    return Closest(rays.at(found.depth), found.depth, inside.hit, found.found, face)
 
 
 def along_face(gradient: Tensor, direction_obj: Tensor, face_obj: Tensor) -> Tensor:
@@ -301,3 +301,42 @@ def surface_depth(field: Field, owner: Tensor, rays: ObjectRays, depth: Tensor, 
         step = at.value / torch.where(regular, slope, torch.ones_like(slope))
         depth = depth - torch.where(regular, step, torch.zeros_like(step))
     return depth
+
+
+class Bracket(NamedTuple):
+    """Depths of rays (...) between which each enters a shape, one end outside and one inside."""
+
+    depth: Tensor  # (...) to probe next
+    latest: Tensor  # (...) the end that was probed last
+    latest_sdf: Tensor  # (...) signed distance there
+    latest_inside: Tensor  # (...) bool
+    other: Tensor  # (...) the other end
+    other_sdf: Tensor  # (...) signed distance there, less where it has stayed
+    best: Tensor  # (...) the depth of the least absolute distance so far
+    best_distance: Tensor  # (...)
+
+    @classmethod
+    def between(cls, before: Tensor, before_sdf: Tensor, behind: Tensor, behind_sdf: Tensor) -> Bracket:
+        """A new one, of depths outside and inside."""
+        inside = torch.ones_like(behind_sdf, dtype=torch.bool)
+        depth = _line_zero(before, before_sdf, behind, behind_sdf)
+        return cls(depth, behind, behind_sdf, inside, before, before_sdf, behind, behind_sdf.abs())
+
+    def probed(self, sdf: Tensor) -> Bracket:
+        """With one end moved to `depth`, of signed distance (...): false position by nearly Illinois' rule."""
+        inside = sdf < 0
+        crossed = inside ^ self.latest_inside
+        other = torch.where(crossed, self.latest, self.other)
+        # Halving the value of an end that stays makes the convergence superlinear. Illinois' rule begins with the
+        # second probe; from the first one on it takes fewer operations, and eight probes come as near.
+        other_sdf = torch.where(crossed, self.latest_sdf, 0.5 * self.other_sdf)
+        distance = sdf.abs()
+        best = torch.where(distance < self.best_distance, self.depth, self.best)
+        best_distance = torch.fmin(distance, self.best_distance)
+        depth = _line_zero(other, other_sdf, self.depth, sdf)
+        return Bracket(depth, self.depth, sdf, inside, other, other_sdf, best, best_distance)
+
+
+def _line_zero(depth: Tensor, sdf: Tensor, other: Tensor, other_sdf: Tensor) -> Tensor:
+    # One of them is not negative and the other is, so the share is in [0, 1].
+    return torch.lerp(depth, other, sdf / (sdf - other_sdf))

@@ -14,27 +14,27 @@ from typing import TypeAlias
 import torch
 from torch import Tensor
 
-from directshape_torch.config import RefinerConfig, SolverConfig, StageConfig
+from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.depth import marched_views
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
-from directshape_torch.image.gradients import grey_levels
-from directshape_torch.image.pyramid import GreyPair
+from directshape_torch.image.grey_levels import GreyPair, grey_levels
 from directshape_torch.numerics.checks import check_shape, check_stored
-from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.gradient_mode import map_tensors
+from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.packing import Observation
 from directshape_torch.rows import CarSums, Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.stereo_matching.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.check_term import check_term
 from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import prior_terms
-from directshape_torch.terms.silhouette import MaskRows, Silhouettes
-from directshape_torch.terms.silhouette_product import SilhouetteProducts
+from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import (
     Evaluation,
     Figures,
@@ -43,21 +43,20 @@ from directshape_torch.terms.term import (
     Term,
     Where,
     by_autograd,
-    choose_blocks,
     linear_of,
     part_of,
     part_of_rows,
     parts_of,
     summed,
-    take_blocks,
     with_varying_blocks,
 )
 
 # Those of "point_cloud" hold for the methods with points, the first two for the others.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
 
-# A rig that is off by more between two iterations than this is another rig.
-_MAX_STEP_OFFSET_PX = 1.0
+# Trust region: the largest step of each unknown; a larger one is scaled as a whole. A rig that is off by a pixel more
+# between two iterations is another rig.
+_MAX_STEP_M, _MAX_STEP_RAD, _MAX_STEP_CODE, _MAX_STEP_OFFSET_PX = 0.5, 0.15, 1.0, 1.0
 
 TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
 """Makes a user's term for some cars of a call: of these frames, all detections, the cars to refine, the shapes."""
@@ -76,6 +75,7 @@ class CarProblem:
         factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
         num_extra: how many of the terms, the last ones, are a user's own.
         num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
+        marches: every ray is marched at every state of the iterations, not tracked.
     """
 
     prior: ShapePrior
@@ -86,6 +86,7 @@ class CarProblem:
     factors: Tensor | None = None
     num_extra: int = 0
     num_offsets: int = 0
+    marches: bool = False
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -139,15 +140,18 @@ class CarProblem:
             terms.append(form(config.silhouette, cars, masks, prior.bounds_obj, torch.ones_like(masks.filled[:, :1])))
         if config.method != "geometric" and config.photometric.weight > 0:
             pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
-            of_images = pyramid, observation.hidden_right, detections.mask_left
-            terms.append(Photometric.of_pixels(config.photometric, cars, pixels[0], sides[0], *of_images))
+            left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
+            terms.append(Photometric(config.photometric, cars, left))
         terms += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
         names = [name for term in terms for name in term.names]
         extra = [make(frames, detections, cars, prior) for make in extra_terms]
         terms += extra
         if not terms:
             raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
-        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets)
+        # What is differentiated afterwards is the marched energy, so its minimum must be found.
+        is_differentiated = config.backward.mode != "none" and torch.is_grad_enabled()
+        marches = config.solver.rays == "marched" or is_differentiated
+        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets, marches)
         if extra:
             code = prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
             sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
@@ -184,7 +188,7 @@ class CarProblem:
         after_wider = any(other.contour_width_px > stage.contour_width_px for other in earlier)
         return CarStage(self, stage, tuple(term.begin(stage, sight) for term in self.terms), after_wider)
 
-    def of_cars(self, keep: Tensor) -> CarProblem:
+    def of_problems(self, keep: Tensor) -> CarProblem:
         """The problem of the cars where `keep` (B,) holds."""
         numbers = keep.nonzero()[:, 0].tolist()
         masks = self.masks.of_cars(keep, numbers)
@@ -257,8 +261,7 @@ class CarStage:
     def start(self, sight: Sight) -> tuple[CarIterations, Evaluation]:
         """What the iterations work on, and the energy where they begin."""
         problem = self.problem
-        # What is differentiated afterwards is the marched energy, so its minimum must be found.
-        if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
+        if problem.marches:
             terms, rest = self.terms, None
             wheres = tuple(term.where(sight) for term in terms)
         else:
@@ -306,8 +309,11 @@ class CarStage:
         return retract(state, step, self.problem.config.solver.max_code)
 
     def step_limits(self) -> Tensor:
-        """Largest trusted step of each unknown, (D,)."""
-        return step_limits(self.problem.config.solver, self.problem.prior, self.problem.num_offsets)
+        """Largest trusted step of each unknown, (D,) float64; not to be written to."""
+        prior, num_offsets = self.problem.prior, self.problem.num_offsets
+        limits = [_MAX_STEP_M] * 3 + [_MAX_STEP_RAD] * 3 + [_MAX_STEP_CODE] * prior.num_codes
+        limits += [_MAX_STEP_OFFSET_PX] * num_offsets
+        return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))
 
 
 @dataclass(frozen=True)
@@ -392,16 +398,16 @@ class CarIterations:
         """The new evaluation of cars whose step was accepted (B,), the old one of the others."""
         conditions = accepted, accepted[:, None], accepted[:, None, None]
         cost, gradient, hessian = (torch.where(*x) for x in zip(conditions, new[:3], old[:3], strict=True))
-        pairs = zip(self.terms, new.wheres, old.wheres, strict=True)
-        return Evaluation(
-            cost, gradient, hessian, tuple(choose_blocks(accepted[term.blocks.owner], *pair) for term, *pair in pairs)
-        )
+        wheres = []
+        for term, *where in zip(self.terms, new.wheres, old.wheres, strict=True):
+            in_blocks = accepted[term.blocks.owner][:, None]
+            wheres.append(map_tensors(lambda x, y, chosen=in_blocks: torch.where(chosen, x, y), *where))
+        return Evaluation(cost, gradient, hessian, tuple(wheres))
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
         """The state moved by tangent vectors (B, D) within the trust region."""
-        config = self.stage.problem.config.solver
         # No component of the rotation is larger than its limit.
-        return retract(state, step, config.max_code, math.sqrt(3) * config.max_step_rotation_rad)
+        return retract(state, step, self.stage.problem.config.solver.max_code, math.sqrt(3) * _MAX_STEP_RAD)
 
     def step_limits(self) -> Tensor:
         """Largest trusted step of each unknown, (D,)."""
@@ -410,8 +416,11 @@ class CarIterations:
     def of_problems(self, keep: Tensor, numbers: Sequence[int], at: Evaluation) -> tuple[CarIterations, Evaluation]:
         """Those of the cars where `keep` (B,) holds, `numbers` of them, with their evaluation."""
         index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        kept = (term.blocks.of_cars(keep, numbers)[1] for term in self.terms)
-        wheres = tuple(take_blocks(where, blocks) for where, blocks in zip(at.wheres, kept, strict=True))
+        kept = [term.blocks.of_cars(keep, numbers)[1] for term in self.terms]
+        wheres = tuple(
+            map_tensors(lambda x, blocks=blocks: x.index_select(-2, blocks), where)
+            for where, blocks in zip(at.wheres, kept, strict=True)
+        )
         rest, factors = (None if x is None else x.index_select(0, index) for x in (self.rest, self.factors))
         masks = self.masks if self.rest is not None else self.masks.of_cars(keep, numbers)
         terms = tuple(term.of_cars(keep, numbers) for term in self.terms)
@@ -462,10 +471,3 @@ def method_stages(config: RefinerConfig) -> list[StageConfig]:
         for unknowns in ("pose", "shape", "both")
     )
     return [pose_stage, shape_stage] * cloud.rounds if cloud.order == "alternating" else [joint_stage]
-
-
-def step_limits(config: SolverConfig, prior: ShapePrior, num_offsets: int) -> Tensor:
-    """Largest trusted step (D,) of each unknown, float64; not to be written to."""
-    limits = [config.max_step_translation_m] * 3 + [config.max_step_rotation_rad] * 3
-    limits += [config.max_step_code] * prior.num_codes + [_MAX_STEP_OFFSET_PX] * num_offsets
-    return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))

@@ -18,9 +18,8 @@ from directshape_torch.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.solver.gauss_newton import Minimum, minimise
+from directshape_torch.solver.gauss_newton import Minimum, minimise, search_start
 from directshape_torch.solver.problem import put_rows, where_rows
-from directshape_torch.solver.search import search_start
 from directshape_torch.terms.cars import CarBatch, CarState
 
 
@@ -96,11 +95,10 @@ def trace_refinement(refiner: DirectShapeRefiner, frames: FrameBatch, detections
     took_part = result.cost_before.isfinite().all(dim=1)
     rows = took_part.nonzero()[:, 0]
     everyone, inputs = refiner.problem(frames, detections)
-    problem, initial = everyone.of_cars(took_part), CarState(*(x[rows] for x in inputs))
+    problem, initial = everyone.of_problems(took_part), CarState(*(x[rows] for x in inputs))
     with full_precision(frames.images_left.device.type), compiling(refiner.config.compile, len(detections)):
-        start = search_start(
-            problem, initial, CarBatch.from_scene(frames, detections).of_cars(took_part), refiner.config.search
-        )
+        cars = CarBatch.from_scene(frames, detections).of_cars(took_part)
+        start = search_start(problem, initial, cars.search_moves(refiner.config.search))
         minimum = minimise(problem, initial, refiner.config.solver, start, record=True)
         states = [initial, *([] if start is initial else [start]), *_ends(minimum)]
         costs = torch.stack([minimum.stage.figures(problem.look(state)).term_costs for state in states])

@@ -13,13 +13,15 @@ from torch import Tensor, nn
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.diagnosis.box_alignment import align_boxes
+from directshape_torch.diagnosis.car_rows import kept, placed
+from directshape_torch.diagnosis.outcome import Outcome, judged, outcome_of, outcome_of_boxes
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.observation.car_points import PointSamples, car_points
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
-from directshape_torch.outcome import Outcome, assemble, judged, outcome_of, outcome_of_boxes
 from directshape_torch.problem import CarProblem, TermFactory
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -27,11 +29,10 @@ from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.backward import attached_state
-from directshape_torch.solver.gauss_newton import minimise
-from directshape_torch.solver.search import search_start
-from directshape_torch.stereo_matching.car_points import PointSamples, car_points
-from directshape_torch.stereo_matching.dense_disparity import with_disparity
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.solver.gauss_newton import minimise, search_start
+from directshape_torch.status import Status, is_refined
+from directshape_torch.stereo_matching.disparity import with_disparity
+from directshape_torch.terms.cars import CarBatch, CarState, following
 
 
 class KnownRig(Protocol):
@@ -149,7 +150,7 @@ class DirectShapeRefiner(nn.Module):
             outcome = self._minimise(problem, initial, cars)
             state = CarState(*(full.index_copy(0, rows, part) for full, part in zip(state, outcome.state, strict=True)))
             status = status.index_copy(0, rows, outcome.status)
-        return assemble(self.prior, frames, detections, state, status, rows, outcome)
+        return _assembled(self.prior, frames, detections, state, status, rows, outcome)
 
     def problem(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
@@ -214,11 +215,13 @@ class DirectShapeRefiner(nn.Module):
             return outcome_of_boxes(problem, align_boxes(problem, initial, cars))
         record = torch.is_grad_enabled() and self.config.backward.mode == "unroll"
         with torch.no_grad():
-            start = search_start(problem, initial, cars, self.config.search)
+            start = search_start(problem, initial, cars.search_moves(self.config.search))
             minimum = minimise(problem, initial, self.config.solver, start, record)
             outcome = judged(minimum, initial, outcome_of(problem, initial, minimum, cars), self.config.acceptance)
             minimum = replace(minimum, state=outcome.state, status=outcome.status)
-        state = attached_state(problem, initial, start, minimum, self.config, cars.detection_row)
+        if record:
+            start = following(initial, start)
+        state = attached_state(problem, start, minimum, self.config.backward, cars.detection_row)
         return replace(outcome, state=state)
 
 
@@ -237,3 +240,55 @@ class _Seen(NamedTuple):
 
     def of_objects(self, keep: Tensor) -> _Seen:
         return _Seen(self.pixels.of_objects(keep), None if self.points is None else self.points.of_objects(keep))
+
+
+def _assembled(
+    prior: ShapePrior,
+    frames: FrameBatch,
+    detections: Detections,
+    state: CarState,
+    status: Tensor,
+    rows: Tensor,
+    outcome: Outcome,
+) -> RefinementResult:
+    """The result of a call whose cars `rows` were minimised; the others keep what they came with."""
+    count = len(detections)
+
+    def spread(part: Tensor) -> Tensor:
+        return placed(part.to(torch.float64), rows, count)
+
+    iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
+    refined = is_refined(status)
+    returned_input = (status == Status.not_trusted.code) | (status == Status.no_evidence.code)
+    figures_known = refined | returned_input
+    # The input pose is returned to the bit for cars that were not refined, not inverted twice.
+    T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), detections.T_cam_obj)
+    return RefinementResult(
+        T_cam_obj=T_cam_obj,
+        code=state.code,
+        status_code=status,
+        iterations=iterations,
+        term_names=outcome.term_names,
+        cost_before=spread(outcome.cost_before),
+        cost_after=spread(outcome.cost_after),
+        covariance=kept(spread(outcome.covariance), refined),
+        covariance_xyz_yaw=kept(spread(outcome.covariance_xyz_yaw), refined),
+        cost_history=spread(outcome.cost_history),
+        quality=outcome.quality.spread(rows, count).where(figures_known),
+        observability=outcome.observability.spread(rows, count).where(refined),
+        profile=outcome.profile.spread(rows, count).where(figures_known),
+        # The caller may reuse the tensor for the next call.
+        input_dimensions_hwl=detections.dimensions_hwl.clone(),
+        ground_source=_ground_sources(frames, detections),
+        t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
+        prior=prior,
+        has_shape=outcome.has_shape,
+    )
+
+
+def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ...]:
+    """Where the plane of each car's frame came from; which frame that is the host asks only where it matters."""
+    sources = frames.ground.source
+    if len(set(sources)) == 1:
+        return sources[:1] * len(detections)
+    return tuple(sources[frame] for frame in detections.frame_index.tolist())

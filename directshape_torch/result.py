@@ -15,8 +15,8 @@ from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.shape.zero_level import zero_level_extents
 from directshape_torch.status import Status, is_refined
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.numerics.table_lookup import occurrences
+from directshape_torch.numerics.tensors import occurrences
 
 BLOCK = 64
 """Rows of a block."""

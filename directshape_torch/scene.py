@@ -19,8 +19,14 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.se3 import from_rotation_translation
-from directshape_torch.numerics.checks import check_rotation, check_shape, check_sigmas, is_no_rotation
-from directshape_torch.numerics.tensor_record import Dense, TensorRecord
+from directshape_torch.numerics.checks import (
+    Dense,
+    TensorRecord,
+    check_rotation,
+    check_shape,
+    check_sigmas,
+    is_no_rotation,
+)
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5

@@ -19,6 +19,7 @@ What the columns mean: docs/gradients.md.
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,12 +28,27 @@ import torch
 from command_line import run_command
 
 from directshape_torch.errors import InputError
-from directshape_torch.laboratory.own_term import load_factory
 from directshape_torch.laboratory.regimes import regimes_named
 from directshape_torch.laboratory.report import console_table, summary, write_report
 from directshape_torch.laboratory.scenes import load_scene
 from directshape_torch.laboratory.study import SUBJECT_NAMES, StudyPlan, run_study, subjects_named
+from directshape_torch.problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
+
+
+def load_factory(name: str) -> TermFactory:
+    """The factory `(frames, detections, cars, prior) -> Term` of a term of one's own, by "module:factory".
+
+    Raises:
+        InputError: there is no such module or factory.
+    """
+    module, _, attribute = name.partition(":")
+    try:
+        factory: TermFactory = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        cure = "give the name of a module that can be imported and of a function in it, as in my_terms:upright"
+        raise InputError("--term", "module:factory", f"{name!r}: {error}", cure) from error
+    return factory
 
 
 def run(args: argparse.Namespace) -> int:

@@ -37,6 +37,7 @@ from tqdm import tqdm
 from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry.box3d import box_corners
+from directshape_torch.geometry.camera import points_from_disparity
 from directshape_torch.geometry.ground_plane import height_above
 from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -46,7 +47,6 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes
 from directshape_torch.rig.rig_file import load_fields
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.points import points_from_disparity
 
 CLASSES = ("Car", "Van")
 SMALLEST_HEIGHT_PX = 25.0

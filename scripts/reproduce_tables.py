@@ -1,7 +1,7 @@
 """The paper's experiments, one command each: pose, shape, ablation, detectors.
 
     export DIRECTSHAPE_DATA=...                      # or --data ROOT, a full KITTI with detections and masks
-    python scripts/reproduce_tables.py pose          # AP before and after: ours, the geometric rival, both together
+    python scripts/reproduce_tables.py pose          # AP before and after: ours, the geometric baseline, both together
     python scripts/reproduce_tables.py shape         # completeness, accuracy, F1 and RMSE over tau
     python scripts/reproduce_tables.py ablation      # scripts/paper_tables/ablation_rows.py, row by row
     python scripts/reproduce_tables.py detectors     # every detector, and counterparts of the paper's four

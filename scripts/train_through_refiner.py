@@ -4,8 +4,8 @@
 
 In front of the refiner stands a network that sees crops of images and masks and the detector's box, and proposes for
 each car factors of the terms (`--net weights`), a residual on the logits of its masks (`--net masks`), or `both`.
-Behind it stands a loss on the refined box, and the gradient comes back through the refinement (`--mode`). Its rival is
-the same correction as a constant for all cars, trained in the same way on the same frames.
+Behind it stands a loss on the refined box, and the gradient comes back through the refinement (`--mode`). The baseline
+is the same correction as a constant for all cars, trained in the same way on the same frames.
 
 Frames are dealt into folds by a seeded shuffle; each fold is judged by the training on the others, with the unchanged
 default settings. The training itself uses `fast.yaml` with 200 pixels a car and side and unrolls three iterations.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from directshape_torch.numerics.device_constants import constant_like, made_once
+from directshape_torch.numerics.tensors import constant_like, made_once
 
 
 class Constants:

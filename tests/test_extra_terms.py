@@ -16,13 +16,13 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
 from directshape_torch.errors import InputError
+from directshape_torch.observation.car_points import car_points
 from directshape_torch.problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.rows import Blocks
 from directshape_torch.scene import Detections
 from directshape_torch.status import Status
-from directshape_torch.stereo_matching.car_points import car_points
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior
@@ -150,6 +150,10 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
         {"information": property(lambda _: torch.ones(2, 1))},
         r"information: expected shape \(2,\), got \(2, 1\)",
     ),
+    "weights in single precision": (
+        {"block_weight": property(lambda term: _own("block_weight")(term).float())},
+        r"block_weight: expected float64, for sums, got torch.float32; convert it with .double\(\)",
+    ),
     "row weights without an axis": (
         {"row_weight": property(lambda _: torch.ones(2, 1))},
         r"row_weight: expected shape \(2, R, N\), got \(2, 1\)",
@@ -174,6 +178,10 @@ BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "a norm of everything": (
         {"norm": lambda self, residual: PriorTerm.norm(self, residual.sum())},
         r"'user': norm\(...\).rho: expected shape \(2, 1, 1\), got \(\)",
+    ),
+    "a norm without weights": (
+        {"norm": lambda self, residual: PriorTerm.norm(self, residual)._replace(hessian_weight=torch.ones(2))},
+        r"'user': norm\(...\).hessian_weight: expected shape \(2, 1, 1\), got \(2,\)",
     ),
     "one cost for all names": ({"moving": _one_cost_for_all}, r"the cost of moving\(...\): expected shape \(2, 1\)"),
     "cars that do not leave": (

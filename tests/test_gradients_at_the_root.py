@@ -44,7 +44,7 @@ def at_the_root() -> tuple[CarProblem, Minimum[CarState], Tensor]:
     detections = replace(detections, mask_left=mask + 0.1 * by[0] * noise)
     weights = {"photometric": (1 + by[1]).expand(len(detections))}
     problem, initial = DirectShapeRefiner(prior, CONFIG).problem(scene.frames, detections, weights)
-    problem = problem.of_cars(torch.arange(len(detections)) == ROWS[0])
+    problem = problem.of_problems(torch.arange(len(detections)) == ROWS[0])
     minimum = minimise(problem, take_rows(initial, ROWS), CONFIG.solver)
     return problem, _walked_on(problem, minimum, 30), by
 

@@ -11,8 +11,8 @@ from directshape_torch.config import SearchConfig
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.solver.search import move_by_disparity, search_start, turn
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.solver.gauss_newton import search_start
+from directshape_torch.terms.cars import CarBatch, CarState, move_by_disparity, turn
 
 
 def _state() -> CarState:
@@ -44,7 +44,7 @@ def test_the_cheapest_start_wins_and_never_loses_to_the_input() -> None:
     detections = disturbed(scene.detections, 0.3, 0.2)
     problem, initial = DirectShapeRefiner(prior, DEFAULT).problem(scene.frames, detections)
     wide = SearchConfig((-2.0, -1.0, 1.0, 2.0), (-10.0, 10.0))
-    start = search_start(problem, initial, CarBatch.from_scene(scene.frames, detections), wide)
+    start = search_start(problem, initial, CarBatch.from_scene(scene.frames, detections).search_moves(wide))
     seen = problem.look(initial)
     stage = problem.begin(problem.stages()[0], seen)
     assert (stage.figures(problem.look(start)).cost <= stage.figures(seen).cost).all()
@@ -59,7 +59,7 @@ def _cars(scene: Street) -> CarBatch:
 def test_no_offsets_are_no_search() -> None:
     prior, scene = cached_street()
     problem, initial = DirectShapeRefiner(prior, DEFAULT).problem(scene.frames, scene.detections)
-    start = search_start(problem, initial, _cars(scene), SearchConfig((), ()))
+    start = search_start(problem, initial, _cars(scene).search_moves(SearchConfig((), ())))
     assert torch.equal(start.T_obj_cam, initial.T_obj_cam)
 
 
@@ -67,5 +67,5 @@ def test_a_perfect_start_is_kept() -> None:
     scene = cached_street()[1]
     problem, initial = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).problem(scene.frames, scene.detections)
     exact = CarState.of(initial.T_obj_cam, scene.code)
-    start = search_start(problem, exact, _cars(scene), SearchConfig((-3.0, 3.0), (-15.0, 15.0)))
+    start = search_start(problem, exact, _cars(scene).search_moves(SearchConfig((-3.0, 3.0), (-15.0, 15.0))))
     torch.testing.assert_close(start.T_obj_cam, exact.T_obj_cam)

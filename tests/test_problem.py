@@ -227,7 +227,7 @@ def test_the_state_moves_within_the_trust_region(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(se3, "exp", recorded)
     after = iterations.retract(state, step_of(5, 0.05, 9.0))
-    assert bounds == [pytest.approx(math.sqrt(3) * DEFAULT.solver.max_step_rotation_rad)]
+    assert bounds == [pytest.approx(math.sqrt(3) * float(stage.step_limits()[3]))]
     assert after.code.abs().max() == DEFAULT.solver.max_code
 
 
@@ -489,7 +489,7 @@ def test_a_field_that_is_known_brings_the_unbiased_energy_back() -> None:
     assert (unknown.cost > 2 * known.cost).all()
     stage, state = begun_at(prior, frames, detections)
     assert _gradient_error(stage, state, stage.problem.term_names).max() < 1e-4
-    assert (photometric_of(stage).pixels.bias_px == 2).all()
+    assert (photometric_of(stage).left.pixels.bias_px == 2).all()
 
 
 def test_a_field_of_another_rig_is_an_error() -> None:

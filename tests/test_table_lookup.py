@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.numerics.table_lookup import take
+from directshape_torch.numerics.tensors import take
 
 FLAT = torch.arange(5.0, dtype=torch.float64) ** 2
 

@@ -20,7 +20,7 @@ from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.stereo_matching.dense_disparity import with_disparity
+from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.visualize.inspection.car_figures import write_car_figures
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.point_figure import stereo_points

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.evaluation.shape_error_surface import SurfaceSource
-from directshape_torch.geometry.pinhole import project, rays_from_pixels
+from directshape_torch.geometry.camera import project, rays_from_pixels
 from directshape_torch.io.frame_layout import FrameLayout, first_disparity
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.regions import MASK_THRESHOLD

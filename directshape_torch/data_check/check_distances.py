@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from directshape_torch.data_check.car_evidence import FrameEvidence
 from directshape_torch.data_check.finding import Finding, Severity
+from directshape_torch.geometry.camera import depth_from_disparity
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.points import depth_from_disparity
 
 # The visible surface lies before the centre by about a third of the box's depth.
 _SURFACE_SHARE = 0.33

@@ -22,13 +22,12 @@ from directshape_torch.diagnosis.disparity_profile import (
     shifted_costs,
 )
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.problem import CarProblem
 from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import where_rows
-from directshape_torch.solver.search import move_by_disparity
 from directshape_torch.status import Status
-from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.cars import CarBatch, CarState, move_by_disparity
 from directshape_torch.terms.photometric import Photometric, Surface
 
 ROUNDS_PX = ((3.0, 0.25), (3.0, 0.25), (0.5, 0.05))

@@ -17,9 +17,10 @@ from directshape_torch.compile import compilable
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.device_constants import made_once
+from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
-from directshape_torch.terms.photometric import Photometric, PhotometricRows, Surface, photometric_norm, residuals_at
+from directshape_torch.terms.photometric import Photometric, Surface, photometric_norm
+from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_at
 
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""

@@ -12,7 +12,7 @@ from torch import Tensor
 from directshape_torch.diagnosis.disparity_profile import DisparityProfile
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
-from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.problem import CarStage
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.terms.cars import CarState

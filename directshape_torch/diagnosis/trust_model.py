@@ -19,7 +19,7 @@ from torch import Tensor
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.read_files import read_json
-from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.tensors import constant_like
 
 SCHEMA = "directshape_torch.trust_model/1"
 BUNDLED = Path(__file__).parents[1] / "assets" / "trust_model.json"

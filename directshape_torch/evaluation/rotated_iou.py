@@ -49,22 +49,6 @@ def bev_iou(
     return _ratio(_intersection_area(boxes_a, boxes_b), _area(boxes_a), _area(boxes_b))
 
 
-def bev_iou_matrix(
-    boxes_a: Tensor,  # (N, 5)
-    boxes_b: Tensor,  # (M, 5)
-) -> Tensor:
-    """Intersection over union (N, M) of every footprint of one set with every one of another; see `bev_iou`.
-
-    Example:
-        >>> bev_iou_matrix(torch.zeros(2, 5), torch.zeros(3, 5)).shape
-        torch.Size([2, 3])
-    """
-    check_shape("boxes_a", boxes_a, ("N", 5), _BEV_LAYOUT)
-    check_shape("boxes_b", boxes_b, ("M", 5), _BEV_LAYOUT)
-    a, b = boxes_a[:, None], boxes_b[None]
-    return _ratio(_intersection_area(a, b), _area(a), _area(b))
-
-
 def iou_3d(
     boxes_a: Tensor,  # (N, 7)
     boxes_b: Tensor,  # (N, 7)
@@ -84,16 +68,6 @@ def iou_3d(
     check_shape("boxes_a", boxes_a, ("N", 7), _BOX_LAYOUT)
     check_shape("boxes_b", boxes_b, (len(boxes_a), 7), _BOX_LAYOUT)
     return _iou_3d(boxes_a, boxes_b)
-
-
-def iou_3d_matrix(
-    boxes_a: Tensor,  # (N, 7)
-    boxes_b: Tensor,  # (M, 7)
-) -> Tensor:
-    """Intersection over union (N, M) of every upright box of one set with every one of another; see `iou_3d`."""
-    check_shape("boxes_a", boxes_a, ("N", 7), _BOX_LAYOUT)
-    check_shape("boxes_b", boxes_b, ("M", 7), _BOX_LAYOUT)
-    return _iou_3d(boxes_a[:, None], boxes_b[None])
 
 
 def _iou_3d(a: Tensor, b: Tensor) -> Tensor:

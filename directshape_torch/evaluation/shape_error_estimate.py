@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.evaluation.shape_error import Points
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.ray_cast import cast
+from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.export.visible_surface import FrameView, Points
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.stereo_matching.car_points import car_points
-from directshape_torch.stereo_matching.dense_disparity import with_disparity
+from directshape_torch.observation.car_points import car_points
+from directshape_torch.stereo_matching.disparity import with_disparity
 
 _ALL_POINTS = 10_000_000
 

@@ -16,7 +16,7 @@ from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.device_constants import made_once
+from directshape_torch.numerics.tensors import made_once
 
 # Below this squared angle trigonometric ratios are replaced by Taylor series, whose first terms left out are then
 # below float64's rounding. Unlike the ratios they have finite derivatives of every order at zero.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.table_lookup import take
+from directshape_torch.numerics.tensors import take
 
 
 def bilinear_with_gradient(

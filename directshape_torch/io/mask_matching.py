@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import BOX_EDGES, box_corners
-from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.stereo import warp_to_right
+from directshape_torch.geometry.camera import project, rays_from_pixels, warp_to_right
 from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.scene import StereoCamera
 

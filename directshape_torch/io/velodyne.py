@@ -10,7 +10,7 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.read_files import read_bytes
-from directshape_torch.geometry.pinhole import project
+from directshape_torch.geometry.camera import project
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.scene import StereoCamera
 

@@ -11,17 +11,15 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.depth import closest_of_march, first_hits, march
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.short_axes import length
-from directshape_torch.laboratory.own_term import checked_term
 from directshape_torch.laboratory.regimes import Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
-from directshape_torch.numerics.table_lookup import occurrences
+from directshape_torch.numerics.tensors import length, occurrences
+from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
 from directshape_torch.problem import CarProblem, CarStage, TermFactory
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.stereo_matching.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.silhouette import contour_zeta
 from directshape_torch.terms.term import Linear, Sight, Term, linear_of
@@ -112,7 +110,7 @@ class Bench:
             stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
         terms = _named(*stages)
         sight = stages[0].problem.look(drawn.state)
-        rows = {name: rows_at(checked_term(term, sight), sight) for name, term in terms.items()}
+        rows = {name: rows_at(term, sight) for name, term in terms.items()}
         return cls(regime, stages[0], terms, drawn.state, sight, rows)
 
 
@@ -176,7 +174,7 @@ def _chosen(
 ) -> Observation:
     """The pixels that a regime is about, at most so many per car and side."""
     field, bounds = field_of(prior.bind(state.code)), prior.bounds_obj
-    zeta = contour_zeta(cars, config.silhouette, config.stages[regime.stage])
+    zeta = contour_zeta(cars, config.stages[regime.stage])
     chosen = []
     for pixels in (observation.left, observation.right):
         rows = Rows.of_sorted(pixels.object_index, len(cars))

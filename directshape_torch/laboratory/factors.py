@@ -18,10 +18,16 @@ from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.experiments import Experiment, factor_experiment
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms import robust
-from directshape_torch.terms.photometric import Comparison, Photometric, Surface, compared
+from directshape_torch.terms.photometric import Photometric, Surface
+from directshape_torch.terms.photometric_rows import Comparison, compared
 from directshape_torch.terms.point_cloud import PointCloud
-from directshape_torch.terms.silhouette import Silhouettes, closest_approach_residual
-from directshape_torch.terms.silhouette_product import Samples, SilhouetteProducts, product_residual
+from directshape_torch.terms.silhouette import (
+    Samples,
+    SilhouetteProducts,
+    Silhouettes,
+    closest_approach_residual,
+    product_residual,
+)
 from directshape_torch.terms.term import Linear
 
 # Each point of the trilinear lookup binds a grid of its own.
@@ -90,7 +96,7 @@ def pi_closest(bench: Bench) -> Experiment:
     assert isinstance(term, Silhouettes)
     seen = (term.rows.filled > 0) & closest.crosses
     at = bench.sight.field.value(closest.points_obj, term.rows.rays.owner, constant=True)[seen]
-    fixed = term.zeta.expand_as(seen)[seen], term.config.saturation, term.rows.foreground[seen]
+    fixed = term.zeta.expand_as(seen)[seen], term.rows.foreground[seen]
     J = closest_approach_residual(at, *fixed)[1][:, None, None]
     return factor_experiment(
         "pi_closest", lambda x: closest_approach_residual(x[:, 0], *fixed)[0][:, None], at[:, None], J

@@ -23,7 +23,7 @@ from directshape_torch.laboratory.experiments import jacobian
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.solver.damped_solve import damped_step, limit_step
+from directshape_torch.solver.iteration import damped_step, limit_step
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.term import Evaluation, Linear, Term, linear_of, part_of, summed

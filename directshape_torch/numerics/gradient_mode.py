@@ -55,15 +55,23 @@ def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         with torch.no_grad():
             result = function(*args, **kwargs)
-        return _detached(result) if is_forward_mode() else result
+        return map_tensors(Tensor.detach, result) if is_forward_mode() else result
 
     return call
 
 
-def _detached(result: Any) -> Any:
-    if isinstance(result, Tensor):
-        return result.detach()
-    return result if result is None else type(result)(*map(_detached, result))
+def map_tensors(change: Callable[..., Tensor], value: Any, *others: Any) -> Any:
+    """A tensor, or the tensors of nested named tuples, changed: each together with its counterparts in the others.
+
+    Example:
+        >>> map_tensors(torch.add, torch.ones(1), torch.ones(1))
+        tensor([2.])
+    """
+    if isinstance(value, Tensor):
+        return change(value, *others)
+    if not value:
+        return value
+    return type(value)(*(map_tensors(change, *parts) for parts in zip(value, *others, strict=True)))
 
 
 def is_plain(tensor: Tensor) -> bool:

@@ -1,7 +1,7 @@
 """Gradient magnitudes and thresholds where cars are: in each image the threshold cells around its regions.
 
-What `gradient_magnitude` and `cell_thresholds` find in whole frames, number for number, at a cost that follows the
-cars.
+From which gradient on a pixel is worth its cost the image's own texture tells (round 1 of the selection, as in Direct
+Sparse Odometry, Engel et al., 2018): the 3x3-smoothed median of the magnitudes in cells of 32 px plus 7 grey levels.
 """
 
 from __future__ import annotations
@@ -12,12 +12,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from directshape_torch.image.frame_parts import gradient_magnitude_of_part
-from directshape_torch.observation.gradient_thresholds import THRESHOLD_CELL_PX, smoothed_thresholds
-from directshape_torch.observation.lower_median import lower_medians
-from directshape_torch.observation.portions import pixels_at_once
+from directshape_torch.image.grey_levels import gradient_magnitude_of_part
+from directshape_torch.numerics.tensors import pixels_at_once
 
+THRESHOLD_CELL_PX = 32
+"""Side of the cells that have one threshold each."""
+THRESHOLD_OFFSET_GREY = 7.0
 Box = tuple[int, int, int, int]
+_INTEGERS = {torch.float32: torch.int32, torch.float64: torch.int64}
+
+# Flags are added eight at a time, as bytes of integers of eight, which overflow beyond so many.
+_BYTES, _MOST_IN_A_BYTE = 8, 255
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,7 @@ class GradientCells:
 
     Attributes:
         magnitude: (C, side, side) grey levels per pixel, infinite beyond the frame; differentiable by the images.
-        thresholds: (C,) as `cell_thresholds` gives them for the cells that regions touch; nonsense for others.
+        thresholds: (C,) of the cells that regions touch; nonsense for others.
         first, columns: (B,) of each region: cell (row, column) of its image has number `first + row columns + column`.
         side_px: of the cells.
     """
@@ -62,6 +67,12 @@ class GradientCells:
         first, columns = (x.index_select(0, region_index) for x in (self.first, self.columns))
         entry = ((first + row * columns + column) * self.side_px + v) * self.side_px + u
         return self.magnitude.flatten().index_select(0, entry)
+
+    def threshold_at(self, region_index: Tensor, uv: Tensor) -> Tensor:
+        """Thresholds (P,) of the cells of pixels (P, 2) of regions (P,)."""
+        column, row = torch.div(uv, self.side_px, rounding_mode="floor").unbind(1)
+        first, columns = (x.index_select(0, region_index) for x in (self.first, self.columns))
+        return self.thresholds.index_select(0, first + row * columns + column)
 
 
 @dataclass(frozen=True)
@@ -168,3 +179,72 @@ def _thresholds(medians: Tensor, parts: Sequence[_Part]) -> Tensor:
         place.copy_(medians[part.first : part.end].view(part.shape))
     smoothed = smoothed_thresholds(grids)
     return torch.cat([grid[:rows, :columns].flatten() for grid, (rows, columns) in zip(smoothed, shapes, strict=True)])
+
+
+def smoothed_thresholds(
+    medians: Tensor,  # (F, rows, columns)
+) -> Tensor:
+    """Thresholds (F, rows, columns): the 3x3 mean of the cells' medians, NaN where there is none, plus the offset.
+
+    At the image border the mean is over the cells there are; it is 0 where no cell has a median.
+    """
+    known = medians.isfinite()
+    stacked = torch.stack([medians.nan_to_num(nan=0.0), known.to(medians.dtype)], dim=1)
+    total, count = torch.nn.functional.avg_pool2d(stacked, 3, stride=1, padding=1).unbind(1)
+    return total / count.clamp(min=1 / 9) + THRESHOLD_OFFSET_GREY
+
+
+def lower_medians(
+    values: Tensor,  # (C, n)
+) -> Tensor:
+    """Lower median of the finite values of each row, NaN where there is none: `nanmedian` for values not negative.
+
+    The bits of floats that are not negative are ordered as the floats are, so the median is found bit by bit from the
+    highest. Each bit costs one count of smaller values, of one byte of each: where the higher bytes are known, only
+    values with the same ones matter.
+
+    Args:
+        values: (C, n) float32 or float64, not negative; NaN and infinity do not count.
+
+    Returns:
+        (C,), one of the values of each row.
+
+    Example:
+        >>> lower_medians(torch.tensor([[4.0, 1.0, 3.0, 2.0], [7.0, torch.inf, torch.nan, 9.0]]))
+        tensor([2., 7.])
+    """
+    # Whole integers of eight bytes; what is added does not count.
+    missing = -values.shape[1] % _BYTES
+    values = torch.nn.functional.pad(values, (0, missing), value=torch.inf) if missing else values.contiguous()
+    values = values.detach()
+    # What is as large as all values is made once: new memory costs more than the arithmetic on it.
+    wide, keys, flags, others = (torch.empty_like(values, dtype=d) for d in (values.dtype, *[torch.uint8] * 3))
+    # A comparison with NaN is false, so both stay out of the count, and both have more bits than any finite value.
+    num_finite = torch.lt(values, torch.inf, out=wide).sum(dim=1, keepdim=True)
+    rank = torch.div(num_finite - 1, 2, rounding_mode="floor").long()
+    integers, shifted = (x.view(_INTEGERS[values.dtype]) for x in (values, wide))
+    found = torch.zeros(len(values), 1, dtype=integers.dtype, device=values.device)
+    others.zero_()
+    for shift in range(8 * (values.element_size() - 1), -1, -8):
+        # Values whose higher bytes are others are never counted: nothing is above theirs.
+        keys.copy_(torch.bitwise_right_shift(integers, shift, out=shifted))
+        torch.maximum(keys, others, out=keys)
+        byte = torch.zeros_like(found, dtype=torch.uint8)
+        for bit in range(7, -1, -1):
+            byte.add_(_count_below(keys, byte + (1 << bit), flags) <= rank, alpha=1 << bit)
+        found += byte.to(found.dtype) << shift
+        rank -= _count_below(keys, byte, flags)
+        torch.maximum(others, torch.ne(keys, byte, out=flags).mul_(255), out=others)
+    return torch.where(num_finite > 0, found.view(values.dtype), torch.nan)[:, 0]
+
+
+def _count_below(
+    keys: Tensor,  # (C, 8 m) uint8
+    bound: Tensor,  # (C, 1) uint8
+    flags: Tensor,  # (C, 8 m) uint8, to write to
+) -> Tensor:
+    """How many keys of each row are below its bound, (C, 1)."""
+    torch.lt(keys, bound, out=flags)
+    if keys.shape[1] > _BYTES * _MOST_IN_A_BYTE:
+        return flags.sum(dim=1, keepdim=True)
+    return flags.view(torch.int64).sum(dim=1).view(torch.uint8).view(-1, _BYTES).sum(dim=1, keepdim=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.portions import pixels_at_once, portions
+from directshape_torch.numerics.tensors import pixels_at_once, portions
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections
 

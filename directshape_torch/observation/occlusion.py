@@ -8,58 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from itertools import accumulate
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.instance_crops import InstanceCrops, instance_crops
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections
 
 Side = Literal["left", "right"]
 OcclusionOrder = Literal["depth", "box_bottom"]
-
-
-def hidden_pixels(
-    detections: Detections,
-    side: Side,
-    object_index: Tensor,  # (P,)
-    uv: Tensor,  # (P, 2)
-    order: OcclusionOrder = "depth",
-) -> Tensor:
-    """Whether each pixel of an object is covered by the mask of an instance in front of it.
-
-    Args:
-        detections: B objects, with further occluders or without.
-        side: image that the pixels and the masks belong to.
-        object_index: (P,) integer, the object that each pixel belongs to.
-        uv: (P, 2) integer pixels (column, row). Pixels outside the mask images are not hidden.
-        order: see `instances_in_front`.
-
-    Returns:
-        (P,) bool.
-
-    Raises:
-        InputError: wrong shapes, non-integer pixels, unknown side or order.
-    """
-    if uv.ndim != 2 or uv.shape[-1] != 2 or uv.is_floating_point():
-        raise InputError("uv", "integer pixels (P, 2)", f"{tuple(uv.shape)} {uv.dtype}", "round them")
-    if object_index.shape != uv.shape[:1]:
-        raise InputError("object_index", f"shape ({len(uv)},)", f"{tuple(object_index.shape)}", "one entry a pixel")
-    height, width = detections.mask_left.shape[1:]
-    inside = (uv >= 0).all(dim=1) & (uv[:, 0] < width) & (uv[:, 1] < height)
-    pixel = torch.where(inside, uv[:, 1] * width + uv[:, 0], 0)
-    in_front = instances_in_front(detections, side, order)
-    hidden = torch.zeros_like(inside)
-    first = 0
-    for masks in _masks(detections, side):
-        covered = _covered(masks, in_front[first : first + len(masks)], object_index, pixel)
-        hidden |= covered
-        first += len(masks)
-    return hidden & inside
 
 
 def instances_in_front(
@@ -263,22 +224,104 @@ def _masks(detections: Detections, side: Side) -> list[Tensor]:
     return masks
 
 
-def _covered(
-    masks: Tensor,  # (I, H, W)
-    in_front: Tensor,  # (I, B)
-    object_index: Tensor,  # (P,)
-    pixel: Tensor,  # (P,) row-major within an image
-) -> Tensor:
-    """Whether any instance in front covers each pixel: as many lookups as the worst car has occluders."""
-    covered = torch.zeros_like(pixel, dtype=torch.bool)
-    num_ranks = int(in_front.sum(dim=0).max()) if in_front.numel() else 0
-    if not len(pixel) or not num_ranks:
-        return covered
-    occluders = in_front.to(torch.uint8).argsort(dim=0, descending=True, stable=True)[:num_ranks]
-    exists = in_front.gather(0, occluders)
-    flat, image_size = masks.reshape(-1), masks.shape[1] * masks.shape[2]
-    for instance, is_real in zip(occluders, exists, strict=True):
-        (concerned,) = is_real[object_index].nonzero(as_tuple=True)
-        entry = instance[object_index[concerned]] * image_size + pixel[concerned]
-        covered[concerned] |= flat.index_select(0, entry) > MASK_THRESHOLD
-    return covered
+_BITS_OF_A_WORD = 31
+"""Instances that share an int32, whose sign stays out of it."""
+
+# So that frames in which nothing covers anything are no special case for whoever looks something up.
+_SPARE_ROWS = 2
+
+
+@dataclass(frozen=True)
+class InstanceCrops:
+    """N instances in F frames: memory follows the area around them.
+
+    Attributes:
+        boxes: (F, 4) integer (u0, v0, u1, v1), half open, around the instances of each frame; all 0 where none is.
+        start: (F,) first row of each frame in `covering`.
+        covering: (A, W) int32, the instances that cover each pixel, row-major; two more rows, which nothing covers.
+        bits: (N, W) int32, the bit of each instance, in one of the W words (1, 4, 8, ...).
+    """
+
+    boxes: Tensor
+    start: Tensor
+    covering: Tensor
+    bits: Tensor
+
+
+def instance_crops(
+    masks: Sequence[Tensor],
+    boxes: Tensor,  # (N, 4)
+    frame_index: Tensor,  # (N,)
+    num_frames: int,
+) -> InstanceCrops:
+    """Write the instances of all frames into one crop a frame.
+
+    Args:
+        masks: stacks (I, H, W), N instances in all; foreground probability or bool.
+        boxes: (N, 4) integer, half open, around the pixels of each mask above 0.5; all 0: leave the instance out.
+        frame_index: (N,) integer.
+        num_frames: F.
+
+    Example:
+        >>> masks = torch.zeros(2, 4, 6)
+        >>> masks[0, 1, 1:4], masks[1, 1:3, 3:5] = 1.0, 1.0
+        >>> boxes = torch.tensor([[1, 1, 4, 2], [3, 1, 5, 3]])
+        >>> crops = instance_crops([masks], boxes, torch.tensor([0, 0]), num_frames=1)
+        >>> crops.covering[:8].view(2, 4)
+        tensor([[1, 1, 3, 2],
+                [0, 0, 2, 2]], dtype=torch.int32)
+    """
+    places, around = _places(torch.cat([frame_index[:, None], boxes], dim=1).tolist(), num_frames)
+    width = [u1 - u0 for u0, _, u1, _ in around]
+    start = [0, *accumulate((v1 - v0) * (u1 - u0) for u0, v0, u1, v1 in around)]
+    num_words = _num_words(max((place.rank for place in places), default=0) + 1)
+    covering = torch.zeros(start[-1] + _SPARE_ROWS, num_words, dtype=torch.int32, device=boxes.device)
+    bits = [[0] * num_words for _ in boxes]
+    every_mask = [mask for stack in masks for mask in stack.detach().unbind()]
+    for place in places:
+        word, bit = divmod(place.rank, _BITS_OF_A_WORD)
+        bits[place.instance][word] = 1 << bit
+        (u0, v0, u1, v1), (left, top, _, _) = place.box, around[place.frame]
+        first = start[place.frame] + (v0 - top) * width[place.frame] + u0 - left
+        in_crop = covering.as_strided(
+            (v1 - v0, u1 - u0), (width[place.frame] * num_words, num_words), first * num_words + word
+        )
+        # Every instance has a bit of its own, so adding is setting it.
+        in_crop.add_(every_mask[place.instance][v0:v1, u0:u1] > MASK_THRESHOLD, alpha=1 << bit)
+    return InstanceCrops(
+        boxes.new_tensor(around).view(num_frames, 4),
+        boxes.new_tensor(start[:-1]),
+        covering,
+        covering.new_tensor(bits).view(len(boxes), num_words),
+    )
+
+
+def _num_words(num_instances: int) -> int:
+    """1, 4, 8, 16, ...: more than are needed, but each number of words is a compilation of whatever looks them up."""
+    words = 1
+    while words * _BITS_OF_A_WORD < num_instances:
+        words = max(4, 2 * words)
+    return words
+
+
+class _Place(NamedTuple):
+    """Where an instance is written."""
+
+    instance: int
+    frame: int
+    box: tuple[int, int, int, int]
+    rank: int  # among those of its frame
+
+
+def _places(instances: Sequence[Sequence[int]], num_frames: int) -> tuple[list[_Place], list[tuple[int, ...]]]:
+    """Places of the instances that are there, from their frames and boxes (N, 5), and the box around each frame's."""
+    around: list[tuple[int, ...]] = [(0, 0, 0, 0)] * num_frames
+    counts, places = [0] * num_frames, []
+    for number, (frame, u0, v0, u1, v1) in enumerate(instances):
+        if u1 <= u0:
+            continue
+        left, top, right, bottom = around[frame] if counts[frame] else (u0, v0, u1, v1)
+        around[frame] = (min(left, u0), min(top, v0), max(right, u1), max(bottom, v1))
+        places.append(_Place(number, frame, (u0, v0, u1, v1), counts[frame]))
+        counts[frame] += 1
+    return places, around

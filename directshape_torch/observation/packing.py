@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.geometry.stereo import right_rays
-from directshape_torch.observation.chosen_pixels import ChosenPixels, chosen_pixels
+from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
 from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides
 from directshape_torch.observation.regions import region_boxes
+from directshape_torch.observation.sampling import ChosenPixels, chosen_pixels
 from directshape_torch.scene import Detections, FrameBatch
 
 # Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
@@ -105,7 +104,7 @@ def pack_pixels(
         extents: of the masks of these detections, where they are known already.
     """
     extents = scene_extents(detections) if extents is None else extents
-    regions = car_regions(frames, detections, config, extents)
+    regions = car_regions(frames, detections, extents)
     both, hidden = torch.cat(regions), None
     if config.occlusion:
         hidden = crops_of_sides(detections, ("left", "right"), extents, both, len(frames), config.occlusion_order)
@@ -142,9 +141,7 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
     return field.offsets(uv_left)
 
 
-def car_regions(
-    frames: FrameBatch, d: Detections, config: SamplingConfig, extents: SceneExtents | None = None
-) -> tuple[Tensor, Tensor]:
+def car_regions(frames: FrameBatch, d: Detections, extents: SceneExtents | None = None) -> tuple[Tensor, Tensor]:
     """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
     extents = scene_extents(d) if extents is None else extents
     # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
@@ -152,9 +149,6 @@ def car_regions(
         torch.cat([d.box_2d, torch.full_like(d.box_2d, torch.nan)]),
         torch.cat([extents.left.boxes, extents.right.boxes]),
         frames.sizes[d.frame_index].repeat(2, 1),
-        join=True,
-        margin_px=config.region_margin_px,
-        margin_share=config.region_margin_share,
     ).tensor_split(2)
     return left * d.has_mask_left[:, None], right
 

@@ -1,4 +1,4 @@
-"""The pixel selection of `pixel_sampling` on threshold cells: whole lines of a cell at a time instead of single pixels.
+"""The strongest pixel of each small cell, found by whole lines of threshold cells instead of single pixels.
 
 A line is what a row of one small cell's region has in common with a threshold cell. Lines of the same small cells are
 compared element by element first; only their best elements are brought together one by one.
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.observation.gradient_cells import GradientCells
-from directshape_torch.observation.small_cells import CellPixels, small_cell_side
+from directshape_torch.observation.regions import CellPixels, small_cell_side
 
 _INT32_MIN, _INT64_MIN = torch.iinfo(torch.int32).min, torch.iinfo(torch.int64).min
 
@@ -24,7 +24,10 @@ def strongest_pixels(
     image_width: int,
     settings: SamplingConfig,
 ) -> CellPixels:
-    """What `candidate_pixels` finds in the modes "adaptive" and "round_one".
+    """Of each small cell the strongest pixel above its threshold, else the strongest; the first of equals, row-major.
+
+    In the mode "round_one" only the former. Gradients are compared in float32, whatever the input, and one that is not
+    finite is 0.
 
     Args:
         cells: magnitudes and thresholds around the regions.

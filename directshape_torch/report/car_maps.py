@@ -11,7 +11,7 @@ import torch
 
 from directshape_torch.io.frame_detections import build_detections
 from directshape_torch.io.result_files import ShapeArrays
-from directshape_torch.observation.occlusion import OcclusionOrder, hidden_pixels
+from directshape_torch.observation.occlusion import OcclusionOrder, occlusion_crops
 from directshape_torch.report.drawn_frame import CarState
 from directshape_torch.report.frame_material import DetailSettings, DrawnCars, FrameMaterial
 from directshape_torch.report.json_numbers import numbers
@@ -106,9 +106,7 @@ def _masks(
 def _hidden(detections: Detections, car: int, window: Window, order: OcclusionOrder) -> npt.NDArray[np.bool_]:
     """(H, W), true where an instance in front of the car covers a pixel of the window."""
     u0, v0, u1, v1 = window
-    rows, columns = torch.meshgrid(torch.arange(v0, v1), torch.arange(u0, u1), indexing="ij")
-    uv = torch.stack([columns, rows], dim=-1).reshape(-1, 2)
-    inside = hidden_pixels(detections, "left", torch.full((len(uv),), car), uv, order)
     hidden = torch.zeros(detections.mask_left.shape[1:], dtype=torch.bool)
-    hidden[v0:v1, u0:u1] = inside.reshape(rows.shape)
+    windows = torch.tensor(window).expand(len(detections), 4)
+    hidden[v0:v1, u0:u1] = occlusion_crops(detections, "left", windows, order).crop(car)
     return np.asarray(hidden.numpy())

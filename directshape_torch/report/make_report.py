@@ -206,9 +206,6 @@ class _PageOfRun:
 
 
 class _Silhouette(TypedDict, total=False):
-    min_zeta_per_m: float
-    max_zeta_per_m: float
-    saturation: float
     probability_floor: float
 
 
@@ -238,8 +235,7 @@ class _Results:
 def map_settings(refiner: dict[str, Any]) -> MapSettings:
     """Settings of residual maps from those of a run; what a run does not say has its default."""
     stages, silhouette = refiner.get("stages", ()), refiner.get("silhouette", {})
-    names = ("min_zeta_per_m", "max_zeta_per_m", "saturation", "probability_floor")
-    given = {name: silhouette[name] for name in names if name in silhouette}
+    given = {name: silhouette[name] for name in ("probability_floor",) if name in silhouette}
     if stages:
         given["contour_width_px"] = stages[-1].get("contour_width_px", MapSettings.contour_width_px)
     brightness = refiner.get("photometric", {}).get("brightness", "gain")

@@ -14,17 +14,16 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.geometry.stereo import warp_to_right
-from directshape_torch.image.gradients import grey_levels
+from directshape_torch.geometry.camera import rays_from_pixels, warp_to_right
+from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.ray_cast import cast
 from directshape_torch.report.pictures import Window
 from directshape_torch.scene import StereoCamera
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
-from directshape_torch.terms.silhouette import closest_approach_residual
+from directshape_torch.terms.silhouette import ZETA_BOUNDS, closest_approach_residual
 
 Floats = npt.NDArray[np.floating[Any]]
 
@@ -36,12 +35,9 @@ _GAIN_BOUNDS = (0.8, 1.25)
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Settings of the run that bear on the maps: the silhouette's softness and bounds, and brightness."""
+    """Settings of the run that bear on the maps: the silhouette's softness, and brightness."""
 
     contour_width_px: float = 0.5
-    min_zeta_per_m: float = 4.0
-    max_zeta_per_m: float = 400.0
-    saturation: float = 16.0
     probability_floor: float = 0.01
     matches_brightness: bool = True
 
@@ -146,13 +142,13 @@ def _photometric(
 def _silhouette(closest_sdf: Tensor, p_fg: Tensor, zeta: float, settings: MapSettings) -> Tensor:
     """The residual with the sign of projection minus mask."""
     p_fg = p_fg.clamp(settings.probability_floor, 1 - settings.probability_floor)
-    residual, _ = closest_approach_residual(closest_sdf, torch.full_like(p_fg, zeta), settings.saturation, p_fg)
+    residual, _ = closest_approach_residual(closest_sdf, torch.full_like(p_fg, zeta), p_fg)
     return residual * torch.sign(torch.sigmoid(-zeta * closest_sdf) - p_fg)
 
 
 def _zeta(camera: StereoCamera, depth_m: float, settings: MapSettings) -> float:
     zeta = float(camera.K_left[0, 0, 0]) / (max(depth_m, 0.1) * settings.contour_width_px)
-    return min(max(zeta, settings.min_zeta_per_m), settings.max_zeta_per_m)
+    return min(max(zeta, ZETA_BOUNDS[0]), ZETA_BOUNDS[1])
 
 
 def _grey(image: npt.NDArray[np.uint8]) -> Tensor:

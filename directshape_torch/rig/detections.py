@@ -6,13 +6,12 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import box_corners
-from directshape_torch.geometry.pinhole import project
-from directshape_torch.image.gradients import grey_levels
+from directshape_torch.geometry.camera import disparity_of_depth, project
+from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.rig.near_side import near_side_depth
 from directshape_torch.rig.silhouette_size import size_error
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.points import disparity_of_depth
 from directshape_torch.stereo_matching.subpixel import refine_disparity
 
 # A reduced observation, pixels: place in the left image, measured disparity, the same less the implied one and its

@@ -7,10 +7,10 @@ from pathlib import Path
 import torch
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.geometry.camera import depth_from_disparity
 from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.rig.disparity_observations import KnownDepth
 from directshape_torch.scene import StereoCamera
-from directshape_torch.stereo_matching.points import depth_from_disparity
 
 FOLDERS = ("disp_noc_0", "disp_occ_0")
 

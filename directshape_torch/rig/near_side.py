@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.rays import ray_box_interval
 from directshape_torch.geometry.se3 import inverse, transform
 

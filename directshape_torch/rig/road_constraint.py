@@ -14,8 +14,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from directshape_torch.geometry.camera import disparity_of_depth, rays_from_pixels
 from directshape_torch.geometry.disparity_field import polynomial_basis
-from directshape_torch.geometry.pinhole import rays_from_pixels
 from directshape_torch.rig.disparity_observations import DisparityObservations
 from directshape_torch.rig.field_constraint import (
     PATCH_SIGMA_PX,
@@ -25,7 +25,6 @@ from directshape_torch.rig.field_constraint import (
 )
 from directshape_torch.rig.road_pixels import RoadPixels
 from directshape_torch.scene import StereoCamera
-from directshape_torch.stereo_matching.points import disparity_of_depth
 
 # Roads are even to about this share of the camera's height, and so is the disparity on them.
 _UNEVENNESS = 0.01

@@ -9,11 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.geometry.camera import depth_from_disparity, disparity_of_depth, rays_from_pixels
 from directshape_torch.rig.motion_tracks import matched_pixels
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.plane_from_points import fit_ground_plane
-from directshape_torch.stereo_matching.points import depth_from_disparity, disparity_of_depth
 
 _SPACING_PX = 8
 _BORDER_PX = 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.pinhole import project
+from directshape_torch.geometry.camera import project
 from directshape_torch.geometry.se3 import transform
 
 # Corners of roof, belt, bumpers and wheels in lengths, heights and widths of a box; either side, either end.

@@ -7,8 +7,6 @@ from typing import NamedTuple, Protocol
 
 from torch import Tensor
 
-from directshape_torch.shape.grid_cells import GridField, Lookup
-from directshape_torch.shape.grid_lookup import derivatives_at, gradient_at, value_at
 from directshape_torch.shape.ray_minimum import (
     RayMinimum,
     curvature_by_values,
@@ -16,7 +14,7 @@ from directshape_torch.shape.ray_minimum import (
     minimum_by_values,
     minimum_in_grids,
 )
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup, derivatives_at, gradient_at, value_at
 from directshape_torch.shape.shape_prior import BoundShape
 
 

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, shown
-from directshape_torch.shape import kernel_pca_prior_file, neural_prior_file
+from directshape_torch.shape import kernel_pca_prior as kernel_pca_prior_file
+from directshape_torch.shape import neural_prior as neural_prior_file
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior

@@ -7,17 +7,20 @@ mirrored smoothly about the middle plane of the car: shapes are symmetric by con
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.errors import InputError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.numerics.checks import check_shape
-from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
+from directshape_torch.shape.tensor_file import read_tensors, write_tensors
 
 # Half width of the zone about the middle plane where the mirrored coordinate `sqrt(z^2 + s^2)` is rounded.
 MIRROR_ROUNDING_M = 0.2
@@ -144,7 +147,7 @@ class NeuralShapePrior(nn.Module):
 
     def save(self, path: Path | str) -> None:
         """Write a safetensors file, atomically."""
-        from directshape_torch.shape.neural_prior_file import write_neural_prior
+        from directshape_torch.shape.neural_prior import write_neural_prior
 
         write_neural_prior(self, Path(path))
 
@@ -155,7 +158,7 @@ class NeuralShapePrior(nn.Module):
         Raises:
             DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
         """
-        from directshape_torch.shape.neural_prior_file import read_neural_prior
+        from directshape_torch.shape.neural_prior import read_neural_prior
 
         return read_neural_prior(Path(path))
 
@@ -261,3 +264,44 @@ def _safe_norm(vector: Tensor) -> Tensor:
     squared = (vector * vector).sum(-1)
     positive = squared > 0
     return torch.where(positive, torch.where(positive, squared, torch.ones_like(squared)).sqrt(), squared)
+
+
+_MOST_NODES = 2**24
+SCHEMA = "directshape_torch.neural_shape_prior/1"
+CURE = "make one with: python scripts/train_neural_prior.py"
+
+
+def write_neural_prior(prior: NeuralShapePrior, path: Path) -> None:
+    """Write a prior, its weights as they are; a reader never sees a half-written file."""
+    tensors = {**dict(prior.named_parameters()), **dict(prior.named_buffers())}
+    description = {
+        "schema": SCHEMA,
+        "layer_widths": prior.layer_widths,
+        "num_codes": prior.num_codes,
+        "grid_shape": prior.grid_shape,
+        "spacing_m": prior.spacing_m,
+        "provenance": asdict(prior.provenance),
+    }
+    write_tensors(path, tensors, description)
+
+
+def read_neural_prior(path: Path) -> NeuralShapePrior:
+    """Read a prior, float32 on the CPU.
+
+    Raises:
+        DataFormatError: missing, truncated, of another schema, or with tensors that do not fit together.
+    """
+    tensors, description = read_tensors(path, SCHEMA, CURE)
+    try:
+        settings = {name: description[name] for name in ("layer_widths", "num_codes", "spacing_m")}
+        nx, ny, nz = description["grid_shape"]
+        if len(settings["layer_widths"]) > len(tensors) or math.prod((nx, ny, nz)) > _MOST_NODES:
+            raise ValueError(f"more layers than tensors, or more than {_MOST_NODES} nodes")
+        provenance = PriorProvenance(**description["provenance"])
+        # Without memory and random numbers until it is filled: the sizes are those that somebody has written down.
+        with torch.device("meta"):
+            prior = NeuralShapePrior(origin=torch.zeros(3), grid_shape=(nx, ny, nz), provenance=provenance, **settings)
+        prior.load_state_dict(tensors, assign=True)
+    except (InputError, KeyError, TypeError, ValueError, RuntimeError) as problem:
+        raise DataFormatError(path, f"it describes no neural prior: {problem}", cure=CURE) from problem
+    return prior

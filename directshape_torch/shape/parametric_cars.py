@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.parametric_cars_parts import (
+from directshape_torch.shape.parametric_cars_solid import (
     GLASS,
     LIGHT,
     PAINT,
@@ -24,9 +24,10 @@ from directshape_torch.shape.parametric_cars_parts import (
     RIM,
     TRIM,
     TYRE,
+    Array,
     car_part_labels,
+    implicit,
 )
-from directshape_torch.shape.parametric_cars_solid import Array, implicit
 from directshape_torch.shape.parametric_cars_types import BODY_TYPES, CarParameters, sample_car
 
 if TYPE_CHECKING:

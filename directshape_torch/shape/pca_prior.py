@@ -12,10 +12,9 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
-from directshape_torch.numerics.device_constants import constant_like
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.shape.sdf_grid import GridShape, zero_level_extents
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.shape.zero_level import zero_level_extents
 
 # Codes within this many standard deviations of the mean are 'in use': the Lipschitz bound covers them.
 CODE_NORM_IN_USE = 3.0
@@ -118,12 +117,6 @@ class PCAShapePrior(nn.Module):
         """Bound of |gradient| on the grid over all codes of norm up to `code_norm`."""
         return float(_gradient_bound(self.mean, self.basis, code_norm) / self.spacing_m)
 
-    @property
-    def dimensions_residual_std_hwl(self) -> Tensor:
-        """Standard deviation (3,), metres, of the training cars' dimensions that the code does not tell."""
-        explained = (self.dimensions_basis_hwl**2).sum(dim=-1)
-        return (self.dimensions_std_hwl**2 - explained).clamp_min(1e-6).sqrt()
-
     def initial_code(self, num_objects: int) -> Tensor:
         """Codes of the mean shape, (B, K) zeros."""
         return self.mean.new_zeros(num_objects, self.num_codes)
@@ -152,26 +145,6 @@ class PCAShapePrior(nn.Module):
     def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
         """`dimensions_hwl` with its constant derivative, (B, 3) and (B, 3, K)."""
         return DimensionsDerivative(self.dimensions_hwl(code), self.dimensions_basis_hwl.expand(len(code), -1, -1))
-
-    def code_from_dimensions(
-        self,
-        dimensions_hwl: Tensor,  # (B, 3)
-        std_m: float = 0.1,
-    ) -> Tensor:  # (B, K)
-        """The most probable code of a car whose dimensions were measured with standard deviation `std_m`.
-
-        Example:
-            >>> prior = PCAShapePrior.load_bundled()
-            >>> long_car = prior.dimensions_mean_hwl + torch.tensor([0.0, 0.0, 0.5])
-            >>> bool(prior.dimensions_hwl(prior.code_from_dimensions(long_car[None]))[0, 2] > long_car[2] - 0.2)
-            True
-        """
-        check_shape("dimensions_hwl", dimensions_hwl, ("B", 3))
-        A = self.dimensions_basis_hwl
-        noise = torch.diag(self.dimensions_residual_std_hwl**2 + std_m**2)
-        gain = torch.linalg.solve(A @ A.T + noise, A)  # (3, K): the transposed Kalman gain of a N(0, 1) code
-        code: Tensor = (dimensions_hwl - self.dimensions_mean_hwl) @ gain
-        return code
 
     def with_num_codes(self, num_codes: int) -> PCAShapePrior:
         """The prior of the first components only.

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -15,8 +14,6 @@ from directshape_torch.numerics.checks import check_shape
 
 if TYPE_CHECKING:
     import trimesh
-
-    from directshape_torch.shape.sdf_grid import GridShape
 
 
 def sdf_to_mesh(
@@ -60,23 +57,6 @@ def sdf_to_mesh(
         T = T_cam_obj.detach().double().cpu().numpy()
         vertices = vertices @ T[:3, :3].T + T[:3, 3]
     return trimesh.Trimesh(vertices, faces, process=False)
-
-
-def shape_meshes(shape: GridShape, T_cam_obj: Tensor) -> list[trimesh.Trimesh]:
-    """Meshes in camera coordinates of B bound grids with poses (B, 4, 4).
-
-    Example:
-        >>> from directshape_torch.shape.pca_prior import PCAShapePrior
-        >>> prior = PCAShapePrior.load_bundled()
-        >>> meshes = shape_meshes(prior.bind(prior.initial_code(1)), torch.eye(4)[None])
-        >>> meshes[0].is_watertight
-        True
-    """
-    check_shape("T_cam_obj", T_cam_obj, (len(shape.values), 4, 4))
-    return [
-        sdf_to_mesh(values, shape.origin, shape.spacing_m, T)
-        for values, T in zip(torch.unbind(shape.values), torch.unbind(T_cam_obj), strict=True)
-    ]
 
 
 def marching_cubes_padded(

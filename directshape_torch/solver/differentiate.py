@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from directshape_torch.solver.damped_solve import damped_step, limit_step
 from directshape_torch.solver.gauss_newton import Iteration, Minimum
+from directshape_torch.solver.iteration import damped_step, limit_step
 from directshape_torch.solver.problem import (
     DifferentiableProblem,
     DifferentiableStage,

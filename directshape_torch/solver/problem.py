@@ -33,14 +33,6 @@ class EnergyAt(Protocol):
         ...
 
 
-class FiguresAt(Protocol):
-    """What a stage says of a state; the solver compares nothing but costs."""
-
-    @property
-    def cost(self) -> Tensor:  # (B,)
-        ...
-
-
 class StageProblem(Protocol[StateT]):
     """What the iterations of a stage see of B problems, and of fewer and fewer of them."""
 
@@ -76,7 +68,7 @@ class BegunStage(Protocol[StateT]):
         ...
 
     def figures(self, seen: Any) -> Any:
-        """The `FiguresAt` a state, at which the problem was looked at by itself."""
+        """What is said of a state that was looked at by itself; the solver compares nothing but its `cost` (B,)."""
         ...
 
 
@@ -118,6 +110,10 @@ class DifferentiableProblem(Problem[StateT], Protocol):
     """A problem whose stages can be differentiated."""
 
     def begin(self, stage: StageConfig, seen: Any) -> DifferentiableStage[StateT]: ...
+
+    def of_problems(self, keep: Tensor) -> DifferentiableProblem[StateT]:
+        """The same without the problems where `keep` (B,) is false."""
+        ...
 
 
 def take_rows(state: StateT, index: Tensor) -> StateT:

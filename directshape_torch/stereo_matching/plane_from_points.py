@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.camera import points_from_disparity
 from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.points import points_from_disparity
 
 _DEPTH_RANGE_M = (3.0, 40.0)
 _LARGEST_LATERAL_M = 12.0

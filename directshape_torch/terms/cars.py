@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from directshape_torch.config import SearchConfig
 from directshape_torch.geometry import se3
 from directshape_torch.scene import Detections, FrameBatch
 
@@ -65,6 +68,39 @@ def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_ang
     twist, code_step, offset_step = torch.split_with_sizes(delta.to(state.code.dtype), sizes, dim=1)
     T_obj_cam = torch.bmm(se3.exp(twist, max_angle), state.T_obj_cam)
     return CarState(T_obj_cam, (state.code + code_step).clamp(-max_code, max_code), state.offset_px + offset_step)
+
+
+def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float | Tensor) -> CarState:
+    """Cars moved along the viewing ray of their origin so that its disparity grows by `offset_px`, (B,) or one."""
+    T_cam_obj = se3.inverse(state.T_obj_cam)
+    origin = T_cam_obj[:, :3, 3]
+    disparity = focal_baseline / origin[:, 2]
+    scale = disparity / (disparity + offset_px).clamp_min(0.1)
+    moved = se3.from_rotation_translation(T_cam_obj[:, :3, :3], origin * scale[:, None])
+    return state._replace(T_obj_cam=se3.inverse(moved))
+
+
+def turn(state: CarState, angle_rad: float) -> CarState:
+    """Cars turned about the vertical axis of their own object frame."""
+    twist = torch.zeros(6, dtype=state.code.dtype, device=state.code.device)
+    twist[4] = angle_rad
+    return state._replace(T_obj_cam=se3.exp(twist) @ state.T_obj_cam)
+
+
+def following(initial: CarState, start: CarState) -> CarState:
+    """The state that `search_moves` made of the input, as a function of it: moved by a disparity, turned by an angle.
+
+    Both are constants. A disparity moves the origin along its viewing ray, `origin / (1 + a z)` with `a` the disparity
+    over focal length and baseline; an angle turns the car about itself.
+    """
+    origin, chosen = (se3.inverse(state.T_obj_cam)[:, :3, 3] for state in (initial, start))
+    here = origin.detach()
+    a = (here[:, 2] / chosen[:, 2].detach() - 1) / here[:, 2]
+    moved = origin / (1 + a * origin[:, 2])[:, None]
+    R_obj_cam = initial.T_obj_cam[:, :3, :3]
+    turn = (start.T_obj_cam[:, :3, :3] @ R_obj_cam.mT).detach()
+    R_moved = turn @ R_obj_cam
+    return start._replace(T_obj_cam=se3.from_rotation_translation(R_moved, -(R_moved @ moved[..., None])[..., 0]))
 
 
 @dataclass(frozen=True)
@@ -154,6 +190,14 @@ class CarBatch:
         assert self.offset_sigma_px is not None
         per_px = torch.where(self.offset_sigma_px > 0, 1 / self.focal_baseline, 0.0)
         return offset_px * per_px[:, None]
+
+    def search_moves(self, config: SearchConfig) -> list[list[Callable[[CarState], CarState]]]:
+        """Moves of the cars to try before the first step: disparities, then headings."""
+        moves, turns = config.disparity_offsets_px, config.yaw_offsets_deg
+        return [
+            [partial(move_by_disparity, focal_baseline=self.focal_baseline, offset_px=offset) for offset in moves],
+            [partial(turn, angle_rad=math.radians(angle)) for angle in turns],
+        ]
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarBatch:
         """Those of the cars where `keep` (B,) holds: `numbers` of them, should the host know it, who waits if not."""

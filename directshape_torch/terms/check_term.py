@@ -70,6 +70,9 @@ def _check_rows(called: str, term: Term, num_cars: int) -> None:
         ("information", term.information),
     ):
         check_shape(f"{called}: {name}", weight, (num_blocks,), "one for each block")
+    for name, weight in (("block_weight", term.block_weight), ("information", term.information)):
+        if weight.dtype != torch.float64:
+            raise InputError(f"{called}: {name}", "float64, for sums", str(weight.dtype), "convert it with .double()")
     check_shape(
         f"{called}: row_weight", term.row_weight, (num_blocks, "R", "N"), "one for each block, row and residual"
     )
@@ -97,4 +100,5 @@ def _check_linear(called: str, term: Term, where: Where, sight: Sight) -> None:
     check_shape(f"{called}.J_inner_state", J_inner_state, by_state, "by (v, omega, dcode), without the residual's axis")
     again = term.residual(sight.field, sight.state, at.where)
     check_shape(f"{called.replace('linear', 'residual')}", again, of_rows, "those of linear(...)")
-    check_shape(f"{called.replace('linear', 'norm')}.rho", term.norm(at.residual).rho, of_rows, "one for each residual")
+    for name, values in term.norm(at.residual)._asdict().items():
+        check_shape(f"{called.replace('linear', 'norm')}.{name}", values, of_rows, "one for each residual")

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from directshape_torch.config import PriorConfig, StageConfig
 from directshape_torch.geometry import se3
-from directshape_torch.numerics.device_constants import constant_like
+from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
 from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior

@@ -42,17 +42,6 @@ def huber(residual: Tensor, corner: float) -> RobustValue:
     return RobustValue(inner * (magnitude - 0.5 * inner), weight * residual, weight, weight)
 
 
-def huber_cost(magnitude: float, corner: float) -> float:
-    """`huber(...).rho` of one number that is not negative: what a pixel pays that is lost.
-
-    Example:
-        >>> huber_cost(3.0, 2.0)
-        4.0
-    """
-    inner = min(magnitude, corner)
-    return inner * (magnitude - 0.5 * inner)
-
-
 def truncated_huber(residual: Tensor, corner: float, limit: float) -> RobustValue:
     """Huber's norm that stays constant beyond `limit`: a reflection is no worse than a pixel that is lost.
 

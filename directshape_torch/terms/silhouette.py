@@ -2,30 +2,41 @@
 
 `r = -log(pi p_fg + (1 - pi) p_bg)` for every ray, with the projection `pi = sigmoid(-zeta m)` of the least signed
 distance m along it. By the envelope theorem the Jacobian of m is that of the point where it is taken. Derivation:
-docs/derivations/silhouette_closest_approach.md. The paper's product over samples: `silhouette_product`.
+docs/derivations/silhouette_closest_approach.md.
+
+The paper's projection is a product over the samples of each ray, `pi = 1 - prod_s 1 / (exp(Phi_s zeta) + 1)`. It
+dilates the contour and is there to be faithful to the paper (`SilhouetteProducts`,
+docs/derivations/silhouette_product.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
+from torch.nn.functional import logsigmoid
 
 from directshape_torch.config import SilhouetteConfig, StageConfig
-from directshape_torch.depth import Closest, along_face, attached_closest_depth, tracked_closest
-from directshape_torch.geometry.short_axes import cross
+from directshape_torch.depth import Closest, along_face, attached_closest_depth, march, tracked_closest
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.numerics.tensors import cross
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.rows import Blocks, CarSums, Rays, Rows
 from directshape_torch.shape.field import Field
-from directshape_torch.shape.grid_cells import Lookup
+from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.term import Linear, Sight, Where
 
+# Of zeta, per metre.
+ZETA_BOUNDS = (4.0, 400.0)
+# |zeta sdf| from which the projection is certain and has no gradient (closest approach only).
+SATURATION = 16.0
+# The smallest residual in the reweighting 1/r.
+_RESIDUAL_FLOOR = 0.01
 # A ray is near the contour where |zeta sdf| is below this: beyond, its slope is at most 4 % of the steepest.
 IN_PLAY_EXPONENT = 8.0
 # And as far again as the contour may move during a stage, beyond which the next stage picks it up.
@@ -127,10 +138,10 @@ class MaskRows:
         return -torch.log1p(-self.foreground)
 
 
-def contour_zeta(cars: CarBatch, config: SilhouetteConfig, stage: StageConfig) -> Tensor:
+def contour_zeta(cars: CarBatch, stage: StageConfig) -> Tensor:
     """Steepness (B,) of the projection per metre: a contour as wide as the stage says, in pixels at the input depth."""
     zeta = cars.focal_over_depth / stage.contour_width_px
-    return zeta.clamp(config.min_zeta_per_m, config.max_zeta_per_m)
+    return zeta.clamp(*ZETA_BOUNDS)
 
 
 @dataclass(frozen=True)
@@ -175,7 +186,7 @@ class Silhouettes:
         return self.rows.filled[..., None]
 
     def begin(self, stage: StageConfig, sight: Sight) -> Self:
-        return replace(self, zeta=contour_zeta(self.cars, self.config, stage)[self.rows.rays.owner][:, None])
+        return replace(self, zeta=contour_zeta(self.cars, stage)[self.rows.rays.owner][:, None])
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
         """Rays near the contour, or that may come to be: the others are certain, whatever the next steps do."""
@@ -205,6 +216,8 @@ class Silhouettes:
         at = field.derivatives(points, self.rows.rays.owner, constant)
         gradient = along_face(at.gradient, rays.direction_obj, now.face_obj)
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
+        # The envelope theorem speaks of minima: where a search still goes on the residual is a constant of this step.
+        J_residual_sdf = torch.where(now.found, J_residual_sdf, 0.0)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
     def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
@@ -216,10 +229,10 @@ class Silhouettes:
         off_face = (where.face_obj * (points - where.points_obj)).sum(0)
         depth = where.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
         sdf = field.value(rays.at(depth), self.rows.rays.owner)
-        return self._of_distance(sdf, where.crosses)[0][..., None]
+        return self._of_distance(torch.where(where.found, sdf, sdf.detach()), where.crosses)[0][..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
-        return robust.identity(residual, self.config.residual_floor)
+        return robust.identity(residual, _RESIDUAL_FLOOR)
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> Self:
         (rows, kept), cars = self.rows.kept_of_cars(keep, numbers), self.cars.of_cars(keep, numbers)
@@ -230,7 +243,7 @@ class Silhouettes:
 
     def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (M, R) of least distances and its derivative by them; rays that miss the bounds have a constant."""
-        of_closest = closest_approach_residual(sdf, self.zeta, self.config.saturation, self.rows.foreground)
+        of_closest = closest_approach_residual(sdf, self.zeta, self.rows.foreground)
         elsewhere = self.rows.residual_of_a_miss(), torch.zeros_like(sdf)
         residual, slope = (torch.where(crosses, x, y) for x, y in zip(of_closest, elsewhere, strict=True))
         return residual, slope
@@ -239,17 +252,16 @@ class Silhouettes:
 def closest_approach_residual(
     closest_sdf: Tensor,  # (..., P) least signed distance along each ray, metres
     zeta: Tensor,  # broadcastable to (..., P), per metre
-    saturation: float,
     foreground: Tensor,  # (..., P)
 ) -> tuple[Tensor, Tensor]:
     """Residual and `J_residual_sdf` (..., P) at the point of closest approach, zero where saturated.
 
-    `pi = sigmoid(-zeta m)`; beyond `|zeta m| = saturation` the projection is certain. Without logarithms: of pi and
+    `pi = sigmoid(-zeta m)`; beyond `|zeta m| = SATURATION` the projection is certain. Without logarithms: of pi and
     1 - pi the smaller one is a quotient and no difference, so the likelihood `A = pi p_fg + (1 - pi) p_bg` loses no
     digit. `d r / d sdf = zeta pi (1 - pi) (p_fg - p_bg) / A`.
 
     Example:
-        >>> on_contour = (torch.zeros(1), torch.full((1,), 2.0), 16.0, torch.full((1,), 0.75))
+        >>> on_contour = (torch.zeros(1), torch.full((1,), 2.0), torch.full((1,), 0.75))
         >>> closest_approach_residual(*on_contour)
         (tensor([0.6931]), tensor([0.5000]))
     """
@@ -257,13 +269,13 @@ def closest_approach_residual(
     is_outside = x > 0
     # Not `abs`, whose derivative at zero is zero: on the contour itself the residual has one.
     distance = torch.where(is_outside, x, -x)
-    decay = torch.exp(-distance.clamp_max(saturation))
+    decay = torch.exp(-distance.clamp_max(SATURATION))
     larger = 1 / (1 + decay)
     smaller = decay * larger
     hit, miss = torch.where(is_outside, smaller, larger), torch.where(is_outside, larger, smaller)
     likelihood = hit * foreground + miss * (1 - foreground)
     derivative = zeta * smaller * larger * (2 * foreground - 1) / likelihood
-    return -likelihood.log(), torch.where(distance < saturation, derivative, torch.zeros_like(derivative))
+    return -likelihood.log(), torch.where(distance < SATURATION, derivative, torch.zeros_like(derivative))
 
 
 def sdf_state_jacobian(
@@ -279,3 +291,87 @@ def sdf_state_jacobian(
     """
     points, gradient = points_obj.movedim(0, -1), gradient.movedim(0, -1)
     return torch.cat([gradient, cross(points, gradient), at.J_value_code], dim=-1)
+
+
+class Samples(NamedTuple):
+    """Where the rays of a state are sampled."""
+
+    depths: Tensor  # (S, M, 64) metres
+    crosses: Tensor  # (M, 64) bool
+
+
+@dataclass(frozen=True)
+class SilhouetteProducts(Silhouettes):
+    """The term of both images with the paper's projection; rays and weights are those of `Silhouettes`.
+
+    Everything is kept in log space, so that rays deep inside or far outside lose no digits. The samples of a ray are
+    fixed shares of its interval with the prior's bounds, constants of a linearisation.
+    """
+
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[SilhouetteProducts, Where, Tensor]:
+        return self, (), torch.zeros(len(self.cars), 2, dtype=torch.float64, device=self.zeta.device)
+
+    def where(self, sight: Sight) -> Where:
+        return ()
+
+    def linear(self, field: Field, state: CarState, where: Where) -> Linear:
+        owner = self.rows.rays.owner
+        rays = self.rows.rays.in_objects(state.T_obj_cam)
+        marched = march(field, owner, rays, self.bounds_obj, self.config.samples_per_ray)
+        constant = nothing_is_differentiated()
+        sdf = marched.sdf if constant else field.value(rays.at(marched.depths), owner)
+        residual, J_residual_sdf = product_residual(sdf, self.zeta, self.rows.foreground)
+        # One sample at a time: a Jacobian per sample is never kept.
+        J = torch.zeros(0)
+        for number, depth in enumerate(marched.depths):
+            points = rays.at(depth)
+            at = field.derivatives(points, owner, constant)
+            part = J_residual_sdf[number][..., None] * sdf_state_jacobian(points, at.gradient, at)
+            J = part if number == 0 else J + part
+        crosses = marched.crosses
+        J = torch.where(crosses[..., None], J, torch.zeros_like(J))
+        residual = torch.where(crosses, residual, self.rows.residual_of_a_miss())
+        return Linear(residual[..., None], torch.ones_like(residual)[..., None], J, Samples(marched.depths, crosses))
+
+    def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
+        rays = self.rows.rays.in_objects(state.T_obj_cam)
+        sdf = field.value(rays.at(where.depths), self.rows.rays.owner)
+        residual, _ = product_residual(sdf, self.zeta, self.rows.foreground)
+        return torch.where(where.crosses, residual, self.rows.residual_of_a_miss())[..., None]
+
+
+def product_residual(
+    sdf: Tensor,  # (S, ...) signed distance at the samples of each ray, metres
+    zeta: Tensor,  # broadcastable to (...), per metre
+    foreground: Tensor,  # (...)
+) -> tuple[Tensor, Tensor]:
+    """Residual (...) and `J_residual_sdf` (S, ...) of the paper's product form.
+
+    `log (1 - pi) = -sum_s softplus(-zeta sdf_s)`, `d pi / d sdf_s = -zeta (1 - pi) sigmoid(-zeta sdf_s)` and
+    `d r / d pi = -(p_fg - p_bg) / A` (paper, supplement, eqs. for dA/dpi, dpi/dPhi and dC/dPhi; Phi = -sdf).
+
+    Example:
+        >>> product_residual(torch.zeros(1, 1), torch.ones(1), torch.full((1,), 0.99))[0]
+        tensor([0.6931])
+    """
+    # -softplus(-x) = logsigmoid(x), which has no cut-off, unlike `softplus`.
+    log_miss = logsigmoid(zeta * sdf).sum(dim=0)
+    log_hit = log_one_minus_exp(log_miss)
+    residual = -torch.logaddexp(log_hit + foreground.log(), log_miss + torch.log1p(-foreground))
+    d_residual_pi = -(2 * foreground - 1) * residual.exp()
+    d_pi_sdf = -zeta * torch.exp(log_miss + logsigmoid(-zeta * sdf))
+    return residual, d_residual_pi * d_pi_sdf
+
+
+def log_one_minus_exp(x: Tensor) -> Tensor:
+    """`log(1 - exp(x))` for x < 0 without cancellation (Maechler's two branches), finite for x -> 0.
+
+    Example:
+        >>> log_one_minus_exp(torch.tensor(-0.6931472))
+        tensor(-0.6931)
+    """
+    x = x.clamp_max(-torch.finfo(x.dtype).tiny)
+    near_zero = x > -0.6931471805599453
+    by_expm1 = torch.log(-torch.expm1(torch.where(near_zero, x, torch.full_like(x, -0.5))))
+    by_log1p = torch.log1p(-torch.exp(torch.where(near_zero, torch.full_like(x, -1.0), x)))
+    return torch.where(near_zero, by_expm1, by_log1p)

@@ -166,6 +166,7 @@ _SIZES = {
     "depth": 0,
     "depths": 1,
     "crosses": 0,
+    "found": 0,
     "on_surface": 0,
     "usable": 0,
 }
@@ -253,17 +254,3 @@ def by_autograd(
     zero = torch.zeros(state.num_unknowns, dtype=state.code.dtype, device=state.code.device)
     jacobians, values = torch.func.jacfwd(residuals, has_aux=True)(zero)
     return list(zip(values, jacobians, strict=True))
-
-
-def take_blocks(where: Any, kept: Tensor) -> Any:
-    """Some of the blocks (Q,) of where rows look."""
-    if isinstance(where, Tensor):
-        return where.index_select(-2, kept)
-    return type(where)(*(take_blocks(part, kept) for part in where)) if where else where
-
-
-def choose_blocks(condition: Tensor, new: Any, old: Any) -> Any:
-    """Where rows look: the new word in blocks where the condition (M,) holds, else the old one."""
-    if isinstance(new, Tensor):
-        return torch.where(condition[:, None], new, old)
-    return type(new)(*(choose_blocks(condition, *pair) for pair in zip(new, old, strict=True))) if new else new

@@ -7,10 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.image.frame_parts import gradient_magnitude
-from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.packing import car_regions
-from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.observation.sampling import sampling_settings, selected_pixels
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.visualize.sampling_picture import occlusion_picture, sampling_picture
 
@@ -35,9 +33,9 @@ def observation_sheet(
         InputError: no such car, or one without pixels in the left image.
     """
     config = SamplingConfig() if config is None else config
-    left, _ = car_regions(frames, detections, config)
-    magnitude = gradient_magnitude(frames.images_left, frames.sizes)
-    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, left, sampling_settings(config, "left"))
+    left, _ = car_regions(frames, detections)
+    settings = sampling_settings(config, "left")
+    chosen = selected_pixels(frames.images_left, frames.sizes, detections.frame_index, left, settings)
     order = config.occlusion_order
     panels = [
         sampling_picture(frames, detections, left, chosen, object_number, order=order),

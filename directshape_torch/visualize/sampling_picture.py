@@ -11,12 +11,11 @@ from directshape_torch.errors import InputError
 from directshape_torch.observation.occlusion import (
     OcclusionOrder,
     Side,
-    hidden_pixels,
     instances_in_front,
     occlusion_crops,
 )
-from directshape_torch.observation.pixel_sampling import PixelSelection
 from directshape_torch.observation.regions import MASK_THRESHOLD
+from directshape_torch.observation.sampling import PixelSelection
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.visualize.drawing import Picture, picture_of
 
@@ -54,7 +53,7 @@ def sampling_picture(
     picture = _enlarged(_crop(frames, detections, object_number, side, region), scale)
     of_car = selection.object_index == object_number
     uv, above = selection.uv[of_car], selection.above_threshold[of_car]
-    hidden = hidden_pixels(detections, side, selection.object_index[of_car], uv, order)
+    hidden = occlusion_crops(detections, side, regions, order).at(selection.object_index[of_car], uv)
     u0, v0 = region[:2]
     for (u, v), is_above in zip(uv[~hidden].tolist(), above[~hidden].tolist(), strict=True):
         centre = (round((u - u0 + 0.5) * scale), round((v - v0 + 0.5) * scale))

@@ -102,7 +102,7 @@ def stage_tasks(loaded: LoadedFrame) -> list[StageTask]:
     problem, state = refiner.problem(loaded.frame, loaded.detections)
     # Cars that are refused at the door are left out.
     keep = refiner(loaded.frame, loaded.detections).iterations > 0
-    problem, state = problem.of_cars(keep), CarState(*(x[keep] for x in state))
+    problem, state = problem.of_problems(keep), CarState(*(x[keep] for x in state))
     tasks = []
     for stage in problem.stages():
         alone = replace(problem, config=replace(problem.config, stages=(stage,)))
@@ -186,7 +186,7 @@ def single_car_energies(task: StageTask) -> list[CarEnergy]:
     """The energy of each car by itself."""
     number = torch.arange(len(task.start.code), device=task.start.code.device)
     starts = [CarState(*(x[car : car + 1] for x in task.start)) for car in number.tolist()]
-    return [CarEnergy.of(task.problem.of_cars(number == n), task.stage, start) for n, start in enumerate(starts)]
+    return [CarEnergy.of(task.problem.of_problems(number == n), task.stage, start) for n, start in enumerate(starts)]
 
 
 class TangentModel(nn.Module):
@@ -229,14 +229,14 @@ class _Kernel(nn.Module):
 
 
 def make_optimizer(model: TangentModel, config: SolverConfig) -> Any:
-    """Levenberg-Marquardt with the damping of our own solver, and reweighting ("FastTriggs"), PyPose's advice."""
+    """Levenberg-Marquardt, reweighted as PyPose advises ("FastTriggs"), with our damping (`solver/iteration.py`)."""
     pypose = importlib.import_module("pypose")
     strategy = pypose.optim.strategy.Adaptive(
         damping=config.initial_damping,
-        up=config.damping_increase,
-        down=config.damping_decrease,
-        min=config.min_damping,
-        max=config.max_damping,
+        up=8.0,
+        down=0.3,
+        min=1e-7,
+        max=1e5,
     )
     optimizer = pypose.optim.LM(model, strategy=strategy, kernel=_Kernel(model.energy))
     optimizer.jackwargs["strategy"] = "forward-mode"

@@ -44,19 +44,19 @@ TARGETS: dict[str, Target] = {
         _JACOBIANS,
     ),
     "silhouette_products": Target(
-        "directshape_torch/terms/silhouette_product.py",
+        "directshape_torch/terms/silhouette.py",
         ("SilhouetteProducts.linear", "SilhouetteProducts.residual", "product_residual"),
         _JACOBIANS,
     ),
     "photometric": Target(
         "directshape_torch/terms/photometric.py",
-        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth", "compared", "_warped"),
+        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth"),
         (*_OFFSET, *_GRADIENTS),
     ),
-    "photometric_patch": Target(
-        "directshape_torch/terms/photometric_patch.py",
-        ("patch_derivative",),
-        _JACOBIANS,
+    "photometric_rows": Target(
+        "directshape_torch/terms/photometric_rows.py",
+        ("compared", "warped_pixels", "patch_derivative"),
+        (*_OFFSET, *_GRADIENTS),
     ),
     "point_cloud": Target(
         "directshape_torch/terms/point_cloud.py",
@@ -115,10 +115,10 @@ TARGETS: dict[str, Target] = {
     "retract": Target("directshape_torch/terms/cars.py", ("retract",), _JACOBIANS),
     "offset": Target("directshape_torch/terms/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
     "pinhole": Target(
-        "directshape_torch/geometry/pinhole.py", ("rays_from_pixels", "project"), ("tests/geometry/test_pinhole.py",)
+        "directshape_torch/geometry/camera.py", ("rays_from_pixels", "project"), ("tests/geometry/test_pinhole.py",)
     ),
     "stereo_warp": Target(
-        "directshape_torch/geometry/stereo.py",
+        "directshape_torch/geometry/camera.py",
         ("warp_to_right", "_shifted", "right_rays"),
         ("tests/geometry/test_stereo.py",),
     ),
@@ -138,7 +138,7 @@ TARGETS: dict[str, Target] = {
         ("tests/shape/test_sdf_grid.py", "tests/shape/test_pca_prior.py"),
     ),
     "grid_lookup": Target(
-        "directshape_torch/shape/grid_lookup.py",
+        "directshape_torch/shape/sdf_grid.py",
         (
             "value_at",
             "derivatives_at",
@@ -151,7 +151,7 @@ TARGETS: dict[str, Target] = {
         ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_many_lookups.py"),
     ),
     "grid_cells": Target(
-        "directshape_torch/shape/grid_cells.py",
+        "directshape_torch/shape/sdf_grid.py",
         (
             "GridField.last_node",
             "GridField.num_nodes",
@@ -172,12 +172,12 @@ TARGETS: dict[str, Target] = {
         ),
     ),
     "short_axes": Target(
-        "directshape_torch/geometry/short_axes.py",
+        "directshape_torch/numerics/tensors.py",
         ("length", "all_along", "cross"),
         ("tests/geometry/test_short_axes.py",),
     ),
     "bracket": Target(
-        "directshape_torch/shape/bracket.py",
+        "directshape_torch/depth.py",
         ("Bracket.between", "Bracket.probed", "_line_zero"),
         ("tests/shape/test_bracket.py",),
     ),

@@ -13,9 +13,9 @@ from torch import Tensor
 from directshape_torch.evaluation.comparison_summary import ComparedCar
 from directshape_torch.evaluation.pose_error import boxes_of
 from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou
+from directshape_torch.geometry.camera import depth_from_disparity
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.scene import StereoCamera
-from directshape_torch.stereo_matching.points import depth_from_disparity
 from label_disparity.measurement import SideMeasurement, disparity
 
 _PLACEBO_DRAWS = 20

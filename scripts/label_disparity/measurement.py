@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.geometry.camera import disparity_of_depth
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.instance_masks import file_of_frame
@@ -19,7 +20,6 @@ from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.rig.disparity_observations import KnownDepth, cell_index, observe_disparity
 from directshape_torch.rig.labels import depth_of_near_side, known_depth_of_car
 from directshape_torch.scene import StereoCamera
-from directshape_torch.stereo_matching.points import disparity_of_depth
 
 # Patches are 9 x 9 pixels; one in each such cell of the image is independent of the others.
 _PATCH_PX = 9

@@ -1,4 +1,4 @@
-"""Completeness, accuracy, F1 and RMSE over tau: mean shape at the input pose, the geometric rival, ours."""
+"""Completeness, accuracy, F1 and RMSE over tau: mean shape at the input pose, the geometric baseline, ours."""
 
 from __future__ import annotations
 

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
-from directshape_torch.config import SamplingConfig
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of
@@ -77,7 +76,7 @@ class CarBatch:
     true_boxes: Tensor
 
 
-def prepare_frame(loaded: LoadedFrame, sampling: SamplingConfig) -> CarFrame:
+def prepare_frame(loaded: LoadedFrame) -> CarFrame:
     """Crops and features of all cars of a frame, and the cars that count: labelled, with a left mask.
 
     Raises:
@@ -92,12 +91,12 @@ def prepare_frame(loaded: LoadedFrame, sampling: SamplingConfig) -> CarFrame:
         for row, partner in enumerate(match_to_labels(objects, loaded.labels))
         if partner >= 0 and has_mask[row] and counts.counts(loaded.labels[partner])
     )
-    return CarFrame(loaded, car_inputs(loaded.frame, loaded.detections, sampling), counted)
+    return CarFrame(loaded, car_inputs(loaded.frame, loaded.detections), counted)
 
 
-def car_inputs(frames: FrameBatch, detections: Detections, sampling: SamplingConfig) -> CarInputs:
+def car_inputs(frames: FrameBatch, detections: Detections) -> CarInputs:
     """What a network sees of the B cars of a call."""
-    left, right = car_regions(frames, detections, sampling)
+    left, right = car_regions(frames, detections)
     images = frames.images_left[detections.frame_index], frames.images_right[detections.frame_index]
     crops = (_crops(images[0], detections.mask_left, left), _crops(images[1], detections.mask_right, right))
     return CarInputs(_features(detections, left, right, crops), *crops, left, right)

@@ -90,8 +90,7 @@ def folds_of(frame_ids: Sequence[str], num_folds: int, seed: int) -> dict[str, i
 def load_frames(options: Options) -> tuple[CarFrame, ...]:
     """All frames, once for each process."""
     dataset = KittiStereoDataset(options.data, options.detections, options.masks, frames=options.frames)
-    sampling = load_config("default").sampling
-    return tuple(prepare_frame(dataset.load(frame_id), sampling) for frame_id in dataset.frame_ids)
+    return tuple(prepare_frame(dataset.load(frame_id)) for frame_id in dataset.frame_ids)
 
 
 def training_refiner(mode: BackwardMode) -> DirectShapeRefiner:

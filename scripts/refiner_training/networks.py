@@ -1,4 +1,4 @@
-"""What is trained: a network over crops and box features, and its rival, the same corrections as constants."""
+"""What is trained: a network over crops and box features, and its baseline, the same corrections as constants."""
 
 from __future__ import annotations
 

@@ -22,26 +22,23 @@ from torch import Tensor
 
 from directshape_torch.depth import march
 from directshape_torch.geometry import box3d, se3
+from directshape_torch.geometry.camera import project, rays_from_pixels, right_rays, warp_to_right
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
-from directshape_torch.geometry.pinhole import project, rays_from_pixels
-from directshape_torch.geometry.stereo import right_rays, warp_to_right
-from directshape_torch.image.gradients import grey_levels
+from directshape_torch.image.grey_levels import grey_levels, halve
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.image.pyramid import halve, halve_intrinsics
 from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import RefinedBox, write_result_text
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
-from directshape_torch.shape.grid_cells import Lookup
+from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.iteration import damped_step
 from directshape_torch.terms.cars import CarState, retract
-from directshape_torch.terms.photometric import DSO_PATTERN
+from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from directshape_torch.terms.priors import dimensions_prior, height_prior, shape_prior
-from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.silhouette_product import product_residual
+from directshape_torch.terms.silhouette import product_residual, sdf_state_jacobian
 
 ROOT = Path(__file__).parents[2]
 K = torch.tensor([[720.0, 0.0, 610.0], [0.0, 720.0, 172.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -236,8 +233,8 @@ def test_15_update_is_on_the_left_and_in_one_place() -> None:
         for path in (ROOT / "directshape_torch").rglob("*.py")
         if re.search(r"se3\.exp\([^)]*\) @ \w+\.T_obj_cam", path.read_text(encoding="utf-8"))
     ]
-    # `search` makes start states by turning the input; all iterations go through `retract`.
-    assert set(callers) <= {"cars.py", "search.py"}
+    # `turn` makes start states of a search there; all iterations go through `retract`.
+    assert set(callers) <= {"cars.py"}
 
 
 def test_16_the_code_is_whitened() -> None:
@@ -277,11 +274,16 @@ def test_19_photometry_is_in_grey_levels() -> None:
 def test_20_pyramid_is_the_2x2_mean_with_its_intrinsics() -> None:
     image = torch.tensor([[1.0, 3.0], [5.0, 7.0]]).reshape(1, 1, 2, 2)
     assert halve(image).item() == 4.0
-    coarse = halve_intrinsics(K)
-    torch.testing.assert_close(coarse[:2, 2], (K[:2, 2] + 0.5) / 2 - 0.5)
-    # A point's pixels on both levels: the coarse pixel 0 covers fine pixels 0 and 1, so its centre is at 0.5.
+    # Where a point appears, by an image whose values are its own columns: the coarse pixel 0 covers the fine ones 0 and
+    # 1, so its centre is at 0.5.
+    coarse = torch.diag(vector(0.5, 0.5, 1)) @ K
+    coarse[:2, 2] = (K[:2, 2] + 0.5) / 2 - 0.5
     point = vector(1.0, -0.5, 9.0)
-    torch.testing.assert_close(project(point, coarse), (project(point, K) + 0.5) / 2 - 0.5)
+    columns = torch.arange(1242.0, dtype=torch.float64).repeat(1, 1, 2, 1)
+    level = halve(columns)[0, :, 0]
+    u = project(point, coarse)[0]
+    left = int(u)
+    torch.testing.assert_close(torch.lerp(level[0, left], level[0, left + 1], u - left), project(point, K)[0])
 
 
 def test_21_bias_is_measured_minus_true_disparity() -> None:
@@ -333,9 +335,9 @@ def test_25_letters() -> None:
     B, K_, F = len(scene.detections), prior.num_codes, len(scene.frames)
     D, S, N = 6 + K_, DEFAULT.silhouette.samples_per_ray, len(DSO_PATTERN)
     term, sight = photometric_of(stage), stage.problem.look(state)
-    P = len(term.pixels)
+    P = len(term.left.pixels)
     H, W = scene.frames.images_left.shape[2:]
-    assert term.pixels.uv.shape == (P, 2)
+    assert term.left.pixels.uv.shape == (P, 2)
     owner, rays = stage.problem.rays[0].owner, stage.problem.rays[0].in_objects(state.T_obj_cam)
     assert march(sight.field, owner, rays, prior.bounds_obj, S).sdf.shape == (S, len(owner), 64)
     assert len(term.pixel_set.rows.intensity_left) == N == 8
@@ -352,7 +354,7 @@ def test_26_systems_are_float64() -> None:
     )
     _, at = stage.start(stage.problem.look(state))
     assert at.cost.dtype == at.gradient.dtype == at.hessian.dtype == torch.float64
-    assert photometric_of(stage).pixels.uv.dtype == state.code.dtype == torch.float32
+    assert photometric_of(stage).left.pixels.uv.dtype == state.code.dtype == torch.float32
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -26,8 +26,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import FrameBatch
-from directshape_torch.solver.search import move_by_disparity
-from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.cars import CarState, move_by_disparity
 from directshape_torch.terms.photometric import Surface
 
 OFFSETS = profile_offsets()

@@ -11,8 +11,8 @@ from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
+from directshape_torch.diagnosis.outcome import outcome_of
 from directshape_torch.diagnosis.quality import _probabilities, mask_ious, photometric_agreement
-from directshape_torch.outcome import outcome_of
 from directshape_torch.problem import CarStage
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.status import Status
@@ -103,7 +103,7 @@ def test_what_is_hidden_in_the_right_image_is_not_compared() -> None:
 
 def test_no_cars_agree_with_nothing() -> None:
     stage, state = begun()
-    none = stage.problem.of_cars(torch.zeros(2, dtype=torch.bool))
+    none = stage.problem.of_problems(torch.zeros(2, dtype=torch.bool))
     seen = none.look(CarState.of(state.T_obj_cam[:0], state.code[:0]))
     empty = none.begin(none.stages()[1], seen)
     rows = empty.photometric_part(empty.figures(seen))

@@ -16,8 +16,8 @@ from helpers.priors import prior_of
 from directshape_torch.cli.main import main
 from directshape_torch.io.result_files import SHAPES_SCHEMA_VERSION
 from directshape_torch.io.run_manifest import MANIFEST_SCHEMA_VERSION
-from directshape_torch.shape.kernel_pca_prior_file import SCHEMA as KERNEL_SCHEMA
-from directshape_torch.shape.neural_prior_file import SCHEMA as NEURAL_SCHEMA
+from directshape_torch.shape.kernel_pca_prior import SCHEMA as KERNEL_SCHEMA
+from directshape_torch.shape.neural_prior import SCHEMA as NEURAL_SCHEMA
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.prior_file import SCHEMA as PRIOR_SCHEMA
 from directshape_torch.shape.tensor_file import read_tensors

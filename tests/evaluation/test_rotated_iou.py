@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from directshape_torch.errors import InputError
-from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, bev_iou_matrix, iou_3d, iou_3d_matrix
+from directshape_torch.evaluation.rotated_iou import bev_boxes, bev_iou, iou_3d
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 
 
@@ -141,23 +141,11 @@ def test_laws(a: tuple[float, ...], b: tuple[float, ...], shift: tuple[float, fl
     assert bev_iou(move(first), move(second)).item() == pytest.approx(overlap, abs=1e-9)
 
 
-@pytest.mark.parametrize(("n", "m"), [(0, 0), (0, 3), (1, 1), (4, 3)])
-def test_matrix_equals_pairs(n: int, m: int):
-    a, b = _random_boxes(n, seed=5), _random_boxes(m, seed=6)
-    matrix = bev_iou_matrix(a, b)
-    assert matrix.shape == (n, m)
-    pairs = [bev_iou(a[i : i + 1], b[j : j + 1]) for i in range(n) for j in range(m)]
-    expected = torch.cat(pairs).reshape(n, m) if pairs else torch.zeros(n, m, dtype=torch.float64)
-    torch.testing.assert_close(matrix, expected, atol=1e-14, rtol=0)
-    assert bev_iou(a, a).shape == (n,)
-
-
 def test_iou_3d_hand_derived():
     # Footprints 4 x 2 shifted by 2 share 4; heights 1.5 (y 0.1 .. 1.6) and 2.0 (y -0.9 .. 1.1) share 1.0.
     a, b = _boxes((0, 1.6, 10, 1.5, 2, 4, 0)), _boxes((2, 1.1, 10, 2.0, 2, 4, 0))
     expected = 4.0 / (8 * 1.5 + 8 * 2.0 - 4.0)
     assert iou_3d(a, b).item() == pytest.approx(expected, abs=1e-12)
-    assert iou_3d_matrix(a, b).item() == pytest.approx(expected, abs=1e-12)
     assert iou_3d(a, a).item() == pytest.approx(1, abs=1e-12)
     above = _boxes((0, 0.1, 10, 1.5, 2, 4, 0))  # stands exactly on top of a
     assert iou_3d(a, above).item() == 0

@@ -26,7 +26,7 @@ from directshape_torch.evaluation.shape_error_cars import evaluate_shapes
 from directshape_torch.evaluation.shape_error_scores import ShapeScores
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.geometry.camera import disparity_of_depth, rays_from_pixels
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
 from directshape_torch.io.mask_files import FrameJsonMasks
@@ -34,7 +34,6 @@ from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
-from directshape_torch.stereo_matching.points import disparity_of_depth
 
 FRAMES = ("000000", "000001")
 # The second car is 18 px high.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.geometry.short_axes import all_along, cross, length
+from directshape_torch.numerics.tensors import all_along, cross, length
 
 
 @pytest.mark.parametrize("dim", [0, 1, -1])

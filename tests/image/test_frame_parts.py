@@ -5,14 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 from kornia.filters import spatial_gradient
+from reference.pixel_sampling import gradient_magnitude
 from torch import Tensor
 
-from directshape_torch.image.frame_parts import (
-    gradient_magnitude,
+from directshape_torch.image.grey_levels import (
     gradient_magnitude_at,
     gradient_magnitude_of_part,
+    grey_levels,
+    length_2d,
 )
-from directshape_torch.image.gradients import grey_levels, length_2d
 
 # Of a frame of 41 x 33 pixels: inside, along each edge, in corners, single pixels, all of it.
 PARTS = [(5, 6, 20, 31), (0, 6, 4, 9), (30, 2, 33, 8), (3, 0, 9, 2), (3, 40, 9, 41), (0, 0, 1, 1), (32, 40, 33, 41),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from directshape_torch.errors import InputError
-from directshape_torch.image.gradients import grey_levels, length_2d
+from directshape_torch.image.grey_levels import grey_levels, length_2d
 
 
 def test_grey_levels_of_the_primaries() -> None:

@@ -1,4 +1,4 @@
-"""Pyramid levels and their intrinsics."""
+"""Pyramid levels: which pixels a coarser one is made of."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from directshape_torch.errors import InputError
-from directshape_torch.image.pyramid import halve, halve_intrinsics, halve_sizes
+from directshape_torch.image.grey_levels import halve, halve_sizes
 
 
 def test_halve_is_the_mean_of_each_block() -> None:
@@ -21,23 +21,14 @@ def test_odd_last_row_and_column_are_dropped() -> None:
     assert halve_sizes(torch.tensor([[3, 5], [1, 4]])).tolist() == [[1, 2], [1, 2]]
 
 
-def test_intrinsics_follow_the_image() -> None:
-    # A linear image shows where a scene point goes: pixel u of the full image carries the value u.
-    K = torch.tensor([[720.0, 0.0, 609.5], [0.0, 721.0, 172.8], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    ray = torch.tensor([-0.8, -0.2, 1.0], dtype=torch.float64)
-    u_full, v_full, _ = K @ ray
-    u_half, v_half, _ = halve_intrinsics(K) @ ray
+def test_a_coarse_pixel_lies_between_two_fine_ones() -> None:
+    # A linear image shows where a point goes: pixel u of the full image carries the value u.
     ramp = torch.arange(1242.0, dtype=torch.float64).repeat(1, 1, 4, 1)
     coarse = halve(ramp)[0, 0, 0]
-    left = int(u_half.floor())
-    value = torch.lerp(coarse[left], coarse[left + 1], u_half - left)
-    torch.testing.assert_close(value, u_full)
-    torch.testing.assert_close(2 * v_half + 0.5, v_full)
+    torch.testing.assert_close(coarse, 2 * torch.arange(621.0, dtype=torch.float64) + 0.5)
 
 
 def test_no_images_and_errors() -> None:
     assert halve(torch.zeros(0, 3, 9, 16)).shape == (0, 3, 4, 8)
     with pytest.raises(InputError, match="use fewer levels"):
         halve(torch.zeros(1, 3, 4, 1))
-    with pytest.raises(InputError, match=r"K: expected shape \(\.\.\., 3, 3\)"):
-        halve_intrinsics(torch.zeros(3, 4))

@@ -8,10 +8,8 @@ from helpers.host_traffic import host_traffic
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.observation.even_pixels import even_pixels
-from directshape_torch.observation.pixel_sampling import candidate_pixels
-from directshape_torch.observation.regions import RegionPixels, region_pixels
-from directshape_torch.observation.small_cells import small_cell_side
+from directshape_torch.observation.regions import region_pixels, small_cell_side
+from directshape_torch.observation.sampling import even_pixels
 
 
 def by_pixels(regions: Tensor, settings: SamplingConfig) -> tuple[Tensor, Tensor]:
@@ -77,17 +75,6 @@ def test_middles_that_are_nearly_between_two_pixels() -> None:
     settings = SamplingConfig(min_pixels=200, max_pixels=200)
     for found, expected in zip(by_lines(regions, settings), by_pixels(regions, settings), strict=True):
         assert torch.equal(found, expected)
-
-
-def test_the_selection_by_pixels_takes_the_same() -> None:
-    regions = torch.tensor([[3, 5, 90, 40], [0, 0, 0, 0], [7, 7, 9, 60], [0, 0, 866, 274]])
-    settings = SamplingConfig(mode="uniform", min_pixels=100, max_pixels=200)
-    pixels = RegionPixels.of(regions)
-    unseen = torch.zeros(len(pixels))
-    candidates = candidate_pixels(pixels, regions, unseen, unseen > 0, settings)
-    found = pixels.uv_of(candidates.pixel[candidates.exists])
-    for by_number, expected in zip(found, by_lines(regions, settings), strict=True):
-        assert torch.equal(by_number, expected)
 
 
 def test_no_regions() -> None:

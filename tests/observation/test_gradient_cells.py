@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from reference.pixel_sampling import cell_thresholds, gradient_magnitude
 from torch import Tensor
 
-from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.observation.gradient_cells import Box, ImageRegion, gradient_cells
-from directshape_torch.observation.gradient_thresholds import cell_thresholds
 
 SIZES = [[90, 130], [61, 97]]
 

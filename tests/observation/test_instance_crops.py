@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.observation.instance_crops import instance_crops
 from directshape_torch.observation.mask_extents import mask_extents
+from directshape_torch.observation.occlusion import instance_crops
 
 
 @pytest.mark.parametrize("counts", [(3, 0, 2), (0, 0), (150, 100)])

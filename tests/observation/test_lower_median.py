@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.observation.lower_median import lower_medians
+from directshape_torch.observation.gradient_cells import lower_medians
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

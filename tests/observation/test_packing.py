@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 import torch
+from reference.occlusion import hidden_pixels
+from reference.pixel_sampling import gradient_magnitude, select_pixels
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.image.frame_parts import gradient_magnitude
-from directshape_torch.observation.chosen_pixels import sampling_settings
 from directshape_torch.observation.mask_extents import scene_extents
-from directshape_torch.observation.occlusion import Side, hidden_pixels
+from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import Observation, car_regions, pack_pixels
-from directshape_torch.observation.pixel_sampling import select_pixels
+from directshape_torch.observation.sampling import sampling_settings
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
 from tests.helpers.synthetic_scene import stereo_camera
 
@@ -95,9 +95,7 @@ def random_scene(seed: int, count: int, num_frames: int = 3, others: int = 4) ->
 
 def assert_equal_to_whole_frames(frames: FrameBatch, d: Detections, config: SamplingConfig) -> Observation:
     seen = pack_pixels(frames, d, config)
-    for side, pixels, regions in zip(
-        ("left", "right"), (seen.left, seen.right), car_regions(frames, d, config), strict=True
-    ):
+    for side, pixels, regions in zip(("left", "right"), (seen.left, seen.right), car_regions(frames, d), strict=True):
         object_index, uv, foreground, magnitude = whole_frame_side(frames, d, side, regions, config)
         assert torch.equal(pixels.object_index, object_index)
         assert torch.equal(pixels.uv, uv.to(pixels.uv.dtype))

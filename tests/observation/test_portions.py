@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from directshape_torch.observation.portions import pixels_at_once, portions
+from directshape_torch.numerics.tensors import pixels_at_once, portions
 
 
 @settings(max_examples=60, deadline=None)

@@ -6,12 +6,11 @@ from typing import Any
 
 import pytest
 import torch
+from reference.pixel_sampling import gradient_magnitude, select_pixels
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
-from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.observation.gradient_cells import ImageRegion, gradient_cells
-from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.observation.strongest_pixels import strongest_pixels
 
 SIZES = torch.tensor([[70, 150], [64, 101]])

@@ -251,12 +251,10 @@ def test_results_of_other_lines_are_refused(run: FinishedRun, tmp_path: Path) ->
 def test_settings_of_maps_are_those_of_the_run() -> None:
     refiner = {
         "stages": [{"contour_width_px": 2.0}, {"contour_width_px": 0.7}],
-        "silhouette": {"saturation": 9.0, "probability_floor": 0.02, "weight": 12.0},
+        "silhouette": {"probability_floor": 0.02, "weight": 12.0},
         "photometric": {"brightness": "none"},
     }
-    expected = replace(
-        MapSettings(), contour_width_px=0.7, saturation=9.0, probability_floor=0.02, matches_brightness=False
-    )
+    expected = replace(MapSettings(), contour_width_px=0.7, probability_floor=0.02, matches_brightness=False)
     assert map_settings(refiner) == expected
     assert map_settings({}) == MapSettings()
     with pytest.raises(InputError, match="most_frames"):

@@ -164,16 +164,16 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_pose_table_and_that_runs_are_kept(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few = {"ours": settings.Settings(("stages=[{max_iterations: 2}]",)), "rival": settings.GEOMETRIC}
+    few = {"ours": settings.Settings(("stages=[{max_iterations: 2}]",)), "baseline": settings.GEOMETRIC}
     monkeypatch.setattr(pose_table, "METHODS", few)
     words = ["pose", "--data", str(data), "--out", str(tmp_path), "--draws", "20", "--stereo-bias", "none"]
     assert script.main([*words, "--device", "cpu"]) == 0
     text = (tmp_path / "pose.md").read_text(encoding="utf-8")
     assert "| input |" in text
-    assert "| rival |" in text
+    assert "| baseline |" in text
     assert "Few cars: 2 detections of 2 physical cars" in text
     rows = _rows(tmp_path / "pose_ap.csv")
-    assert {row["after"] for row in rows} == {"input", "ours", "rival"}
+    assert {row["after"] for row in rows} == {"input", "ours", "baseline"}
     assert {row["labels"] for row in rows if row["difficulty"] == "hard"} == {"2"}
     assert (tmp_path / "plots" / f"pose_{data.name}_data_3d_0.7.png").read_bytes()[1:4] == b"PNG"
     manifest = json.loads((tmp_path / "pose_manifest.json").read_text(encoding="utf-8"))

@@ -37,7 +37,7 @@ def frames(data_set: Path) -> list[object]:
         d = loaded.detections
         grown = [max_pool2d(m[:, None].double(), 5, stride=1, padding=2)[:, 0] for m in (d.mask_left, d.mask_right)]
         loaded = replace(loaded, detections=replace(d, mask_left=grown[0], mask_right=grown[1]))
-        parts.append(car_frames.prepare_frame(loaded, DEFAULT.sampling))
+        parts.append(car_frames.prepare_frame(loaded))
     return parts
 
 

@@ -9,9 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.shape.grid_cells import GridField
-from directshape_torch.shape.grid_lookup import derivatives_at, value_at
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.sdf_grid import GridField, GridShape, derivatives_at, value_at
 
 COUNT = 50
 

@@ -6,9 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.shape.grid_cells import GridField
-from directshape_torch.shape.grid_lookup import derivatives_at, value_at
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.sdf_grid import GridField, GridShape, derivatives_at, value_at
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
 COUNTS, SPACING = (6, 5, 4), 0.4

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.zero_level import zero_level_extents
+from directshape_torch.shape.sdf_grid import zero_level_extents
 
 
 def box_sdf(

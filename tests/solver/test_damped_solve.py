@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.solver.damped_solve import damped_step, limit_step
+from directshape_torch.solver.iteration import damped_step, limit_step
 
 
 def _systems(count: int, size: int = 5) -> tuple[torch.Tensor, torch.Tensor]:

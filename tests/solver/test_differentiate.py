@@ -18,7 +18,6 @@ EXACT = SolverConfig(
     cost_tolerance=0.0,
     step_tolerance=1e-14,
     initial_damping=1e-3,
-    max_step_translation_m=10.0,
 )
 STAGES = [StageConfig(2.0, 1, 30), StageConfig(1.0, 0, 60)]
 

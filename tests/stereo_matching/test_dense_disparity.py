@@ -14,8 +14,7 @@ from helpers.synthetic_scene import cached_street, joined_frames
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError, MissingDependencyError
-from directshape_torch.stereo_matching.dense_disparity import with_disparity
-from directshape_torch.stereo_matching.elas import match_disparity_elas
+from directshape_torch.stereo_matching.disparity import match_disparity_elas, with_disparity
 
 
 def test_frames_keep_the_disparity_that_they_bring() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.terms.brightness import Brightness, matched_brightness
+from directshape_torch.terms.photometric import Brightness, matched_brightness
 
 CAR = torch.tensor([0] * 30 + [1] * 20)
 

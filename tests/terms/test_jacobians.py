@@ -13,12 +13,11 @@ from torch import Tensor
 
 from directshape_torch.problem import CarStage
 from directshape_torch.terms.cars import CarState
-from directshape_torch.terms.photometric import DSO_PATTERN, Photometric, Surface
-from directshape_torch.terms.photometric_patch import patch_residual
+from directshape_torch.terms.photometric import Photometric, Surface
+from directshape_torch.terms.photometric_rows import CONTRAST_FLOOR, DSO_PATTERN, patch_residual
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorTerm
-from directshape_torch.terms.silhouette import Silhouettes
-from directshape_torch.terms.silhouette_product import SilhouetteProducts
+from directshape_torch.terms.silhouette import SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import Linear, Term, by_autograd
 
 CASES = [("typical", config) for config in ALL_CONFIGS] + [(regime, "default") for regime in REGIMES[1:]]
@@ -62,15 +61,15 @@ def _reference(begun: CarStage, term: Term, at: Linear, state: CarState) -> Tens
     left = rows.intensity_left.movedim(0, -1)
     # The term's own left levels hold the match of brightness, which `test_brightness` examines.
     given = _left_levels(begun, term)
-    of_patch = left, rows.neighbour_weight.movedim(0, -1), config.patch, config.contrast_floor_grey_levels
+    of_patch = left, rows.neighbour_weight.movedim(0, -1), config.patch, CONTRAST_FLOOR
     return patch_residual(plain + given - left, *of_patch)
 
 
 def _left_levels(begun: CarStage, term: Photometric) -> Tensor:
     """Left grey levels (M, R, 8) before any match of brightness."""
-    images, fixed = term.pyramid[begun.config.image_level], term.pixel_set
-    own = term.all_rows.row.flatten()[fixed.sight_place]
-    uv = (term.pixels.uv[own][:, :, None] + 0.5) * images.scale - 0.5 + torch.tensor(DSO_PATTERN)
+    images, fixed = term.left.pyramid[begun.config.image_level], term.pixel_set
+    own = term.left.packed.row.flatten()[fixed.sight_place]
+    uv = (term.left.pixels.uv[own][:, :, None] + 0.5) * images.scale - 0.5 + torch.tensor(DSO_PATTERN)
     frame = term.cars.frame_index[fixed.blocks.owner].tolist()
     sizes = [images.sizes[f].tolist() for f in frame]
     return torch.stack(

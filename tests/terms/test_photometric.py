@@ -16,9 +16,11 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.problem import CarStage
+from directshape_torch.terms import photometric_rows
 from directshape_torch.terms.cars import CarState
-from directshape_torch.terms.photometric import DSO_PATTERN, compared, is_grazing, residuals_at
-from directshape_torch.terms.robust import huber_cost
+from directshape_torch.terms.photometric import is_grazing
+from directshape_torch.terms.photometric_rows import DSO_PATTERN, GRADIENT_CONSTANT, compared, residuals_at
+from directshape_torch.terms.robust import huber
 
 
 def _stage(config: RefinerConfig = PAPER) -> tuple[CarStage, CarState]:
@@ -50,7 +52,7 @@ def test_residuals_at_any_depth_are_the_references_and_have_its_slope(regime: st
     depth = term.cars.input_depth[rows.rays.owner][:, None] * (1 + 0.1 * torch.rand_like(rows.pixel_weight))
     at = compared(rows, term.config, depth)
     expected, landed, in_front = reference.photometric(term, level, depth)
-    size = term.pyramid[level].sizes[0]
+    size = term.left.pyramid[level].sizes[0]
     inside = ((landed >= 0) & (landed <= size.flip(0) - 1)).all(-1) & (in_front > 0)
     counted = at.comparable & (rows.pixel_weight > 0)
     assert counted.double().mean() > 0.3
@@ -71,8 +73,7 @@ def test_grazing_rays_are_those_below_the_cosine() -> None:
     cosine = torch.tensor([0.099, 0.101], dtype=torch.float64)
     normal = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64).view(3, 1, 1).expand(3, 1, 2)
     direction = 3 * torch.stack([cosine, 0 * cosine, (1 - cosine**2).sqrt()])[:, None]
-    config = replace(DEFAULT.photometric, min_ray_cosine=0.1)
-    assert is_grazing(normal, direction, config)[0].tolist() == [True, False]
+    assert is_grazing(normal, direction)[0].tolist() == [True, False]
 
 
 @pytest.mark.parametrize("config", [PAPER, TRUNCATED], ids=["plain", "truncated"])
@@ -80,7 +81,7 @@ def test_a_pixel_that_loses_its_surface_pays_the_constant(config: RefinerConfig)
     stage, state = _stage(config)
     term, column = photometric_of(stage), 2
     gone, still = (figures_at(stage, s) for s in (_translated(state, [30.0, 0.0, 0.0]), state))
-    lost = huber_cost(term.config.lost_grey_levels, term.config.huber_grey_levels)
+    lost = huber(torch.tensor(term.config.lost_grey_levels), term.config.huber_grey_levels).rho
     weight = term.row_weight * term.block_weight[:, None, None]
     expected = torch.stack([lost * weight[term.blocks.owner == car].sum() for car in range(2)])
     torch.testing.assert_close(gone.term_costs[:, column], expected)
@@ -139,11 +140,11 @@ def test_pixel_sets_and_their_weights() -> None:
         stage, _ = _stage(config)
         term = photometric_of(stage)
         counted = term.pixel_set.rows.pixel_weight > 0
-        own = term.all_rows.row.flatten()[term.pixel_set.sight_place][counted]
-        assert bool((term.pixels.foreground[own] > 0.5).all()) is needs_mask
+        own = term.left.packed.row.flatten()[term.pixel_set.sight_place][counted]
+        assert bool((term.left.pixels.foreground[own] > 0.5).all()) is needs_mask
         assert int(counted.sum()) == int(term.pixel_set.support.sum())
-        c2 = term.config.gradient_constant_grey_levels**2
-        expected = c2 / (c2 + term.pixels.gradient_magnitude[own] ** 2)
+        c2 = GRADIENT_CONSTANT**2
+        expected = c2 / (c2 + term.left.pixels.gradient_magnitude[own] ** 2)
         torch.testing.assert_close(term.pixel_set.rows.pixel_weight[counted], expected)
 
 
@@ -165,7 +166,9 @@ def test_gain_brings_the_left_image_to_the_brightness_of_the_right_one() -> None
 
 
 @pytest.mark.parametrize("change", ["darker", "flatter"])
-def test_forms_that_do_not_see_a_change_of_the_right_image_have_the_same_gradient(change: str) -> None:
+def test_forms_that_do_not_see_a_change_of_the_right_image_have_the_same_gradient(
+    change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """20 grey levels darker, or 0.9 of the contrast about 100: the paper's residuals see both, the others not."""
     prior, scene = cached_street()
     grey = 255 * scene.frames.images_right
@@ -184,5 +187,6 @@ def test_forms_that_do_not_see_a_change_of_the_right_image_have_the_same_gradien
     assert off_by() > 0.1
     # Residuals after the match are those of the right image, so its contrast is a factor of them, squared in g.
     assert off_by(brightness="affine") < (1e-6 if change == "darker" else 0.2)
-    assert off_by(patch="normalised", contrast_floor_grey_levels=0.1) < 1e-2
+    monkeypatch.setattr(photometric_rows, "CONTRAST_FLOOR", 0.1)
+    assert off_by(patch="normalised") < 1e-2
     assert (off_by(patch="zero_mean") < 1e-9) is (change == "darker")

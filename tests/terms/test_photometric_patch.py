@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from directshape_torch.terms.photometric_patch import PatchForm, patch_derivative, patch_residual
+from directshape_torch.terms.photometric_rows import PatchForm, patch_derivative, patch_residual
 
 FLOOR = 5.0
 FORMS: tuple[PatchForm, ...] = ("plain", "zero_mean", "normalised")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.terms.robust import RobustValue, huber, huber_cost, identity, quadratic, truncated_huber
+from directshape_torch.terms.robust import RobustValue, huber, identity, quadratic, truncated_huber
 
 RESIDUALS = torch.tensor(
     [-40.0, -9.0001, -8.9999, -0.5, 0.0, 0.5, 8.9999, 9.0001, 14.9, 15.1, 40.0], dtype=torch.float64
@@ -31,11 +30,6 @@ def test_huber_is_half_the_square_inside_and_linear_outside() -> None:
     assert norm.rho.tolist() == [8.0, 139.5]
     assert norm.gradient_weight.tolist() == [4.0, -9.0]
     assert norm.hessian_weight.tolist() == [1.0, 0.45]
-
-
-@pytest.mark.parametrize("magnitude", [0.0, 4.0, 9.0, 20.0])
-def test_the_cost_of_one_number_is_that_of_the_norm(magnitude: float) -> None:
-    assert huber_cost(magnitude, 9.0) == huber(torch.tensor(magnitude, dtype=torch.float64), 9.0).rho.item()
 
 
 def test_huber_is_smooth_at_its_corner() -> None:

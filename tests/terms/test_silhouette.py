@@ -19,11 +19,17 @@ from directshape_torch.depth import closest_of_march, march
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays
 from directshape_torch.shape.field import PackedField
+from directshape_torch.terms import silhouette
 from directshape_torch.terms.cars import CarState
-from directshape_torch.terms.silhouette import Silhouettes, closest_approach_residual
-from directshape_torch.terms.silhouette_product import SilhouetteProducts, log_one_minus_exp, product_residual
+from directshape_torch.terms.silhouette import (
+    SATURATION,
+    SilhouetteProducts,
+    Silhouettes,
+    closest_approach_residual,
+    log_one_minus_exp,
+    product_residual,
+)
 
-SATURATION = 16.0
 ZETAS = {"far": 9.0, "typical": 90.0, "near": 400.0}
 
 
@@ -32,7 +38,7 @@ def vector(*values: float) -> Tensor:
 
 
 def closest(sdf: Tensor, zeta: Tensor, foreground: Tensor) -> Tensor:
-    return closest_approach_residual(sdf, zeta, SATURATION, foreground)[0]
+    return closest_approach_residual(sdf, zeta, foreground)[0]
 
 
 def product(sdf: Tensor, zeta: Tensor, foreground: Tensor) -> Tensor:
@@ -49,7 +55,7 @@ def test_closest_approach_derivative_three_ways(regime: str) -> None:
     zeta = torch.full((60,), ZETAS[regime], dtype=torch.float64)
     sdf = torch.linspace(-20, 20, 60, dtype=torch.float64) / zeta
     fg = foreground(60)[torch.randperm(60)]
-    _, analytic = closest_approach_residual(sdf, zeta, SATURATION, fg)
+    _, analytic = closest_approach_residual(sdf, zeta, fg)
     leaf = sdf.clone().requires_grad_()
     (by_autograd,) = torch.autograd.grad(closest(leaf, zeta, fg).sum(), leaf)
     torch.testing.assert_close(analytic, by_autograd, rtol=1e-10, atol=1e-12)
@@ -74,18 +80,18 @@ def test_product_derivative_three_ways(regime: str) -> None:
 
 def test_by_hand() -> None:
     """On the contour (sdf = 0, pi = 1/2) of a sure foreground pixel: dr/dsdf = zeta/4 (p_fg - p_bg) / (1/2)."""
-    residual, derivative = closest_approach_residual(vector(0.0), vector(80.0), SATURATION, vector(0.99))
+    residual, derivative = closest_approach_residual(vector(0.0), vector(80.0), vector(0.99))
     assert float(residual) == pytest.approx(math.log(2))
     assert float(derivative) == pytest.approx(80 / 4 * 0.98 / 0.5)
     # A mask that says one half says nothing.
-    of_both = closest_approach_residual(vector(-0.1, 0.3), vector(80.0), SATURATION, vector(0.5, 0.5))
+    of_both = closest_approach_residual(vector(-0.1, 0.3), vector(80.0), vector(0.5, 0.5))
     torch.testing.assert_close(of_both[0], vector(math.log(2), math.log(2)))
     assert (of_both[1] == 0).all()
 
 
 def test_moving_the_surface_away_costs_in_the_foreground_and_pays_in_the_background() -> None:
     zeta, fg, sdf = vector(80.0, 80.0), vector(0.99, 0.01), vector(0.0, 0.0)
-    assert torch.sign(closest_approach_residual(sdf, zeta, SATURATION, fg)[1]).tolist() == [1.0, -1.0]
+    assert torch.sign(closest_approach_residual(sdf, zeta, fg)[1]).tolist() == [1.0, -1.0]
     assert torch.sign(product_residual(sdf[None], zeta, fg)[1][0]).tolist() == [1.0, -1.0]
 
 
@@ -117,14 +123,15 @@ def test_log_one_minus_exp_keeps_its_digits() -> None:
 
 # In an energy
 
-SOFT = replace(DEFAULT.silhouette, min_zeta_per_m=0.2, max_zeta_per_m=0.2)
-
 
 @pytest.mark.parametrize("form", ["closest_approach", "product"])
-def test_a_ray_that_misses_the_bounds_counts_as_background(form: Literal["closest_approach", "product"]) -> None:
+def test_a_ray_that_misses_the_bounds_counts_as_background(
+    form: Literal["closest_approach", "product"], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """However soft the contour: so soft here that the distance alone would still give a gradient."""
+    monkeypatch.setattr(silhouette, "ZETA_BOUNDS", (0.2, 0.2))
     prior, scene = cached_street()
-    config = replace(DEFAULT, silhouette=replace(SOFT, form=form))
+    config = replace(DEFAULT, silhouette=replace(DEFAULT.silhouette, form=form))
     stage, state = begun_stage(prior, scene.frames, disturbed(scene.detections), config)
     away = se3.exp(vector(40.0, 0, 0, 0, 0, 0))
     at = figures_at(stage, CarState.of(away @ state.T_obj_cam, state.code))

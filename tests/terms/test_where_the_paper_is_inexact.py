@@ -12,16 +12,14 @@ from reference.rays import RaysObj, first_entry, least
 from torch import Tensor
 
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.geometry.stereo import right_rays
+from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.shape.grid_cells import Lookup
+from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.shape.shape_prior import BoundShape
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.priors import height_prior
-from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.silhouette_product import product_residual
+from directshape_torch.terms.silhouette import product_residual, sdf_state_jacobian
 
 K = torch.tensor([[720.0, 0.0, 600.0], [0.0, 720.0, 180.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

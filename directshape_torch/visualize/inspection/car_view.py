@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.diagnosis.ray_cast import RayCast, cast
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
@@ -19,10 +20,9 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.refinable import without_empty_masks
-from directshape_torch.ray_cast import RayCast, cast
 from directshape_torch.refinement_trace import RefinementTrace
+from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.shape.zero_level import zero_level_extents
 from directshape_torch.terms.cars import CarState
 from directshape_torch.visualize.drawing import Picture, picture_of
 from directshape_torch.visualize.inspection.shape_in_image import (
@@ -109,9 +109,8 @@ class CarView:
     @cached_property
     def regions(self) -> tuple[Window, Window]:
         """Regions of the left and the right image whose pixels speak about the car."""
-        config = self.trace.config.sampling
         detections = without_empty_masks(self.loaded.detections)
-        left, right = (r[self.car].tolist() for r in car_regions(self.loaded.frame, detections, config))
+        left, right = (r[self.car].tolist() for r in car_regions(self.loaded.frame, detections))
         return (left[0], left[1], left[2], left[3]), (right[0], right[1], right[2], right[3])
 
     def window(self, side: Side) -> Window:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.config import PointCloudConfig
-from directshape_torch.geometry.pinhole import rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.io.figure_files import new_figure
+from directshape_torch.observation.car_points import car_points
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.stereo_matching.car_points import car_points
-from directshape_torch.stereo_matching.dense_disparity import with_disparity
+from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.field_views import COLOURS, distance_at, distance_scale
 from directshape_torch.visualize.inspection.panels import AFTER_INK, write_figure

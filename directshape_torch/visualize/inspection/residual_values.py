@@ -73,10 +73,11 @@ def _of_silhouette(masks: MaskRows, side: int, pixels: PixelSamples, at: Part) -
 
 
 def _of_photometry(term: Photometric, at: Part) -> _Pixels:
-    fixed = term.pixel_set
+    fixed, left = term.pixel_set, term.left
+    assert left is not None, "a stage of all cars has all pixels"
     counted = fixed.rows.pixel_weight > 0
     weight = fixed.rows.neighbour_weight.movedim(0, -1)
     mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
-    pixel = term.all_rows.row.flatten()[fixed.sight_place]
+    pixel = left.packed.row.flatten()[fixed.sight_place]
     car = fixed.blocks.owner[:, None].expand_as(counted)
-    return _Pixels(car[counted], term.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted])
+    return _Pixels(car[counted], left.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted])

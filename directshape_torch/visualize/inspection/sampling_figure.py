@@ -10,14 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.image.frame_parts import gradient_magnitude
 from directshape_torch.io.figure_files import new_figure
 from directshape_torch.io.instance_masks import SIDES
-from directshape_torch.observation.chosen_pixels import sampling_settings
-from directshape_torch.observation.occlusion import Side, hidden_pixels
+from directshape_torch.observation.occlusion import Side, occlusion_crops
 from directshape_torch.observation.packing import car_regions
-from directshape_torch.observation.pixel_sampling import select_pixels
 from directshape_torch.observation.refinable import without_empty_masks
+from directshape_torch.observation.sampling import sampling_settings, selected_pixels
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.panels import draw_lines, show_crop, write_figure
 from directshape_torch.visualize.sampling_picture import PANEL_GAP_PX, occlusion_picture
@@ -57,15 +55,15 @@ def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
     """The pixels as the refinement chose them, with the round that each comes from."""
     config = view.trace.config.sampling
     frames, detections = view.loaded.frame, without_empty_masks(view.loaded.detections)
-    left, right = car_regions(frames, detections, config)
+    left, right = car_regions(frames, detections)
     images, regions = (frames.images_left, left) if side == "left" else (frames.images_right, right)
-    magnitude = gradient_magnitude(images, frames.sizes)
-    chosen = select_pixels(magnitude, frames.sizes, detections.frame_index, regions, sampling_settings(config, side))
+    settings = sampling_settings(config, side)
+    chosen = selected_pixels(images, frames.sizes, detections.frame_index, regions, settings)
     mine = chosen.object_index == view.car
     uv, above = chosen.uv[mine], chosen.above_threshold[mine]
-    hidden = hidden_pixels(detections, side, chosen.object_index[mine], uv, config.occlusion_order)
+    hidden = occlusion_crops(detections, side, regions, config.occlusion_order).at(chosen.object_index[mine], uv)
     kept = ~hidden if config.occlusion else torch.ones_like(hidden)
-    by_gradient = sampling_settings(config, side).mode in ("adaptive", "round_one")
+    by_gradient = settings.mode in ("adaptive", "round_one")
     return SampledPixels(np.asarray(uv[kept].cpu()), np.asarray(above[kept].cpu()), int((~kept).sum()), by_gradient)
 
 
@@ -93,7 +91,7 @@ def write_occlusion_picture(path: Path | str, view: CarView) -> None:
     """Write, as PNG, image, masks and occlusion mask, the left image above the right one where it has a region too."""
     detections = without_empty_masks(view.loaded.detections)
     config = view.trace.config.sampling
-    regions = car_regions(view.loaded.frame, detections, config)
+    regions = car_regions(view.loaded.frame, detections)
     # One scale for both images, or the car would seem to change its size.
     scale = max(2, round(_LEAST_HEIGHT_PX / max(v1 - v0 for _, v0, _, v1 in view.regions)))
     rows = []

@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.geometry.pinhole import rays_from_pixels
-from directshape_torch.geometry.stereo import right_rays
+from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import residual_offsets
 from directshape_torch.scene import Detections, FrameBatch

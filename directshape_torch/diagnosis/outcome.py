@@ -9,20 +9,21 @@ from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.diagnosis.box_alignment import ROUNDS_PX, BoxAlignment
-from directshape_torch.diagnosis.car_rows import kept, placed
-from directshape_torch.diagnosis.covariance import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.diagnosis.disparity_profile import DisparityProfile, disparity_profile
 from directshape_torch.diagnosis.evidence import Course
-from directshape_torch.diagnosis.observability import Observability, observability_of
+from directshape_torch.diagnosis.observability import (
+    Observability,
+    covariance_of,
+    covariance_xyz_yaw,
+    observability_of,
+    without_offset,
+)
 from directshape_torch.diagnosis.quality import FitQuality, fit_quality
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.problem import CarProblem, CarStage
-from directshape_torch.result import RefinementResult
-from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.solver.iteration import damped_step
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
@@ -215,55 +216,3 @@ def _sigma_along(covariance_xyz_yaw: Tensor, location: Tensor) -> Tensor:
     ray = ray / ray.norm(dim=1, keepdim=True)
     variance: Tensor = (ray[:, None] @ C @ ray[..., None])[:, 0, 0]
     return variance.sqrt()
-
-
-def assemble(
-    prior: ShapePrior,
-    frames: FrameBatch,
-    detections: Detections,
-    state: CarState,
-    status: Tensor,
-    rows: Tensor,
-    outcome: Outcome,
-) -> RefinementResult:
-    """The result of a call whose cars `rows` were minimised; the others keep what they came with."""
-    count = len(detections)
-
-    def spread(part: Tensor) -> Tensor:
-        return placed(part.to(torch.float64), rows, count)
-
-    iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
-    refined = is_refined(status)
-    returned_input = (status == Status.not_trusted.code) | (status == Status.no_evidence.code)
-    figures_known = refined | returned_input
-    # The input pose is returned to the bit for cars that were not refined, not inverted twice.
-    T_cam_obj = torch.where(refined[:, None, None], se3.inverse(state.T_obj_cam), detections.T_cam_obj)
-    return RefinementResult(
-        T_cam_obj=T_cam_obj,
-        code=state.code,
-        status_code=status,
-        iterations=iterations,
-        term_names=outcome.term_names,
-        cost_before=spread(outcome.cost_before),
-        cost_after=spread(outcome.cost_after),
-        covariance=kept(spread(outcome.covariance), refined),
-        covariance_xyz_yaw=kept(spread(outcome.covariance_xyz_yaw), refined),
-        cost_history=spread(outcome.cost_history),
-        quality=outcome.quality.spread(rows, count).where(figures_known),
-        observability=outcome.observability.spread(rows, count).where(refined),
-        profile=outcome.profile.spread(rows, count).where(figures_known),
-        # The caller may reuse the tensor for the next call.
-        input_dimensions_hwl=detections.dimensions_hwl.clone(),
-        ground_source=_ground_sources(frames, detections),
-        t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
-        prior=prior,
-        has_shape=outcome.has_shape,
-    )
-
-
-def _ground_sources(frames: FrameBatch, detections: Detections) -> tuple[str, ...]:
-    """Where the plane of each car's frame came from; which frame that is the host asks only where it matters."""
-    sources = frames.ground.source
-    if len(set(sources)) == 1:
-        return sources[:1] * len(detections)
-    return tuple(sources[frame] for frame in detections.frame_index.tolist())

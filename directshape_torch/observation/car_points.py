@@ -9,9 +9,9 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.table_lookup import occurrences
+from directshape_torch.geometry.camera import points_from_disparity
+from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.stereo_matching.points import points_from_disparity
 
 _MASK_THRESHOLD = 0.5
 

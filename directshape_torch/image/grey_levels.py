@@ -1,0 +1,192 @@
+"""Grey levels of images, their gradients where something is to be seen, and their pyramid of exact 2x2 means."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from kornia.color import rgb_to_grayscale
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.numerics.tensors import constant_like, take
+
+# Of red, green and blue in a grey level of 0..255 (ITU-R BT.601).
+_WEIGHTS = (255 * 0.299, 255 * 0.587, 255 * 0.114)
+
+
+def grey_levels(
+    images: Tensor,  # (*, 3, H, W)
+) -> Tensor:
+    """Grey levels 0..255 of RGB images in [0, 1].
+
+    Args:
+        images: (*, 3, H, W), RGB in [0, 1].
+
+    Returns:
+        (*, H, W), `255 (0.299 R + 0.587 G + 0.114 B)`.
+
+    Raises:
+        InputError: not (*, 3, H, W) or not floating point.
+
+    Example:
+        >>> grey_levels(torch.ones(1, 3, 1, 2, dtype=torch.float64))
+        tensor([[[255., 255.]]], dtype=torch.float64)
+    """
+    if images.ndim < 3 or images.shape[-3] != 3:
+        raise InputError("images", "shape (*, 3, H, W)", f"{tuple(images.shape)}", "put the colour axis there")
+    if not images.is_floating_point():
+        raise InputError("images", "floating point in [0, 1]", str(images.dtype), "divide by 255")
+    return rgb_to_grayscale(images, constant_like(_WEIGHTS, images)).squeeze(-3)
+
+
+def length_2d(
+    d_u: Tensor,  # (*,)
+    d_v: Tensor,  # (*,)
+) -> Tensor:
+    """Euclidean length (*,) of an image gradient; its derivative is 0 where the image is flat.
+
+    A length that is not finite has no derivative either: 0 and not NaN, which a product with the 0 of whoever does not
+    use it would spread over the image.
+
+    Example:
+        >>> flat = torch.zeros(1, requires_grad=True)
+        >>> length_2d(flat, flat).backward()
+        >>> flat.grad
+        tensor([0.])
+    """
+    square = (d_u * d_u).add_(d_v * d_v)
+    if not square.requires_grad:
+        return square.sqrt_()
+    constant = square.detach().sqrt()
+    has_slope = (constant > 0) & constant.isfinite()
+    d_u, d_v = (torch.where(has_slope, d, 0) for d in (d_u, d_v))
+    square = torch.where(has_slope, d_u * d_u + d_v * d_v, 1)
+    return torch.where(has_slope, square.sqrt(), constant)
+
+
+def gradient_magnitude_of_part(
+    image: Tensor,  # (3, H, W)
+    size_hw: tuple[int, int],
+    part: tuple[int, int, int, int],
+) -> Tensor:
+    """Length of the image gradient in one part of a frame, by central differences; differentiable by the image.
+
+    Args:
+        image: (3, H, W), RGB in [0, 1], padded at the right and bottom.
+        size_hw: (height, width) of the frame without padding; at its own edge the edge is replicated.
+        part: (u0, v0, u1, v1) within the frame, half open, not empty.
+
+    Returns:
+        (v1 - v0, u1 - u0), grey levels per pixel.
+
+    Example:
+        >>> ramp = torch.arange(40.0).expand(3, 40, 40) / 255
+        >>> gradient_magnitude_of_part(ramp, (40, 40), (0, 8, 3, 9))
+        tensor([[0.5000, 1.0000, 1.0000]])
+    """
+    (u0, v0, u1, v1), (height, width) = part, size_hw
+    # One pixel more on each side, as far as there is one.
+    left, top, right, bottom = int(u0 > 0), int(v0 > 0), int(u1 < width), int(v1 < height)
+    grey = grey_levels(image[:, v0 - top : v1 + bottom, u0 - left : u1 + right])
+    if not left or not top or not right or not bottom:
+        missing = (1 - left, 1 - right, 1 - top, 1 - bottom)
+        grey = torch.nn.functional.pad(grey[None], missing, mode="replicate")[0]
+    d_u, d_v = grey[1:-1, 2:] - grey[1:-1, :-2], grey[2:, 1:-1] - grey[:-2, 1:-1]
+    return length_2d(d_u, d_v).mul_(0.5)
+
+
+def gradient_magnitude_at(
+    images: Tensor,  # (F, 3, H, W)
+    sizes: Tensor,  # (F, 2)
+    frame_index: Tensor,  # (P,)
+    uv: Tensor,  # (P, 2)
+) -> Tensor:
+    """`gradient_magnitude_of_part` at single pixels, the same numbers; differentiable by the images.
+
+    Args:
+        images: (F, 3, H, W), RGB in [0, 1], padded at the right and bottom.
+        sizes: (F, 2) integer (height, width) of each frame without padding; at its own edge the edge is replicated.
+        frame_index: (P,) frame of each pixel.
+        uv: (P, 2) integer, within their frames.
+
+    Returns:
+        (P,), grey levels per pixel.
+
+    Example:
+        >>> ramp = torch.arange(40.0).expand(1, 3, 40, 40) / 255
+        >>> gradient_magnitude_at(ramp, torch.tensor([[40, 40]]), torch.tensor([0, 0]), torch.tensor([[0, 8], [1, 8]]))
+        tensor([0.5000, 1.0000])
+    """
+    last_v, last_u = (sizes - 1).index_select(0, frame_index).unbind(1)
+    u, v = uv.unbind(1)
+    # To the right, to the left, below, above.
+    places_u = torch.stack([torch.minimum(u + 1, last_u), (u - 1).clamp_min(0), u, u])
+    places_v = torch.stack([v, v, torch.minimum(v + 1, last_v), (v - 1).clamp_min(0)])
+    channel = torch.arange(3, device=images.device)[:, None, None]
+    if images.is_contiguous():
+        plane = frame_index * 3 + channel
+        values = take(images.view(-1), (plane * images.shape[2] + places_v) * images.shape[3] + places_u)
+    else:
+        # Without a copy of whole frames that lie in memory in another order.
+        values = images[frame_index, channel, places_v, places_u]
+    right, left, below, above = grey_levels(values).unbind(0)
+    return length_2d(right - left, below - above).mul_(0.5)
+
+
+def halve(
+    images: Tensor,  # (F, C, H, W)
+) -> Tensor:
+    """The next coarser pyramid level: each pixel is the mean of a 2x2 block.
+
+    An odd last row or column has no partner and is dropped, so that every coarse pixel is a true 2x2 mean, with its
+    centre at pixel `2 u + 0.5` of the finer level.
+
+    Args:
+        images: (F, C, H, W), H and W at least 2.
+
+    Returns:
+        (F, C, H // 2, W // 2).
+
+    Raises:
+        InputError: not four axes, or a side below 2 pixels.
+
+    Example:
+        >>> halve(torch.arange(8.0).reshape(1, 1, 2, 4))
+        tensor([[[[2.5000, 4.5000]]]])
+    """
+    if images.ndim != 4 or min(images.shape[2:]) < 2:
+        raise InputError("images", "shape (F, C, H, W) with H, W >= 2", f"{tuple(images.shape)}", "use fewer levels")
+    height, width = (side // 2 * 2 for side in images.shape[2:])
+    top, bottom = images[:, :, 0:height:2], images[:, :, 1:height:2]
+    rows = top + bottom
+    return (rows[..., 0:width:2] + rows[..., 1:width:2]) / 4
+
+
+def halve_sizes(
+    sizes: Tensor,  # (F, 2)
+) -> Tensor:
+    """(height, width) of each frame one level up; integer division, as `halve` drops an odd last row or column.
+
+    A side of one pixel stays one: a lookup must find a pixel in every frame of a batch.
+
+    Example:
+        >>> halve_sizes(torch.tensor([[375, 1242]]))
+        tensor([[187, 621]])
+    """
+    return torch.div(sizes, 2, rounding_mode="floor").clamp_min(1)
+
+
+@dataclass(frozen=True)
+class GreyPair:
+    """Grey levels of both images at one pyramid level."""
+
+    left: Tensor  # (F, H, W)
+    right: Tensor  # (F, H, W)
+    sizes: Tensor  # (F, 2)
+    scale: float  # level pixels per full-resolution pixel
+
+    def halved(self) -> GreyPair:
+        """The next coarser level."""
+        left, right = (halve(image[:, None])[:, 0] for image in (self.left, self.right))
+        return GreyPair(left, right, halve_sizes(self.sizes), 0.5 * self.scale)

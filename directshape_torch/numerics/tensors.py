@@ -1,0 +1,170 @@
+"""Small operations on tensors, each in the form that is cheap where it runs."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from directshape_torch.numerics.gradient_mode import is_plain
+
+
+def take(
+    flat: Tensor,  # (A,)
+    index: Tensor,  # (*,) integer, 0 .. A - 1
+) -> Tensor:
+    """The entries (*,) of a flat tensor at indices of any shape.
+
+    Example:
+        >>> take(torch.tensor([5.0, 6.0, 7.0]), torch.tensor([[2, 0]]))
+        tensor([[7., 5.]])
+    """
+    if torch.compiler.is_compiling():
+        # The same compiled code from one step instead of three: every step costs the compiler milliseconds.
+        return flat[index]
+    return flat.index_select(0, index.reshape(-1)).view(index.shape)
+
+
+def occurrences(
+    index: Tensor,  # (P,)
+    count: int,
+) -> Tensor:
+    """How often (count,) each of the numbers from 0 to below `count` occurs among indices.
+
+    `bincount` would let the host wait for a graphics card, to learn the largest number.
+
+    Example:
+        >>> occurrences(torch.tensor([2, 0, 2]), 4)
+        tensor([1, 0, 2, 0])
+    """
+    return index.new_zeros(count).scatter_add(0, index, torch.ones_like(index))
+
+
+_T = TypeVar("_T")
+
+
+def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
+    """The numbers (n,) as a tensor of the dtype and on the device of another; not to be written to.
+
+    Example:
+        >>> constant_like((0.5, 2.0), torch.zeros(1))
+        tensor([0.5000, 2.0000])
+    """
+    return _kept(_CONSTANTS, values, like, lambda dtype, device: torch.tensor(values, dtype=dtype, device=device))
+
+
+def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tensor], _T]:
+    """For a function that makes constants of a dtype on a device: one that gives those like a tensor.
+
+    Example:
+        >>> @made_once
+        ... def ramp(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        ...     return torch.arange(3, dtype=dtype, device=device)
+        >>> ramp(torch.zeros(1)), ramp(torch.zeros(1)) is ramp(torch.ones(1))
+        (tensor([0., 1., 2.]), True)
+    """
+    constants: dict[_Key, Any] = {}
+
+    @wraps(make)
+    def like(tensor: Tensor) -> _T:
+        return _kept(constants, (), tensor, make)
+
+    return like
+
+
+_Key = tuple[tuple[float, ...], torch.dtype, torch.device]
+_CONSTANTS: dict[_Key, Any] = {}
+_MOST_KEPT = 256
+
+
+def _kept(
+    constants: dict[_Key, Any],
+    values: tuple[float, ...],
+    like: Tensor,
+    make: Callable[[torch.dtype, torch.device], _T],
+) -> _T:
+    if torch.compiler.is_compiling():
+        # Constants of the compiled code, made without a change of mode, with which PyTorch stores no traces on disk.
+        return make(like.dtype, like.device)
+    key = (values, like.dtype, like.device)
+    # A tracer's tensors go with its own constants alone; those of `torch.func` with all.
+    known: _T | None = constants.get(key) if type(like) is Tensor else None
+    if known is not None:
+        return known
+    with torch.inference_mode(False):
+        made = make(like.dtype, like.device)
+        if is_plain(torch.empty(0, device=like.device)):
+            if len(constants) >= _MOST_KEPT:
+                constants.clear()
+            constants[key] = made
+    return made
+
+
+def length(vectors: Tensor, dim: int) -> Tensor:
+    """Euclidean length along an axis; at zero its derivative is NaN.
+
+    Example:
+        >>> length(torch.tensor([[3.0], [4.0]]), dim=0)
+        tensor([5.])
+    """
+    return (vectors * vectors).sum(dim).sqrt()
+
+
+def all_along(flags: Tensor, dim: int) -> Tensor:
+    """`flags.all(dim)` of an axis with few entries.
+
+    Example:
+        >>> all_along(torch.tensor([[True, False], [True, True]]), dim=0)
+        tensor([ True, False])
+    """
+    if torch.compiler.is_compiling():
+        return flags.all(dim)  # one step to trace, and the compiler writes the loop
+    return functools.reduce(torch.logical_and, flags.unbind(dim))
+
+
+def cross(left: Tensor, right: Tensor) -> Tensor:
+    """Cross products (*, 3) of vectors (*, 3).
+
+    Example:
+        >>> cross(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
+        tensor([0., 0., 1.])
+    """
+    if not torch.compiler.is_compiling():
+        product: Tensor = torch.linalg.cross(left, right)
+        return product
+    # The compiler looks up each component of PyTorch's own by a computed index.
+    (x, y, z), (u, v, w) = ([vectors[..., k] for k in range(3)] for vectors in (left, right))
+    return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u], dim=-1)
+
+
+# Single precision of half a million pixels is 2 MB. New memory of many megabytes, which the operating system clears and
+# maps page by page, costs more than the arithmetic on it. A graphics card wants few and large kernels instead.
+_PIXELS_AT_ONCE = {"cpu": 2**19}
+_PIXELS_AT_ONCE_ELSEWHERE = 2**26
+
+
+def pixels_at_once(device: torch.device) -> int:
+    """Pixels that are worth being treated together."""
+    return _PIXELS_AT_ONCE.get(device.type, _PIXELS_AT_ONCE_ELSEWHERE)
+
+
+def portions(amounts: Sequence[int], most: int) -> list[slice]:
+    """Consecutive entries whose amounts add up to at most so many, or single ones of more; none is left out.
+
+    Example:
+        >>> portions([3, 3, 9, 0, 2], most=7)
+        [slice(0, 2, None), slice(2, 3, None), slice(3, 5, None)]
+    """
+    found, begin, total = [], 0, 0
+    for number, amount in enumerate(amounts):
+        if number > begin and total + amount > most:
+            found.append(slice(begin, number))
+            begin, total = number, 0
+        total += amount
+    if begin < len(amounts):
+        found.append(slice(begin, len(amounts)))
+    return found

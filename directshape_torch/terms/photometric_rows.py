@@ -1,0 +1,355 @@
+"""Pixels of the left image compared with the right one, each with its neighbourhood warped by one depth.
+
+Cameras, the rig's residual field and the pyramid level are in two lines per neighbour, `along_ray depth +
+along_baseline`, so a comparison at any depths is a few products and a lookup. Exposure, vignetting and veiling glare
+change slowly over the image, so over eight pixels they are an offset and a factor: `patch_residual` can take both off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import PhotometricConfig
+from directshape_torch.image.grey_levels import GreyPair
+from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
+from directshape_torch.numerics.tensors import all_along, made_once
+from directshape_torch.observation.occlusion import OcclusionCrops
+from directshape_torch.observation.packing import PixelSamples
+from directshape_torch.rows import Rays, Rows
+from directshape_torch.terms.cars import CarBatch
+
+PatchForm = Literal["plain", "zero_mean", "normalised"]
+
+# DSO's pattern of 8 neighbourhood pixels (Engel et al., Direct Sparse Odometry, fig. 4), as (du, dv).
+DSO_PATTERN: tuple[tuple[int, int], ...] = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
+_CENTRE = DSO_PATTERN.index((0, 0))
+# c of the gradient weight c^2 / (c^2 + |grad I_l|^2) (DSO), grey levels per pixel.
+GRADIENT_CONSTANT = 50.0
+# Standard deviation that a neighbourhood has at least for "normalised", grey levels: noise is not blown up.
+CONTRAST_FLOOR = 5.0
+# What is not so far in front of the right camera is not seen by it.
+_LEAST_DEPTH_M = 1e-6
+
+
+@made_once
+def _pattern(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`DSO_PATTERN` as a tensor (2, N, 1, 1)."""
+    return torch.tensor(DSO_PATTERN, dtype=dtype, device=device).mT[..., None, None]
+
+
+class PhotometricRows(NamedTuple):
+    """The pixel set of a stage in M blocks of 64, each pixel with N neighbours."""
+
+    rays: Rays
+    along_ray: Tensor  # (3, N, M, 64) homogeneous right pixel (at the pyramid level) per metre of depth
+    along_baseline: Tensor  # (3, M, 64) and at depth zero
+    intensity_left: Tensor  # (N, M, 64) grey levels, brought to the brightness of the right image
+    pixel_weight: Tensor  # (M, 64) of the gradient; zero in empty places and outside of the set
+    neighbour_weight: Tensor  # (N, M, 64) zero for neighbours that the mask says are not on the car
+    right: RightView
+
+    def take(self, kept: Tensor, owner: Tensor) -> PhotometricRows:
+        """Some of the blocks (Q,), of cars (Q,) that are numbered anew."""
+        return PhotometricRows(
+            self.rays.take(kept, owner),
+            self.along_ray.index_select(2, kept),
+            self.along_baseline.index_select(1, kept),
+            self.intensity_left.index_select(1, kept),
+            self.pixel_weight.index_select(0, kept),
+            self.neighbour_weight.index_select(1, kept),
+            self.right.take(kept),
+        )
+
+
+class RightView(NamedTuple):
+    """What each block is compared with: its frame's right image, and where nearer instances hide its car there."""
+
+    pixels: Tensor  # (A,) grey levels of all frames at the pyramid level, behind one another
+    frame: Tensor  # (M, 4) first pixel of the block's frame, pixels from row to row, last column, last row
+    to_full: Tensor  # (M, 2) full-resolution pixel per pixel of the level, and that of level pixel 0
+    crop: Tensor  # (M, 6) u0, v0, u1, v1 of where the car can be hidden, first entry and width in `covering`
+    in_front: Tensor  # (M, W) bits of the instances in front of the car
+    covering: Tensor  # (C, W) bits of the instances that cover each pixel
+
+    def take(self, kept: Tensor) -> RightView:
+        """Some of the blocks."""
+        return self._replace(
+            frame=self.frame[kept], to_full=self.to_full[kept], crop=self.crop[kept], in_front=self.in_front[kept]
+        )
+
+
+class Comparison(NamedTuple):
+    """Right minus left grey levels of the neighbours, and the derivative by the depth of their pixel."""
+
+    residual: Tensor  # (M, 64, N)
+    J_residual_depth: Tensor  # (M, 64, N)
+    comparable: Tensor  # (M, 64) bool: every neighbour lands in the right image, the pixel is not hidden there
+
+
+@dataclass(frozen=True)
+class LeftPixels:
+    """What pixel sets are made of: all packed pixels of the left image, and both images.
+
+    Attributes:
+        pixels: P packed pixels.
+        packed: how they fill the blocks of a `Sight`.
+        rays: of these blocks.
+        pyramid: both images at every level that a stage asks for.
+        hidden_right: where nearer instances cover the right image; None: nowhere.
+        mask_left: (detections of the call, H, W).
+    """
+
+    pixels: PixelSamples
+    packed: Rows
+    rays: Rays
+    pyramid: tuple[GreyPair, ...]
+    hidden_right: OcclusionCrops | None
+    mask_left: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        pixels: PixelSamples,
+        packed: Rows,
+        pyramid: Sequence[GreyPair],
+        hidden_right: OcclusionCrops | None,
+        mask_left: Tensor,
+    ) -> LeftPixels:
+        """From pixels, and how they fill blocks."""
+        rays = Rays.of_rows(packed, pixels.origin_cam, pixels.ray_cam)
+        return cls(pixels, packed, rays, tuple(pyramid), hidden_right, mask_left)
+
+    def of_cars(self, keep: Tensor, num_cars: int) -> LeftPixels:
+        """The pixels of the cars where `keep` (B,) holds, of which there are so many."""
+        pixels = self.pixels.of_objects(keep)
+        packed = Rows.of_sorted(pixels.object_index, num_cars)
+        return LeftPixels.of(pixels, packed, self.pyramid, self.hidden_right, self.mask_left)
+
+    def rows(
+        self, config: PhotometricConfig, cars: CarBatch, packed: Rows, row: Tensor, image_level: int
+    ) -> PhotometricRows:
+        """Some of the pixels, rows (M, 64), with the left image's side of their residuals."""
+        owner, images = packed.blocks.owner, self.pyramid[image_level]
+        frame = cars.frame_index[owner]
+        uv_level = (self.pixels.uv[row].movedim(-1, 0)[:, None] + 0.5) * images.scale - 0.5 + _pattern(self.pixels.uv)
+        view = _frame_view(images, frame)
+        u_level, v_level = uv_level
+        intensity = bilinear_patch(images.left.reshape(-1), *view[:2], u_level, v_level, *view[2:]).value
+        uv_full = (uv_level + 0.5) / images.scale - 0.5
+        K = cars.K_left[owner][..., None]  # (M, 3, 3, 1)
+        v = (uv_full[1] - K[:, 1, 2]) / K[:, 1, 1]
+        u = (uv_full[0] - K[:, 0, 2] - K[:, 0, 1] * v) / K[:, 0, 0]
+        along_ray, along_baseline = self._warp_lines(cars, owner, row, images.scale, u, v)
+        c2 = GRADIENT_CONSTANT**2
+        weight = c2 / (c2 + self.pixels.gradient_magnitude[row] ** 2)
+        neighbours = torch.ones_like(intensity)
+        if config.pixel_set != "hit":  # the paper's keeps those that are not on the car
+            neighbours = self._neighbours_on_car(cars, owner, *uv_full)
+        return PhotometricRows(
+            Rays.of_rows(packed._replace(row=row), self.pixels.origin_cam, self.pixels.ray_cam),
+            along_ray,
+            along_baseline,
+            intensity,
+            weight,
+            neighbours,
+            self._right_view(cars, images, frame, owner),
+        )
+
+    def _warp_lines(
+        self, cars: CarBatch, owner: Tensor, row: Tensor, scale: float, u: Tensor, v: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The warp of each neighbour as a line in homogeneous pixels of the level, `along_ray depth + along_baseline`.
+
+        Cameras, the rig's residual field and the level are all in it: an image point lies at `u_right = pinhole -
+        bias`, `v_right = pinhole + vertical`.
+        """
+        pinhole = (cars.K_right @ cars.T_right_cam[:, :3])[owner].permute(1, 2, 0)[..., None]  # (3, 4, M, 1)
+        shift_u, shift_v = 0.5 - self.pixels.bias_px[row], 0.5 + self.pixels.vertical_px[row]
+        last = pinhole[2]
+        line = torch.stack(
+            [
+                scale * pinhole[0] + (shift_u * scale - 0.5) * last,
+                scale * pinhole[1] + (shift_v * scale - 0.5) * last,
+                last.expand(-1, *row.shape),
+            ]
+        )  # (3, 4, M, 64)
+        return line[:, 0, None] * u + line[:, 1, None] * v + line[:, 2, None], line[:, 3]
+
+    def _neighbours_on_car(self, cars: CarBatch, owner: Tensor, u: Tensor, v: Tensor) -> Tensor:
+        """One (N, M, 64) for neighbours on the car, zero for those that the mask gives to something else.
+
+        All neighbours are warped with the centre's depth: background beside the contour would pull the depth of a small
+        car away from its surface.
+        """
+        last_row, last_column = (self.pyramid[0].sizes[cars.frame_index[owner]] - 1)[:, :, None].unbind(1)
+        inside = (u >= -0.5) & (v >= -0.5) & (u <= last_column + 0.5) & (v <= last_row + 0.5)
+        column, row = (x.round().long().clamp_min(0).minimum(last) for x, last in ((u, last_column), (v, last_row)))
+        on_car = self.mask_left[cars.detection_row[owner][:, None], row, column] > 0.5
+        return (inside & on_car).to(u.dtype)
+
+    def _right_view(self, cars: CarBatch, images: GreyPair, frame: Tensor, owner: Tensor) -> RightView:
+        per_level = 1 / images.scale
+        to_full = images.right.new_full((len(owner), 2), per_level)
+        to_full[:, 1] = 0.5 * per_level - 0.5
+        view = torch.cat(_frame_view(images, frame), dim=1)
+        hidden, row = self.hidden_right, cars.detection_row[owner]
+        if hidden is None:
+            nowhere = torch.zeros(len(owner), 6, dtype=torch.long, device=owner.device)
+            covered = nowhere, nowhere[:, :1], nowhere.new_zeros(2, 1)
+        else:
+            covered = hidden.table[row], hidden.in_front[row], hidden.covering
+        return RightView(images.right.reshape(-1), view, to_full, *covered)
+
+
+def _frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """First pixel of frames (M,), pixels from row to row, last column, last row: (M, 1) each."""
+    _, height, width = images.right.shape
+    last_row, last_column = (images.sizes[frame] - 1).unbind(1)
+    columns = frame * (height * width), torch.full_like(frame, width), last_column, last_row
+    first, step, last_u, last_v = (x.long()[:, None] for x in columns)
+    return first, step, last_u, last_v
+
+
+def compared(rows: PhotometricRows, config: PhotometricConfig, depth: Tensor) -> Comparison:
+    """Residuals at depths (M, 64) with their derivatives, all neighbours warped with the pixel's own depth."""
+    warped = warped_pixels(rows, depth)
+    along, at = rows.along_ray, warped.at
+    d_u = torch.addcmul(along[0], warped.u, along[2], value=-1) * warped.inverse_z
+    d_v = torch.addcmul(along[1], warped.v, along[2], value=-1) * warped.inverse_z
+    plain, of_patch = _plain_and_patch(rows, config, at)
+    J = patch_derivative((at.d_u * d_u + at.d_v * d_v).movedim(-3, -1), plain, *of_patch)
+    return Comparison(patch_residual(plain, *of_patch), J, warped.is_comparable(rows.right))
+
+
+def residuals_at(rows: PhotometricRows, config: PhotometricConfig, depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Residuals (..., M, 64, N) at depths (..., M, 64), and where (..., M, 64) they can be compared; differentiable."""
+    warped = warped_pixels(rows, depth)
+    plain, of_patch = _plain_and_patch(rows, config, warped.at)
+    return patch_residual(plain, *of_patch), warped.is_comparable(rows.right)
+
+
+def _plain_and_patch(
+    rows: PhotometricRows, config: PhotometricConfig, at: BilinearPatch
+) -> tuple[Tensor, tuple[Tensor, Tensor, PatchForm, float]]:
+    """Right minus left grey levels (..., M, 64, N), and the other arguments of `patch_residual`."""
+    left, weight = rows.intensity_left, rows.neighbour_weight
+    of_patch = left.movedim(0, -1), weight.movedim(0, -1), config.patch, CONTRAST_FLOOR
+    return (at.value - left).movedim(-3, -1), of_patch
+
+
+class Warped(NamedTuple):
+    """Neighbours (..., N, M, 64) in the right image, at the pyramid level."""
+
+    u: Tensor
+    v: Tensor
+    inverse_z: Tensor
+    in_front: Tensor
+    at: BilinearPatch
+
+    def is_comparable(self, right: RightView) -> Tensor:
+        """Pixels (..., M, 64) all of whose neighbours land in the right image, and that nothing nearer hides there."""
+        inside = all_along(self.at.inside & self.in_front, dim=-3)
+        u, v = (x[..., _CENTRE, :, :].detach() for x in (self.u, self.v))
+        return inside & ~_is_hidden(right, u, v)
+
+
+def warped_pixels(rows: PhotometricRows, depth: Tensor) -> Warped:
+    """The neighbours of pixels at depths (..., M, 64), looked up where they land."""
+    depth = depth.unsqueeze(-3)
+    x, y, z = (torch.addcmul(at, along, depth) for at, along in zip(rows.along_baseline, rows.along_ray, strict=True))
+    in_front = z > _LEAST_DEPTH_M
+    inverse = 1 / torch.where(in_front, z, 1.0)
+    u, v = x * inverse, y * inverse
+    first_pixel, row_step, last_column, last_row = rows.right.frame.mT[..., None]
+    at = bilinear_patch(rows.right.pixels, first_pixel, row_step, u, v, last_column, last_row)
+    return Warped(u, v, inverse, in_front, at)
+
+
+def _is_hidden(right: RightView, u_level: Tensor, v_level: Tensor) -> Tensor:
+    """Whether a nearer instance hides the car at pixels (..., M, 64) of its right image (`OcclusionCrops.at`)."""
+    scale, first = right.to_full.mT[..., None]
+    u, v = (torch.round(torch.addcmul(first, x, scale)) for x in (u_level, v_level))
+    u0, v0, u1, v1, entry, width = right.crop.mT[..., None]
+    inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
+    column, row = (torch.where(inside, x, torch.zeros_like(x)).long() for x in (u, v))
+    entry = torch.where(inside, entry + row * width + column, 0)
+    covering = right.covering.index_select(0, entry.reshape(-1)).view(*entry.shape, right.covering.shape[1])
+    covered: Tensor = ((covering & right.in_front[:, None]) != 0).any(dim=-1) & inside
+    return covered
+
+
+def patch_residual(
+    residual: Tensor,  # (..., P, N) right minus left, grey levels
+    intensity_left: Tensor,  # (P, N) grey levels
+    weight: Tensor,  # (P, N) 1 for neighbours that count, 0 for the others
+    form: PatchForm,
+    contrast_floor: float,  # grey levels
+) -> Tensor:
+    """Residuals (..., P, N) of neighbourhoods in grey levels of the left image.
+
+    "zero_mean" takes the mean off both neighbourhoods; "normalised" (as in normalised cross-correlation) also gives the
+    right one the contrast of the left one. A contrast counts as at least the floor, so that noise is not blown up where
+    there is no texture.
+
+    Example:
+        >>> left, weight = torch.tensor([[90.0, 110.0]]), torch.ones(1, 2)
+        >>> brighter = 0.5 * left + 30
+        >>> patch_residual(brighter - left, left, weight, "zero_mean", 1e-3)
+        tensor([[ 5., -5.]])
+        >>> patch_residual(brighter - left, left, weight, "normalised", 1e-3).round(decimals=3)
+        tensor([[0., 0.]])
+    """
+    if form == "plain":
+        return residual
+    if form == "zero_mean":
+        return _centred(residual, weight)
+    left, right = _centred(intensity_left, weight), _centred(residual + intensity_left, weight)
+    return _contrast(left, weight, contrast_floor) / _contrast(right, weight, contrast_floor) * right - left
+
+
+def patch_derivative(
+    J_residual_depth: Tensor,  # (P, N) of the plain residual, grey levels per metre
+    residual: Tensor,  # (P, N) plain
+    intensity_left: Tensor,  # (P, N)
+    weight: Tensor,  # (P, N)
+    form: PatchForm,
+    contrast_floor: float,
+) -> Tensor:
+    """Derivatives (P, N) of `patch_residual` by the one depth of each pixel: multiples of one row, as the plain ones.
+
+    With the right neighbourhood x, its mean taken off, and c its contrast: `d(x / c) = (dx - y mean(y dx)) / c` where
+    `y = x / c`, whatever the floor.
+
+    Example:
+        >>> J, left, weight = torch.tensor([[1.0, 3.0]]), torch.zeros(1, 2), torch.ones(1, 2)
+        >>> patch_derivative(J, left, left, weight, "zero_mean", 1.0)
+        tensor([[-1.,  1.]])
+    """
+    if form == "plain":
+        return J_residual_depth
+    J = _centred(J_residual_depth, weight)
+    if form == "zero_mean":
+        return J
+    left, right = _centred(intensity_left, weight), _centred(residual + intensity_left, weight)
+    contrast = _contrast(right, weight, contrast_floor)
+    unit = right / contrast
+    return _contrast(left, weight, contrast_floor) / contrast * (J - unit * _mean(unit * J, weight))
+
+
+def _mean(values: Tensor, weight: Tensor) -> Tensor:
+    """Mean (..., P, 1) over the neighbours that count; zero where none does."""
+    return (weight * values).sum(dim=-1, keepdim=True) / weight.sum(dim=-1, keepdim=True).clamp_min(1)
+
+
+def _centred(values: Tensor, weight: Tensor) -> Tensor:
+    return values - _mean(values, weight)
+
+
+def _contrast(centred: Tensor, weight: Tensor, floor: float) -> Tensor:
+    """Standard deviation (..., P, 1), the floor added in squares: smooth, so that its derivative has no kink."""
+    return torch.sqrt(_mean(centred * centred, weight) + floor**2)
