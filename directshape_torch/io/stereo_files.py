@@ -191,7 +191,8 @@ class FileStereoDataset:
             known = wanted
         if not known:
             wanted_file = self.layout.detection_file_name
-            raise InputError("frames", f"at least one detection file {wanted_file} in {self.detections_dir}", "none")
+            where = f"detection file {wanted_file} in {self.detections_dir}" if split is None else f"frame in {split}"
+            raise InputError("frames", f"at least one {where}", "none")
         for frame_id in known:
             check_frame_id("frames", frame_id)
         return tuple(known)

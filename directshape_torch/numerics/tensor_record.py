@@ -10,8 +10,7 @@ from typing import Any, NamedTuple, Self, get_type_hints
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import FOLLOWING, Kind, check_shape, check_stored
+from directshape_torch.numerics.checks import FOLLOWING, Kind, check_alike, check_shape, check_stored
 
 
 class Dense:
@@ -61,7 +60,7 @@ class TensorRecord:
             sizes |= dict(zip(spec.shape, value.shape, strict=True))
             if spec.kind in FOLLOWING:
                 first = first or DeclaredTensor(name, value, spec.kind)
-                _check_alike(name, value, first)
+                check_alike(name, value, first.name, first.value)
             check_stored(name, value)
 
     @classmethod
@@ -96,10 +95,3 @@ class TensorRecord:
                 yield from value.tensors(f"{name}.{each.name}")
             elif each.name in declared and value is not None:
                 yield DeclaredTensor(f"{name}.{each.name}", value, declared[each.name][0].kind)
-
-
-def _check_alike(name: str, value: Tensor, first: DeclaredTensor) -> None:
-    for what in ("dtype", "device"):
-        wanted, got = getattr(first.value, what), getattr(value, what)
-        if wanted != got:
-            raise InputError(name, f"the {what} of {first.name} ({wanted})", str(got), "move them together with .to()")
