@@ -45,7 +45,8 @@ class PCAShapePrior(nn.Module):
         provenance: where the prior comes from.
 
     Raises:
-        InputError: shapes that do not fit together, or a spacing that is not positive.
+        InputError: shapes, dtypes or devices that do not fit together, numbers that are not finite, or a spacing that
+            is not positive.
 
     Example:
         >>> prior = PCAShapePrior.load_bundled()
@@ -94,6 +95,8 @@ class PCAShapePrior(nn.Module):
             check_shape(name, tensor, shape, kind="floating")
             check_alike(name, tensor, "mean", mean)
             check_stored(name, tensor)
+            if not bool(tensor.isfinite().all()):
+                raise InputError(name, "finite numbers", "NaN or infinity")
             self.register_buffer(name, tensor)
         check_positive("spacing_m", spacing_m)
         self.spacing_m = float(spacing_m)

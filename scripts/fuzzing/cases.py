@@ -49,7 +49,7 @@ def answer(case: Case, seed: int) -> dict[str, object]:
     try:
         name, is_finite = case(random.Random(seed))
         outcome = "accepted" if is_finite else "silent NaN"
-    except _CaseError as failed:
+    except CaseError as failed:
         name, error = failed.name, failed.error
         if isinstance(error, DirectShapeError):
             outcome = "refused"
@@ -60,7 +60,7 @@ def answer(case: Case, seed: int) -> dict[str, object]:
     return {"seed": seed, "name": name, "outcome": outcome, "said": said}
 
 
-class _CaseError(Exception):
+class CaseError(Exception):
     """A case raised."""
 
     def __init__(self, name: str, error: Exception) -> None:
@@ -78,7 +78,7 @@ def _odd_calls() -> Case:
         try:
             return odd.name, odd.outcome()
         except Exception as error:
-            raise _CaseError(odd.name, error) from error
+            raise CaseError(odd.name, error) from error
 
     return case
 
@@ -101,7 +101,7 @@ def _damaged_files(folder: Path) -> Case:
         try:
             sample.read()
         except Exception as error:
-            raise _CaseError(name, error) from error
+            raise CaseError(name, error) from error
         finally:
             sample.path.write_bytes(contents[name])
         return name, True
