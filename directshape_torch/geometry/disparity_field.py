@@ -200,7 +200,8 @@ class DisparityField:
             >>> DisparityField.constant(0.25, (640, 480), K, K, T).offsets(torch.zeros(1, 2))
             (tensor([0.2500]), tensor([0.]))
         """
-        check_shape("uv_left", uv_left, (*getattr(uv_left, "shape", ())[:-1], 2), kind="floating")
+        sizes = uv_left.shape[:-1] if isinstance(uv_left, Tensor) and not uv_left.is_nested else ()
+        check_shape("uv_left", uv_left, (*sizes, 2), kind="floating")
         inside = nearest_in_convex_polygon(uv_left, self.hull_uv.to(uv_left))
         both = (self.coefficients, self.vertical_coefficients)
         coefficients = torch.stack([x.to(uv_left) for x in both], dim=1)

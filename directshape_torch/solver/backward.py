@@ -42,7 +42,7 @@ def attached_state(
     part, backward = problem.of_cars(refined), config.backward
     if backward.mode == "unroll":
         first = take_rows(_following(initial, start), rows)
-        state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations)
+        state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations, car_numbers[rows])
     else:
         exact = backward.mode == "implicit"
         limit = backward.max_remaining_step

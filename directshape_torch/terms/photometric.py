@@ -208,6 +208,10 @@ class Photometric:
         place = self.all_rows.places[row]
         rows = self._fixed(packed, row, self.pyramid[stage.image_level])
         depth = sight.hits.depth.flatten()[place]
+        if not nothing_is_differentiated():
+            # The brightness follows the surface.
+            rays = rows.rays.in_objects(sight.state.T_obj_cam)
+            depth = surface_depth(sight.field, packed.blocks.owner, rays, depth, packed.filled)
         warped = _warped(rows, self.warped_depth(depth, sight.state, packed.blocks.owner)[0])
         right, counted = warped.at.value, (packed.filled & warped.is_comparable(rows.right)).to(depth.dtype)
         neighbours, owner = counted * rows.neighbour_weight, packed.blocks.owner

@@ -15,7 +15,7 @@ from typing import Any
 OUTCOMES = ("accepted", "refused", "foreign exception", "silent NaN", "crash", "hang", "over memory")
 _SCRIPT = Path(__file__).parent.parent / "fuzz.py"
 # A child reads its samples first.
-_PATIENCE_AT_START_S = 300.0
+_PATIENCE_AT_START_S = 1800.0
 
 
 @dataclass
