@@ -101,12 +101,11 @@ def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> Re
     shift = torch.stack([at[name].expand(len(d)) for name in BOX], dim=1)
     location = d.T_cam_obj[:, :3, 3] + shift[:, :3]
     T_cam_obj = pose_from_kitti(location, rotation_y_from_pose(d.T_cam_obj) + shift[:, 3])
-    assert d.pose_sigma is not None, "the scene has standard deviations"
     detections = replace(
         d,
         T_cam_obj=T_cam_obj,
         dimensions_hwl=d.dimensions_hwl + shift[:, 4:],
-        pose_sigma=d.pose_sigma * (1 + at["pose_sigma"]),
+        pose_sigma=None if d.pose_sigma is None else d.pose_sigma * (1 + at["pose_sigma"]),
         mask_left=d.mask_left + at["masks"] * scene.directions["masks"],
     )
     frames = replace(
@@ -129,20 +128,20 @@ def outputs(result: RefinementResult) -> Tensor:
     return place + 0.3 * (result.code * weight).sum(dim=1)
 
 
-def differences(scene: Scene, config: RefinerConfig, step: float) -> Tensor:
+def differences(scene: Scene, config: RefinerConfig, step: float, inputs: Sequence[str] = INPUTS) -> Tensor:
     """Central differences (inputs, B) of the refinement itself."""
 
     def at(name: str, by: float) -> Tensor:
         with torch.no_grad():
             return outputs(refined(scene, config, {name: torch.tensor(by, dtype=torch.float64)}))
 
-    return torch.stack([(at(name, step) - at(name, -step)) / (2 * step) for name in INPUTS])
+    return torch.stack([(at(name, step) - at(name, -step)) / (2 * step) for name in inputs])
 
 
-def gradients(scene: Scene, config: RefinerConfig) -> Tensor:
+def gradients(scene: Scene, config: RefinerConfig, inputs: Sequence[str] = INPUTS) -> Tensor:
     """What the backward mode says of the same (inputs, B)."""
     zero = torch.zeros((), dtype=torch.float64)
-    by = {name: zero.clone().requires_grad_() for name in INPUTS}
+    by = {name: zero.clone().requires_grad_() for name in inputs}
     found = outputs(refined(scene, config, by))
     columns = []
     for car in range(len(found)):
