@@ -169,7 +169,7 @@ class BackwardConfig(Settings):
         at_least=1,
     )
     max_remaining_step: float = setting(
-        0.1,
+        0.001,
         "implicit modes: no gradient for cars whose next Newton step exceeds this share of the trust region",
         above=0,
     )
