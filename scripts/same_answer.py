@@ -4,7 +4,7 @@ Refines the frames of a data set one by one, eight in a call, from boxes moved b
 request, compiled; compares the boxes with those of the frames one by one. With `--long` once more with 80 iterations in
 the last stage, which tells a rule that stops too early (the differences vanish) from flat minima (they stay).
 
-    python scripts/same_answer.py --data RENDERED --detections RENDERED/detections/stereo --masks RENDERED/training/masks
+    python scripts/same_answer.py --long --data KITTI --detections DETECTIONS --masks MASKS
 """
 
 from __future__ import annotations

@@ -179,10 +179,12 @@ def test_the_brightness_follows_the_images(
     inputs: StreetInputs, brightness: Literal["gain", "affine"], tolerance: float
 ) -> None:
     matched = replace(SETTLED, photometric=replace(SETTLED.photometric, brightness=brightness))
-    implicit, unrolled = (gradient_by(inputs, with_mode(mode, matched), "images") for mode in ("implicit", "unroll"))
+    # One car ends a little beside its root.
+    modes = (with_mode("implicit", matched, max_remaining_step=0.1), with_mode("unroll", matched))
+    implicit, unrolled = (gradient_by(inputs, mode, "images") for mode in modes)
     step = 1e-5
     ends = [float(summary(inputs.refine(matched, "images", sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
-    # Left out: the state at which the stage begins follows the images. Constants would be 20 and 50 percent off.
+    # `implicit` leaves out that the state at which the stage begins follows the images. Constants: 20 and 50 percent off.
     assert abs(implicit - numeric) < tolerance * abs(numeric)
     assert abs(unrolled - numeric) < 0.06 * abs(numeric)
