@@ -185,6 +185,6 @@ def test_the_brightness_follows_the_images(
     step = 1e-5
     ends = [float(summary(inputs.refine(matched, "images", sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
-    # `implicit` leaves out that the state at which the stage begins follows the images. Constants: 20 and 50 percent off.
+    # `implicit` leaves out that the state at which the stage begins follows the images. Constants: 20 and 50 % off.
     assert abs(implicit - numeric) < tolerance * abs(numeric)
     assert abs(unrolled - numeric) < 0.06 * abs(numeric)
