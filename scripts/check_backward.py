@@ -38,7 +38,7 @@ THINNED = (
     "backward.unroll_iterations=1000",
     "sampling.min_pixels=150",
     "sampling.max_pixels=150",
-    "acceptance.min_probability_not_worse=0",
+    "acceptance.min_probability_better=0",
 )
 # What a row of the table changes in the default settings.
 OPTIONS: dict[str, tuple[str, ...]] = {
