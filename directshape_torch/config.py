@@ -150,9 +150,14 @@ class BackwardConfig(Settings):
         '"none" (no graph), "unroll" (repeats the last iterations), "implicit" (implicit function theorem at the final '
         'stage) or "implicit_gauss_newton" (the same with the Gauss-Newton matrix: cheaper, biased)',
     )
-    unroll_iterations: int = setting(5, "how many of the last iterations are repeated", at_least=1)
+    unroll_iterations: int = setting(
+        1000,
+        "how many of the last accepted steps are repeated at most; fewer than there are leave the input pose without "
+        "a gradient",
+        at_least=1,
+    )
     max_remaining_step: float = setting(
-        0.1,
+        0.001,
         "implicit modes: no gradient for cars whose next Newton step exceeds this share of the trust region",
         above=0,
     )

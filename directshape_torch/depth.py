@@ -108,18 +108,23 @@ def marched_views(
 @as_constant
 def march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> March:
     """Sample every ray at the middles of `num_samples` equal parts of its interval with the bounds."""
-    inside = rays.interval(bounds_obj)
-    share = (torch.arange(num_samples, dtype=inside.near.dtype, device=inside.near.device) + 0.5) / num_samples
-    depths = inside.near + (inside.far - inside.near) * share[:, None, None]
+    depths, crosses = sample_depths(rays, bounds_obj, num_samples)
     at_once = max(1, _POINTS_AT_ONCE // max(1, num_samples * depths.shape[2]))
     if torch.compiler.is_compiling() or len(owner) <= at_once or depths.device.type != "cpu":
-        return March(depths, field.value(rays.at(depths), owner, constant=True), inside.hit)
+        return March(depths, field.value(rays.at(depths), owner, constant=True), crosses)
     parts = []
     for first in range(0, len(owner), at_once):
         some = slice(first, first + at_once)
         points = ObjectRays(rays.centre_obj[:, some], rays.direction_obj[:, some]).at(depths[:, some])
         parts.append(field.value(points, owner[some], constant=True))
-    return March(depths, torch.cat(parts, dim=1), inside.hit)
+    return March(depths, torch.cat(parts, dim=1), crosses)
+
+
+def sample_depths(rays: ObjectRays, bounds_obj: Tensor, num_samples: int) -> tuple[Tensor, Tensor]:
+    """The depths (S, M, R) of a march, ascending, and which rays (M, R) cross the bounds; differentiable."""
+    inside = rays.interval(bounds_obj)
+    share = (torch.arange(num_samples, dtype=inside.near.dtype, device=inside.near.device) + 0.5) / num_samples
+    return inside.near + (inside.far - inside.near) * share[:, None, None], inside.hit
 
 
 @as_constant

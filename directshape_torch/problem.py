@@ -175,11 +175,12 @@ class CarProblem:
         return parts_of(terms[:own], field, state, wheres[:own]) + of_extra
 
     def look(self, state: CarState) -> Sight:
-        """What every ray sees at a state, marched: constants."""
+        """What every ray sees at a state, marched: constants; state and field keep their graphs."""
         with torch.no_grad():
             field = field_of(self.prior.bind(state.code))
             bounds, num_samples = self.prior.bounds_obj, self.config.silhouette.samples_per_ray
-            return Sight(state, field, *marched_views(*self.rays, bounds, num_samples, field, state.T_obj_cam))
+            views = marched_views(*self.rays, bounds, num_samples, field, state.T_obj_cam)
+        return Sight(state, field_of(self.prior.bind(state.code)) if torch.is_grad_enabled() else field, *views)
 
     def begin(self, stage: StageConfig, sight: Sight) -> CarStage:
         """The stage with everything fixed at a state that must not change while costs are compared."""
@@ -274,10 +275,10 @@ class CarStage:
 
     def linearise_differentiably(self, state: CarState) -> Evaluation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""
-        sight = self.problem.look(CarState(*(x.detach() for x in state)))
-        field = field_of(self.problem.prior.bind(state.code))
-        layout = _Layout.of(self.terms, self.problem.factors)
-        wheres = tuple(term.where(sight) for term in self.terms)
+        with torch.no_grad():
+            sight = self.problem.look(state)
+            wheres = tuple(term.where(sight) for term in self.terms)
+        field, layout = field_of(self.problem.prior.bind(state.code)), _Layout.of(self.terms, self.problem.factors)
         parts = self.problem.parts(self.terms, field, state, wheres)
         return self.without_held(summed(layout.sums(), layout.weight, parts))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import TYPE_CHECKING
 
 import torch
@@ -12,7 +13,7 @@ from directshape_torch.diagnosis.disparity_profile import DisparityProfile
 from directshape_torch.diagnosis.observability import Observability
 from directshape_torch.diagnosis.quality import FitQuality
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
-from directshape_torch.errors import InputError
+from directshape_torch.errors import InputError, shown
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.shape.sdf_grid import zero_level_extents
@@ -147,9 +148,9 @@ class RefinementResult:
         Raises:
             InputError: no such car.
         """
-        if not 0 <= index < len(self):
+        if not (isinstance(index, Integral) and 0 <= index < len(self)):
             raise InputError(
-                "index", f"a car of 0..{len(self) - 1}" if len(self) else "no car", f"{index}: {len(self)} cars"
+                "index", f"a car of 0..{len(self) - 1}" if len(self) else "no car", f"{shown(index)}: {len(self)} cars"
             )
         from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 

@@ -22,9 +22,12 @@ from directshape_torch.geometry.se3 import from_rotation_translation
 from directshape_torch.numerics.checks import (
     Dense,
     TensorRecord,
+    check_alike,
+    check_positive,
     check_rotation,
     check_shape,
     check_sigmas,
+    check_stored,
     is_no_rotation,
 )
 
@@ -100,8 +103,8 @@ class StereoCamera(TensorRecord):
         check_shape("P_right", P_right, (len(P_left), 3, 4))
         if P_left.dtype not in (torch.float32, torch.float64):
             raise InputError("P_left", "float32 or float64", str(P_left.dtype), "convert it with .float() or .double()")
-        if P_right.dtype != P_left.dtype:
-            raise InputError("P_right", f"the dtype of P_left ({P_left.dtype})", str(P_right.dtype))
+        check_alike("P_right", P_right, "P_left", P_left)
+        check_stored("P_left", P_left)
         K_left, K_right = P_left[..., :3], P_right[..., :3]
         t_left, t_right = _translation("P_left", P_left), _translation("P_right", P_right)
         T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
@@ -202,10 +205,9 @@ class GroundPlane(TensorRecord):
             >>> GroundPlane.from_camera_height(1.65).offset
             tensor([1.6500])
         """
-        if not 0 < height_m < math.inf:
-            raise InputError("height_m", "metres above 0", f"{height_m:g}", "give the camera's height above the road")
+        check_positive("height_m", height_m, "give the camera's height above the road, in metres")
         normal = torch.tensor([[0.0, -1.0, 0.0]]).repeat(num_frames, 1)
-        return cls(normal, torch.full((num_frames,), height_m), ("camera_height",) * num_frames)
+        return cls(normal, torch.full((num_frames,), float(height_m)), ("camera_height",) * num_frames)
 
 
 @dataclass(frozen=True)

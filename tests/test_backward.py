@@ -15,6 +15,7 @@ from directshape_torch.config import RefinerConfig, SearchConfig, StageConfig
 from directshape_torch.geometry import se3
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.solver.differentiate import StartNotReachedWarning
 
 MODES = ("unroll", "implicit", "implicit_gauss_newton")
 
@@ -48,7 +49,8 @@ def test_the_gauss_newton_matrix_is_near_but_not_equal(inputs: StreetInputs) -> 
 def test_the_input_pose_counts_when_the_window_reaches_back_to_it(inputs: StreetInputs) -> None:
     few = replace(SETTLED, stages=(StageConfig(1.0, 0, 2),))
     whole = gradient_by(inputs, with_mode("unroll", few), "pose")
-    last_step_only = gradient_by(inputs, with_mode("unroll", few, unroll_iterations=1), "pose")
+    with pytest.warns(StartNotReachedWarning, match=r"problems 0, 1 have no gradient.*backward\.unroll_iterations"):
+        last_step_only = gradient_by(inputs, with_mode("unroll", few, unroll_iterations=1), "pose")
     step = 1e-6
     ends = [float(summary(inputs.refine(few, "pose", sign * step))) for sign in (1, -1)]
     # zeta follows the input depth; here the car moves sideways and it stays.
@@ -177,10 +179,12 @@ def test_the_brightness_follows_the_images(
     inputs: StreetInputs, brightness: Literal["gain", "affine"], tolerance: float
 ) -> None:
     matched = replace(SETTLED, photometric=replace(SETTLED.photometric, brightness=brightness))
-    implicit, unrolled = (gradient_by(inputs, with_mode(mode, matched), "images") for mode in ("implicit", "unroll"))
+    # One car ends a little beside its root.
+    modes = (with_mode("implicit", matched, max_remaining_step=0.1), with_mode("unroll", matched))
+    implicit, unrolled = (gradient_by(inputs, mode, "images") for mode in modes)
     step = 1e-5
     ends = [float(summary(inputs.refine(matched, "images", sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
-    # Left out: the state at which the stage begins follows the images. Constants would be 20 and 50 percent off.
+    # `implicit` leaves out that the state at which the stage begins follows the images. Constants: 20 and 50 % off.
     assert abs(implicit - numeric) < tolerance * abs(numeric)
     assert abs(unrolled - numeric) < 0.06 * abs(numeric)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 from itertools import pairwise
 from pathlib import Path
@@ -86,3 +87,13 @@ def test_fast_has_less_to_do() -> None:
     steps = [sum(stage.max_iterations for stage in config.stages) for config in (fast, default)]
     assert steps[0] < steps[1]
     assert fast.sampling.max_pixels < default.sampling.max_pixels
+
+
+def test_paper_names_an_option_that_exists_for_each_deviation() -> None:
+    text = (CONFIGS / "paper.yaml").read_text(encoding="utf-8")
+    header = text[: text.index("\nmethod:")]
+    known = keys(config_to_mapping(RefinerConfig()))
+    named = set(re.findall(r"\b(?:photometric|silhouette|sampling|solver|priors)\.(?!md)[a-z_]+(?:\*)?", header))
+    assert len(named) >= 8
+    for name in named:
+        assert any(key == f".{name}" or (name.endswith("*") and key.startswith(f".{name[:-1]}")) for key in known), name

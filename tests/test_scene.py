@@ -217,7 +217,7 @@ def test_a_plane_may_lie_above_the_camera_or_be_unknown() -> None:
 
 @pytest.mark.parametrize("height_m", [0.0, -1.65, float("nan"), float("inf")])
 def test_camera_heights_are_above_0(height_m: float) -> None:
-    with pytest.raises(InputError, match=rf"height_m: expected metres above 0, got {height_m:g}; give the camera"):
+    with pytest.raises(InputError, match=r"height_m: expected a finite number above 0, got .*; give the camera"):
         GroundPlane.from_camera_height(height_m)
 
 

@@ -74,9 +74,13 @@ class RunLock:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         while self._file is None:
             self._file = self._locked()
-        self._file.truncate(0)
-        json.dump({"host": platform.node(), "pid": os.getpid(), "started_at": time.time()}, self._file)
-        self._file.flush()
+        try:
+            self._file.truncate(0)
+            json.dump({"host": platform.node(), "pid": os.getpid(), "started_at": time.time()}, self._file)
+            self._file.flush()
+        except OSError:  # the disk is full
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -84,11 +88,14 @@ class RunLock:
             return
         # Removed before it is let go of, so that nobody locks a file that is about to vanish; of a moved folder it
         # may be another run's by now.
-        with suppress(FileNotFoundError):
-            if self._is_at_its_place(self._file):
-                self.path.unlink()
-        self._file.close()
-        self._file = None
+        try:
+            with suppress(FileNotFoundError, NotADirectoryError):
+                if self._is_at_its_place(self._file):
+                    self.path.unlink()
+        finally:
+            file, self._file = self._file, None
+            with suppress(OSError):  # what a full disk did not take
+                file.close()
 
     def _is_at_its_place(self, file: IO[str]) -> bool:
         """Whether the path still leads to the file that is held."""

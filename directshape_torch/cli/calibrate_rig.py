@@ -92,24 +92,22 @@ def _add(source: str, args: argparse.Namespace, rigs: list[RigEstimate]) -> None
 
 
 def _add_detections(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
-    from tqdm import tqdm
-
+    from directshape_torch.cli.progress import Bar
     from directshape_torch.rig.of_dataset import estimate_rigs
 
-    with tqdm(desc="detections", unit="frame", file=sys.stderr, disable=not sys.stderr.isatty()) as bar:
+    with Bar(desc="detections", unit="frame", file=sys.stderr, disable=not sys.stderr.isatty()) as bar:
         estimate_rigs(dataset_of(args), lambda _: bar.update(), rigs)
 
 
 def _add_truth(args: argparse.Namespace, source: TruthSource, rigs: list[RigEstimate]) -> None:
     """Every frame that can be read; one that cannot is reported and left out."""
-    from tqdm import tqdm
-
+    from directshape_torch.cli.progress import Bar
     from directshape_torch.errors import DataFormatError
     from directshape_torch.rig.frames_with_truth import add_truth, chosen_frames, observe_frame, truth_files
 
     files, frames = truth_files(args.data, source), []
     names = chosen_frames(list(files), args.frames)
-    for frame_id in tqdm(names, desc=source, unit="frame", disable=not sys.stderr.isatty()):
+    for frame_id in Bar(names, desc=source, unit="frame", disable=not sys.stderr.isatty()):
         try:
             frames.append(observe_frame(args.data, frame_id, files[frame_id], source))
         except DataFormatError as error:
@@ -118,8 +116,7 @@ def _add_truth(args: argparse.Namespace, source: TruthSource, rigs: list[RigEsti
 
 
 def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
-    from tqdm import tqdm
-
+    from directshape_torch.cli.progress import Bar
     from directshape_torch.errors import InputError
     from directshape_torch.rig.estimate import rig_among
     from directshape_torch.rig.observe_motion import observe_motion
@@ -132,9 +129,9 @@ def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
     for before, after in sequence.gaps():
         print(f"warning: frames {before} and {after} are not consecutive: few points are found again", file=sys.stderr)
     hidden = not sys.stderr.isatty()
-    shown = tqdm(sequence.frame_ids, desc="motion", unit="frame", disable=hidden)
+    shown = Bar(sequence.frame_ids, desc="motion", unit="frame", disable=hidden)
     constraints, size_wh = observe_motion(sequence, args.camera_height or None, shown)
-    with tqdm(desc="fit to all frames, then to halves", unit="step", disable=hidden) as bar:
+    with Bar(desc="fit to all frames, then to halves", unit="step", disable=hidden) as bar:
         found = self_calibrate(constraints, size_wh, len(sequence.frame_ids), bar.update)
     if not found.converged:
         print("warning: the fit was still moving when it was ended", file=sys.stderr)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from directshape_torch.cli.inspect_truth import points_of_car, true_points
+from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.files.atomic_files import write_png
@@ -60,7 +60,7 @@ def inspect_frame(
     silhouettes = silhouette_trace(refiner, loaded) if drawn else None
     clouds = stereo_points(loaded.frame, loaded.detections, refiner.config.point_cloud) if drawn else []
     truth, known = true_corners_cam(loaded), true_points(root, layout, loaded)
-    for row in tqdm(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
+    for row in Bar(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
         line = line_of(loaded, row)
         centre_cam = trace.T_cam_obj[-1][row, :3, 3]
         points = points_of_car(known, loaded, row, centre_cam)

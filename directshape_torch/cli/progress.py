@@ -9,7 +9,7 @@ from typing import Self
 from tqdm import tqdm
 
 
-class _Bar(tqdm):  # type: ignore[type-arg]
+class Bar(tqdm):  # type: ignore[type-arg]
     """Without the thread that would outlive it."""
 
     monitor_interval = 0
@@ -20,7 +20,7 @@ class ProgressBar:
 
     def __init__(self, task: str = "refine") -> None:
         self._task = task
-        self._bar: _Bar | None = None
+        self._bar: Bar | None = None
         self._num_failed = 0
 
     def __enter__(self) -> Self:
@@ -33,7 +33,7 @@ class ProgressBar:
     def started(self, frame_ids: Sequence[str]) -> None:
         """Show the bar; nothing where there is nothing to do."""
         if frame_ids:
-            self._bar = _Bar(total=len(frame_ids), unit="frame", desc=self._task, file=sys.stderr)
+            self._bar = Bar(total=len(frame_ids), unit="frame", desc=self._task, file=sys.stderr)
 
     def finished(self, frame_id: str, failure: str | None) -> None:
         """Advance; print the reason of a failure above the bar."""

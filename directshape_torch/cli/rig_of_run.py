@@ -34,11 +34,10 @@ def rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool
 
 
 def _estimate(dataset: FileStereoDataset) -> list[RigEstimate]:
-    from tqdm import tqdm
-
+    from directshape_torch.cli.progress import Bar
     from directshape_torch.rig.of_dataset import estimate_rigs
 
-    with tqdm(desc="rig", unit="frame", file=sys.stderr) as bar:
+    with Bar(desc="rig", unit="frame", file=sys.stderr) as bar:
         return estimate_rigs(dataset, lambda _: bar.update())
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.files.read_files import read_json
-from directshape_torch.numerics.checks import check_shape, check_stored
+from directshape_torch.numerics.checks import check_shape, check_size_wh, check_stored
 from directshape_torch.numerics.gradient_mode import is_plain
 
 SCHEMA = "directshape disparity field"
@@ -125,6 +125,7 @@ class DisparityField:
     covariance: Tensor = field(default_factory=lambda: torch.zeros(NUM_COEFFICIENTS, NUM_COEFFICIENTS))
 
     def __post_init__(self) -> None:
+        check_size_wh("size_wh", self.size_wh)
         for name, shape in _TENSOR_SHAPES.items():
             check_shape(name, getattr(self, name), ["M" if n is None else n for n in shape], kind="floating")
             check_stored(name, getattr(self, name))
@@ -150,6 +151,8 @@ class DisparityField:
             >>> DisparityField.constant(-0.4, (1242, 375), K, K, T).bias(torch.tensor([[10.0, 20.0]]))
             tensor([-0.4000])
         """
+        check_size_wh("size_wh", size_wh)
+        check_shape("K_left", K_left, (3, 3), kind="floating")
         coefficients = torch.zeros(NUM_COEFFICIENTS, dtype=K_left.dtype, device=K_left.device)
         coefficients[0] = value_px
         right, bottom = float(size_wh[0] - 1), float(size_wh[1] - 1)
@@ -197,6 +200,8 @@ class DisparityField:
             >>> DisparityField.constant(0.25, (640, 480), K, K, T).offsets(torch.zeros(1, 2))
             (tensor([0.2500]), tensor([0.]))
         """
+        sizes = uv_left.shape[:-1] if isinstance(uv_left, Tensor) and not uv_left.is_nested else ()
+        check_shape("uv_left", uv_left, (*sizes, 2), kind="floating")
         inside = nearest_in_convex_polygon(uv_left, self.hull_uv.to(uv_left))
         both = (self.coefficients, self.vertical_coefficients)
         coefficients = torch.stack([x.to(uv_left) for x in both], dim=1)

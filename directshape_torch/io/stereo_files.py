@@ -191,9 +191,10 @@ class FileStereoDataset:
             known = wanted
         if not known:
             wanted_file = self.layout.detection_file_name
-            raise InputError("frames", f"at least one detection file {wanted_file} in {self.detections_dir}", "none")
+            where = f"detection file {wanted_file} in {self.detections_dir}" if split is None else f"frame in {split}"
+            raise InputError("frames", f"at least one {where}", "none")
         for frame_id in known:
-            check_frame_id("frames", frame_id)
+            check_frame_id("frames" if split is None else f"{split}, frames", frame_id)
         return tuple(known)
 
     def _read_images(self, frame_id: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from functools import cache
+from numbers import Integral, Real
 from typing import Any, Literal, NamedTuple, Self, get_type_hints
 
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
+from directshape_torch.errors import InputError, shown
 
 # Calibration files have six digits or more, and float32 seven.
 _ROTATION_TOLERANCE = 1e-3
@@ -63,10 +65,43 @@ def check_shape(
         raise InputError(name, words, str(tensor.dtype), conversion)
 
 
+def check_alike(name: str, value: Tensor, first_name: str, first: Tensor) -> None:
+    """Raise `InputError` unless a tensor has the dtype and device of the first one of its kind."""
+    for what in ("dtype", "device"):
+        wanted, got = getattr(first, what), getattr(value, what)
+        if wanted != got:
+            raise InputError(name, f"the {what} of {first_name} ({wanted})", str(got), "move them together with .to()")
+
+
 def check_stored(name: str, tensor: Tensor) -> None:
     """Raise `InputError` for a tensor on the device "meta", which has no numbers."""
     if tensor.is_meta:
         raise InputError(name, "a tensor with numbers", "one on the device 'meta'", "make it on a device with memory")
+
+
+def check_positive(name: str, value: object, cure: str = "") -> None:
+    """Raise `InputError` unless `value` is a finite number above 0.
+
+    Example:
+        >>> check_positive("height_m", 1.65)
+    """
+    try:
+        fits = isinstance(value, Real) and not isinstance(value, bool) and 0 < float(value) < math.inf
+    except OverflowError:  # a whole number that no float holds
+        fits = False
+    if not fits:
+        raise InputError(name, "a finite number above 0", shown(value), cure)
+
+
+def check_size_wh(name: str, size: object) -> None:
+    """Raise `InputError` unless `size` is a width and a height in whole pixels.
+
+    Example:
+        >>> check_size_wh("size_wh", (1242, 375))
+    """
+    fits = isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and int(n) > 0 for n in size)
+    if not fits:
+        raise InputError(name, "(width, height) in pixels, whole and above 0", shown(size))
 
 
 def is_no_rotation(
@@ -171,7 +206,7 @@ class TensorRecord:
             sizes |= dict(zip(spec.shape, value.shape, strict=True))
             if spec.kind in FOLLOWING:
                 first = first or DeclaredTensor(name, value, spec.kind)
-                _check_alike(name, value, first)
+                check_alike(name, value, first.name, first.value)
             check_stored(name, value)
 
     @classmethod
@@ -206,10 +241,3 @@ class TensorRecord:
                 yield from value.tensors(f"{name}.{each.name}")
             elif each.name in declared and value is not None:
                 yield DeclaredTensor(f"{name}.{each.name}", value, declared[each.name][0].kind)
-
-
-def _check_alike(name: str, value: Tensor, first: DeclaredTensor) -> None:
-    for what in ("dtype", "device"):
-        wanted, got = getattr(first.value, what), getattr(value, what)
-        if wanted != got:
-            raise InputError(name, f"the {what} of {first.name} ({wanted})", str(got), "move them together with .to()")

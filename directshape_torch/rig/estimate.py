@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField
+from directshape_torch.numerics.checks import check_shape, check_stored
 from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.pixels import PixelEvidence, hull
 from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
@@ -21,6 +22,8 @@ from directshape_torch.scene import Detections, FrameBatch
 _MOST_ROWS = 1000
 # Of fewer the noise of a detector is a guess.
 _FEWEST_CARS = 10
+# No image is wider, and the powers of larger numbers leave a sum no digits.
+_LARGEST_PX = 1e5
 # Half of a car's image: where it stands the field is seen.
 _CAR_UV_PX = (40.0, 20.0)
 
@@ -57,6 +60,9 @@ class RigEstimate(nn.Module):
 
     def __init__(self, size_wh: tuple[int, int], K_left: Tensor, K_right: Tensor, T_right_cam: Tensor) -> None:
         super().__init__()
+        for name, matrix, size in (("K_left", K_left, 3), ("K_right", K_right, 3), ("T_right_cam", T_right_cam, 4)):
+            check_shape(name, matrix, (size, size), kind="floating")
+            check_stored(name, matrix)
         matrices = (matrix.detach().double().cpu() for matrix in (K_left, K_right, T_right_cam))
         self._blank = DisparityField.constant(0.0, size_wh, *matrices)
         self.rows = torch.zeros(0, len(COLUMNS), dtype=torch.float64)
@@ -83,8 +89,17 @@ class RigEstimate(nn.Module):
         self.add_rows(observe_detections(frames, detections))
 
     def add_rows(self, rows: Tensor) -> None:
-        """Take in reduced observations of detections, (N, 8) `rig.detections.COLUMNS`."""
-        rows = torch.cat([self.rows, rows])
+        """Take in reduced observations of detections, (N, 8) `rig.detections.COLUMNS`.
+
+        Raises:
+            InputError: they are none: of another shape, not finite, or of pixels far from any image.
+        """
+        check_shape("rows", rows, ("N", len(COLUMNS)), kind="floating")
+        check_stored("rows", rows)
+        largest = float(rows.detach().abs().amax()) if len(rows) else 0.0
+        if not largest <= _LARGEST_PX:
+            raise InputError("rows", f"finite pixels of at most {_LARGEST_PX:g}", f"{largest:g}")
+        rows = torch.cat([self.rows, rows.detach().to(self.rows)])
         # The same rows are kept, in the same order, however they came.
         key = (rows[:, :4] * rows.new_tensor([0.754877, 0.569840, 0.430159, 0.324718])).sum(dim=1) % 1
         self.rows, self._solved = rows[key.argsort()[:_MOST_ROWS]], None

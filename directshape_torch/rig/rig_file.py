@@ -55,7 +55,7 @@ def load_rigs(path: Path | str) -> list[RigEstimate]:
         raise DataFormatError(path, f"is no file of rigs (schema {SCHEMA!r}, version {SCHEMA_VERSION})", cure=_CURE)
     try:
         return [_rig(entry) for entry in content["rigs"]]
-    except (KeyError, TypeError, ValueError, IndexError, InputError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError, InputError) as error:
         raise DataFormatError(path, f"is damaged ({error!r})", cure=_CURE) from error
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError, MeshError
+from directshape_torch.numerics.checks import check_positive
 
 if TYPE_CHECKING:
     import trimesh
@@ -83,8 +84,7 @@ class MeshOptions:
             raise InputError("up_axis", "another axis than forward_axis", repr(self.up_axis))
         lengths = [("scale", self.scale), ("voxel_m", self.voxel_m), ("closing_m", self.closing_m)]
         for name, value in lengths + ([("length_m", self.length_m)] if self.length_m is not None else []):
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(name, "a positive number", f"{value}")
+            check_positive(name, value)
 
 
 def load_mesh_obj(path: Path | str, options: MeshOptions | None = None) -> trimesh.Trimesh:
@@ -99,7 +99,8 @@ def load_mesh_obj(path: Path | str, options: MeshOptions | None = None) -> trime
         mesh = trimesh.load_mesh(path, process=False)
     except Exception as problem:  # the loaders of the formats raise whatever their parsers raise
         raise MeshError(f"{path}: cannot be read as a mesh ({type(problem).__name__}: {problem})") from problem
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
+    has_faces = isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0 and mesh.vertices.shape[1] == 3
+    if not has_faces or not np.isfinite(mesh.vertices).all():
         raise MeshError(f"{path}: holds no triangles with finite vertices")
     return place_mesh(mesh, options or MeshOptions())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.checks import check_alike, check_positive, check_shape, check_stored
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.sdf_grid import GridShape, zero_level_extents
 from directshape_torch.shape.shape_prior import DimensionsDerivative
@@ -45,7 +44,8 @@ class PCAShapePrior(nn.Module):
         provenance: where the prior comes from.
 
     Raises:
-        InputError: shapes that do not fit together, or a spacing that is not positive.
+        InputError: shapes, dtypes or devices that do not fit together, numbers that are not finite, or a spacing that
+            is not positive.
 
     Example:
         >>> prior = PCAShapePrior.load_bundled()
@@ -76,25 +76,28 @@ class PCAShapePrior(nn.Module):
         provenance: PriorProvenance,
     ) -> None:
         super().__init__()
-        check_shape("mean", mean, ("nx", "ny", "nz"))
-        check_shape("basis", basis, (*mean.shape, "K"))
-        num_codes = basis.shape[-1]
-        check_shape("origin", origin, (3,))
-        check_shape("explained_variance_ratio", explained_variance_ratio, (num_codes,))
-        check_shape("dimensions_mean_hwl", dimensions_mean_hwl, (3,))
-        check_shape("dimensions_basis_hwl", dimensions_basis_hwl, (3, num_codes))
-        check_shape("dimensions_std_hwl", dimensions_std_hwl, (3,))
+        check_shape("mean", mean, ("nx", "ny", "nz"), kind="floating")
         if min(mean.shape) < 2:
             raise InputError("mean", "at least two nodes along each axis", str(tuple(mean.shape)))
-        if not (math.isfinite(spacing_m) and spacing_m > 0):
-            raise InputError("spacing_m", "a positive length in metres", f"{spacing_m}")
-        self.register_buffer("mean", mean)
-        self.register_buffer("basis", basis)
-        self.register_buffer("origin", origin)
-        self.register_buffer("explained_variance_ratio", explained_variance_ratio)
-        self.register_buffer("dimensions_mean_hwl", dimensions_mean_hwl)
-        self.register_buffer("dimensions_basis_hwl", dimensions_basis_hwl)
-        self.register_buffer("dimensions_std_hwl", dimensions_std_hwl)
+        check_shape("basis", basis, (*mean.shape, "K"), kind="floating")
+        num_codes = basis.shape[-1]
+        tensors = {
+            "mean": (mean, mean.shape),
+            "basis": (basis, basis.shape),
+            "origin": (origin, (3,)),
+            "explained_variance_ratio": (explained_variance_ratio, (num_codes,)),
+            "dimensions_mean_hwl": (dimensions_mean_hwl, (3,)),
+            "dimensions_basis_hwl": (dimensions_basis_hwl, (3, num_codes)),
+            "dimensions_std_hwl": (dimensions_std_hwl, (3,)),
+        }
+        for name, (tensor, shape) in tensors.items():
+            check_shape(name, tensor, shape, kind="floating")
+            check_alike(name, tensor, "mean", mean)
+            check_stored(name, tensor)
+            if not bool(tensor.isfinite().all()):
+                raise InputError(name, "finite numbers", "NaN or infinity")
+            self.register_buffer(name, tensor)
+        check_positive("spacing_m", spacing_m)
         self.spacing_m = float(spacing_m)
         self.provenance = provenance
 

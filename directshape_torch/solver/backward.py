@@ -37,7 +37,7 @@ def attached_state(
     part = problem.of_problems(refined)
     if backward.mode == "unroll":
         first = take_rows(start, rows)
-        state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations)
+        state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations, numbers[rows])
     else:
         exact = backward.mode == "implicit"
         limit = backward.max_remaining_step

@@ -28,12 +28,17 @@ class NotStationaryWarning(UserWarning):
     """Problems without implicit gradient, because their iterations ended too far from a stationary point."""
 
 
+class StartNotReachedWarning(UserWarning):
+    """Problems whose start has no gradient, because fewer steps are repeated than have led away from it."""
+
+
 def unrolled_state(
     problem: DifferentiableProblem[StateT],
     start: StateT,
     minimum: Minimum[StateT],
     rows: Tensor,
     num_iterations: int,
+    names: Tensor | None = None,
 ) -> StateT:
     """The states of some problems as functions of the problem (and of the start), by repeating their last steps.
 
@@ -44,6 +49,8 @@ def unrolled_state(
         minimum: of all problems, with its trajectory.
         rows: (R,) which of them.
         num_iterations: how many of its last steps are repeated for each problem; memory grows with it.
+        names: (R,) the numbers by which a `StartNotReachedWarning` names problems whose start wants a gradient and gets
+            none; default `rows`.
 
     Returns:
         States of the R problems: the values of `minimum`, the derivatives of the repeated steps.
@@ -54,15 +61,22 @@ def unrolled_state(
     led_to_the_end = _steps_that_led_to_the_end(trajectory)
     from_the_end = led_to_the_end.long().flip(0).cumsum(0).flip(0)
     repeated = led_to_the_end & (from_the_end <= num_iterations)
-    state = where_rows(from_the_end[0] <= num_iterations, start, _first_states(trajectory, repeated))
+    led_here = from_the_end[0] <= num_iterations
+    if any(part.requires_grad for part in start):
+        _warn_of_lost_starts((rows if names is None else names)[~led_here].tolist())
+    state = where_rows(led_here, start, _first_states(trajectory, repeated))
     stages, begun, stage = problem.stages(), -1, None
     for iteration, taken in zip(trajectory, repeated, strict=True):
         if not bool(taken.any()):
             continue
         if stage is None or iteration.stage != begun:
             begun = iteration.stage
-            stage = problem.begin(stages[begun], problem.look(take_rows(minimum.stage_starts[begun], rows)))
+            began = take_rows(minimum.stage_starts[begun], rows)
+            # Where the repeated steps have led to it, the state at which a stage begins is a function too.
+            began = where_rows(led_here, _with_values(began, state), began)
+            stage = problem.begin(stages[begun], problem.look(began))
         state = where_rows(taken, _step(stage, state, iteration), state)
+        led_here = led_here | taken
     return _with_values(take_rows(minimum.state, rows), state)
 
 
@@ -114,7 +128,9 @@ def implicit_state(
         States of the R problems: the values of `minimum`; unknowns at a bound are constants.
     """
     state = take_rows(minimum.state, rows)
-    stage = problem.begin(problem.stages()[-1], problem.look(take_rows(minimum.stage_starts[-1], rows)))
+    with torch.no_grad():
+        seen = problem.look(take_rows(minimum.stage_starts[-1], rows))
+    stage = problem.begin(problem.stages()[-1], seen)
     free = stage.free_unknowns(state)
     delta = torch.zeros(free.shape, dtype=torch.float64, device=free.device)
     at, J = _gradient_and_its_jacobian(stage, state, delta, exact)
@@ -145,6 +161,16 @@ def _gradient_and_its_jacobian(
     # Each row of g belongs to one problem, so the sum over the problems has the rows of all of them at once.
     rows = [torch.autograd.grad(g.sum(), delta, retain_graph=True)[0] for g in at.gradient.unbind(dim=1)]
     return at, torch.stack(rows, dim=1)
+
+
+def _warn_of_lost_starts(others: Sequence[int]) -> None:
+    if others:
+        warnings.warn(
+            f"the input states of problems {_listed(others)} have no gradient: more steps were taken than "
+            "backward.unroll_iterations repeats",
+            StartNotReachedWarning,
+            stacklevel=2,
+        )
 
 
 def _warn_of_the_others(stationary: Tensor, names: Tensor) -> None:

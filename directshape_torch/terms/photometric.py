@@ -134,6 +134,10 @@ class Photometric:
         place = left.packed.places[row]
         rows = left.rows(self.config, self.cars, packed, row, stage.image_level)
         depth = sight.hits.depth.flatten()[place]
+        if not nothing_is_differentiated():
+            # The brightness follows the surface.
+            rays = rows.rays.in_objects(sight.state.T_obj_cam)
+            depth = surface_depth(sight.field, packed.blocks.owner, rays, depth, packed.filled)
         warped = warped_pixels(rows, self.warped_depth(depth, sight.state, packed.blocks.owner)[0])
         right, counted = warped.at.value, (packed.filled & warped.is_comparable(rows.right)).to(depth.dtype)
         neighbours, owner = counted * rows.neighbour_weight, packed.blocks.owner

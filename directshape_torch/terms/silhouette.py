@@ -20,7 +20,14 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from directshape_torch.config import SilhouetteConfig, StageConfig
-from directshape_torch.depth import Closest, along_face, attached_closest_depth, march, tracked_closest
+from directshape_torch.depth import (
+    Closest,
+    along_face,
+    attached_closest_depth,
+    march,
+    sample_depths,
+    tracked_closest,
+)
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import cross
 from directshape_torch.observation.packing import PixelSamples
@@ -317,21 +324,24 @@ class SilhouetteProducts(Silhouettes):
     def linear(self, field: Field, state: CarState, where: Where) -> Linear:
         owner = self.rows.rays.owner
         rays = self.rows.rays.in_objects(state.T_obj_cam)
-        marched = march(field, owner, rays, self.bounds_obj, self.config.samples_per_ray)
-        constant = nothing_is_differentiated()
-        sdf = marched.sdf if constant else field.value(rays.at(marched.depths), owner)
+        num_samples, constant = self.config.samples_per_ray, nothing_is_differentiated()
+        if constant:
+            depths, sdf, crosses = march(field, owner, rays, self.bounds_obj, num_samples)
+        else:
+            # The samples move with the bounds: a constant of this linearisation, but not of its derivative.
+            depths, crosses = sample_depths(rays, self.bounds_obj, num_samples)
+            sdf = field.value(rays.at(depths), owner)
         residual, J_residual_sdf = product_residual(sdf, self.zeta, self.rows.foreground)
         # One sample at a time: a Jacobian per sample is never kept.
         J = torch.zeros(0)
-        for number, depth in enumerate(marched.depths):
+        for number, depth in enumerate(depths):
             points = rays.at(depth)
             at = field.derivatives(points, owner, constant)
             part = J_residual_sdf[number][..., None] * sdf_state_jacobian(points, at.gradient, at)
             J = part if number == 0 else J + part
-        crosses = marched.crosses
         J = torch.where(crosses[..., None], J, torch.zeros_like(J))
         residual = torch.where(crosses, residual, self.rows.residual_of_a_miss())
-        return Linear(residual[..., None], torch.ones_like(residual)[..., None], J, Samples(marched.depths, crosses))
+        return Linear(residual[..., None], torch.ones_like(residual)[..., None], J, Samples(depths.detach(), crosses))
 
     def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
         rays = self.rows.rays.in_objects(state.T_obj_cam)

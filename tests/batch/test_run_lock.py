@@ -70,3 +70,27 @@ def test_processes_of_other_machines_are_not_judged(tmp_path: Path) -> None:
     assert owner == LockOwner("elsewhere", 1, 0.0)
     assert owner is not None
     assert owner.is_alive is None
+
+
+def test_a_folder_whose_place_a_file_takes_holds_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with RunLock(out) as lock:
+        lock_path(out).unlink()
+        out.rmdir()
+        out.write_text("a file")
+    assert lock._file is None
+    out.unlink()
+    with RunLock(out):
+        assert lock_path(out).exists()
+
+
+def test_a_full_disk_leaves_nothing_locked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("json.dump", full)
+        with pytest.raises(OSError, match="No space"):
+            RunLock(tmp_path).__enter__()
+    with RunLock(tmp_path):
+        pass

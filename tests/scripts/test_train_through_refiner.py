@@ -47,7 +47,7 @@ def refiner(mode: str = "unroll") -> DirectShapeRefiner:
         stages=(StageConfig(1.0, 0, 12),),
         sampling=replace(DEFAULT.sampling, min_pixels=120, max_pixels=120),
         solver=replace(DEFAULT.solver, cost_tolerance=1e-9, step_tolerance=1e-6),
-        backward=BackwardConfig(mode),
+        backward=BackwardConfig(mode, max_remaining_step=0.1),
     )
     return DirectShapeRefiner(ellipsoid_prior(), config)
 

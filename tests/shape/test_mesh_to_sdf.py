@@ -99,7 +99,7 @@ def test_unreadable_files_and_options(tmp_path):
         load_mesh_obj(tmp_path / "missing.obj")
     with pytest.raises(InputError, match="up_axis: expected another axis"):
         MeshOptions(forward_axis="+x", up_axis="-x")
-    with pytest.raises(InputError, match="scale: expected a positive number"):
+    with pytest.raises(InputError, match="scale: expected a finite number above 0"):
         MeshOptions(scale=0.0)
 
 

@@ -1,15 +1,18 @@
-"""Odd values in the place of any tensor of a call."""
+"""Odd values in the place of a tensor or a number."""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
+NUMBERS: tuple[Any, ...] = (
+    None, True, -1, 0, 1, 0.5, 1e-30, 1e30, -1e30, 2**31, 2**63, 10**400, float("nan"), float("inf"), "x", "1", [],
+    (1, 2), (160, -1), (0, 0), torch.tensor(2.0), torch.tensor([1, 2]), object(),
+)  # fmt: skip
 MUTATIONS: dict[str, Callable[[Tensor, random.Random], Any]] = {
     "none": lambda *_: None,
     "list": lambda x, _: x.tolist(),
@@ -67,23 +70,3 @@ def one_of(x: Tensor, r: random.Random, value: float) -> Tensor:
     if x.numel():
         changed.view(-1)[r.randrange(x.numel())] = limited(x, value)
     return changed
-
-
-def places(record: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """The fields of a record of tensors and of further such records."""
-    for each in fields(record):
-        value = getattr(record, each.name)
-        if isinstance(value, Tensor):
-            yield (*path, each.name)
-        elif is_dataclass(value):
-            yield from places(value, (*path, each.name))
-
-
-def at(record: Any, path: tuple[str, ...]) -> Any:
-    return record if not path else at(getattr(record, path[0]), path[1:])
-
-
-def changed(record: Any, path: tuple[str, ...], value: Any) -> Any:
-    """The record with another value there, all its checks done anew."""
-    inner = value if len(path) == 1 else changed(getattr(record, path[0]), path[1:], value)
-    return replace(record, **{path[0]: inner})

@@ -1,0 +1,261 @@
+"""Gradients through whole refinements against finite differences: every backward mode with every option.
+
+Cars of the bundled frame, float64, their pixels thinned. Each input of a refinement is moved along one direction, and
+the sum of a car's outputs with fixed weights is differentiated twice: by the backward mode, and by central differences
+of the refinement itself, at two steps. Where the two steps disagree by more than 5 % the refinement is at a kink there,
+and the pair is left out and counted. The error of a row is that of all inputs and cars, relative to the differences.
+
+    python scripts/check_backward.py --out backward
+    python scripts/check_backward.py --option default "silhouette.form=product" --mode unroll --cars 2
+
+Written: `backward.csv`, a line for each option, mode, input and car, and the table of docs/backward.md, `backward.md`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from command_line import run_command
+from torch import Tensor
+
+from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, PCAShapePrior, RefinerConfig, load_config
+from directshape_torch.files.atomic_files import write_text
+from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
+from directshape_torch.laboratory.scenes import load_scene, select_detections
+from directshape_torch.result import RefinementResult
+from directshape_torch.solver.differentiate import NotStationaryWarning
+
+MODES = ("unroll", "implicit", "implicit_gauss_newton")
+THINNED = (
+    "backward.unroll_iterations=1000",
+    "sampling.min_pixels=150",
+    "sampling.max_pixels=150",
+    "acceptance.min_probability_better=0",
+)
+# What a row of the table changes in the default settings.
+OPTIONS: dict[str, tuple[str, ...]] = {
+    "default": (),
+    "brightness none": ("photometric.brightness=none",),
+    "brightness affine": ("photometric.brightness=affine",),
+    "silhouette product": ("silhouette.form=product",),
+    "patch zero_mean": ("photometric.patch=zero_mean",),
+    "patch normalised": ("photometric.patch=normalised",),
+    "pixel set hit": ("photometric.pixel_set=hit",),
+    "truncated": ("photometric.truncated=true",),
+    "tilt cosine": ("priors.tilt_form=cosine",),
+    "unknown offset": ("rig.disparity_sigma_px=0.3",),
+    "plain steps": (
+        "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 6}, {contour_width_px: 0.5, image_level: 0, "
+        "max_iterations: 6}]",
+    ),
+    "search": ("search.disparity_offsets_px=[-2, 2]",),
+    "geometric": ("method=geometric", "point_cloud.min_points=20"),
+    "combined": ("method=combined", "point_cloud.min_points=20"),
+}
+_STEP, _SMALLER_STEP = 1e-6, 2.5e-7
+_KINK = 0.05
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The cars, and the directions in which the inputs are moved."""
+
+    frames: FrameBatch
+    detections: Detections
+    prior: PCAShapePrior
+    directions: Mapping[str, Tensor]
+
+    @classmethod
+    def of_demo(cls, num_cars: int) -> Scene:
+        """The first cars of the bundled frame, with standard deviations of the detector."""
+        loaded = load_scene(None, None, None, None)
+        frames, found = loaded.frame.to(dtype=torch.float64), loaded.detections.to(dtype=torch.float64)
+        detections = select_detections(found, torch.arange(num_cars))
+        sigma = detections.score.new_tensor([0.6, 0.2, 0.1, 0.1]).expand(num_cars, 4)
+        # Clamped probabilities have no gradient.
+        soft = (x.clamp(0.1, 0.9) for x in (detections.mask_left, detections.mask_right))
+        left, right = soft
+        detections = replace(detections, pose_sigma=sigma, mask_left=left, mask_right=right)
+        generator = torch.Generator().manual_seed(5)
+        inputs = {"left image": frames.images_left, "right image": frames.images_right, "masks": left}
+        noise = {name: 0.05 * torch.randn(x.shape, generator=generator, dtype=x.dtype) for name, x in inputs.items()}
+        return cls(frames, detections, PCAShapePrior.load_bundled().double(), noise)
+
+
+BOX = ("x", "y", "z", "heading", "height", "width", "length")
+INPUTS = (*BOX, "pose_sigma", "left image", "right image", "masks", "prior mean", "prior basis", "term weight")
+
+
+def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> RefinementResult:
+    """The result with inputs moved by `by[name]`: of the box (B,), else one number."""
+    frames, d = scene.frames, scene.detections
+    at = {name: by.get(name, torch.zeros((), dtype=torch.float64)) for name in INPUTS}
+    shift = torch.stack([at[name].expand(len(d)) for name in BOX], dim=1)
+    location = d.T_cam_obj[:, :3, 3] + shift[:, :3]
+    T_cam_obj = pose_from_kitti(location, rotation_y_from_pose(d.T_cam_obj) + shift[:, 3])
+    detections = replace(
+        d,
+        T_cam_obj=T_cam_obj,
+        dimensions_hwl=d.dimensions_hwl + shift[:, 4:],
+        pose_sigma=None if d.pose_sigma is None else d.pose_sigma * (1 + at["pose_sigma"]),
+        mask_left=d.mask_left + at["masks"] * scene.directions["masks"],
+    )
+    frames = replace(
+        frames,
+        images_left=frames.images_left + at["left image"] * scene.directions["left image"],
+        images_right=frames.images_right + at["right image"] * scene.directions["right image"],
+    )
+    prior = PCAShapePrior.load_bundled().double()
+    prior.mean = prior.mean + at["prior mean"]
+    prior.basis = prior.basis * (1 + at["prior basis"])
+    refiner = DirectShapeRefiner(prior, config)
+    weighted = "points" if config.method == "geometric" else "silhouette_left"
+    return refiner(frames, detections, {weighted: (1 + at["term weight"]).expand(len(d))})
+
+
+def outputs(result: RefinementResult) -> Tensor:
+    """One number (B,) of each car, that depends on its position, heading and shape."""
+    weight = torch.linspace(0.5, 1.0, result.code.shape[1], dtype=result.code.dtype)
+    place = result.T_cam_obj[:, :3, 3].sum(dim=1) + 2 * rotation_y_from_pose(result.T_cam_obj)
+    return place + 0.3 * (result.code * weight).sum(dim=1)
+
+
+def differences(scene: Scene, config: RefinerConfig, step: float, inputs: Sequence[str] = INPUTS) -> Tensor:
+    """Central differences (inputs, B) of the refinement itself."""
+
+    def at(name: str, by: float) -> Tensor:
+        with torch.no_grad():
+            return outputs(refined(scene, config, {name: torch.tensor(by, dtype=torch.float64)}))
+
+    return torch.stack([(at(name, step) - at(name, -step)) / (2 * step) for name in inputs])
+
+
+def gradients(scene: Scene, config: RefinerConfig, inputs: Sequence[str] = INPUTS) -> Tensor:
+    """What the backward mode says of the same (inputs, B)."""
+    zero = torch.zeros((), dtype=torch.float64)
+    by = {name: zero.clone().requires_grad_() for name in inputs}
+    found = outputs(refined(scene, config, by))
+    columns = []
+    for car in range(len(found)):
+        leaves = list(by.values())
+        columns.append(torch.stack(torch.autograd.grad(found[car], leaves, retain_graph=True, materialize_grads=True)))
+    return torch.stack(columns, dim=1)
+
+
+@dataclass(frozen=True)
+class Row:
+    """An option and a mode: gradients, differences at two steps, each (inputs, B)."""
+
+    option: str
+    mode: str
+    gradient: Tensor
+    numeric: Tensor
+    numeric_smaller: Tensor
+    num_skipped: int
+
+    @property
+    def smooth(self) -> Tensor:
+        """Where both differences agree (inputs, B)."""
+        scale = self.numeric.abs().maximum(self.numeric_smaller.abs())
+        return (self.numeric - self.numeric_smaller).abs() <= _KINK * scale + 1e-7
+
+    @property
+    def error(self) -> Tensor:
+        """Relative to the differences (inputs, B); absolute where they are below a thousandth."""
+        return (self.gradient - self.numeric_smaller).abs() / self.numeric_smaller.abs().clamp_min(1e-3)
+
+    def cells(self) -> list[str]:
+        """Of the table: what, how many, and the errors."""
+        smooth, error = self.smooth, self.error
+        box = error[: len(BOX)][smooth[: len(BOX)]]
+        rest = error[len(BOX) :][smooth[len(BOX) :]]
+        numbers = [f"{float(x.median()):.0e} / {float(x.max()):.0e}" if len(x) else "" for x in (box, rest)]
+        return [
+            self.option,
+            self.mode,
+            str(int(smooth.sum())),
+            str(int((~smooth).sum())),
+            str(self.num_skipped),
+            *numbers,
+        ]
+
+
+HEADER = (
+    "option",
+    "mode",
+    "pairs",
+    "kinks left out",
+    "cars without gradient",
+    "box: median / max",
+    "others: median / max",
+)
+
+
+def study(scene: Scene, options: Sequence[str], modes: Sequence[str], report: Callable[[str], None]) -> list[Row]:
+    """All of them."""
+    rows = []
+    for option in options:
+        changes = OPTIONS.get(option, (option,) if "=" in option else ())
+        # With a mode, because those march their rays under `no_grad` too.
+        base = [*THINNED, *changes]
+        config = load_config(None, [*base, "backward.mode=unroll"])
+        numeric, smaller = (differences(scene, config, step) for step in (_STEP, _SMALLER_STEP))
+        for mode in modes:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", NotStationaryWarning)
+                found = gradients(scene, load_config(None, [*base, f"backward.mode={mode}"]))
+            skipped = int((found == 0).all(dim=0).sum()) if caught else 0
+            rows.append(Row(option, mode, found, numeric, smaller, skipped))
+            report(" | ".join(rows[-1].cells()))
+    return rows
+
+
+def as_markdown(rows: Sequence[Row]) -> str:
+    """The table of docs/backward.md."""
+    lines = [HEADER, ("---",) * len(HEADER), *(row.cells() for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def as_csv(rows: Sequence[Row]) -> str:
+    """A line for each pair."""
+    file = io.StringIO()
+    writer = csv.writer(file)
+    writer.writerow(("option", "mode", "input", "car", "gradient", "difference", "smaller_difference", "smooth"))
+    for row in rows:
+        for number, name in enumerate(INPUTS):
+            for car in range(row.gradient.shape[1]):
+                values = (float(x[number, car]) for x in (row.gradient, row.numeric, row.numeric_smaller))
+                writer.writerow((row.option, row.mode, name, car, *values, bool(row.smooth[number, car])))
+    return file.getvalue()
+
+
+def run(args: argparse.Namespace) -> None:
+    """Study, print, write."""
+    rows = study(Scene.of_demo(args.cars), args.option, args.mode, lambda line: print(line, file=sys.stderr))
+    print(as_markdown(rows), end="")
+    if args.out is not None:
+        write_text(args.out / "backward.csv", as_csv(rows))
+        write_text(args.out / "backward.md", as_markdown(rows))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--option", nargs="+", default=list(OPTIONS), metavar="NAME", help="default all; or KEY=VALUE")
+    parser.add_argument("--mode", nargs="+", default=list(MODES), choices=MODES, help="default all")
+    parser.add_argument("--cars", type=int, default=3, metavar="N", help="of the bundled frame (default 3)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for backward.csv and backward.md")
+    torch.set_num_threads(1)
+    return run_command(parser, run, arguments)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

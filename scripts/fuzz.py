@@ -1,0 +1,94 @@
+"""Odd arguments, damaged files, killed and faulty runs, by the thousand: what holds, in numbers.
+
+    python scripts/fuzz.py --calls 5000 --files 20000 --kills 40 --faults 1 --out fuzz
+    python scripts/fuzz.py --files 1 --seed 1234          # one case again
+
+Calls and files are those of `tests/fuzz`, made from their seeds, each in a child process with a memory limit and a time
+limit. An odd value or a damaged file is accepted or refused by an error of the package; all else is a finding, and the
+exit code is 1. Kills end runs, or their workers, with SIGKILL, SIGTERM or SIGINT at a random moment, their start
+included; faults make every n-th write or rename fail with ENOSPC or EIO, and take the output folder away. After each
+the next run must end with the bytes of one that nothing happened to. Written: `fuzz.json` and, readable, `fuzz.txt`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+TESTS = Path(__file__).resolve().parent.parent / "tests"
+sys.path[:0] = [str(TESTS / "fuzz"), str(TESTS), str(TESTS.parent)]
+
+from command_line import run_command  # noqa: E402
+from fuzzing.cases import serve  # noqa: E402
+from fuzzing.children import OUTCOMES, tally  # noqa: E402
+from fuzzing.faults import inject_faults  # noqa: E402
+from fuzzing.kills import kill_runs  # noqa: E402
+
+from directshape_torch.errors import InputError  # noqa: E402
+from directshape_torch.files.atomic_files import write_json, write_text  # noqa: E402
+
+
+def run(args: argparse.Namespace) -> int:
+    """Everything that was asked for; 1 where something was found.
+
+    Raises:
+        InputError: a number below 0.
+    """
+    if args.serve:
+        serve(args.serve)
+        return 0
+    for name in ("calls", "files", "kills", "faults"):
+        if getattr(args, name) < 0:
+            raise InputError(f"--{name}", "at least 0", f"{getattr(args, name)}")
+    figures: dict[str, dict[str, object]] = {}
+    for kind in ("calls", "files"):
+        if count := getattr(args, kind):
+            found = tally(kind, iter(range(args.seed, args.seed + count)), args.timeout, _say)
+            figures[kind] = {**{name: found.counts[name] for name in OUTCOMES}, "found": found.found}
+    if args.kills:
+        figures["kills"] = kill_runs(args.kills, args.seed, _say)
+    if args.faults:
+        figures["faults"] = inject_faults(args.faults, _say)
+    table = as_table(figures)
+    print(table)
+    if args.out is not None:
+        write_json(args.out / "fuzz.json", figures)
+        write_text(args.out / "fuzz.txt", table + "\n")
+    return int(any(figures[kind]["found"] for kind in figures))
+
+
+def as_table(figures: dict[str, dict[str, object]]) -> str:
+    """A line for each outcome of each kind, then what was found."""
+    lines = [
+        f"{kind:8} {name:44} {value}"
+        for kind, counts in figures.items()
+        for name, value in counts.items()
+        if name != "found"
+    ]
+    lines += [f"{kind}: {json.dumps(each)}" for kind, counts in figures.items() for each in counts["found"]]  # type: ignore[attr-defined]
+    return "\n".join(lines)
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line and run; 0: nothing found, 1: something, 2: wrong use."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--calls", type=int, default=0, metavar="N", help="calls with an odd argument")
+    parser.add_argument("--files", type=int, default=0, metavar="N", help="damaged files")
+    parser.add_argument("--kills", type=int, default=0, metavar="N", help="runs that are ended at a random moment")
+    parser.add_argument("--faults", type=int, default=0, metavar="N", help="fail every N-th write and rename, in turn")
+    parser.add_argument("--seed", type=int, default=0, help="of the first case")
+    parser.add_argument("--timeout", type=float, default=60.0, metavar="S", help="of a case (default 60 seconds)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for fuzz.json and fuzz.txt")
+    parser.add_argument("--serve", choices=("calls", "files"), help=argparse.SUPPRESS)
+    return run_command(parser, run, arguments)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

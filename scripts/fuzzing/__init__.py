@@ -1,0 +1,1 @@
+"""Odd calls, damaged files, killed and faulty runs in numbers (`scripts/fuzz.py`)."""

@@ -1,0 +1,43 @@
+"""Boxes of the bundled frame that are wrong by factors, with masks that are right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from directshape_torch import DirectShapeRefiner, RefinementResult, load_config
+from directshape_torch.laboratory.scenes import load_scene, select_detections
+from directshape_torch.status import Status
+
+
+def refined(factor: float, dimensions: float, *settings: str) -> RefinementResult:
+    scene = load_scene()
+    first = select_detections(scene.detections, scene.detections.frame_index.new_tensor([0, 1, 3]))
+    T_cam_obj = first.T_cam_obj.clone()
+    T_cam_obj[:, :3, 3] *= factor
+    moved = replace(first, T_cam_obj=T_cam_obj, dimensions_hwl=first.dimensions_hwl * dimensions)
+    config = load_config("default", list(settings))
+    result: RefinementResult = DirectShapeRefiner(config=config).to(T_cam_obj.dtype)(scene.frame, moved)
+    assert result.sigma_xyz_yaw[result.refined].isfinite().all()
+    return result
+
+
+@pytest.mark.parametrize("dimensions", [1.0, 200.0])
+def test_boxes_beyond_two_kilometres_have_no_evidence_whatever_is_accepted(dimensions: float) -> None:
+    result = refined(200.0, dimensions, "acceptance.min_probability_better=0")
+    assert (result.T_cam_obj[:, 2, 3] > 2000).all()
+    assert result.status == [Status.no_evidence] * 3
+    assert result.quality.probability_not_worse.isnan().all()
+
+
+@pytest.mark.parametrize(("factor", "dimensions"), [(2.0, 1.0), (2.0, 2.0), (0.5, 1.0), (0.5, 0.5)])
+def test_wrong_depth_is_less_sure_than_a_right_one(factor: float, dimensions: float) -> None:
+    """Of twice the size at twice the depth, so that they cover their masks, too."""
+    right, wrong = refined(1.0, 1.0), refined(factor, dimensions)
+    known = wrong.quality.probability_not_worse.nan_to_num(0.0)
+    assert (known < right.quality.probability_not_worse - 0.05).all()
+
+
+def test_boxes_as_they_are_come_back_refined() -> None:
+    assert refined(1.0, 1.0).refined.all()

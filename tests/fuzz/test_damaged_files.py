@@ -1,0 +1,55 @@
+"""Damaged files of every format are refused by an error of ours that names the file, or read."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+from file_damage import damaged
+from file_samples import Sample, samples
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from directshape_torch.errors import DirectShapeError, ResumeError
+
+FORMATS = (
+    "times", "tracking", "tracks", "shapes", "disparity", "field", "rigs", "split", "scan", "network", "prior", "mesh",
+    "trust", "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
+    "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "run", "journal",
+)  # fmt: skip
+# More of them, and what they cost: scripts/fuzz.py.
+TRIES = 25
+
+
+@pytest.fixture(scope="module")
+def whole(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Sample]:
+    found = samples(shared_kitti, tmp_path_factory.mktemp("files"))
+    assert set(found) == set(FORMATS)
+    return found
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_damaged_files(whole: dict[str, Sample], name: str) -> None:
+    sample = whole[name]
+    errors: list[DirectShapeError] = []
+    content = sample.path.read_bytes()
+    sample.read()
+
+    @given(chance=st.randoms(use_true_random=False))
+    @settings(max_examples=TRIES, suppress_health_check=list(HealthCheck))
+    def read(chance: random.Random) -> None:
+        sample.path.write_bytes(damaged(content, sample.path.name, chance))
+        try:
+            sample.read()
+        except DirectShapeError as error:
+            errors.append(error)
+        finally:
+            sample.path.write_bytes(content)
+
+    read()
+    for error in errors:
+        # Of a whole folder it may be a file that does not fit the damaged one.
+        assert sample.path.stem in str(error) or "/out/" in str(error) or isinstance(error, ResumeError)
+        assert len(str(error)) < 2500
+    assert len(errors) > TRIES // 5 or not sample.is_exact

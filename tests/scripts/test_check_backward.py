@@ -1,0 +1,43 @@
+"""Gradients of whole refinements of the bundled frame: a network in front learns from all of a box."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import check_backward as script
+import pytest
+import torch
+
+from directshape_torch import DirectShapeRefiner, load_config
+from directshape_torch.solver.differentiate import StartNotReachedWarning
+
+
+@pytest.fixture(scope="module")
+def scene() -> script.Scene:
+    return script.Scene.of_demo(1)
+
+
+def test_all_seven_numbers_of_a_box_have_the_gradient_of_the_refinement(scene: script.Scene) -> None:
+    """As shipped but for the number of pixels: mode `unroll` and nothing else."""
+    config = load_config("default", ["backward.mode=unroll", *script.THINNED[1:]])
+    scene = replace(scene, detections=replace(scene.detections, pose_sigma=None))
+    found = script.gradients(scene, config, script.BOX)
+    numeric = script.differences(scene, config, 2.5e-7, script.BOX)
+    assert found.abs().min() > 1e-3
+    assert float(((found - numeric).abs() / numeric.abs()).median()) < 1e-4
+    assert float(((found - numeric).abs() / numeric.abs()).max()) < 0.05
+
+
+def test_a_start_that_is_not_reached_is_named(scene: script.Scene) -> None:
+    config = load_config("default", ["backward.mode=unroll", "backward.unroll_iterations=2", *script.THINNED[1:]])
+    detections = replace(scene.detections, T_cam_obj=scene.detections.T_cam_obj.clone().requires_grad_())
+    with pytest.warns(StartNotReachedWarning, match=r"problems 0 have no gradient.*backward\.unroll_iterations"):
+        DirectShapeRefiner(scene.prior, config)(scene.frames, detections)
+
+
+def test_a_row_tells_kinks_from_errors() -> None:
+    numeric = torch.tensor([[1.0], [2.0], [3.0]]).expand(3, 2)
+    row = script.Row("default", "unroll", numeric * 1.01, numeric, numeric * torch.tensor([1.0, 2.0]), 0)
+    assert row.smooth.tolist() == [[True, False]] * 3
+    table = script.as_markdown([row])
+    assert "| default | unroll | 3 | 3 | 0 | 1e-02 / 1e-02 |" in table
