@@ -64,13 +64,12 @@ class CompilationError(DirectShapeError, RuntimeError):
 
 
 class MissingDependencyError(DirectShapeError, ImportError):
-    """An optional package is needed for what was asked."""
+    """An optional package is needed for what was asked; one that is in no extra of ours comes without `extra`."""
 
     def __init__(self, package: str, extra: str, purpose: str, *, environment: str = "") -> None:
         command = f"{environment} pip install" if environment else "pip install"
-        super().__init__(
-            f"{purpose} needs the package {package!r}; install it with: {command} 'directshape_torch[{extra}]'"
-        )
+        cure = f"install it with: {command} 'directshape_torch[{extra}]'" if extra else "install it as its pages say"
+        super().__init__(f"{purpose} needs the package {package!r}; {cure}")
 
 
 def shortened(text: str, most: int = _LONGEST_PART) -> str:
