@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from safetensors.torch import load, save
@@ -202,13 +202,22 @@ class RigEstimate(nn.Module):
             return False
         return True
 
+    def content(self) -> dict[str, Any]:
+        """All that the estimate rests on, as tensors and numbers."""
+        rig = {name: getattr(self._blank, name) for name in ("K_left", "K_right", "T_right_cam")}
+        pixels = {kind: evidence._asdict() for kind, evidence in self.pixels.items()}
+        return {"size_wh": list(self._blank.size_wh), **rig, "rows": self.rows, "pixels": pixels}
+
     def get_extra_state(self) -> Tensor:
-        """All that the estimate rests on, as the bytes of a safetensors file; `set_extra_state` takes it back."""
-        state = {name: getattr(self._blank, name) for name in ("K_left", "K_right", "T_right_cam")}
-        state |= {"size_wh": torch.tensor(self._blank.size_wh), "rows": self.rows}
-        for kind, evidence in self.pixels.items():
-            state |= {f"pixels.{kind}.{name}": torch.as_tensor(value) for name, value in evidence._asdict().items()}
-        return torch.tensor(list(save({name: value.clone() for name, value in state.items()})), dtype=torch.uint8)
+        """`content()` as the bytes of a safetensors file; `set_extra_state` takes it back."""
+        content = self.content()
+        pixels = {
+            f"pixels.{kind}.{name}": value
+            for kind, sums in content.pop("pixels").items()
+            for name, value in sums.items()
+        }
+        state = {name: torch.as_tensor(value).clone() for name, value in {**content, **pixels}.items()}
+        return torch.tensor(list(save(state)), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Of `get_extra_state`; nothing of what was known before stays."""
