@@ -59,6 +59,10 @@ class RunInProgressError(DirectShapeError):
     """Another process is writing to the output folder."""
 
 
+class SceneWarning(UserWarning):
+    """What a refiner found wrong with images, calibration, masks or boxes (setting `check`)."""
+
+
 class CompilationError(DirectShapeError, RuntimeError):
     """Compiled functions were asked for (`compile: on`) where they cannot be had."""
 

@@ -479,7 +479,7 @@ class Detections(TensorRecord):
         has_left = left.flatten(1).any(dim=1) if has_mask_left is None else has_mask_left
         has_right = right.flatten(1).any(dim=1) if has_mask_right is None else has_mask_right
         if box_2d is None:
-            box_2d = torch.where(left.flatten(1).any(dim=1)[:, None], _around(left), _around(right)).to(boxes)
+            box_2d = torch.where(left.flatten(1).any(dim=1)[:, None], boxes_around(left), boxes_around(right)).to(boxes)
         return cls(
             frame_index=torch.zeros(count, dtype=torch.long, device=boxes.device)
             if frame_index is None
@@ -525,10 +525,10 @@ def _stacked(name: str, masks: Masks, count: int) -> Tensor:
     return masks
 
 
-def _around(
+def boxes_around(
     masks: Tensor,  # (B, H, W)
 ) -> Tensor:
-    """u_min, v_min, u_max, v_max (B, 4) of the pixels above 0.5; NaN without any."""
+    """u_min, v_min, u_max, v_max (B, 4) of the pixels above 0.5, float64; NaN without any."""
     inside = masks if masks.dtype == torch.bool else masks > 0.5
     spans = []
     for axis in (1, 2):  # columns, then rows
