@@ -14,6 +14,7 @@ from directshape_torch.errors import (
     MissingDependencyError,
     ResumeError,
 )
+from directshape_torch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
@@ -59,9 +60,11 @@ __all__ = [
     "RefinerConfig",
     "ResumeError",
     "RigEstimate",
+    "ShapeFit",
     "ShapePrior",
     "Status",
     "StereoCamera",
     "check_scene",
+    "fit_shape",
     "load_config",
 ]

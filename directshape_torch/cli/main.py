@@ -32,6 +32,7 @@ COMMANDS = (
     "export",
     "inspect",
     "check_data",
+    "fit_shape",
 )
 
 _DESCRIPTION = "Refine pose and shape of cars in stereo frames by differentiable rendering of signed distance fields."
