@@ -41,6 +41,8 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
         The findings; printed, it says what was measured, what was expected, and how to mend it.
 
     Example:
+        >>> import torch
+        >>> from directshape_torch import StereoCamera
         >>> K = torch.tensor([[360.0, 0.0, 300.0], [0.0, 360.0, 90.0], [0.0, 0.0, 1.0]])
         >>> image, mask = torch.zeros(3, 375, 1242), torch.zeros(1, 375, 1242, dtype=torch.bool)
         >>> mask[0, 180:240, 500:640] = True
