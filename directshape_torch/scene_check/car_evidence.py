@@ -70,10 +70,11 @@ class FrameEvidence:
 
 
 def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameEvidence]:
-    """The evidence of every frame; cars with numbers that are not finite, or a mask of another size, are left out."""
+    """The evidence of every frame; cars with numbers that are not finite, or without 2D box and mask, are left out."""
     frame_index = detections.frame_index.cpu().numpy()
     usable = (_array(detections.T_cam_obj).reshape(-1, 16), _array(detections.dimensions_hwl))
     known = np.logical_and.reduce([np.isfinite(part).all(axis=1) for part in usable])
+    known &= np.isfinite(_array(detections.box_2d)).all(axis=1) | detections.has_mask_left.cpu().numpy()
     sizes = frames.sizes.cpu().tolist()
     return [
         _frame_evidence(frames, detections, number, np.flatnonzero(known & (frame_index == number)), (height, width))

@@ -49,7 +49,7 @@ def test_a_mistake_in_one_frame_is_named(name: str) -> None:
     ("data", "detections", "masks"),
     [
         *(("kitti15", name, "training/masks") for name in ("noisy_stereo", "noisy_mono", "biased_mono", "pointrcnn")),
-        *(("kitti", name, "training/masks") for name in ("noisy_stereo", "noisy_mono", "pointgnn")),
+        *(("kitti", name, "training/masks") for name in ("noisy_stereo", "noisy_mono")),
         ("rendered", "stereo", "training/masks"),
         ("rendered", "mono", "masks_degraded"),
     ],
