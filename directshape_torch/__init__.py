@@ -14,16 +14,30 @@ from directshape_torch.errors import (
     MissingDependencyError,
     ResumeError,
 )
+from directshape_torch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
+from directshape_torch.scene_check.check_scene import check_scene
+from directshape_torch.scene_check.finding import CheckReport, Finding
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
 
+
+def __getattr__(name: str) -> str:
+    """`__version__`, looked up only when it is asked for."""
+    if name == "__version__":
+        from directshape_torch.batch.refine_dataset import package_version
+
+        return package_version()
+    raise AttributeError(f"module 'directshape_torch' has no attribute {name!r}")
+
+
 __all__ = [
+    "CheckReport",
     "ConfigError",
     "DataFormatError",
     "Detections",
@@ -31,6 +45,7 @@ __all__ = [
     "DirectShapeRefiner",
     "DisparityField",
     "DisparityProfile",
+    "Finding",
     "FitQuality",
     "FrameBatch",
     "GroundPlane",
@@ -45,8 +60,11 @@ __all__ = [
     "RefinerConfig",
     "ResumeError",
     "RigEstimate",
+    "ShapeFit",
     "ShapePrior",
     "Status",
     "StereoCamera",
+    "check_scene",
+    "fit_shape",
     "load_config",
 ]

@@ -370,6 +370,11 @@ class RefinerConfig(Settings):
         "so far if nobody knows, has at least 3000 cars. Results differ in the last digits, so a choice makes runs "
         "repeatable to the bit, whatever came before them",
     )
+    check: Literal["first", "always", "off"] = setting(
+        "first",
+        "look for common mistakes in images, calibration, masks and boxes (docs/check_data.md) in the first call of a "
+        "refiner, in every call, or never; what is found is a Python warning, and results do not depend on it",
+    )
     stages: tuple[StageConfig, ...] = (
         StageConfig(contour_width_px=2.0, image_level=1, max_iterations=6, over_relaxation=1.6),
         StageConfig(contour_width_px=0.5, image_level=0, max_iterations=6, over_relaxation=1.6),

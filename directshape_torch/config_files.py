@@ -83,8 +83,8 @@ def _convert(hint: Any, value: Any, where: str, known: Mapping[str, str]) -> Any
         return tuple(_convert(*entry, known) for entry in _entries(arguments, value, where))
     if origin is Literal:
         # YAML 1.1 reads the words on and off as truth values.
-        is_switch = isinstance(value, bool) and {"on", "off"} <= set(arguments)
-        return ("off", "on")[value] if is_switch else value
+        word = "on" if value else "off"
+        return word if isinstance(value, bool) and word in arguments else value
     return _convert_scalar(hint, value, where)
 
 

@@ -59,18 +59,21 @@ class RunInProgressError(DirectShapeError):
     """Another process is writing to the output folder."""
 
 
+class SceneWarning(UserWarning):
+    """What a refiner found wrong with images, calibration, masks or boxes (setting `check`)."""
+
+
 class CompilationError(DirectShapeError, RuntimeError):
     """Compiled functions were asked for (`compile: on`) where they cannot be had."""
 
 
 class MissingDependencyError(DirectShapeError, ImportError):
-    """An optional package is needed for what was asked."""
+    """An optional package is needed for what was asked; one that is in no extra of ours comes without `extra`."""
 
     def __init__(self, package: str, extra: str, purpose: str, *, environment: str = "") -> None:
         command = f"{environment} pip install" if environment else "pip install"
-        super().__init__(
-            f"{purpose} needs the package {package!r}; install it with: {command} 'directshape_torch[{extra}]'"
-        )
+        cure = f"install it with: {command} 'directshape_torch[{extra}]'" if extra else "install it as its pages say"
+        super().__init__(f"{purpose} needs the package {package!r}; {cure}")
 
 
 def shortened(text: str, most: int = _LONGEST_PART) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
@@ -15,7 +16,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.diagnosis.box_alignment import align_boxes
 from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.diagnosis.outcome import Outcome, judged, outcome_of, outcome_of_boxes
-from directshape_torch.errors import InputError
+from directshape_torch.errors import InputError, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.car_points import PointSamples, car_points
@@ -25,6 +26,7 @@ from directshape_torch.observation.refinable import check_fit, check_no_tangents
 from directshape_torch.problem import CarProblem, TermFactory
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene_check.check_scene import check_scene
 from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -84,6 +86,7 @@ class DirectShapeRefiner(nn.Module):
         self.config = RefinerConfig() if config is None else config
         self.extra_terms = tuple(extra_terms)
         self.rig = rig
+        self._has_checked = False
         if self.extra_terms and self.config.method == "box_alignment":
             raise InputError("extra_terms", "none with method box_alignment", f"{len(extra_terms)}", "choose direct")
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
@@ -125,6 +128,7 @@ class DirectShapeRefiner(nn.Module):
         frames, detections = self._with_rig(frames, detections)
         of_prior = dict((*self.prior.named_buffers(), *self.prior.named_parameters()))
         check_no_tangents(frames, detections, term_weights, of_prior)
+        self._warn_of(frames, detections)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
         with (
             torch.set_grad_enabled(differentiate),
@@ -132,6 +136,16 @@ class DirectShapeRefiner(nn.Module):
             compiling(self.config.compile, len(detections)),
         ):
             return self._refine(frames, detections, term_weights)
+
+    def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
+        """Mistakes that the tensors of this call show, as the setting `check` asks."""
+        when = self.config.check
+        if when == "off" or (when == "first" and self._has_checked) or not len(detections):
+            return
+        self._has_checked = True
+        for finding in check_scene(frames, detections, match_images=False).findings:
+            if finding.severity != "note":
+                warnings.warn(str(finding), SceneWarning, stacklevel=5)
 
     def _refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None

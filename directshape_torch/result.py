@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, Self
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
 
+from directshape_torch.diagnosis.car_rows import CarRecord
 from directshape_torch.diagnosis.disparity_profile import DisparityProfile
 from directshape_torch.diagnosis.observability import Observability
 from directshape_torch.diagnosis.quality import FitQuality
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
-from directshape_torch.errors import InputError, shown
+from directshape_torch.errors import InputError, MissingDependencyError, shown
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
+from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
+from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status, is_refined
 
 if TYPE_CHECKING:
     import trimesh
+
+
+Frame = Literal["ref", "cam"]
+# Cars that a result names when it is printed.
+_PRINTED_CARS = 6
 
 
 @dataclass(frozen=True)
@@ -41,9 +54,14 @@ class KittiBoxes:
     alpha: Tensor
 
 
-@dataclass(frozen=True)
-class RefinementResult:
+@dataclass(frozen=True, repr=False)
+class RefinementResult(CarRecord):
     """Outcome of a refinement of B cars, in the order of the detections.
+
+    A result is indexed by a number, a slice, numbers or booleans, one a car, and is a result again; `for car in result`
+    gives results of one car. `.to(...)`, `.cpu()` and `.detach()` are those of tensors. Poses, codes and boxes have the
+    dtype of the inputs (float32, float64); costs, covariances and all figures of quality are float64; statuses and
+    iterations are int64.
 
     Attributes:
         T_cam_obj: (B, 4, 4) refined poses; the input's where the status says so.
@@ -68,6 +86,19 @@ class RefinementResult:
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
         prior: the shapes.
         has_shape: the shape was refined, so that boxes are measured on it; False for the method "box_alignment".
+
+    Example:
+        >>> import pathlib
+        >>> import directshape_torch as ds
+        >>> from directshape_torch.io.kitti_dataset import KittiStereoDataset
+        >>> demo = pathlib.Path(ds.__file__).parent / "assets" / "demo"
+        >>> inputs = KittiStereoDataset(demo, demo / "detections" / "noisy_stereo", demo / "training" / "masks")
+        >>> frame = inputs.load("000000")
+        >>> result = ds.DirectShapeRefiner(config=ds.load_config("fast"))(frame.frame, frame.detections)
+        >>> len(result), len(result[0]), len(result[result.refined])
+        (6, 1, 6)
+        >>> result.to_boxes("opencv").shape, result.corners().shape
+        (torch.Size([6, 7]), torch.Size([6, 8, 3]))
     """
 
     T_cam_obj: Tensor
@@ -91,6 +122,81 @@ class RefinementResult:
 
     def __len__(self) -> int:
         return len(self.T_cam_obj)
+
+    def __getitem__(self, index: int | slice | Tensor | list[int] | NDArray[Any]) -> Self:
+        """The result of some of the cars.
+
+        Raises:
+            InputError: no such car, or not one boolean for each car.
+        """
+        return self.rows(_chosen_rows(index, len(self)))
+
+    def __iter__(self) -> Iterator[Self]:
+        """Results of one car each."""
+        return (self[row] for row in range(len(self)))
+
+    def rows(self, index: Tensor) -> Self:
+        """The cars `index` (M,), in that order."""
+        sources = tuple(self.ground_source[row] for row in index.tolist())
+        return replace(super().rows(index), ground_source=sources)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """On another device, poses, codes and shapes of another dtype; a prior that moves is a copy."""
+        moved = super().to(device)
+        if dtype is not None:
+            like_input = ("T_cam_obj", "code", "input_dimensions_hwl", "t_cam_ref")
+            moved = replace(moved, **{name: getattr(moved, name).to(dtype) for name in like_input})
+        return replace(moved, prior=_moved_prior(self.prior, moved.T_cam_obj))
+
+    def numpy(self) -> dict[str, NDArray[Any]]:
+        """All tensors as arrays by the names of `state_dict`, the boxes in the frame of labels, and words."""
+        boxes = self.boxes()
+        tensors = {**self.detach().cpu().state_dict(), **{f"boxes.{name}": x for name, x in vars(boxes).items()}}
+        words = {
+            "status": [status.name for status in self.status],
+            "term_names": list(self.term_names),
+            "ground_source": list(self.ground_source),
+        }
+        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items()}
+        return {**arrays, **{name: np.array(each, dtype=np.str_) for name, each in words.items()}}
+
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Tensor], prior: ShapePrior | None = None) -> Self:
+        """What `state_dict()` came from, read back by `torch.load(weights_only=True)` or safetensors.
+
+        Args:
+            state: tensors by name.
+            prior: the shapes of the result, which its state does not hold; default the bundled ones.
+
+        Raises:
+            InputError: a tensor is missing, or the prior has another number of codes.
+        """
+        shapes = PCAShapePrior.load_bundled() if prior is None else prior
+        result = cls._from_state(state, prior=shapes)
+        if result.code.shape[1] != shapes.num_codes:
+            expected = f"the prior of the result, with {result.code.shape[1]} codes"
+            raise InputError("prior", expected, f"one with {shapes.num_codes}", "give the prior of the refiner")
+        return result if prior is not None else replace(result, prior=_moved_prior(shapes, result.T_cam_obj))
+
+    def __repr__(self) -> str:
+        """Statuses, and the first cars in a table."""
+        counts = Counter(status.name for status in self.status).most_common()
+        lines = [
+            f"RefinementResult of {len(self)} cars ({self.T_cam_obj.dtype}, {self.T_cam_obj.device})",
+            f"  {', '.join(f'{count} {name}' for name, count in counts) or 'no cars'}",
+        ]
+        head = self.detach()[:_PRINTED_CARS].cpu()
+        if len(head):
+            lines.append("  car      x      y      z  heading  length  mask IoU  better  status")
+        boxes, quality = head.to_boxes("kitti").tolist(), head.quality
+        for row, (x, y, z, _, _, length, heading) in enumerate(boxes):
+            iou, better = float(quality.mask_iou_left[row]), float(quality.probability_better[row])
+            lines.append(
+                f"  {row:3d} {x:6.2f} {y:6.2f} {z:6.2f} {heading:8.2f} {length:7.2f} {iou:9.2f} {better:7.2f}  "
+                f"{head.status[row].name}"
+            )
+        more = len(self) - len(head)
+        return "\n".join([*lines, f"  and {more} more"] if more else lines)
 
     @property
     def status(self) -> list[Status]:
@@ -116,21 +222,50 @@ class RefinementResult:
 
         Location is `T_ref_obj` of (mid x, max y, mid z) of the level, not the object origin.
         """
-        values = self.prior.values(self.code)
-        extents = zero_level_extents(values, self.prior.origin, self.prior.spacing_m)
+        T_ref_box, dimensions = self._boxes("ref")
+        location, rotation_y = T_ref_box[:, :3, 3], rotation_y_from_pose(T_ref_box)
+        return KittiBoxes(dimensions, location, rotation_y, alpha_from_kitti(location, rotation_y))
+
+    def to_boxes(
+        self, convention: BoxFormat = "kitti", frame: Frame = "cam", T_cam_boxes: Tensor | None = None
+    ) -> Tensor:
+        """The boxes of `boxes()` as (B, 7) numbers in the convention of a detector, what `Detections.from_boxes` takes.
+
+        Args:
+            convention: order and meaning of the numbers, see `directshape_torch.geometry.box_formats`.
+            frame: "cam", the left camera's, or "ref", that of labels, for camera conventions.
+            T_cam_boxes: rigid motion to the left camera, (4, 4) or (B, 4, 4), from the frame in which the boxes shall
+                be; needed for LiDAR conventions, and in place of `frame`.
+
+        Raises:
+            InputError: an unknown convention or frame, or a LiDAR convention without `T_cam_boxes`.
+        """
+        T_frame_box, dimensions = self._boxes("cam" if T_cam_boxes is not None else frame)
+        return poses_to_boxes(T_frame_box, dimensions, convention, T_cam_boxes)
+
+    def corners(self, frame: Frame = "cam") -> Tensor:
+        """Corners (B, 8, 3) of the same boxes: the four on the ground, from the front right one on, then those above.
+
+        Raises:
+            InputError: a frame that is neither "cam" nor "ref".
+        """
+        return box_corners(*self._boxes(frame))
+
+    def _boxes(self, frame: str) -> tuple[Tensor, Tensor]:
+        """Poses (B, 4, 4) of the boxes, their origins in the middle of the bottom faces, and dimensions (B, 3)."""
+        if frame not in ("ref", "cam"):
+            raise InputError("frame", "'cam' or 'ref'", repr(frame))
+        T = self.T_ref_obj if frame == "ref" else self.T_cam_obj
+        extents = zero_level_extents(self.prior.values(self.code), self.prior.origin, self.prior.spacing_m)
         lower, upper = extents.unbind(1)
         length, height, width = (upper - lower).unbind(-1)
         middle = 0.5 * (lower + upper)
         bottom_obj = torch.stack([middle[:, 0], upper[:, 1], middle[:, 2]], dim=-1)
-        T_ref_obj = self.T_ref_obj
-        location = se3.transform(T_ref_obj, bottom_obj)
-        rotation_y = rotation_y_from_pose(T_ref_obj)
-        dimensions = torch.stack([height, width, length], dim=-1)
         # A car whose shape was not refined keeps the detector's box, not one of the mean shape.
         refined = self.refined[:, None] & self.has_shape
-        dimensions = torch.where(refined, dimensions, self.input_dimensions_hwl)
-        location = torch.where(refined, location, T_ref_obj[:, :3, 3])
-        return KittiBoxes(dimensions, location, rotation_y, alpha_from_kitti(location, rotation_y))
+        dimensions = torch.where(refined, torch.stack([height, width, length], dim=-1), self.input_dimensions_hwl)
+        location = torch.where(refined, se3.transform(T, bottom_obj), T[:, :3, 3])
+        return se3.from_rotation_translation(T[:, :3, :3], location), dimensions
 
     @property
     def sigma_xyz_yaw(self) -> Tensor:
@@ -156,3 +291,53 @@ class RefinementResult:
 
         values = self.prior.values(self.code[index : index + 1])[0]
         return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, T_cam_obj=self.T_cam_obj[index])
+
+    def meshes(self, kind: Literal["trimesh", "pytorch3d"] = "trimesh") -> Any:
+        """Surfaces of all cars in the left camera frame: a list of `trimesh.Trimesh`, or one PyTorch3D `Meshes`.
+
+        Cars that were not refined have the mean shape, at the pose of the detector. No gradients flow into meshes.
+
+        Raises:
+            InputError: another kind.
+            MissingDependencyError: PyTorch3D is asked for and not installed.
+        """
+        if kind == "trimesh":
+            return [self.mesh(row) for row in range(len(self))]
+        if kind != "pytorch3d":
+            raise InputError("kind", "'trimesh' or 'pytorch3d'", repr(kind))
+        try:
+            from pytorch3d.structures import Meshes
+        except ImportError as error:
+            raise MissingDependencyError("pytorch3d", "", 'meshes("pytorch3d")') from error
+        like, surfaces = self.T_cam_obj, self.meshes()
+        return Meshes(
+            verts=[torch.as_tensor(np.array(mesh.vertices)).to(like) for mesh in surfaces],
+            faces=[torch.as_tensor(np.array(mesh.faces)).long().to(like.device) for mesh in surfaces],
+        )
+
+
+def _chosen_rows(index: object, count: int) -> Tensor:
+    """Numbers of the cars that an index names."""
+    if isinstance(index, (int, np.integer)) and not isinstance(index, bool):
+        if not -count <= index < count:
+            raise InputError("index", f"a car of 0..{count - 1}" if count else "no car", f"{index}: {count} cars")
+        return torch.tensor([index % count])
+    if isinstance(index, slice):
+        return torch.arange(count)[index]
+    chosen = torch.as_tensor(index, device="cpu")
+    if chosen.ndim != 1 or (chosen.dtype == torch.bool and len(chosen) != count) or chosen.is_floating_point():
+        expected = f"a car, a slice, numbers of cars, or {count} booleans"
+        raise InputError("index", expected, f"{chosen.dtype} of shape {tuple(chosen.shape)}")
+    rows = chosen.nonzero()[:, 0] if chosen.dtype == torch.bool else chosen.long()
+    if bool(((rows < -count) | (rows >= count)).any()):
+        raise InputError("index", f"cars of 0..{count - 1}" if count else "no car", str(rows.tolist()))
+    return rows % max(1, count)
+
+
+def _moved_prior(prior: ShapePrior, like: Tensor) -> ShapePrior:
+    """The shapes with dtype and device of `like`: themselves where they have them, else a copy."""
+    origin = prior.origin
+    if not isinstance(prior, nn.Module) or (origin.dtype, origin.device) == (like.dtype, like.device):
+        return prior
+    moved: ShapePrior = copy.deepcopy(prior).to(like)
+    return moved

@@ -8,6 +8,7 @@ with the centre of the top-left pixel at (0, 0).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import NoneType
 from typing import Annotated
@@ -17,6 +18,7 @@ from kornia.geometry import camera as kornia_camera
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.se3 import from_rotation_translation
 from directshape_torch.numerics.checks import (
@@ -30,6 +32,9 @@ from directshape_torch.numerics.checks import (
     check_stored,
     is_no_rotation,
 )
+
+# Of B cars in an image: (B, H, W), or (H, W) and None for each.
+Masks = Tensor | Sequence[Tensor | None]
 
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
@@ -77,6 +82,41 @@ class StereoCamera(TensorRecord):
                 f"baseline {self.baseline.min().item():.4f} m",
                 "swap the two cameras, or the sign of the baseline",
             )
+
+    @classmethod
+    def from_intrinsics(
+        cls,
+        K: Tensor,  # (3, 3) or (F, 3, 3)
+        baseline_m: float | Tensor,  # or (F,)
+        K_right: Tensor | None = None,
+        disparity_field: DisparityField | None = None,
+    ) -> StereoCamera:
+        """Of an ideal rectified pair: parallel cameras side by side, and labels in the frame of the left one.
+
+        Args:
+            K: intrinsics of the images, pixels; one matrix for one frame, or one for each of F frames.
+            baseline_m: distance of the two cameras, metres, positive.
+            K_right: of the right images where they differ.
+            disparity_field: residual disparity of the rig (measured minus true), or None.
+
+        Raises:
+            InputError: other shapes or types, intrinsics that are not `[[fx, s, cx], [0, fy, cy], [0, 0, 1]]` with
+                positive focal lengths, or a baseline that is not above 0.
+
+        Example:
+            >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+            >>> StereoCamera.from_intrinsics(K, 0.54).baseline
+            tensor([0.5400])
+        """
+        K_left = _intrinsics("K", K)
+        of_right = K_left.clone() if K_right is None else _intrinsics("K_right", K_right).expand_as(K_left).clone()
+        baseline = torch.as_tensor(baseline_m, dtype=K_left.dtype, device=K_left.device)
+        if baseline.ndim > 1 or (baseline.ndim == 1 and len(baseline) != len(K_left)):
+            got = str(tuple(baseline.shape))
+            raise InputError("baseline_m", f"a number, or {len(K_left)} of them", f"shape {got}", "in metres")
+        T_right_cam = torch.eye(4).to(K_left).repeat(len(K_left), 1, 1)
+        T_right_cam[:, 0, 3] = -baseline
+        return cls(K_left.clone(), of_right, T_right_cam, torch.zeros_like(K_left[:, 0]), disparity_field)
 
     @classmethod
     def from_projections(
@@ -163,6 +203,11 @@ class StereoCamera(TensorRecord):
     def baseline(self) -> Tensor:
         """Distance of the right camera along the left camera's x axis, (F,), metres, positive."""
         return -self.T_right_cam[:, 0, 3]
+
+    @property
+    def T_cam_ref(self) -> Tensor:
+        """The frame of labels and result files to the left camera, (F, 4, 4)."""
+        return from_rotation_translation(torch.eye(3).to(self.t_cam_ref).expand_as(self.K_left), self.t_cam_ref)
 
 
 @dataclass(frozen=True)
@@ -255,6 +300,51 @@ class FrameBatch(TensorRecord):
                 h, w = (int(n) for n in self.sizes[k])
                 field.check_rig((w, h), self.camera.K_left[k], self.camera.K_right[k], self.camera.T_right_cam[k])
 
+    @classmethod
+    def from_images(
+        cls,
+        images_left: Tensor,  # (F, 3, H, W), or (3, H, W) of one frame
+        images_right: Tensor,
+        camera: StereoCamera,
+        ground: GroundPlane | float = 1.65,
+        frame_ids: Sequence[str] | None = None,
+    ) -> FrameBatch:
+        """Frames without padding, of RGB images in floating point in [0, 1] or uint8.
+
+        Args:
+            images_left, images_right: rectified pairs.
+            camera: of F frames, or of one for all of them.
+            ground: planes, or the height of the camera above a level road, metres.
+            frame_ids: names; default "000000" and on.
+
+        Raises:
+            InputError: what the class raises.
+
+        Example:
+            >>> K = torch.tensor([[700.0, 0.0, 200.0], [0.0, 700.0, 60.0], [0.0, 0.0, 1.0]])
+            >>> image = torch.zeros(3, 120, 400, dtype=torch.uint8)
+            >>> frames = FrameBatch.from_images(image, image, StereoCamera.from_intrinsics(K, 0.54), ground=1.65)
+            >>> frames.sizes, frames.frame_ids
+            (tensor([[120, 400]]), ('000000',))
+        """
+        left, right = (
+            _as_images(name, images, camera.K_left)
+            for name, images in (("images_left", images_left), ("images_right", images_right))
+        )
+        count, like = len(left), camera.K_left
+        if camera.num_frames == 1 and camera.disparity_field is None:
+            camera = StereoCamera(
+                camera.K_left.expand(count, 3, 3),
+                camera.K_right.expand(count, 3, 3),
+                camera.T_right_cam.expand(count, 4, 4),
+                camera.t_cam_ref.expand(count, 3),
+            )
+        if not isinstance(ground, GroundPlane):
+            ground = GroundPlane.from_camera_height(ground, count).to(like.device, like.dtype)
+        sizes = torch.tensor([left.shape[2:]] * count, device=left.device).reshape(count, 2)
+        names = tuple(f"{number:06d}" for number in range(count)) if frame_ids is None else tuple(frame_ids)
+        return cls(left, right, sizes, camera, ground, names)
+
     def __len__(self) -> int:
         return len(self.images_left)
 
@@ -339,8 +429,133 @@ class Detections(TensorRecord):
                 cure = "give 0 for cars at which the rig's disparity is known"
                 raise InputError("offset_sigma_px", "finite standard deviations of at least 0, pixels", got, cure)
 
+    @classmethod
+    def from_boxes(
+        cls,
+        boxes: Tensor,  # (B, 7) or (B, 8, 3)
+        convention: BoxFormat = "kitti",
+        *,
+        mask_left: Masks | None = None,
+        mask_right: Masks | None = None,
+        has_mask_left: Tensor | None = None,
+        has_mask_right: Tensor | None = None,
+        frame_index: Tensor | None = None,
+        score: Tensor | None = None,
+        box_2d: Tensor | None = None,
+        T_cam_boxes: Tensor | None = None,
+        occluders: Occluders | None = None,
+        pose_sigma: Tensor | None = None,
+    ) -> Detections:
+        """From boxes as a detector writes them, and the masks that there are.
+
+        Args:
+            boxes: x, y, z, three sizes and heading, or corners, in metres and radians; what they mean, and in which
+                order, says the convention (`directshape_torch.geometry.box_formats`).
+            convention: "kitti", "mmdet3d_camera", "mmdet3d_lidar", "nuscenes" or "opencv".
+            mask_left, mask_right: (B, H, W) bool, uint8 (0 and 1, or 0..255) or foreground probability; or B entries
+                that are (H, W) or None. One of the two images is enough.
+            has_mask_left, has_mask_right: (B,) bool; default: where a mask has any pixel.
+            frame_index: (B,) default all 0.
+            score: (B,) default all 1.
+            box_2d: (B, 4) u_min, v_min, u_max, v_max of the left image; default: around the left mask, or
+                where there is none around the right one, which is as high.
+            T_cam_boxes: rigid motion from the frame of the boxes to the left camera, (4, 4) or (B, 4, 4). Camera
+                conventions do without where the boxes are in the left camera's frame; boxes in KITTI's own frame of
+                labels bring `camera.T_cam_ref`; LiDAR boxes need camera_from_lidar.
+            occluders, pose_sigma: as in the class.
+
+        Raises:
+            InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, corners that make no box, and what the class
+                raises.
+
+        Example:
+            >>> boxes = torch.tensor([[1.0, 0.85, 20.0, 4.0, 1.6, 1.5, 0.3]])
+            >>> mask = torch.zeros(1, 120, 400, dtype=torch.uint8)
+            >>> mask[0, 50:80, 100:180] = 255
+            >>> detections = Detections.from_boxes(boxes, "opencv", mask_left=mask)
+            >>> detections.T_cam_obj[0, :3, 3], detections.box_2d
+            (tensor([ 1.0000,  1.6000, 20.0000]), tensor([[100.,  50., 179.,  79.]]))
+        """
+        T_cam_obj, dimensions_hwl = boxes_to_poses(boxes, convention, T_cam_boxes)
+        count, given = len(boxes), {"mask_left": mask_left, "mask_right": mask_right}
+        stacked = {name: _stacked(name, masks, count) for name, masks in given.items() if masks is not None}
+        if not stacked:
+            cure = "give mask_left, mask_right, or both; a car without a mask cannot be refined"
+            raise InputError("mask_left", f"masks of {count} cars in one image at least", "None", cure)
+        none = torch.zeros_like(next(iter(stacked.values())), dtype=torch.bool)
+        left, right = (stacked.get(name, none) for name in given)
+        has_left = left.flatten(1).any(dim=1) if has_mask_left is None else has_mask_left
+        has_right = right.flatten(1).any(dim=1) if has_mask_right is None else has_mask_right
+        if box_2d is None:
+            box_2d = torch.where(left.flatten(1).any(dim=1)[:, None], boxes_around(left), boxes_around(right)).to(boxes)
+        return cls(
+            frame_index=torch.zeros(count, dtype=torch.long, device=boxes.device)
+            if frame_index is None
+            else frame_index,
+            T_cam_obj=T_cam_obj,
+            dimensions_hwl=dimensions_hwl,
+            box_2d=box_2d,
+            score=boxes.new_ones(count) if score is None else score,
+            mask_left=left,
+            mask_right=right,
+            has_mask_left=has_left,
+            has_mask_right=has_right,
+            occluders=occluders,
+            pose_sigma=pose_sigma,
+        )
+
     def __len__(self) -> int:
         return len(self.frame_index)
+
+
+def _as_images(name: str, images: Tensor, like: Tensor) -> Tensor:
+    """RGB (F, 3, H, W) in [0, 1], of the dtype of `like` where they were bytes."""
+    shape = (3, "H", "W") if isinstance(images, Tensor) and images.ndim == 3 else ("F", 3, "H", "W")
+    is_bytes = isinstance(images, Tensor) and images.dtype == torch.uint8
+    check_shape(name, images, shape, "colours come first: image.permute(2, 0, 1)", "number" if is_bytes else "image")
+    images = images if images.ndim == 4 else images[None]
+    return images.to(like.dtype) / 255 if is_bytes else images
+
+
+def _stacked(name: str, masks: Masks, count: int) -> Tensor:
+    """Masks (B, H, W) in bool or floating point."""
+    if not isinstance(masks, Tensor):
+        present = [mask for mask in masks if mask is not None]
+        if len(masks) != count or not present or len({mask.shape for mask in present}) > 1:
+            got = f"{len(masks)} entries of sizes {sorted({tuple(mask.shape) for mask in present})}"
+            raise InputError(name, f"{count} masks of one size (H, W), or None where a car has none", got)
+        masks = torch.stack([torch.zeros_like(present[0]) if mask is None else mask for mask in masks])
+    if masks.dtype == torch.uint8:
+        check_shape(name, masks, (count, "H", "W"))
+        # 0 and 1, or shades of grey.
+        return masks.bool() if not masks.numel() or int(masks.max()) <= 1 else masks.float() / 255
+    check_shape(name, masks, (count, "H", "W"), kind="mask")
+    return masks
+
+
+def boxes_around(
+    masks: Tensor,  # (B, H, W)
+) -> Tensor:
+    """u_min, v_min, u_max, v_max (B, 4) of the pixels above 0.5, float64; NaN without any."""
+    inside = masks if masks.dtype == torch.bool else masks > 0.5
+    spans = []
+    for axis in (1, 2):  # columns, then rows
+        seen = inside.any(dim=axis).int()
+        first, last = seen.argmax(dim=1), seen.shape[1] - 1 - seen.flip(1).argmax(dim=1)
+        spans.append(torch.stack([first, last], dim=1).double())
+    box = torch.stack(spans, dim=2).flatten(1)
+    return torch.where(inside.flatten(1).any(dim=1)[:, None], box, torch.nan)
+
+
+def _intrinsics(name: str, K: Tensor) -> Tensor:
+    """Of F frames, (F, 3, 3)."""
+    shape = (3, 3) if isinstance(K, Tensor) and K.ndim == 2 else ("F", 3, 3)
+    check_shape(name, K, shape, kind="floating")
+    K = K if K.ndim == 3 else K[None]
+    last_row = K.new_tensor([0.0, 0.0, 1.0])
+    if not bool(((K[:, 2] == last_row).all(1) & (K[:, 1, 0] == 0) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)).all()):
+        raise InputError(name, "[[fx, s, cx], [0, fy, cy], [0, 0, 1]], pixels", f"{K.tolist()}", "mind its transpose")
+    return K
 
 
 def _check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 import directshape_torch
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, GroundPlane, RefinementResult, StereoCamera
-from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import poses_cam
 
@@ -29,18 +29,14 @@ class DetectorOutput:
 
     Attributes:
         frame_index: (N,) the frame of each car.
-        location_cam: (N, 3) bottom centre of the 3D box in the left camera frame (x right, y down, z forward), metres.
-        dimensions_hwl: (N, 3) height, width, length, metres.
-        rotation_y: (N,) heading as KITTI counts it, radians.
+        boxes: (N, 7) as MMDetection3D has them in a camera frame: x, y, z, length, height, width, heading.
         box_2d: (N, 4) u_min, v_min, u_max, v_max in the left image, pixels.
         score: (N,).
         mask_left, mask_right: (N, H, W) foreground probability in [0, 1], all zero where there is no mask.
     """
 
     frame_index: Tensor
-    location_cam: Tensor
-    dimensions_hwl: Tensor
-    rotation_y: Tensor
+    boxes: Tensor
     box_2d: Tensor
     score: Tensor
     mask_left: Tensor
@@ -65,25 +61,16 @@ class RefinedDetector(nn.Module):
     ) -> tuple[DetectorOutput, RefinementResult]:
         """The detector's boxes, and for each of them a refined pose, a shape and a status."""
         found: DetectorOutput = self.detector(images_left, images_right)
-        num_frames, _, height, width = images_left.shape
-        frames = FrameBatch(
-            images_left=images_left,
-            images_right=images_right,
-            sizes=torch.tensor([[height, width]] * num_frames),
-            camera=StereoCamera.from_projections(P_left, P_right),
-            ground=ground,
-            frame_ids=tuple(f"{number:06d}" for number in range(num_frames)),
-        )
-        detections = Detections(
-            frame_index=found.frame_index,
-            T_cam_obj=pose_from_kitti(found.location_cam, found.rotation_y),
-            dimensions_hwl=found.dimensions_hwl,
-            box_2d=found.box_2d,
-            score=found.score,
+        camera = StereoCamera.from_projections(P_left, P_right)  # or from_intrinsics(K, baseline)
+        frames = FrameBatch.from_images(images_left, images_right, camera, ground)
+        detections = Detections.from_boxes(
+            found.boxes,
+            "mmdet3d_camera",
             mask_left=found.mask_left,
             mask_right=found.mask_right,
-            has_mask_left=found.mask_left.flatten(1).any(dim=1),
-            has_mask_right=found.mask_right.flatten(1).any(dim=1),
+            frame_index=found.frame_index,
+            score=found.score,
+            box_2d=found.box_2d,
         )
         return found, self.refiner(frames, detections)
 
@@ -98,10 +85,8 @@ class StoredDetector(nn.Module):
         poses = poses_cam(lines, loaded.frame.camera.t_cam_ref[0])
         self.output = DetectorOutput(
             frame_index=torch.zeros(len(lines), dtype=torch.int64),
-            location_cam=poses[:, :3, 3],
-            dimensions_hwl=torch.tensor([line.hwl for line in lines]),
-            rotation_y=torch.tensor([line.rotation_y for line in lines]),
-            box_2d=torch.tensor([line.box_2d for line in lines]),
+            boxes=poses_to_boxes(poses, loaded.detections.dimensions_hwl, "mmdet3d_camera"),
+            box_2d=loaded.detections.box_2d,
             score=torch.tensor([line.score or 0.0 for line in lines]),
             mask_left=loaded.detections.mask_left,
             mask_right=loaded.detections.mask_right,
@@ -120,12 +105,10 @@ def main() -> tuple[DetectorOutput, RefinementResult]:
     pipeline = RefinedDetector(StoredDetector(dataset), DirectShapeRefiner())
     found, result = pipeline(frame.images_left, frame.images_right, P_left, P_right, frame.ground)
 
-    boxes = result.boxes()  # KITTI boxes of the refined shapes, in the frame of labels
-    location_cam = boxes.location_ref + result.t_cam_ref
-    spread = result.covariance_xyz_yaw.diagonal(dim1=-2, dim2=-1).sqrt()  # (B, 4), relative
-    for car, status in enumerate(result.status):
-        before, after = (_text(row[car]) for row in (found.location_cam, location_cam))
-        print(f"car {car}: {before} -> {after} m, {status.name}, depth spread {spread[car, 2]:.3f}")
+    boxes = result.to_boxes("mmdet3d_camera")  # of the refined shapes, as the detector writes them
+    for car, one in enumerate(result):
+        before, after = (_text(each[car, :3]) for each in (found.boxes, boxes))
+        print(f"car {car}: {before} -> {after} m, {one.status[0].name}, depth sigma {one.sigma_xyz_yaw[0, 2]:.2f} m")
     refined = result.refined.nonzero()[:, 0].tolist()
     if refined:
         mesh = result.mesh(refined[0])  # a trimesh.Trimesh in the left camera frame

@@ -16,6 +16,7 @@ from directshape_torch.errors import DataFormatError, ResumeError
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.run_manifest import (
+    RESUME_CURE,
     RunManifest,
     check_inputs,
     check_resume,
@@ -121,7 +122,7 @@ class RunRecord:
             if folder.is_dir() and any(folder.iterdir()):
                 raise ResumeError(
                     f"cannot resume: {folder} holds files, but {self.path} is missing, so what they were made of is "
-                    "unknown; choose another output folder, or remove this one to start again"
+                    f"unknown; {RESUME_CURE}"
                 )
 
     def _has_outputs(self, outputs: Sequence[str], frame_id: str) -> bool:
@@ -149,7 +150,7 @@ class RunRecord:
             hashes = hash_files(dataset.input_files(frame_id))
         except DataFormatError as error:
             raise ResumeError(
-                f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}"
+                f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}; {RESUME_CURE}"
             ) from error
         check_inputs(self.manifest, frame_id, hashes)
 

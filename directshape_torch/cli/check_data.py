@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from directshape_torch.cli.data_options import add_data_options, dataset_of
 
 if TYPE_CHECKING:
-    from directshape_torch.data_check.finding import CheckReport
+    from directshape_torch.scene_check.finding import CheckReport
 
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
@@ -46,13 +46,13 @@ def run(args: argparse.Namespace) -> int:
     """
     import json
 
-    from directshape_torch.data_check.check_text import format_report, report_content, write_report
+    from directshape_torch.data_check.check_text import report_content, write_report
 
     report = _report(args)
     if str(args.json) == "-":
         print(json.dumps(report_content(report), indent=2))
         return report.exit_code
-    print(format_report(report), end="")
+    print(report)
     if args.json is not None:
         write_report(args.json, report)
     return report.exit_code
@@ -62,8 +62,8 @@ def _report(args: argparse.Namespace) -> CheckReport:
     """A data set that cannot even be opened has one finding, and that says why."""
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.data_check.check_dataset import check_dataset, spread
-    from directshape_torch.data_check.finding import CheckReport, unreadable
     from directshape_torch.errors import DataFormatError
+    from directshape_torch.scene_check.finding import CheckReport, unreadable
 
     max_frames = None if args.all_frames else args.max_frames
     try:

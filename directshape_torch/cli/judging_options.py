@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from directshape_torch.cli.data_options import frame_id_of
+
 if TYPE_CHECKING:
     from directshape_torch.evaluation.comparison_summary import BootstrapSettings
 
@@ -14,7 +16,7 @@ def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
     """`--split` or `--frames`; `default` says which frames count without them."""
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument("--split", type=Path, metavar="FILE", help=f"one frame id a line; default: {default}")
-    chosen.add_argument("--frames", nargs="+", metavar="ID", help="frame ids")
+    chosen.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
 
 
 def add_interval_options(parser: argparse.ArgumentParser) -> None:

@@ -32,6 +32,7 @@ COMMANDS = (
     "export",
     "inspect",
     "check_data",
+    "fit_shape",
 )
 
 _DESCRIPTION = "Refine pose and shape of cars in stereo frames by differentiable rendering of signed distance fields."
@@ -46,7 +47,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code (docs/file_formats.md): 0 all fine, 1 finished with failures, 2 wrong usage or input.
     """
-    args = make_parser().parse_args(arguments)
+    parser = make_parser()
+    args = parser.parse_args(arguments)
+    if not hasattr(args, "run"):
+        parser.print_help(sys.stderr)
+        return EXIT_WRONG_INPUT
     try:
         with _terminable():
             code: int = args.run(args)
@@ -103,7 +108,7 @@ def make_parser() -> argparse.ArgumentParser:
     """The parser of the program with all of its commands."""
     parser = argparse.ArgumentParser(prog="directshape", description=_DESCRIPTION)
     parser.add_argument("--version", action=_Version, help="print the version and stop")
-    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND")
     for name in COMMANDS:
         importlib.import_module(f"directshape_torch.cli.{name}").add_parser(subparsers)
     return parser

@@ -14,9 +14,13 @@ from directshape_torch.errors import InputError
 if TYPE_CHECKING:
     import torch
 
+    from directshape_torch.config import RefinerConfig
+    from directshape_torch.io.stereo_files import FileStereoDataset
     from directshape_torch.problem import TermFactory
     from directshape_torch.refiner import DirectShapeRefiner
 
+# Enough to tell a mistake from the noise of a detector.
+_CHECKED_FRAMES = 3
 _DESCRIPTION = """
 Refine the rough 3D boxes of a detector: poses, boxes and shapes of all cars of all frames. A second run with the same
 settings continues where the first stopped, however it stopped; 'directshape status' tells how far it is. Exit code: 0
@@ -131,6 +135,7 @@ def run(args: argparse.Namespace) -> int:
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)
     _check_disparity_is_used(args.disparity, refiner.config.method)
     dataset = dataset_of(args)
+    refiner.config = _warned_of(dataset, refiner.config)
     rigs = rigs_of_run(dataset, args.rig, args.out, args.fresh)
     if rigs:
         dataset = dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
@@ -144,6 +149,25 @@ def run(args: argparse.Namespace) -> int:
     if args.rerun is not None:
         write_recording(args.rerun, args.out, dataset, refiner)
     return summary.exit_code
+
+
+def _warned_of(dataset: FileStereoDataset, config: RefinerConfig) -> RefinerConfig:
+    """Print what the first frames show to be wrong; settings with which calls do not look again."""
+    from dataclasses import replace
+
+    from directshape_torch.errors import DirectShapeError
+    from directshape_torch.io.frame_collation import collate
+    from directshape_torch.scene_check.check_scene import check_scene
+
+    if config.check == "off":
+        return config
+    try:
+        frames, detections = collate([dataset.load(frame_id) for frame_id in dataset.frame_ids[:_CHECKED_FRAMES]])
+    except (DirectShapeError, OSError):  # the run says which frame cannot be read, and goes on with the others
+        return config
+    for finding in check_scene(frames, detections, match_images=False).findings:
+        print(f"check: {finding} ('directshape check-data' looks closer)", file=sys.stderr)
+    return replace(config, check="off")
 
 
 def _check_disparity_is_used(folder: Path | None, method: str) -> None:

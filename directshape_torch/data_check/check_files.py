@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from directshape_torch.data_check.finding import Finding
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.scene_check.finding import Finding
 
 _NAMED = 3
 

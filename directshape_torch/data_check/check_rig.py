@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-from directshape_torch.data_check.finding import Finding
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.of_dataset import rig_of_frame
+from directshape_torch.scene_check.finding import Finding
 
 FEWEST_CARS = 8
 # 0.15 px are 0.35 m at 30 m on KITTI's rig.

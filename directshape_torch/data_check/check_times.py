@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from directshape_torch.data_check.finding import Finding, Severity, unreadable
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.scene_check.finding import Finding, Severity, unreadable
 
 # At 15 m/s a car moves 7 cm in 5 ms.
 PAIR_WARNING_S, PAIR_ERROR_S = 0.005, 0.02

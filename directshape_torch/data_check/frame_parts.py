@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -10,14 +10,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.data_check.finding import Finding, unreadable
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.io.image_files import read_rgb
-from directshape_torch.io.instance_masks import InstanceMask, MaskSizeError
+from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.mask_matching import match_masks
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.scene import StereoCamera
+from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
+from directshape_torch.scene_check.check_scene import Pair
+from directshape_torch.scene_check.finding import Finding, unreadable
 
 _Part = TypeVar("_Part")
 
@@ -28,7 +31,7 @@ class FrameParts:
 
     Attributes:
         frame_id: its name.
-        left, right: (H, W, 3) RGB; both or none, and of one size.
+        pair: left and right image (H, W, 3), RGB, of one size.
         calibration: the two projections.
         camera: the same, where it is that of a stereo pair.
         objects: detections of the refined classes with a 3D box.
@@ -36,8 +39,7 @@ class FrameParts:
     """
 
     frame_id: str
-    left: NDArray[np.uint8] | None
-    right: NDArray[np.uint8] | None
+    pair: Pair | None
     calibration: KittiCalibration | None
     camera: StereoCamera | None
     objects: list[KittiObject]
@@ -46,7 +48,7 @@ class FrameParts:
     @property
     def size_hw(self) -> tuple[int, int] | None:
         """Of both images."""
-        return None if self.left is None else (self.left.shape[0], self.left.shape[1])
+        return None if self.pair is None else (self.pair[0].shape[0], self.pair[0].shape[1])
 
 
 def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, list[Finding]]:
@@ -70,9 +72,8 @@ def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, l
     right = attempt("right_image", "a whole PNG or JPEG", lambda: read_rgb(right_path))
     if left is not None and right is not None and left.shape != right.shape:
         findings.append(_other_size(frame_id, left.shape, right.shape))
-        left = right = None
-    if left is None or right is None:
-        left = right = None
+        left = None
+    pair = None if left is None or right is None else (left, right)
     calibration = attempt(
         "calibration_file",
         "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md",
@@ -81,17 +82,68 @@ def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, l
     objects = attempt(
         "detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", lambda: dataset.objects(frame_id)
     )
-    size_hw = None if left is None else (left.shape[0], left.shape[1])
     masks = None
-    if dataset.masks is not None and size_hw is not None:
-        source = dataset.masks
+    if dataset.masks is not None and pair is not None:
+        source, size_hw = dataset.masks, (pair[0].shape[0], pair[0].shape[1])
         masks = attempt("mask_file", "masks of both images", lambda: source.read(frame_id, size_hw))
     plane = "a x + b y + c z + d = 0 with |b| near 1"
     if attempt("plane_file", plane, lambda: layout.plane_path(frame_id)) is not None:
         attempt("plane_file", plane, lambda: layout.plane_ref(frame_id))
     refined = [o for o in objects or [] if o.type in dataset.classes and o.has_box_3d]
-    parts = FrameParts(frame_id, left, right, calibration, _camera(calibration), refined, masks)
+    parts = FrameParts(frame_id, pair, calibration, _camera(calibration), refined, masks)
     return parts, findings
+
+
+def numbers_of(calibration: KittiCalibration) -> tuple[dict[str, NDArray[np.float64]], float]:
+    """Intrinsics by camera, and the baseline in metres, NaN where a focal length is 0."""
+    P = {
+        f"{name} of {calibration.path.name}": matrix
+        for name, matrix in (("P2", calibration.P2), ("P3", calibration.P3))
+    }
+    shift = [matrix[0, 3] / (matrix[0, 0] or np.nan) for matrix in P.values()]
+    return {name: matrix[:, :3] for name, matrix in P.items()}, float(shift[0] - shift[1])
+
+
+def gather_evidence(parts: FrameParts) -> FrameEvidence | None:
+    """The evidence of a frame, or None where its images or its calibration cannot be used.
+
+    Masks are matched by 2D boxes alone, for the 3D ones are what is in question. Those of the right image are held
+    against the same boxes, where they should fit less well.
+    """
+    if parts.camera is None or parts.size_hw is None:
+        return None
+    boxes = CarBoxes(
+        _columns([o.location_ref for o in parts.objects], 3),
+        _columns([o.hwl for o in parts.objects], 3),
+        np.array([o.rotation_y for o in parts.objects], dtype=np.float64),
+        np.array([o.alpha for o in parts.objects], dtype=np.float64),
+        _columns([o.box_2d for o in parts.objects], 4),
+    )
+    of_cars = {side: [mask for mask in parts.masks or [] if mask.is_car and mask.side == side] for side in SIDES}
+    matches = {side: match_masks(boxes.box_2d, of_side) for side, of_side in of_cars.items()}
+    own = {
+        side: [None if k < 0 else of_cars[side][k] for k in matches[side].mask_of_detection.tolist()] for side in SIDES
+    }
+    nothing = (np.nan,) * 4
+    seen = _columns([box for mask in of_cars["left"] for box in (mask.mask_box, mask.box)], 4)
+    return FrameEvidence(
+        frame_id=parts.frame_id,
+        boxes=boxes,
+        mask_boxes={
+            side: _columns([nothing if mask is None else mask.mask_box for mask in own[side]], 4) for side in SIDES
+        },
+        overlap={side: matches[side].overlap for side in SIDES},
+        num_masks={side: len(of_cars[side]) for side in SIDES},
+        seen=(seen,) * len(boxes),
+        masks=tuple(None if mask is None else np.asarray(mask.probability > 0.5) for mask in own["left"]),
+        camera=parts.camera,
+        size_hw=parts.size_hw,
+        has_masks=parts.masks is not None,
+    )
+
+
+def _columns(rows: Sequence[tuple[float, ...]], count: int) -> NDArray[np.float64]:
+    return np.array(rows, dtype=np.float64).reshape(-1, count)
 
 
 def _camera(calibration: KittiCalibration | None) -> StereoCamera | None:

@@ -1,9 +1,105 @@
-"""Figures of some cars among all cars of a call: placing them, and blanking those that do not hold."""
+"""Dataclasses with one row a car: chosen, placed among others, moved, and as flat tensors for files."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import Field, fields, replace
+from typing import Any, ClassVar, Self, get_type_hints
+
 import torch
 from torch import Tensor
+
+from directshape_torch.errors import InputError
+
+
+class CarRecord:
+    """Base of frozen dataclasses of tensors (B, ...), of such records, and of words and other values.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Depths(CarRecord):
+        ...     depth_m: Tensor
+        >>> Depths(torch.tensor([10.0, 20.0])).rows(torch.tensor([1]))
+        Depths(depth_m=tensor([20.]))
+    """
+
+    # Fields that are one for all cars: kept as they are where cars are chosen.
+    shared: ClassVar[frozenset[str]] = frozenset()
+
+    def rows(self, index: Tensor) -> Self:
+        """The cars `index` (M,), in that order."""
+        return self._with(lambda value: value[index.to(value.device)], per_car=True)
+
+    def spread(self, rows: Tensor, count: int) -> Self:
+        """The cars `rows` (B,), ascending, placed among `count` cars; NaN for the others."""
+        return self._with(lambda value: placed(value, rows, count), per_car=True)
+
+    def where(self, condition: Tensor) -> Self:
+        """What is known where the condition (B,) holds, NaN elsewhere."""
+        return self._with(lambda value: kept(value, condition), per_car=True)
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """On another device and, for floating-point tensors, of another dtype."""
+        return self._with(lambda value: value.to(device=device, dtype=dtype if value.is_floating_point() else None))
+
+    def cpu(self) -> Self:
+        """In the memory of the host."""
+        return self.to("cpu")
+
+    def detach(self) -> Self:
+        """Without gradients."""
+        return self._with(lambda value: value.detach())
+
+    def state_dict(self, prefix: str = "") -> dict[str, Tensor]:
+        """All tensors and words by flat names, as `torch.save` and safetensors take them; words are UTF-8 bytes."""
+        state: dict[str, Tensor] = {}
+        for each, value in self._fields():
+            if isinstance(value, CarRecord):
+                state |= value.state_dict(f"{prefix}{each.name}.")
+            elif isinstance(value, tuple):
+                state[prefix + each.name] = torch.tensor(list("\n".join(value).encode()), dtype=torch.uint8)
+            elif isinstance(value, bool):
+                state[prefix + each.name] = torch.tensor(value)
+            elif isinstance(value, Tensor):
+                state[prefix + each.name] = value.detach().clone(memory_format=torch.contiguous_format)
+        return state
+
+    @classmethod
+    def _from_state(cls, state: Mapping[str, Tensor], prefix: str = "", **others: Any) -> Self:
+        """What `state_dict` came from; `others` are the fields that are none of its values."""
+        values = dict(others)
+        hints = get_type_hints(cls)
+        for each in fields(cls):  # type: ignore[arg-type]
+            kind, name = hints[each.name], prefix + each.name
+            if each.name in others:
+                continue
+            if isinstance(kind, type) and issubclass(kind, CarRecord):
+                values[each.name] = kind._from_state(state, f"{name}.")
+            elif name not in state:
+                raise InputError("state", f"the tensor {name!r}", f"{len(state)} others", "save result.state_dict()")
+            elif kind is Tensor:
+                values[each.name] = state[name]
+            elif kind is bool:
+                values[each.name] = bool(state[name])
+            else:
+                text = bytes(state[name].tolist()).decode()
+                values[each.name] = tuple(text.split("\n")) if text else ()
+        return cls(**values)
+
+    def _fields(self) -> Iterator[tuple[Field[Any], Any]]:
+        return ((each, getattr(self, each.name)) for each in fields(self))  # type: ignore[arg-type]
+
+    def _with(self, change: Callable[[Tensor], Tensor], per_car: bool = False) -> Self:
+        changed: dict[str, Any] = {}
+        for each, value in self._fields():
+            if per_car and each.name in self.shared:
+                continue
+            if isinstance(value, CarRecord):
+                changed[each.name] = value._with(change, per_car)
+            elif isinstance(value, Tensor):
+                changed[each.name] = change(value)
+        return replace(self, **changed)  # type: ignore[type-var]
 
 
 def placed(values: Tensor, rows: Tensor, count: int) -> Tensor:

@@ -7,7 +7,7 @@ them, how sharply, and whether a repeated texture offers a second place.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from directshape_torch.compile import compilable
 from directshape_torch.config import PhotometricConfig
-from directshape_torch.diagnosis.car_rows import kept, placed
+from directshape_torch.diagnosis.car_rows import CarRecord
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
@@ -62,7 +62,7 @@ class CostPair(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DisparityProfile:
+class DisparityProfile(CarRecord):
     """Photometric cost of B cars over n offsets of their disparity, with the pixels of the final stage.
 
     Attributes:
@@ -71,6 +71,8 @@ class DisparityProfile:
             single cars; NaN for cars without pixels, or that were not refined.
         num_pixels: (B,) of the curves.
     """
+
+    shared = frozenset({"offsets_px"})
 
     offsets_px: Tensor
     cost_before: Tensor
@@ -83,14 +85,6 @@ class DisparityProfile:
         offsets = _default_offsets(like)
         nan = torch.full((count, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)
         return cls(offsets, nan, nan, nan[:, 0])
-
-    def spread(self, rows: Tensor, count: int) -> DisparityProfile:
-        """Some cars placed among `count` cars."""
-        return replace(self, **{f.name: placed(getattr(self, f.name), rows, count) for f in fields(self)[1:]})
-
-    def where(self, condition: Tensor) -> DisparityProfile:
-        """What is known where the condition (B,) holds, NaN elsewhere."""
-        return replace(self, **{f.name: kept(getattr(self, f.name), condition) for f in fields(self)[1:]})
 
     @property
     def range_px(self) -> Tensor:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from directshape_torch.diagnosis.car_rows import kept, placed
+from directshape_torch.diagnosis.car_rows import CarRecord
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -79,7 +79,7 @@ _NAMED_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class Observability:
+class Observability(CarRecord):
     """What the images say of B cars without any prior, NaN where they were not refined.
 
     Attributes:
@@ -98,14 +98,6 @@ class Observability:
         """Of `count` cars of which nothing is known."""
         nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
         return cls(nan[:, None].expand(-1, 7), nan[:, None, None].expand(-1, 7, 7), nan)
-
-    def spread(self, rows: Tensor, count: int) -> Observability:
-        """Some cars placed among `count` cars."""
-        return Observability(*(placed(getattr(self, f.name), rows, count) for f in fields(self)))
-
-    def where(self, condition: Tensor) -> Observability:
-        """What is known where the condition (B,) holds, NaN elsewhere."""
-        return Observability(*(kept(getattr(self, f.name), condition) for f in fields(self)))
 
     def scaled(self, factor: float) -> Observability:
         """With all standard deviations multiplied."""

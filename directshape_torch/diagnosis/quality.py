@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from directshape_torch.diagnosis.car_rows import kept, placed
+from directshape_torch.diagnosis.car_rows import CarRecord
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.problem import CarStage
@@ -18,7 +18,7 @@ from directshape_torch.terms.term import Part, Sight
 
 
 @dataclass(frozen=True)
-class FitQuality:
+class FitQuality(CarRecord):
     """Agreement of B refined cars with the images; NaN where there is nothing to compare.
 
     Attributes:
@@ -47,14 +47,6 @@ class FitQuality:
         """No figures for `count` cars."""
         nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
         return cls(nan, nan, nan, nan, nan[:, None].expand(-1, len(EVIDENCE_NAMES)), nan, nan)
-
-    def spread(self, rows: Tensor, count: int) -> FitQuality:
-        """The figures of some cars placed among `count` cars."""
-        return FitQuality(*(placed(getattr(self, f.name), rows, count) for f in fields(self)))
-
-    def where(self, condition: Tensor) -> FitQuality:
-        """The figures where the condition (B,) holds, NaN elsewhere."""
-        return FitQuality(*(kept(getattr(self, f.name), condition) for f in fields(self)))
 
 
 @torch.no_grad()

@@ -62,7 +62,7 @@ def evaluate_shapes(
     truth: TruthKind,
     masks: Path | str | MaskSource | None = None,
     labels_dir: Path | str | None = None,
-    frames: Iterable[str] | None = None,
+    frames: Iterable[str | int] | None = None,
     split: Path | str | None = None,
     tracks: CarTracks | Path | str | None = None,
     prior_sha256: str | None = None,
@@ -85,7 +85,7 @@ def evaluate_shapes(
             points of the estimate, uniform by area, against the true ones, whole and visible surface separately.
         masks: the segments, for "disparity": a folder (see `mask_source`) or a source.
         labels_dir: default `training/label_2`.
-        frames: ids of the frames; default all that have both shapes and truth.
+        frames: ids of the frames, or their numbers; default all that have both shapes and truth.
         split: file with one frame id a line, instead of `frames`.
         tracks: which labels show the same physical car.
         prior_sha256: of the prior; shapes of another one are refused. None does not check.
@@ -171,7 +171,7 @@ def _source(training: Path, truth: TruthKind, masks: Path | str | MaskSource | N
     return SegmentSource(folder, mask_source(masks) if isinstance(masks, (str, Path)) else masks)
 
 
-def _choose_frames(inputs: _Inputs, frames: Iterable[str] | None, split: Path | str | None) -> tuple[str, ...]:
+def _choose_frames(inputs: _Inputs, frames: Iterable[str | int] | None, split: Path | str | None) -> tuple[str, ...]:
     if frames is not None and split is not None:
         raise InputError("frames", "frames or split", "both", "give one of them")
     if split is not None:
@@ -180,7 +180,7 @@ def _choose_frames(inputs: _Inputs, frames: Iterable[str] | None, split: Path | 
     if frames is None:
         chosen = [frame_id for frame_id in known if shapes_path(inputs.refined_dir, frame_id).is_file()]
     else:
-        chosen = list(dict.fromkeys(frames))
+        chosen = list(dict.fromkeys(f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames))
     missing = sorted(set(chosen) - set(known))
     if missing:
         raise InputError("frames", "frames with ground truth", ", ".join(missing[:5]))

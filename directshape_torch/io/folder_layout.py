@@ -31,7 +31,7 @@ from directshape_torch.io.instance_masks import (
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
 from directshape_torch.io.mask_files import COCO_CAR_IDS, mask_source
-from directshape_torch.io.mask_matching import project_boxes
+from directshape_torch.scene_check.image_boxes import project_boxes
 
 _CAR = "Car"
 _OTHER_CATEGORY = 0

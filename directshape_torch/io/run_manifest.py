@@ -28,7 +28,7 @@ from directshape_torch.files.schema import check_type, record_of
 MANIFEST_SCHEMA_VERSION = 1
 # `meshes/NNNNNN_LINE.ply`: within the folder, whoever has written the name.
 _MESH_FILE = re.compile(r"meshes/[^/\\]+_[0-9]{1,9}\.(ply|glb)")
-_CURE = "choose another output folder, or remove this one to start again"
+RESUME_CURE = "choose another output folder, or start again with --fresh, which removes the results in this one"
 
 
 class RunSettings(TypedDict, total=False):
@@ -125,27 +125,29 @@ def read_manifest(path: Path | str) -> RunManifest | None:
     """
     if not Path(path).is_file():
         return None
-    content = read_json(path, _CURE)
+    content = read_json(path, RESUME_CURE)
     if not isinstance(content, dict) or "schema_version" not in content:
-        raise DataFormatError(path, "is no summary of a run", cure=_CURE)
+        raise DataFormatError(path, "is no summary of a run", cure=RESUME_CURE)
     version = content.pop("schema_version")
     if version != MANIFEST_SCHEMA_VERSION:
         raise ResumeError(
-            f"{path}: schema version is {shown(version)}, this program writes {MANIFEST_SCHEMA_VERSION}; {_CURE}"
+            f"{path}: schema version is {shown(version)}, this program writes {MANIFEST_SCHEMA_VERSION}; {RESUME_CURE}"
         )
-    manifest = record_of(path, RunManifest, content, _CURE)
-    check_type(path, "config", manifest.config, RunSettings, _CURE)
+    manifest = record_of(path, RunManifest, content, RESUME_CURE)
+    check_type(path, "config", manifest.config, RunSettings, RESUME_CURE)
     check_frames(path, manifest.frames)
     return manifest
 
 
 def check_frames(path: Path | str, frames: Mapping[str, Any]) -> None:
     """Raise `DataFormatError` unless these are entries of frames, and lead nowhere out of the output folder."""
-    check_type(path, "frames", frames, dict[str, FrameEntry], _CURE)
+    check_type(path, "frames", frames, dict[str, FrameEntry], RESUME_CURE)
     for frame_id, entry in frames.items():
         wrong = [name for name in entry.get("mesh_files", ()) if not _MESH_FILE.fullmatch(name)]
         if wrong or not is_frame_id(frame_id):
-            raise DataFormatError(path, f"frames[{shown(frame_id)}]: no name of a frame, or {shown(wrong)}", cure=_CURE)
+            raise DataFormatError(
+                path, f"frames[{shown(frame_id)}]: no name of a frame, or {shown(wrong)}", cure=RESUME_CURE
+            )
 
 
 def check_resume(previous: RunManifest, current: RunManifest) -> None:
@@ -200,7 +202,7 @@ def _check_mapping(what: str, before: Mapping[str, Any], now: Mapping[str, Any])
 
 def _check_same(what: str, before: Any, now: Any) -> None:
     if before != now:
-        raise ResumeError(f"cannot resume: {what} was {_short(before)}, now is {_short(now)}; {_CURE}")
+        raise ResumeError(f"cannot resume: {what} was {_short(before)}, now is {_short(now)}; {RESUME_CURE}")
 
 
 def _short(value: Any) -> str:

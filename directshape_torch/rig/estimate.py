@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
+from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
@@ -216,18 +217,33 @@ class RigEstimate(nn.Module):
             return False
         return True
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """All that the estimate rests on, as tensors and numbers; `set_extra_state` takes it back."""
+    def content(self) -> dict[str, Any]:
+        """All that the estimate rests on, as tensors and numbers."""
         rig = {name: getattr(self._blank, name) for name in ("K_left", "K_right", "T_right_cam")}
         pixels = {kind: evidence._asdict() for kind, evidence in self.pixels.items()}
         return {"size_wh": list(self._blank.size_wh), **rig, "rows": self.rows, "pixels": pixels}
 
-    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+    def get_extra_state(self) -> Tensor:
+        """`content()` as the bytes of a safetensors file; `set_extra_state` takes it back."""
+        content = self.content()
+        pixels = {
+            f"pixels.{kind}.{name}": value
+            for kind, sums in content.pop("pixels").items()
+            for name, value in sums.items()
+        }
+        state = {name: torch.as_tensor(value).clone() for name, value in {**content, **pixels}.items()}
+        return torch.tensor(list(save(state)), dtype=torch.uint8)
+
+    def set_extra_state(self, state: Tensor) -> None:
         """Of `get_extra_state`; nothing of what was known before stays."""
-        matrices = (state[name].double().cpu() for name in ("K_left", "K_right", "T_right_cam"))
-        self._blank = DisparityField.constant(0.0, (state["size_wh"][0], state["size_wh"][1]), *matrices)
-        self.rows, self._solved = state["rows"].double().cpu(), None
-        self.pixels = {kind: PixelEvidence(**evidence) for kind, evidence in state["pixels"].items()}
+        read = load(bytes(state.tolist()))
+        matrices = (read[name] for name in ("K_left", "K_right", "T_right_cam"))
+        width, height = read["size_wh"].tolist()
+        self._blank = DisparityField.constant(0.0, (width, height), *matrices)
+        self.rows, self._solved, self.pixels = read["rows"], None, {}
+        for kind in sorted({name.split(".")[1] for name in read if name.startswith("pixels.")}):
+            points, frames, *others = (read[f"pixels.{kind}.{name}"] for name in PixelEvidence._fields)
+            self.pixels[kind] = PixelEvidence(int(points), int(frames), *others)
 
     @property
     def _focal_baseline(self) -> float:

@@ -40,7 +40,7 @@ _OF_PIXELS = {
 
 def save_rigs(path: Path | str, rigs: Sequence[RigEstimate]) -> None:
     """Write the estimates of one or several rigs."""
-    entries = [{**_plain(rig.get_extra_state()), "says": str(rig)} for rig in rigs]
+    entries = [{**_plain(rig.content()), "says": str(rig)} for rig in rigs]
     write_json(path, {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "rigs": entries})
 
 

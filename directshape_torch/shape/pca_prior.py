@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -246,11 +245,11 @@ class PCAShapePrior(nn.Module):
         """The passenger cars that come with the package (from `parametric_cars`; licence of this project)."""
         return cls.load(Path(__file__).parents[1] / "assets" / "car_prior.npz")
 
-    def get_extra_state(self) -> dict[str, float]:
-        return {"spacing_m": self.spacing_m}
+    def get_extra_state(self) -> Tensor:
+        return torch.tensor(self.spacing_m, dtype=torch.float64)
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.spacing_m = float(state["spacing_m"])
+    def set_extra_state(self, state: Tensor) -> None:
+        self.spacing_m = float(state)
 
 
 def training_codes(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import directshape_torch
 from directshape_torch.cli import main as program
 from directshape_torch.errors import DataFormatError
 
@@ -30,12 +31,25 @@ def test_the_package_is_the_program() -> None:
     assert "calibrate-rig" in done.stdout
 
 
-@pytest.mark.parametrize("arguments", [[], ["refin"], ["refine"], ["compare", "--labels", "x"]])
+@pytest.mark.parametrize("arguments", [["refin"], ["refine"], ["compare", "--labels", "x"]])
 def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         program.main(arguments)
     assert stop.value.code == 2
     assert "usage: directshape" in capsys.readouterr().err
+
+
+def test_the_bare_program_shows_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert program.main([]) == 2
+    assert "check-data" in capsys.readouterr().err
+
+
+def test_the_version_is_that_of_the_program(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        program.main(["--version"])
+    assert capsys.readouterr().out.strip() == directshape_torch.__version__
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        directshape_torch.nothing  # noqa: B018
 
 
 def test_an_error_is_one_line_and_exit_code_2(

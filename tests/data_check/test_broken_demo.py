@@ -12,9 +12,9 @@ from helpers.broken_data import BREAKS, copy_data
 
 import directshape_torch
 from directshape_torch.data_check import check_dataset as checks
-from directshape_torch.data_check import check_distances
-from directshape_torch.data_check.finding import CheckReport
 from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.scene_check import check_pair
+from directshape_torch.scene_check.finding import CheckReport
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
@@ -35,8 +35,7 @@ def once(function: Callable[..., Any]) -> Callable[..., Any]:
 @pytest.fixture(scope="module", autouse=True)
 def match_once() -> Any:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checks, "match_pair", once(checks.match_pair))
-        patch.setattr(check_distances, "match_disparity", once(check_distances.match_disparity))
+        patch.setattr(check_pair, "match_pair", once(check_pair.match_pair))
         yield
 
 

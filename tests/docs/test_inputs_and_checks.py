@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 from directshape_torch.cli.data_options import LAYOUTS
-from directshape_torch.data_check.box_conventions import all_conventions
 from directshape_torch.io import folder_json
+from directshape_torch.scene_check.box_conventions import all_conventions
 
 ROOT = Path(__file__).parents[2]
 INPUTS = (ROOT / "docs" / "inputs.md").read_text(encoding="utf-8")
@@ -40,7 +40,8 @@ def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
 
 
 def test_every_finding_is_in_the_table() -> None:
-    sources = [path.read_text() for path in (ROOT / "directshape_torch" / "data_check").glob("*.py")]
+    folders = (ROOT / "directshape_torch" / name for name in ("data_check", "scene_check"))
+    sources = [path.read_text() for folder in folders for path in folder.glob("*.py")]
     sources.append((ROOT / "directshape_torch" / "cli" / "check_data.py").read_text())
     text = "\n".join(sources)
     named = set(re.findall(r'(?:Finding|unreadable|attempt)\(\s*"([a-z0-9_]{2,})"', text))

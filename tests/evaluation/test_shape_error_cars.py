@@ -231,7 +231,7 @@ def test_errors_name_what_is_wrong(root: Path, tmp_path: Path, capsys: pytest.Ca
     assert "masks: expected masks of the left images" in fails(root / "perfect", "--truth", "disparity")
     assert "has no shapes/NNNNNN.npz" in fails(tmp_path, "--truth", "points")
     assert "frames: expected frames with ground truth, got 000009" in fails(
-        root / "perfect", "--truth", "points", "--frames", "000009"
+        root / "perfect", "--truth", "points", "--frames", "9"
     )
     assert "000000.npz: cannot be read" in fails(tmp_path, "--truth", "points", "--frames", "000000")
     (tmp_path / "shapes").mkdir()

@@ -19,8 +19,8 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.mask_matching import project_boxes
 from directshape_torch.scene import StereoCamera
+from directshape_torch.scene_check.image_boxes import project_boxes
 
 P2 = torch.tensor([[500.0, 0, 60, 30], [0, 500, 30, 0], [0, 0, 1, 0.003]], dtype=torch.float64)
 P3 = torch.tensor([[500.0, 0, 60, -220], [0, 500, 30, 2], [0, 0, 1, 0.003]], dtype=torch.float64)

@@ -1,13 +1,16 @@
-"""Intrinsics and baseline of the files: signs and orders of magnitude."""
+"""Intrinsics and baseline: signs and orders of magnitude."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.data_check.finding import Finding, Severity
-from directshape_torch.io.kitti_calibration import KittiCalibration
+from directshape_torch.scene_check.finding import Finding, Severity
 
+# With these wrong, what disparities and projections show says nothing more.
+SPOILS_CAMERA = frozenset({"baseline_sign", "baseline_length", "focal_length", "principal_point"})
 # Lenses from 15 to 150 degrees of view across the image.
 FOCAL_SHARES = (0.13, 3.8)
 # Crops move the centre; a half of the image is no crop any more.
@@ -15,29 +18,36 @@ CENTRE_SHARE_WARNING = 0.15
 BASELINES_M = (0.03, 3.0)
 # The squares of pixels: rectified images have them unless resized in one direction.
 ASPECT_TOLERANCE = 0.05
+# Images that were resized move both coordinates of the centre by the same factor, which is none near 1.
+_SAME_FACTOR, _LEAST_FACTOR = 0.1, 1.3
 
 
-def check_calibration(calibration: KittiCalibration, size_hw: tuple[int, int] | None, where: str) -> list[Finding]:
+def check_calibration(
+    cameras: Mapping[str, NDArray[np.float64]],
+    baseline_m: float,
+    size_hw: tuple[int, int] | None,
+    where: str,
+) -> list[Finding]:
     """Everything that the numbers alone show.
 
     Args:
-        calibration: of a frame.
-        size_hw: of its images, None where unknown.
+        cameras: intrinsics (3, 3) by the name of the camera, pixels.
+        baseline_m: distance of the right camera along x, NaN where a focal length is nothing.
+        size_hw: of the images, None where unknown.
         where: named in the findings.
     """
-    where = f"{where}, {calibration.path.name}"
     findings = []
-    for name, P in (("P2", calibration.P2), ("P3", calibration.P3)):
+    for name, K in cameras.items():
         if size_hw is not None:
-            findings += _check_intrinsics(name, P, size_hw, where)
-    return findings + _check_baseline(calibration, where)
+            findings += _check_intrinsics(K, size_hw, f"{where}, {name}")
+    return findings + _check_baseline(baseline_m, where)
 
 
-def _check_intrinsics(name: str, P: NDArray[np.float64], size_hw: tuple[int, int], where: str) -> list[Finding]:
+def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: str) -> list[Finding]:
     height, width = size_hw
-    fx, fy, cx, cy = P[0, 0], P[1, 1], P[0, 2], P[1, 2]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     if not FOCAL_SHARES[0] * width < fx < FOCAL_SHARES[1] * width:
-        return [_focal(name, fx, width, where)]
+        return [_focal(fx, width, where)]
     findings = []
     if abs(fx / fy - 1) > ASPECT_TOLERANCE:
         findings.append(
@@ -45,15 +55,15 @@ def _check_intrinsics(name: str, P: NDArray[np.float64], size_hw: tuple[int, int
                 "focal_length",
                 "error",
                 where,
-                f"{name}: fx = {fx:.1f}, fy = {fy:.1f} px",
+                f"fx = {fx:.1f}, fy = {fy:.1f} px",
                 "the same within 5 percent, as rectified images have",
                 "scale fx, cx with the width and fy, cy with the height of resized images",
             )
         )
-    return findings + _check_centre(name, (cx, cy), (width, height), where)
+    return findings + _check_centre((cx, cy), (width, height), where)
 
 
-def _focal(name: str, fx: float, width: int, where: str) -> Finding:
+def _focal(fx: float, width: int, where: str) -> Finding:
     low, high = (share * width for share in FOCAL_SHARES)
     cure = "check the order of the numbers and whether images were resized"
     if 0 < fx < low:
@@ -62,36 +72,28 @@ def _focal(name: str, fx: float, width: int, where: str) -> Finding:
         "focal_length",
         "error",
         where,
-        f"{name}: fx = {fx:.4g} px for images {width} px wide",
+        f"fx = {fx:.4g} px for images {width} px wide",
         f"between {low:.0f} and {high:.0f} px (15 to 150 degrees of view)",
         cure,
     )
 
 
-def _check_centre(name: str, centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:
+def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:
     offset = max(abs(c / n - 0.5) for c, n in zip(centre, size_wh, strict=True))
     if offset <= CENTRE_SHARE_WARNING:
         return []
+    across, down = (c / (0.5 * n) for c, n in zip(centre, size_wh, strict=True))
+    resized = across > 0 and abs(across / down - 1) < _SAME_FACTOR and max(across, 1 / across) > _LEAST_FACTOR
     inside = all(0 <= c < n for c, n in zip(centre, size_wh, strict=True))
-    severity: Severity = "warning" if inside else "error"
-    return [
-        Finding(
-            "principal_point",
-            severity,
-            where,
-            f"{name}: ({centre[0]:.1f}, {centre[1]:.1f}) in images of {size_wh[0]} x {size_wh[1]} pixels",
-            "near the middle of the image",
-            "use the intrinsics of this size of image; cutting moves the point, resizing scales it",
-        )
-    ]
+    severity: Severity = "error" if resized or not inside else "warning"
+    cure = "use the intrinsics of this size of image; cutting moves the point, resizing scales it"
+    if resized:
+        cure = f"K is of images {across:.2f} times as large: multiply fx, fy, cx and cy by {1 / across:.2f}"
+    measured = f"({centre[0]:.1f}, {centre[1]:.1f}) in images of {size_wh[0]} x {size_wh[1]} pixels"
+    return [Finding("principal_point", severity, where, measured, "near the middle of the image", cure)]
 
 
-def _check_baseline(calibration: KittiCalibration, where: str) -> list[Finding]:
-    P2, P3 = calibration.P2, calibration.P3
-    # A focal length of nothing has its finding already.
-    baseline_m = P2[0, 3] / (P2[0, 0] or np.nan) - P3[0, 3] / (P3[0, 0] or np.nan)
-    if np.isnan(baseline_m):
-        return []
+def _check_baseline(baseline_m: float, where: str) -> list[Finding]:
     if baseline_m <= 0:
         return [
             Finding(
@@ -103,7 +105,7 @@ def _check_baseline(calibration: KittiCalibration, where: str) -> list[Finding]:
                 "swap P2 and P3, or flip the sign of the fourth columns",
             )
         ]
-    if BASELINES_M[0] <= baseline_m <= BASELINES_M[1]:
+    if BASELINES_M[0] <= baseline_m <= BASELINES_M[1] or np.isnan(baseline_m):
         return []
     return [
         Finding(

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from directshape_torch.data_check.box_conventions import BoxConvention
-from directshape_torch.data_check.car_evidence import FrameEvidence
-from directshape_torch.data_check.convention_scores import project_conventions
-from directshape_torch.data_check.finding import Finding
-from directshape_torch.io.mask_matching import box_iou
+from directshape_torch.scene_check.box_conventions import BoxConvention
+from directshape_torch.scene_check.car_evidence import FrameEvidence
+from directshape_torch.scene_check.convention_scores import project_conventions
+from directshape_torch.scene_check.finding import Finding
+from directshape_torch.scene_check.image_boxes import box_iou
 
 MIN_GAIN = 0.15
 

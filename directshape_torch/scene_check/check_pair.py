@@ -5,11 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.data_check.finding import Finding, Severity
-from directshape_torch.data_check.pair_matches import PairMatches
 from directshape_torch.scene import StereoCamera
+from directshape_torch.scene_check.check_stereo import swapped
+from directshape_torch.scene_check.finding import Finding, Severity
+from directshape_torch.scene_check.pair_matches import PairMatches, match_pair, mirror
 
+# With these wrong, what disparities and projections show says nothing more.
+SPOILS_PAIR = frozenset(
+    {"images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"}
+)
 MIN_MATCHES = 30
+# Images with so many features that still do not match are not of one scene.
+MANY_FEATURES = 500
 # With fewer, it is asked whether one of the images is mirrored.
 FEW_MATCHES = 200
 # Two photographs of different places agree on fewer, by chance.
@@ -19,6 +26,18 @@ SAME_IMAGE_PX = 0.05
 MAX_NEGATIVE_SHARE = 0.2
 VERTICAL_WARNING_PX, VERTICAL_ERROR_PX = 0.75, 1.5
 SCATTER_WARNING_PX = 1.0
+
+
+def check_images(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera | None, where: str
+) -> list[Finding]:
+    """What feature matches of two images (H, W, 3) show; the camera, where it is known, says where they should be."""
+    matches = match_pair(left, right)
+    if len(matches) < FEW_MATCHES:
+        mirrored = check_mirrored(matches, match_pair(left, mirror(right)), where)
+        if mirrored:
+            return mirrored
+    return check_pair(matches, camera, (left.shape[0], left.shape[1]), where)
 
 
 def check_pair(
@@ -32,7 +51,7 @@ def check_pair(
         size_hw: of the images.
         where: named in the findings.
     """
-    if matches.num_candidates < MIN_MATCHES:
+    if matches.num_candidates < MIN_MATCHES and matches.num_features < MANY_FEATURES:
         return [_too_few(matches, where)]
     if len(matches) < MIN_MATCHES or len(matches) < MIN_INLIER_SHARE * matches.num_candidates:
         return [_other_scene(matches, where)]
@@ -82,18 +101,7 @@ def _check_side(disparity: NDArray[np.float64], where: str) -> list[Finding]:
     negative = float(np.mean(disparity < -1.0))
     if negative <= MAX_NEGATIVE_SHARE:
         return []
-    median = float(np.median(disparity))
-    return [
-        Finding(
-            "images_swapped",
-            "error",
-            where,
-            f"{negative:.0%} of {len(disparity)} matched points lie farther right in the right image "
-            f"(median disparity {median:.1f} px)",
-            "disparities u_left - u_right above 0: everything lies farther left in the right image",
-            "swap the left and the right images (or were they mirrored?)",
-        )
-    ]
+    return [swapped(where, negative, float(np.median(disparity)))]
 
 
 def _check_rows(

@@ -1,15 +1,15 @@
-"""The ways in which other tools write 3D boxes, as functions to KITTI's way."""
+"""The ways in which other tools write 3D boxes and focal lengths, as functions to KITTI's way."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.data_check.car_evidence import CarBoxes
+from directshape_torch.scene_check.car_evidence import CarBoxes
 
 Points = NDArray[np.float64]  # (N, 3)
 Angles = NDArray[np.float64]  # (N,)
@@ -49,34 +49,50 @@ ORDERS: dict[str, tuple[int, int, int]] = {
     AS_DOCUMENTED if order == "hwl" else " ".join(order): (order.index("h"), order.index("w"), order.index("l"))
     for order in map("".join, permutations("hwl"))
 }
+# Factors that bring what is given to pixels and metres. Millimetres, feet, halves; distances of a detector that is
+# trained for another camera may be off by more than a quarter, and are judged by the images.
+FOCALS = (0.4, 0.5, 0.6, 0.7, 0.8, 1.25, 1.4, 1.6, 2.0, 2.5)
+DISTANCES = (0.001, 0.01, 0.1, 0.3048, 0.5, 0.65, 1.5, 2.0, 1 / 0.3048, 10.0, 100.0, 1000.0)
+SIZES = (0.5, 2.0)
 
 
 @dataclass(frozen=True)
 class BoxConvention:
-    """One way to write a box; each part is a key of the table above.
+    """One way to write a box; each part is a key of a table above, or a factor.
 
     Attributes:
         axes, origin, yaw, order: how the box is written.
+        focal: factor of the focal lengths.
+        distance: factor of the locations.
+        size: factor of height, width and length.
     """
 
     axes: str = AS_DOCUMENTED
     origin: str = AS_DOCUMENTED
     yaw: str = AS_DOCUMENTED
     order: str = AS_DOCUMENTED
+    focal: float = 1.0
+    distance: float = 1.0
+    size: float = 1.0
 
     @property
-    def deviations(self) -> dict[str, str]:
+    def deviations(self) -> dict[str, str | float]:
         """The parts that are not as documented."""
-        return {part: value for part, value in vars(self).items() if value != AS_DOCUMENTED}
+        return {part: value for part, value in vars(self).items() if value not in (AS_DOCUMENTED, 1.0)}
 
     def to_kitti(self, boxes: CarBoxes) -> CarBoxes:
         """The boxes as they should have been written, if this is how they were."""
-        hwl = boxes.hwl[:, list(ORDERS[self.order])]
-        location = AXES[self.axes](boxes.location).copy()
+        hwl = self.size * boxes.hwl[:, list(ORDERS[self.order])]
+        location = self.distance * AXES[self.axes](boxes.location)
         location[:, 1] += ORIGINS[self.origin] * hwl[:, 0]
         return CarBoxes(location, hwl, YAWS[self.yaw](boxes.rotation_y), boxes.alpha, boxes.box_2d)
 
 
-def all_conventions() -> Iterator[BoxConvention]:
-    """Every combination, the documented one first."""
-    return (BoxConvention(*parts) for parts in product(AXES, ORIGINS, YAWS, ORDERS))
+def all_conventions() -> tuple[BoxConvention, ...]:
+    """Every combination of axes, origin, heading and order, the documented one first; then single factors."""
+    return (
+        *(BoxConvention(*parts) for parts in product(AXES, ORIGINS, YAWS, ORDERS)),
+        *(BoxConvention(focal=factor) for factor in FOCALS),
+        *(BoxConvention(distance=factor) for factor in DISTANCES),
+        *(BoxConvention(size=factor) for factor in SIZES),
+    )

@@ -21,11 +21,13 @@ class PairMatches:
     Attributes:
         uv_left, uv_right: (N, 2) pixels.
         num_candidates: matches before those were dropped that obey no common epipolar geometry.
+        num_features: of the image that has fewer of them.
     """
 
     uv_left: NDArray[np.float64]
     uv_right: NDArray[np.float64]
     num_candidates: int
+    num_features: int = 0
 
     def __len__(self) -> int:
         return len(self.uv_left)
@@ -53,7 +55,7 @@ def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches
     pairs = np.array([(a, b) for a, b in forward.items() if backward.get(b) == a], dtype=np.int64).reshape(-1, 2)
     uv_left, uv_right = points[0][pairs[:, 0]], points[1][pairs[:, 1]]
     keep = _epipolar_inliers(uv_left, uv_right)
-    return PairMatches(uv_left[keep], uv_right[keep], len(pairs))
+    return PairMatches(uv_left[keep], uv_right[keep], len(pairs), min(map(len, points)))
 
 
 def mirror(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -29,6 +29,10 @@ class Finding:
     measured: str
     expected: str
     cure: str
+
+    def __str__(self) -> str:
+        """One line."""
+        return f"{self.severity}: {self.check} ({self.where}): {self.measured}; expected {self.expected}; {self.cure}"
 
 
 def unreadable(check: str, where: str, expected: str, error: Exception, cure: str) -> Finding:
@@ -62,6 +66,10 @@ class CheckReport:
         """How many findings there are of a severity."""
         return sum(finding.severity == severity for finding in self.findings)
 
+    def __str__(self) -> str:
+        """One block a finding, of findings about single frames one a kind with the first in full, and a last line."""
+        return _text(self)
+
     @property
     def exit_code(self) -> int:
         """1 with errors, else 0."""
@@ -77,3 +85,38 @@ def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         ['error', 'note']
     """
     return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+
+
+def names(findings: Iterable[Finding]) -> set[str]:
+    """The checks that found more than a warning."""
+    return {finding.check for finding in findings if finding.severity != "warning"}
+
+
+def _text(report: CheckReport) -> str:
+    """One block a finding, of findings about single frames one a kind with the first in full, and a last line."""
+    groups: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in report.findings:
+        frames = finding.where.split()[0]
+        kind = ("frame",) if frames == "frame" else (finding.where, finding.measured)
+        groups.setdefault((finding.severity, finding.check, *kind), []).append(finding)
+    blocks = [_block(findings) for findings in groups.values()]
+    return "\n".join([*blocks, _last_line(report)])
+
+
+def _block(findings: Sequence[Finding]) -> str:
+    first = findings[0]
+    more = f" and {len(findings) - 1} more" if len(findings) > 1 else ""
+    return (
+        f"{first.severity}: {first.check} ({first.where}{more})\n"
+        f"  measured  {first.measured}\n"
+        f"  expected  {first.expected}\n"
+        f"  cure      {first.cure}\n"
+    )
+
+
+def _last_line(report: CheckReport) -> str:
+    words = [
+        f"{report.count(severity)} {severity}{'' if report.count(severity) == 1 else 's'}" for severity in SEVERITIES
+    ]
+    of = "" if report.num_checked == report.num_frames else f" of {report.num_frames}"
+    return f"{', '.join(words)} in {report.num_checked}{of} frames with {report.num_cars} cars"

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.data_check.box_conventions import AXES, ORDERS, YAWS, BoxConvention, all_conventions
-from directshape_torch.data_check.car_evidence import FrameEvidence
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.io.kitti_labels import shift_frame
-from directshape_torch.io.mask_matching import box_iou, project_boxes
+from directshape_torch.scene import StereoCamera
+from directshape_torch.scene_check.box_conventions import AXES, ORDERS, YAWS, BoxConvention, all_conventions
+from directshape_torch.scene_check.car_evidence import FrameEvidence
+from directshape_torch.scene_check.image_boxes import box_iou, project_boxes
 
 # Rather the documented convention than one that explains the same a little better.
 _PENALTY_PER_DEVIATION = 0.02
@@ -64,13 +64,13 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
     What the image shows are the 2D box of the detection and the masks, whichever fits best; where the 2D boxes were
     only projected from the 3D ones, the masks alone, and as many cars as there are masks.
     """
-    conventions = tuple(all_conventions())
+    conventions = all_conventions()
     projections = boxes_are_projections(frames)
     overlap = np.concatenate([_overlaps(frame, conventions, projections) for frame in frames], axis=1)
     median_hwl = np.median(np.concatenate([frame.boxes.hwl for frame in frames]), axis=0)
     penalty = [_penalty(convention, median_hwl) for convention in conventions]
     alpha = np.concatenate([frame.boxes.alpha for frame in frames])
-    has_angles = bool((np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0))
+    has_angles = bool((np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0))  # not of NaN
     # Neither origin nor order changes an angle seen from above.
     share = {(axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames) for axes, yaw in product(AXES, YAWS)}
     angle_share = np.array([share[convention.axes, convention.yaw] for convention in conventions])
@@ -97,15 +97,15 @@ def _overlaps(
     frame: FrameEvidence, conventions: Sequence[BoxConvention], boxes_are_projections: bool
 ) -> NDArray[np.float64]:  # (C, N), or the best of each convention where not every car can have a mask
     projected = project_conventions(frame, conventions)
-    seen = np.array([box for mask in frame.masks["left"] for box in (mask.mask_box, mask.box)]).reshape(-1, 4)
     overlaps = np.zeros(projected.shape[:2])
     for car in range(len(frame.boxes)):
-        own = seen if boxes_are_projections else np.concatenate([seen, frame.boxes.box_2d[car : car + 1]])
+        own = frame.seen[car]
+        own = own if boxes_are_projections else np.concatenate([own, frame.boxes.box_2d[car : car + 1]])
         if len(own):
             overlaps[:, car] = box_iou(projected[:, car], own).max(axis=1)
     if not boxes_are_projections:
         return overlaps
-    return -np.sort(-overlaps, axis=1)[:, : min(len(frame.boxes), len(frame.masks["left"]))]
+    return -np.sort(-overlaps, axis=1)[:, : min(len(frame.boxes), frame.num_masks["left"])]
 
 
 def boxes_are_projections(frames: Sequence[FrameEvidence]) -> bool:
@@ -113,7 +113,7 @@ def boxes_are_projections(frames: Sequence[FrameEvidence]) -> bool:
 
     Where there are no masks they are all that there is.
     """
-    if not any(frame.masks["left"] for frame in frames):
+    if not any(frame.num_masks["left"] for frame in frames):
         return False
     overlaps = [
         box_iou(box[None], seen[None])[0, 0]
@@ -127,12 +127,22 @@ def project_conventions(
     frame: FrameEvidence, conventions: Sequence[BoxConvention]
 ) -> NDArray[np.float64]:  # (C, N, 4) pixels
     """2D boxes around the 3D boxes in the left image, under each convention."""
-    found = [convention.to_kitti(frame.boxes) for convention in conventions]
-    T_ref_obj = pose_from_kitti(
-        torch.from_numpy(np.concatenate([boxes.location for boxes in found])),
-        torch.from_numpy(np.concatenate([boxes.rotation_y for boxes in found])),
-    )
-    hwl = torch.from_numpy(np.concatenate([boxes.hwl for boxes in found]))
-    T_cam_obj = shift_frame(T_ref_obj, frame.camera.t_cam_ref[0])
-    projected, _ = project_boxes(T_cam_obj, hwl, frame.camera, frame.size_hw)
-    return projected.reshape(len(conventions), len(frame.boxes), 4)
+    projected = np.empty((len(conventions), len(frame.boxes), 4))
+    for focal in {convention.focal for convention in conventions}:
+        rows = [row for row, convention in enumerate(conventions) if convention.focal == focal]
+        found = [conventions[row].to_kitti(frame.boxes) for row in rows]
+        T_cam_obj = pose_from_kitti(
+            torch.from_numpy(np.concatenate([boxes.location for boxes in found])) + frame.camera.t_cam_ref[0],
+            torch.from_numpy(np.concatenate([boxes.rotation_y for boxes in found])),
+        )
+        hwl = torch.from_numpy(np.concatenate([boxes.hwl for boxes in found]))
+        boxes_2d, _ = project_boxes(T_cam_obj, hwl, _with_focal(frame.camera, focal), frame.size_hw)
+        projected[rows] = boxes_2d.reshape(len(rows), len(frame.boxes), 4)
+    return projected
+
+
+def _with_focal(camera: StereoCamera, factor: float) -> StereoCamera:
+    K_left = camera.K_left.clone()
+    K_left[:, 0, 0] *= factor
+    K_left[:, 1, 1] *= factor
+    return replace(camera, K_left=K_left, disparity_field=None)

@@ -1,0 +1,127 @@
+"""`directshape fit-shape`: poses and shapes of cars from LiDAR points in their boxes, without images."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
+
+_DESCRIPTION = """
+Fit a pose and a shape to the points in each box. Writes, in the frame of the points, OUT/boxes.txt (seven numbers a
+line in the convention of the input), OUT/shapes.npz (poses, codes, statuses, distances of the points) and
+OUT/meshes/NNN.ply.
+Exit code: 0, or 2 for wrong usage or input.
+"""
+
+
+def add_parser(subparsers: Subparsers) -> None:
+    """Add the command and its options."""
+    from directshape_torch.geometry.box_formats import BoxFormat
+
+    parser = subparsers.add_parser("fit-shape", help="fit shapes to LiDAR points in boxes", description=_DESCRIPTION)
+    parser.add_argument(
+        "--points", type=Path, required=True, metavar="FILE", help="points.npy (P, 3 or more), or KITTI's velodyne .bin"
+    )
+    parser.add_argument(
+        "--boxes", type=Path, required=True, metavar="FILE", help="seven numbers a line, in the frame of the points"
+    )
+    parser.add_argument(
+        "--convention",
+        choices=get_args(BoxFormat),
+        default="mmdet3d_lidar",
+        help="of the boxes: order, centre and heading (default: %(default)s)",
+    )
+    parser.add_argument("--prior", metavar="FILE|NAME", default="pca", help="shapes (default: %(default)s)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, fit, write, print; returns the exit code.
+
+    Raises:
+        DirectShapeError: input that cannot be used; for the main program to show.
+    """
+    import numpy as np
+    import torch
+    from trimesh.exchange.ply import export_ply
+
+    from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
+    from directshape_torch.fit_shape import fit_shape
+    from directshape_torch.shape.load_prior import load_prior
+
+    points, boxes = (torch.from_numpy(read(path)) for read, path in ((read_points, args.points), (_boxes, args.boxes)))
+    fit = fit_shape(points, boxes, args.convention, load_prior(args.prior))
+    cars = fit.cars
+    fitted = cars.to_boxes(args.convention, T_cam_boxes=torch.eye(4, dtype=boxes.dtype))
+    (args.out / "meshes").mkdir(parents=True, exist_ok=True)
+    write_text(args.out / "boxes.txt", "".join(" ".join(f"{x:.4f}" for x in box) + "\n" for box in fitted.tolist()))
+    arrays = {
+        "T_points_obj": cars.T_cam_obj,
+        "codes": cars.code,
+        "num_points": fit.num_points,
+        "distances_before_m": fit.distance_before_m,
+        "distances_after_m": fit.distance_after_m,
+    }
+    statuses = np.array([status.name for status in cars.status], dtype=np.str_)
+    write_npz(args.out / "shapes.npz", {**{name: each.numpy() for name, each in arrays.items()}, "statuses": statuses})
+    for row, status in enumerate(cars.status):
+        before, after = float(fit.distance_before_m[row]), float(fit.distance_after_m[row])
+        print(f"car {row}: {int(fit.num_points[row])} points, {before:.3f} -> {after:.3f} m, {status.name}")
+        if status.is_refined:
+            write_bytes(args.out / "meshes" / f"{row:03d}.ply", export_ply(cars.mesh(row)))
+    print(f"results  {args.out}")
+    return 0
+
+
+def read_points(path: Path) -> NDArray[np.float64]:
+    """Points (P, 3) of a file.
+
+    Raises:
+        DataFormatError: it is missing, empty or damaged.
+    """
+    import io
+
+    import numpy as np
+
+    from directshape_torch.errors import DataFormatError
+    from directshape_torch.files.read_files import read_bytes
+
+    content = read_bytes(path)
+    try:
+        if path.suffix == ".bin":
+            points = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
+        else:
+            points = np.load(io.BytesIO(content), allow_pickle=False)
+        xyz = np.asarray(points, dtype=np.float64)[:, :3]
+    except (ValueError, IndexError, EOFError, OSError) as error:
+        cure = "give an array (P, 3) saved by numpy.save, or KITTI's float32 x y z reflectance"
+        raise DataFormatError(path, f"holds no points ({error})", cure=cure) from error
+    if not len(xyz) or xyz.shape[1] != 3 or not np.isfinite(xyz).all():
+        raise DataFormatError(path, "holds no points (P, 3) of finite numbers")
+    return xyz
+
+
+def _boxes(path: Path) -> NDArray[np.float64]:
+    import numpy as np
+
+    from directshape_torch.errors import DataFormatError
+    from directshape_torch.files.text_files import read_lines
+
+    rows = []
+    for line in read_lines(path):
+        try:
+            row = [float(word) for word in line.text.split()]
+        except ValueError:
+            row = []
+        if len(row) != 7 or not np.isfinite(row).all():
+            cure = "write x y z, three sizes and the heading, metres and radians"
+            raise DataFormatError(path, "expected seven numbers", line_number=line.number, line=line.text, cure=cure)
+        rows.append(row)
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)

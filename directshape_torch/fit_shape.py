@@ -1,0 +1,177 @@
+"""Shape and pose of cars from points in their boxes, without images: the point term and the priors alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
+from directshape_torch.numerics.checks import check_shape
+from directshape_torch.observation.car_points import PointSamples
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch, StereoCamera
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.status import Status
+from directshape_torch.terms.cars import CarBatch
+from directshape_torch.terms.point_cloud import PointCloud
+
+# Every car is fitted as seen by a camera of its own, which stands 10 m from it and 1.65 m above the ground of its box.
+_CAMERA_HEIGHT_M, _DISTANCE_M = 1.65, 10.0
+# Points this far outside of a box may be the car's, for detectors err; those near the ground are the road's.
+_BEYOND_BOX_M = 0.4
+_LEAST_HEIGHT_M = 0.15
+_LEAST_POINTS, _MOST_POINTS = 30, 1000
+
+
+@dataclass(frozen=True)
+class ShapeFit:
+    """N cars fitted to points.
+
+    Attributes:
+        cars: poses, codes, boxes and meshes; what is called `cam` there is the frame of the points. The status is
+            `too_few_points` for cars with fewer than 30.
+        num_points: (N,) points of each car.
+        distance_before_m, distance_after_m: (N,) mean distance of these points to the surface of the mean car in the
+            given box, and to the fitted one; NaN where there are none.
+    """
+
+    cars: RefinementResult
+    num_points: Tensor
+    distance_before_m: Tensor
+    distance_after_m: Tensor
+
+
+def fit_shape(
+    points: Tensor,  # (P, 3) metres
+    boxes: Tensor,  # (N, 7) or (N, 8, 3)
+    convention: BoxFormat = "mmdet3d_lidar",
+    prior: ShapePrior | None = None,
+) -> ShapeFit:
+    """Fit a pose and a shape to the points in each box.
+
+    Args:
+        points: of a LiDAR or any other sensor, in the frame of the boxes.
+        boxes: as a detector writes them (`directshape_torch.geometry.box_formats`).
+        convention: of the boxes.
+        prior: the shapes; default the bundled ones.
+
+    Raises:
+        InputError: other shapes or types.
+
+    Example:
+        >>> ring = torch.linspace(0, 2 * math.pi, 200)
+        >>> points = torch.stack([2.0 * ring.cos(), 0.8 * ring.sin(), torch.full_like(ring, -0.9)], dim=1)
+        >>> fit = fit_shape(points, torch.tensor([[0.0, 0.0, -1.6, 4.2, 1.7, 1.5, 0.0]]))
+        >>> fit.cars.status[0].is_refined, fit.num_points
+        (True, tensor([200]))
+    """
+    check_shape("points", points, ("P", 3), kind="floating")
+    points = points.to(boxes)
+    like_camera = torch.eye(4).to(boxes)  # the frame of the points stands for the camera
+    T_points_obj, hwl = boxes_to_poses(boxes, convention, like_camera)
+    count = len(boxes)
+    ahead = torch.tensor([0.0, _CAMERA_HEIGHT_M, _DISTANCE_M]).to(boxes).expand(count, 3)
+    # Turned by 45 degrees, for nothing to be degenerate.
+    T_cam_obj = pose_from_kitti(ahead, torch.full_like(ahead[:, 0], math.pi / 4))
+    samples, T_cam_points = _points_of_boxes(points, T_points_obj, T_cam_obj, hwl)
+    fitter = _fitter(prior, samples).to(boxes)
+    with torch.no_grad():
+        fitted = _without_points_unknown(fitter(*_scene(T_cam_obj, hwl)), samples.counts, T_cam_obj)
+        before = replace(fitted, T_cam_obj=T_cam_obj, code=fitter.prior.initial_code(count).to(boxes))
+        distances = [_distances(samples, cars) for cars in (before, fitted)]
+    T_fitted = se3.inverse(T_cam_points) @ fitted.T_cam_obj
+    kept = torch.where(fitted.refined[:, None, None], T_fitted, T_points_obj)
+    return ShapeFit(replace(fitted, T_cam_obj=kept), samples.counts, *distances)
+
+
+def _fitter(prior: ShapePrior | None, samples: PointSamples) -> DirectShapeRefiner:
+    """A refiner whose terms are the points and the priors."""
+    plain = RefinerConfig(compile="off", check="off")
+    config = replace(
+        plain, silhouette=replace(plain.silhouette, weight=0.0), photometric=replace(plain.photometric, weight=0.0)
+    )
+    of_points = replace(plain.point_cloud, min_points=_LEAST_POINTS)
+
+    def point_term(_: FrameBatch, __: Detections, cars: CarBatch, ___: ShapePrior) -> PointCloud:
+        return PointCloud.of_points(of_points, samples.of_objects(_kept(cars, len(samples.counts))))
+
+    return DirectShapeRefiner(prior, config, extra_terms=[point_term])
+
+
+def _kept(cars: CarBatch, count: int) -> Tensor:
+    keep = torch.zeros(count, dtype=torch.bool, device=cars.detection_row.device)
+    return keep.index_fill(0, cars.detection_row, True)
+
+
+def _without_points_unknown(cars: RefinementResult, counts: Tensor, T_cam_obj: Tensor) -> RefinementResult:
+    """Cars with too few points keep their box."""
+    few = counts < _LEAST_POINTS
+    status = torch.where(few, Status.too_few_points.code, cars.status_code)
+    T = torch.where(few[:, None, None], T_cam_obj, cars.T_cam_obj)
+    return replace(cars, status_code=status, T_cam_obj=T, code=cars.code.masked_fill(few[:, None], 0.0))
+
+
+def _points_of_boxes(
+    points: Tensor, T_points_obj: Tensor, T_cam_obj: Tensor, hwl: Tensor
+) -> tuple[PointSamples, Tensor]:
+    """The points in each box, in the frames (N, 4, 4) of the cameras of the cars."""
+    T_cam_points = T_cam_obj @ se3.inverse(T_points_obj)
+    height, width, length = (hwl + torch.tensor([_BEYOND_BOX_M, 2 * _BEYOND_BOX_M, 2 * _BEYOND_BOX_M]).to(hwl)).T
+    car, chosen, counts = [], [], []
+    for number in range(len(hwl)):
+        x, y, z = se3.transform(se3.inverse(T_points_obj[number]), points).T
+        inside = (x.abs() < length[number] / 2) & (z.abs() < width[number] / 2)
+        inside &= (-y < height[number]) & (-y > _LEAST_HEIGHT_M)
+        (rows,) = inside.nonzero(as_tuple=True)
+        counts.append(len(rows))
+        rows = rows[:: max(1, math.ceil(len(rows) / _MOST_POINTS))]
+        car.append(torch.full_like(rows, number))
+        chosen.append(se3.transform(T_cam_points[number], points[rows]))
+    none = torch.zeros(0, dtype=torch.long, device=points.device)
+    samples = PointSamples(
+        torch.cat([none, *car]),
+        torch.cat([points[:0], *chosen]),
+        torch.tensor(counts, dtype=torch.long, device=points.device),
+    )
+    return samples, T_cam_points
+
+
+def _scene(T_cam_obj: Tensor, hwl: Tensor) -> tuple[FrameBatch, Detections]:
+    """Cars before a camera that sees nothing."""
+    K = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]]).to(T_cam_obj)
+    black = torch.zeros(3, 32, 32).to(T_cam_obj)
+    frames = FrameBatch.from_images(black, black, StereoCamera.from_intrinsics(K, 0.5), _CAMERA_HEIGHT_M)
+    count = len(hwl)
+    # Masks of everything: without any, a refiner leaves a car alone.
+    mask = torch.ones(count, 32, 32, dtype=torch.bool, device=hwl.device)
+    absent = torch.zeros(count, dtype=torch.bool, device=hwl.device)
+    detections = Detections(
+        frame_index=torch.zeros(count, dtype=torch.long, device=hwl.device),
+        T_cam_obj=T_cam_obj,
+        dimensions_hwl=hwl,
+        box_2d=hwl.new_full((count, 4), torch.nan),
+        score=hwl.new_ones(count),
+        mask_left=mask,
+        mask_right=mask,
+        has_mask_left=~absent,
+        has_mask_right=absent,
+    )
+    return frames, detections
+
+
+def _distances(samples: PointSamples, cars: RefinementResult) -> Tensor:
+    """Mean distance (N,) of the points of each car to its surface, metres."""
+    bound = cars.prior.bind(cars.code)
+    owner = samples.object_index
+    points_obj = se3.transform(se3.inverse(cars.T_cam_obj)[owner], samples.points_cam)
+    distance = bound.value(points_obj, owner).abs().double()
+    sums = torch.zeros(len(cars), dtype=torch.float64, device=distance.device).index_add(0, owner, distance)
+    number = torch.bincount(owner, minlength=len(cars))
+    return torch.where(number > 0, sums / number.clamp_min(1), torch.nan)

@@ -1,0 +1,145 @@
+"""What is known of each detected car in the image, to hold its 3D box against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.geometry.box3d import rotation_y_from_pose
+from directshape_torch.scene import Detections, FrameBatch, StereoCamera, boxes_around
+from directshape_torch.scene_check.image_boxes import box_iou
+
+Side = Literal["left", "right"]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CarBoxes:
+    """N boxes as they are given.
+
+    Attributes:
+        location: (N, 3) metres.
+        hwl: (N, 3) the three lengths in the order of the file, metres.
+        rotation_y: (N,) radians, or what stands there.
+        alpha: (N,) radians, or what stands there; NaN where nobody gives it.
+        box_2d: (N, 4) u_min, v_min, u_max, v_max, or what stands there, pixels.
+    """
+
+    location: Floats
+    hwl: Floats
+    rotation_y: Floats
+    alpha: Floats
+    box_2d: Floats
+
+    def __len__(self) -> int:
+        return len(self.location)
+
+
+@dataclass(frozen=True)
+class FrameEvidence:
+    """The N boxes of a frame and the masks that belong to them.
+
+    Attributes:
+        frame_id: its name.
+        boxes: of N cars, locations in the frame `ref` of the camera.
+        mask_boxes: for each side the box (N, 4) around the mask of each car, pixels, NaN where it has none.
+        overlap: for each side the overlap (N,) of that box with what it was matched by, 0 where it has none.
+        num_masks: for each side the masks of cars, whether they belong to a box or not.
+        seen: for each car what of the left masks may be its own, (., 4) boxes.
+        masks: the left mask (H, W) of each car, bool, or None.
+        camera: of the frame.
+        size_hw: of its images.
+        has_masks: whether the frame's masks could be read.
+    """
+
+    frame_id: str
+    boxes: CarBoxes
+    mask_boxes: dict[Side, Floats]
+    overlap: dict[Side, Floats]
+    num_masks: dict[Side, int]
+    seen: tuple[Floats, ...]
+    masks: tuple[NDArray[np.bool_] | None, ...]
+    camera: StereoCamera
+    size_hw: tuple[int, int]
+    has_masks: bool
+
+
+def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameEvidence]:
+    """The evidence of every frame; cars with numbers that are not finite, or without 2D box and mask, are left out."""
+    frame_index = detections.frame_index.cpu().numpy()
+    usable = (_array(detections.T_cam_obj).reshape(-1, 16), _array(detections.dimensions_hwl))
+    known = np.logical_and.reduce([np.isfinite(part).all(axis=1) for part in usable])
+    known &= np.isfinite(_array(detections.box_2d)).all(axis=1) | detections.has_mask_left.cpu().numpy()
+    sizes = frames.sizes.cpu().tolist()
+    return [
+        _frame_evidence(frames, detections, number, np.flatnonzero(known & (frame_index == number)), (height, width))
+        for number, (height, width) in enumerate(sizes)
+    ]
+
+
+def _frame_evidence(
+    frames: FrameBatch, d: Detections, number: int, rows: NDArray[np.int64], size_hw: tuple[int, int]
+) -> FrameEvidence:
+    camera = _camera_of(frames.camera, number)
+    chosen = torch.from_numpy(rows).to(d.T_cam_obj.device)
+    masks = {side: _masks_of(d, side, chosen, size_hw) for side in ("left", "right")}
+    around = {side: boxes_around(each).double().cpu().numpy() for side, each in masks.items()}
+    T = d.T_cam_obj.index_select(0, chosen)
+    unknown = np.full(len(rows), np.nan)
+    boxes = CarBoxes(
+        _array(T[:, :3, 3]),
+        _array(d.dimensions_hwl.index_select(0, chosen)),
+        _array(rotation_y_from_pose(T)),
+        unknown,
+        _array(d.box_2d.index_select(0, chosen)),
+    )
+    left = around["left"]
+    return FrameEvidence(
+        frame_id=frames.frame_ids[number],
+        boxes=boxes,
+        mask_boxes={"left": left, "right": around["right"]},
+        overlap={
+            "left": box_iou(boxes.box_2d, left).diagonal(),
+            "right": box_iou(boxes.box_2d, around["right"]).diagonal(),
+        },
+        num_masks={"left": int(_has(left).sum()), "right": int(_has(around["right"]).sum())},
+        seen=tuple(box[None] if known else box[None][:0] for box, known in zip(left, _has(left), strict=True)),
+        masks=tuple(
+            mask.cpu().numpy() if known else None for mask, known in zip(masks["left"], _has(left), strict=True)
+        ),
+        camera=camera,
+        size_hw=size_hw,
+        has_masks=True,
+    )
+
+
+def _camera_of(camera: StereoCamera, number: int) -> StereoCamera:
+    """Of one frame, in float64 on the host, with boxes in the left camera's own frame."""
+    parts = {name: getattr(camera, name)[number : number + 1] for name in ("K_left", "K_right", "T_right_cam")}
+    one = replace(camera, **parts, t_cam_ref=torch.zeros_like(camera.t_cam_ref[:1]))
+    return one.to("cpu", torch.float64)
+
+
+def _masks_of(d: Detections, side: str, rows: Tensor, size_hw: tuple[int, int]) -> Tensor:
+    """(N, H, W) bool."""
+    masks: Tensor = getattr(d, f"mask_{side}")
+    height, width = size_hw
+    if masks.shape[1] < height or masks.shape[2] < width:
+        return torch.zeros((len(rows), height, width), dtype=torch.bool)
+    masks = masks.index_select(0, rows)[:, :height, :width].detach()
+    present = getattr(d, f"has_mask_{side}").index_select(0, rows)
+    inside = masks if masks.dtype == torch.bool else masks > 0.5
+    return torch.logical_and(inside, present[:, None, None])
+
+
+def _has(boxes: Floats) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(boxes).all(axis=1))
+
+
+def _array(tensor: Tensor) -> Floats:
+    return np.asarray(tensor.detach().double().cpu().numpy())

@@ -1,0 +1,172 @@
+"""Masks against boxes: another frame's, mirrored, shifted, in another order, the sides swapped, none at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from directshape_torch.scene_check.box_conventions import BoxConvention
+from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence, Side
+from directshape_torch.scene_check.convention_scores import project_conventions
+from directshape_torch.scene_check.finding import Finding, Severity
+from directshape_torch.scene_check.image_boxes import box_iou
+
+# Mean overlap of masks and 2D boxes, over as many pairs as there could be.
+OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37
+# A detector may well miss all of three cars.
+MIN_PAIRS = 4
+# How much better the right masks must fit the left boxes.
+MIN_SWAP_GAIN = 0.1
+# Mean overlap with projected 3D boxes that masks must have, and gain, for a way in which they are wrong to be believed.
+MOVED_OVERLAP, MOVED_GAIN = 0.5, 0.2
+
+
+def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
+    """What masks and 2D boxes of all frames show together; masks of the left images alone are enough."""
+    frames = [frame for frame in frames if frame.has_masks and len(frame.boxes)]
+    if not frames:
+        return []
+    counts = {side: sum(frame.num_masks[side] for frame in frames) for side in ("left", "right")}
+    if not counts["left"]:
+        return [_none(counts["left"], counts["right"], sum(len(frame.boxes) for frame in frames))]
+    left, right = _mean_overlap(frames, "left"), _mean_overlap(frames, "right")
+    if right > max(left + MIN_SWAP_GAIN, OVERLAP_WARNING) or _are_crossed(frames):
+        return [_swapped()]
+    return _check_overlap(left, frames)
+
+
+def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[Finding]:
+    """Whether masks fit the 3D boxes once they are mirrored, shifted or given to other cars.
+
+    Args:
+        frames: of all frames.
+        explained: the mean overlap that another way to read the boxes reaches, which must be beaten.
+    """
+    pairs = [_pairs_of(frame) for frame in frames]
+    boxes, masks = (np.concatenate([pair[k] for pair in pairs]).reshape(-1, 4) for k in (0, 1))
+    if len(boxes) < 2:
+        return []
+    width = np.concatenate([np.full(len(pair[0]), frame.size_hw[1]) for pair, frame in zip(pairs, frames, strict=True)])
+    mirrored = np.stack([width - 1 - masks[:, 2], masks[:, 1], width - 1 - masks[:, 0], masks[:, 3]], axis=1)
+    offset = np.median(_middle(boxes) - _middle(masks), axis=0)
+    as_given = _overlap(boxes, masks)
+    ways = {
+        "are mirrored from left to right": (_overlap(boxes, mirrored), "mirror the masks, or read them unmirrored"),
+        f"are shifted by ({-offset[0]:.0f}, {-offset[1]:.0f}) px": (
+            _overlap(boxes, masks + np.tile(offset, 2)),
+            "check crops, padding and the frame that the masks are of",
+        ),
+        "belong to other cars of the same frame": (
+            float(np.mean([value for pair in pairs for value in _reassigned(*pair)])),
+            "give masks in the order of the boxes",
+        ),
+    }
+    (words, (overlap, cure)) = max(ways.items(), key=lambda way: way[1][0])
+    if overlap < MOVED_OVERLAP or overlap < as_given + MOVED_GAIN or overlap < explained - 0.02:
+        return []
+    return [
+        Finding(
+            "masks_elsewhere",
+            "error",
+            f"all frames, {len(boxes)} cars",
+            f"masks {words}: then 3D boxes overlap them by {overlap:.2f} instead of {as_given:.2f}",
+            "the mask of each car where its box is",
+            cure,
+        )
+    ]
+
+
+def _pairs_of(frame: FrameEvidence) -> tuple[Floats, Floats]:
+    """Boxes around the projected 3D box and the own left mask of each car that has one."""
+    if not len(frame.boxes):
+        return np.empty((0, 4)), np.empty((0, 4))
+    masks = frame.mask_boxes["left"]
+    has = np.isfinite(masks).all(axis=1)
+    return project_conventions(frame, [BoxConvention()])[0][has], masks[has]
+
+
+def _middle(boxes: Floats) -> Floats:
+    return 0.5 * (boxes[:, :2] + boxes[:, 2:])
+
+
+def _overlap(boxes: Floats, masks: Floats) -> float:
+    return float(box_iou(boxes, masks).diagonal().mean())
+
+
+def _reassigned(boxes: Floats, masks: Floats) -> Floats:
+    from scipy.optimize import linear_sum_assignment
+
+    overlap = box_iou(boxes, masks)
+    return np.asarray(overlap[linear_sum_assignment(overlap, maximize=True)])
+
+
+def _are_crossed(frames: Sequence[FrameEvidence]) -> bool:
+    """Whether masks of the right images lie farther right than those of the left ones, which no rig can see."""
+    both = [frame.mask_boxes["left"][:, 0::2].mean(1) - frame.mask_boxes["right"][:, 0::2].mean(1) for frame in frames]
+    disparity = np.concatenate(both)
+    disparity = disparity[np.isfinite(disparity)]
+    return len(disparity) > 1 and bool(np.mean(disparity < 0) > 0.7)
+
+
+def _mean_overlap(frames: Sequence[FrameEvidence], side: Side) -> float:
+    """Over all pairs that the frames could have made: as many as there are masks or boxes, whichever are fewer."""
+    found = float(sum(np.nan_to_num(frame.overlap[side]).sum() for frame in frames))
+    return found / max(1, sum(_pairs(frame, side) for frame in frames))
+
+
+def _check_overlap(overlap: float, frames: Sequence[FrameEvidence]) -> list[Finding]:
+    if overlap > OVERLAP_WARNING:
+        return _check_frames(frames)
+    enough = sum(_pairs(frame) for frame in frames) >= MIN_PAIRS
+    severity: Severity = "error" if overlap < OVERLAP_ERROR and enough else "warning"
+    return [_mismatch(severity, "all frames", overlap)]
+
+
+def _check_frames(frames: Sequence[FrameEvidence]) -> list[Finding]:
+    """Single frames whose masks are those of another, among others that are right."""
+    overlaps = {frame.frame_id: _mean_overlap([frame], "left") for frame in frames if _pairs(frame) > 1}
+    return [
+        _mismatch("warning", f"frame {frame_id}", overlap)
+        for frame_id, overlap in overlaps.items()
+        if overlap < OVERLAP_ERROR
+    ]
+
+
+def _pairs(frame: FrameEvidence, side: Side = "left") -> int:
+    return min(len(frame.boxes), frame.num_masks[side])
+
+
+def _mismatch(severity: Severity, where: str, overlap: float) -> Finding:
+    return Finding(
+        "masks_elsewhere",
+        severity,
+        where,
+        f"masks and 2D boxes of cars overlap by {overlap:.2f} in the mean",
+        f"at least {OVERLAP_WARNING}",
+        "check that masks and detections are of the same frames and the same size of image, and that 2D boxes are "
+        "u_min v_min u_max v_max",
+    )
+
+
+def _swapped() -> Finding:
+    return Finding(
+        "masks_swapped",
+        "error",
+        "all frames",
+        "the left boxes fit the right masks better, or cars lie farther right in the right masks than in the left ones",
+        "left boxes that fit left masks, and cars farther left in the right image",
+        "swap the two sides of the masks (or detections and masks were made on the right image)",
+    )
+
+
+def _none(num_left: int, num_right: int, num_cars: int) -> Finding:
+    severity: Severity = "warning" if num_left + num_right else "error" if num_cars >= MIN_PAIRS else "note"
+    return Finding(
+        "no_masks",
+        severity,
+        f"all frames, {num_cars} cars",
+        f"{num_left} masks of cars in the left images, {num_right} in the right ones",
+        "masks of the left images, better of both",
+        "check the side ('image') and the class (category_id 3, or 1 and 26 in PNG) of the masks",
+    )

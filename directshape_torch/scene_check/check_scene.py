@@ -1,0 +1,129 @@
+"""`check_scene`: common mistakes in the tensors of a call, measured and named with their cures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
+from directshape_torch.scene_check.check_box_2d import check_box_2d, check_corners
+from directshape_torch.scene_check.check_boxes import check_boxes
+from directshape_torch.scene_check.check_calibration import SPOILS_CAMERA, check_calibration
+from directshape_torch.scene_check.check_heading import check_heading
+from directshape_torch.scene_check.check_masks import check_masks
+from directshape_torch.scene_check.check_pair import SPOILS_PAIR, check_images
+from directshape_torch.scene_check.check_stereo import check_distances, check_swapped, measure_cars
+from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
+
+# Left and right image, (H, W, 3) RGB.
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
+
+
+def check_scene(frames: FrameBatch, detections: Detections, match_images: bool = True) -> CheckReport:
+    """Look for what is commonly wrong with images, calibration, masks and boxes (docs/check_data.md).
+
+    Among it: the centre of a box for its bottom, headings in degrees, off by 90 or 180 degrees or of the other sign,
+    another order of lengths, axes of a LiDAR, intrinsics of another image size, a wrong focal length or baseline,
+    millimetres, left and right swapped, masks that are mirrored, shifted, of another frame, size or order. What a
+    mistake spoils is not reported on top of it.
+
+    Args:
+        frames: F frames.
+        detections: B cars; the more, the more is seen.
+        match_images: match features of the two images too, which takes a second a frame; it shows whether they are
+            rectified and of the same scene.
+
+    Returns:
+        The findings; printed, it says what was measured, what was expected, and how to mend it.
+
+    Example:
+        >>> import torch
+        >>> from directshape_torch import StereoCamera
+        >>> K = torch.tensor([[360.0, 0.0, 300.0], [0.0, 360.0, 90.0], [0.0, 0.0, 1.0]])
+        >>> image, mask = torch.zeros(3, 375, 1242), torch.zeros(1, 375, 1242, dtype=torch.bool)
+        >>> mask[0, 180:240, 500:640] = True
+        >>> frames = FrameBatch.from_images(image, image, StereoCamera.from_intrinsics(K, 0.54))
+        >>> boxes = torch.tensor([[0.5, 0.9, 20.0, 4.0, 1.6, 1.5, 0.3]])
+        >>> print(check_scene(frames, Detections.from_boxes(boxes, "opencv", mask_left=mask), match_images=False))
+        error: principal_point (frame 000000, left)
+          measured  (300.0, 90.0) in images of 1242 x 375 pixels
+          expected  near the middle of the image
+          cure      K is of images 0.48 times as large: multiply fx, fy, cx and cy by 2.07
+        ...
+    """
+    found: list[Finding] = []
+    pairs: list[Pair] = []
+    for number, (height, width) in enumerate(frames.sizes.cpu().tolist()):
+        where = f"frame {frames.frame_ids[number]}"
+        camera = frames.camera
+        matrices = {"left": camera.K_left[number], "right": camera.K_right[number]}
+        as_numbers = {side: K.detach().double().cpu().numpy() for side, K in matrices.items()}
+        found += check_calibration(as_numbers, float(camera.baseline[number]), (height, width), where)
+        left, right = (images[number, :, :height, :width] for images in (frames.images_left, frames.images_right))
+        pairs.append((_bytes(left), _bytes(right)))
+    found = _once(found)
+    usable = not names(found) & SPOILS_CAMERA
+    evidence = evidence_of_scene(frames, detections)
+    if match_images:
+        for one, pair in zip(evidence, pairs, strict=True):
+            found += check_images(*pair, one.camera if usable else None, f"frame {one.frame_id}")
+    found += _mask_sizes(frames, detections)
+    if usable and not names(found) & {"mask_size"}:
+        found += check_cars(evidence, [None if names(found) & SPOILS_PAIR else pair for pair in pairs])
+    return CheckReport(by_severity(found), len(frames), len(frames), len(detections))
+
+
+def check_cars(frames: Sequence[FrameEvidence], pairs: Sequence[Pair | None]) -> list[Finding]:
+    """Boxes, masks and distances; each is asked only where what it rests on was found right.
+
+    Args:
+        frames: what is known of the cars.
+        pairs: the images of each frame, None where they cannot be used.
+    """
+    cars = [measure_cars(frame, *pair) for frame, pair in zip(frames, pairs, strict=True) if pair is not None]
+    frames = [frame for frame in frames if len(frame.boxes)]
+    swapped = check_swapped(cars)
+    if swapped:
+        return swapped
+    of_boxes = check_box_2d(frames) or check_boxes(frames)
+    if any(finding.severity == "error" for finding in of_boxes):
+        # Masks are found by the boxes and distances are those of the boxes, so they would only say the same again.
+        if "masks_elsewhere" in names(of_boxes):
+            return of_boxes
+        explained = names(of_boxes) != {"box_projection"}
+        of_masks = check_masks(frames)
+        return [*of_boxes, *(found for found in of_masks if found.check != "masks_elsewhere" or not explained)]
+    found = [*of_boxes, *check_corners(frames), *check_masks(frames)]
+    return [*found, *check_distances(cars), *check_heading(frames)]
+
+
+def _bytes(
+    image: Tensor,  # (3, H, W)
+) -> NDArray[np.uint8]:  # (H, W, 3)
+    values = (255 * image.detach().float().nan_to_num(nan=0.0)).clamp(0, 255).round().byte()
+    return np.ascontiguousarray(values.permute(1, 2, 0).cpu().numpy())
+
+
+def _once(findings: Sequence[Finding]) -> list[Finding]:
+    """The first finding of each kind: frames of a call mostly share their camera."""
+    return list({finding.check: finding for finding in reversed(findings)}.values())[::-1]
+
+
+def _mask_sizes(frames: FrameBatch, detections: Detections) -> list[Finding]:
+    images, masks = tuple(frames.images_left.shape[2:]), tuple(detections.mask_left.shape[1:])
+    if not len(detections) or images == masks:
+        return []
+    return [
+        Finding(
+            "mask_size",
+            "error",
+            "all frames",
+            f"masks of {masks[1]} x {masks[0]}, images of {images[1]} x {images[0]} pixels",
+            "masks of the size of their image",
+            "resize the masks to the size of the images, not the images to that of the masks",
+        )
+    ]

@@ -1,0 +1,81 @@
+"""Boxes in images: how far they overlap, and those around projected 3D boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.geometry.box3d import BOX_EDGES, box_corners
+from directshape_torch.geometry.camera import project, rays_from_pixels, warp_to_right
+from directshape_torch.scene import StereoCamera
+
+_NEAR_PLANE_M = 0.5
+
+
+def box_iou(
+    boxes_a: NDArray[np.float64],  # (A, 4) u_min, v_min, u_max, v_max, pixels
+    boxes_b: NDArray[np.float64],  # (B, 4)
+) -> NDArray[np.float64]:  # (A, B)
+    """Intersection over union of image boxes; boxes without an area overlap nothing.
+
+    Example:
+        >>> box_iou(np.array([[0.0, 0.0, 2.0, 2.0]]), np.array([[1.0, 0.0, 3.0, 2.0]])).round(3)
+        array([[0.333]])
+    """
+    a, b = boxes_a.reshape(-1, 1, 4), boxes_b.reshape(1, -1, 4)
+    sides = np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2])
+    intersection = np.clip(sides, 0, None).prod(axis=-1)
+    area_a, area_b = (np.clip(box[..., 2:] - box[..., :2], 0, None).prod(axis=-1) for box in (a, b))
+    union = area_a + area_b - intersection
+    return np.asarray(np.divide(intersection, union, out=np.zeros_like(union), where=union > 0))
+
+
+def project_boxes(
+    T_cam_obj: Tensor,  # (B, 4, 4)
+    dimensions_hwl: Tensor,  # (B, 3) metres
+    camera: StereoCamera,  # of one frame
+    size_hw: tuple[int, int],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:  # (B, 4), (B, 4)
+    """2D boxes around 3D boxes in the left and the right image, clipped to the image; no area where out of sight.
+
+    The right one goes through the residual disparity field of the rig, if there is one. What is behind the camera is
+    cut away 0.5 m in front of it.
+    """
+    points_cam = _visible_edge_ends(box_corners(T_cam_obj.double(), dimensions_hwl.double()))
+    in_front = ~points_cam.isnan().any(dim=-1)
+    points_cam = torch.where(in_front[..., None], points_cam, torch.ones_like(points_cam))
+    K_left, K_right, T_right_cam = (x[0].double() for x in (camera.K_left, camera.K_right, camera.T_right_cam))
+    uv_left = project(points_cam, K_left)
+    field = camera.disparity_field
+    offset = () if field is None else field.offsets(uv_left)
+    right = warp_to_right(rays_from_pixels(uv_left, K_left), points_cam[..., 2], K_right, T_right_cam, *offset)
+    return (
+        _enclosing_box(uv_left, in_front, size_hw),
+        _enclosing_box(right.uv_right, in_front & right.in_front, size_hw),
+    )
+
+
+def _visible_edge_ends(corners_cam: Tensor) -> Tensor:
+    """Both ends of the 12 edges (B, 24, 3), moved along the edge onto the near plane; NaN for hidden edges."""
+    start, end = (corners_cam[:, [edge[k] for edge in BOX_EDGES]] for k in (0, 1))
+
+    def clipped(a: Tensor, b: Tensor) -> Tensor:
+        z_a, z_b = a[..., 2:], b[..., 2:]
+        share = (_NEAR_PLANE_M - z_a) / torch.where(z_b == z_a, torch.ones_like(z_a), z_b - z_a)
+        crossing = a + share * (b - a)
+        nothing = torch.full_like(a, float("nan"))
+        return torch.where(z_a >= _NEAR_PLANE_M, a, torch.where(z_b >= _NEAR_PLANE_M, crossing, nothing))
+
+    return torch.cat([clipped(start, end), clipped(end, start)], dim=1)
+
+
+def _enclosing_box(uv: Tensor, valid: Tensor, size_hw: tuple[int, int]) -> NDArray[np.float64]:
+    big = torch.full_like(uv, float("inf"))
+    low = torch.where(valid[..., None], uv, big).amin(dim=1)
+    high = torch.where(valid[..., None], uv, -big).amax(dim=1)
+    limit = uv.new_tensor([size_hw[1] - 1, size_hw[0] - 1])
+    low = torch.minimum(low.clamp(min=0), limit)
+    high = torch.minimum(high.clamp(min=0), limit)
+    return np.asarray(torch.cat([low, high], dim=-1).cpu().numpy())

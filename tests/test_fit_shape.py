@@ -1,0 +1,115 @@
+"""Shapes from points alone: surfaces of known cars, seen from one side and from all, in the frame of a LiDAR."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from directshape_torch import InputError, PCAShapePrior, ShapeFit, Status, fit_shape
+from directshape_torch.cli.main import main
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box_formats import boxes_to_poses
+from directshape_torch.shape.sdf_grid import zero_level_extents
+from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+
+PRIOR = PCAShapePrior.load_bundled().double()
+CODE = torch.tensor([[1.0, -0.8, 0.5, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)
+LOWER, UPPER = zero_level_extents(PRIOR.values(CODE), PRIOR.origin, PRIOR.spacing_m)[0]
+LENGTH, HEIGHT, WIDTH = (UPPER - LOWER).tolist()
+# In the frame of a LiDAR, one ahead, one behind.
+TRUE_BOXES = torch.tensor(
+    [[12.0, 3.0, -1.7, LENGTH, WIDTH, HEIGHT, 0.4], [-9.0, -2.0, -1.6, LENGTH, WIDTH, HEIGHT, 2.8]], dtype=torch.float64
+)
+ERRORS = torch.tensor([[0.3, -0.15, 0.05, 0.2, 0.1, 0.05, 0.08], [-0.2, 0.2, -0.04, -0.3, 0.0, 0.1, -0.1]]).double()
+
+
+def cars(seen_from_sensor: bool) -> tuple[Tensor, Tensor]:
+    """Points of both cars (P, 3), 400 each, and their poses in the frame of the points."""
+    T, _ = boxes_to_poses(TRUE_BOXES, "mmdet3d_lidar", torch.eye(4).double())
+    mesh = sdf_to_mesh(PRIOR.values(CODE)[0], PRIOR.origin, PRIOR.spacing_m)
+    random = np.random.default_rng(0)
+    clouds = []
+    for pose in T:
+        weights = random.dirichlet((1, 1, 1), 4000)
+        face = random.choice(len(mesh.faces), 4000, p=mesh.area_faces / mesh.area)
+        at = torch.from_numpy((weights[:, :, None] * mesh.vertices[mesh.faces[face]]).sum(1))
+        normal = torch.from_numpy(mesh.face_normals[face].copy()) @ pose[:3, :3].T
+        points = se3.transform(pose, at)
+        keep = (normal * points).sum(1) < 0 if seen_from_sensor else torch.ones(4000, dtype=torch.bool)
+        clouds.append(points[keep][:400] + 0.02 * torch.from_numpy(random.standard_normal((int(keep.sum()), 3)))[:400])
+    return torch.cat(clouds), T
+
+
+def fitted(seen_from_sensor: bool) -> tuple[ShapeFit, Tensor]:
+    points, T = cars(seen_from_sensor)
+    return fit_shape(points, TRUE_BOXES + ERRORS, "mmdet3d_lidar", PRIOR), T
+
+
+@pytest.mark.parametrize(("seen_from_sensor", "limit_m"), [(False, 0.06), (True, 0.12)])
+def test_poses_come_back(seen_from_sensor: bool, limit_m: float) -> None:
+    fit, T = fitted(seen_from_sensor)
+    assert all(status.is_refined for status in fit.cars.status)
+    # Of the boxes around the shapes: where in a car its origin is, no point says.
+    true = replace(fit.cars, T_cam_obj=T, code=CODE.expand(2, -1)).to_boxes(T_cam_boxes=torch.eye(4).double())
+    found = fit.cars.to_boxes(T_cam_boxes=torch.eye(4).double())
+    error = (found - true)[:, :2].norm(dim=1)
+    assert (error < limit_m).all(), error
+    assert (fit.distance_after_m < 0.035).all()
+    assert (fit.distance_after_m < 0.5 * fit.distance_before_m).all()
+    yaw = torch.atan2(fit.cars.T_cam_obj[:, 1, 0], fit.cars.T_cam_obj[:, 0, 0])
+    assert yaw.tolist() == pytest.approx(TRUE_BOXES[:, 6].tolist(), abs=0.03)
+
+
+def test_meshes_and_boxes_stand_where_the_points_are() -> None:
+    fit, _ = fitted(False)
+    boxes = fit.cars.to_boxes("mmdet3d_lidar", T_cam_boxes=torch.eye(4).double())
+    # The mean height of a surface above its ground is that of no box: only what lies along the ground is compared.
+    assert boxes[:, :2].tolist() == pytest.approx(TRUE_BOXES[:, :2].numpy(), abs=0.15)
+    for mesh, box in zip(fit.cars.meshes(), boxes, strict=True):
+        assert mesh.bounds[0, 2] == pytest.approx(float(box[2]), abs=0.05)
+        assert mesh.is_watertight
+
+
+def test_a_car_without_points_keeps_its_box_and_touches_no_other() -> None:
+    points, _ = cars(False)
+    alone = fit_shape(points, (TRUE_BOXES + ERRORS)[:1], "mmdet3d_lidar", PRIOR)
+    far = TRUE_BOXES[:1] + torch.tensor([[50.0, 0, 0, 0, 0, 0, 0]])
+    both = fit_shape(points, torch.cat([(TRUE_BOXES + ERRORS)[:1], far]), "mmdet3d_lidar", PRIOR)
+    assert both.cars.status[1] is Status.too_few_points
+    assert both.num_points.tolist() == [alone.num_points[0], 0]
+    assert both.distance_after_m[1].isnan()
+    T_far, hwl = boxes_to_poses(far, "mmdet3d_lidar", torch.eye(4).double())
+    torch.testing.assert_close(both.cars.T_cam_obj[1:], T_far)
+    torch.testing.assert_close(both.cars.boxes().dimensions_hwl[1:], hwl)
+    torch.testing.assert_close(both.cars.T_cam_obj[0], alone.cars.T_cam_obj[0], atol=1e-8, rtol=0)
+    assert len(fit_shape(points, far[:0], prior=PRIOR).cars) == 0
+    with pytest.raises(InputError, match=r"points: expected shape \(P, 3\)"):
+        fit_shape(points[:, :2], far, prior=PRIOR)
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points, _ = cars(False)
+    reflectance = np.zeros((len(points), 1), dtype=np.float32)
+    (tmp_path / "scan.bin").write_bytes(np.hstack([points.numpy(), reflectance]).astype("<f4").tobytes())
+    np.save(tmp_path / "points.npy", points.numpy())
+    np.savetxt(tmp_path / "boxes.txt", (TRUE_BOXES + ERRORS).numpy())
+    for name in ("scan.bin", "points.npy"):
+        words = ["--points", str(tmp_path / name), "--boxes", str(tmp_path / "boxes.txt")]
+        assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 0
+        assert "converged" in capsys.readouterr().out
+        boxes = np.loadtxt(tmp_path / "out" / "boxes.txt")
+        assert boxes[:, :2] == pytest.approx(TRUE_BOXES[:, :2].numpy(), abs=0.2)
+        assert {path.name for path in (tmp_path / "out" / "meshes").iterdir()} == {"000.ply", "001.ply"}
+        with np.load(tmp_path / "out" / "shapes.npz") as arrays:
+            assert arrays["T_points_obj"].shape == (2, 4, 4)
+    (tmp_path / "boxes.txt").write_text("1 2 3\n")
+    assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
+    assert "line 1: expected seven numbers: '1 2 3'" in capsys.readouterr().err
+    (tmp_path / "points.npy").write_bytes(b"nothing")
+    assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
+    assert "points.npy: holds no points" in capsys.readouterr().err

@@ -1,0 +1,237 @@
+"""From a detector's tensors to a refinement and back: no file, no conversion of one's own."""
+
+from __future__ import annotations
+
+import io
+import sys
+from dataclasses import replace
+from functools import lru_cache
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers.synthetic_scene import cached_street, disturbed
+from safetensors.torch import load, save
+
+from directshape_torch import (
+    Detections,
+    DirectShapeRefiner,
+    FrameBatch,
+    InputError,
+    MissingDependencyError,
+    RefinementResult,
+    RigEstimate,
+    StereoCamera,
+)
+from directshape_torch.geometry.box_formats import poses_to_boxes
+
+PRIOR, STREET = cached_street()
+
+
+@lru_cache(maxsize=1)
+def refined() -> RefinementResult:
+    return DirectShapeRefiner(PRIOR)(STREET.frames, disturbed(STREET.detections))
+
+
+def from_boxes(**changes: object) -> Detections:
+    d = STREET.detections
+    boxes = poses_to_boxes(d.T_cam_obj, d.dimensions_hwl, "opencv")
+    return Detections.from_boxes(boxes, "opencv", **{"mask_left": d.mask_left, "mask_right": d.mask_right, **changes})
+
+
+def test_tensors_alone_give_what_the_records_give() -> None:
+    frame, d = STREET.frames, STREET.detections
+    camera = StereoCamera.from_intrinsics(frame.camera.K_left[0], float(frame.camera.baseline[0]))
+    frames = FrameBatch.from_images(frame.images_left[0], frame.images_right[0], camera, frame.ground)
+    a = DirectShapeRefiner(PRIOR)(frames, from_boxes(box_2d=d.box_2d))
+    b = DirectShapeRefiner(PRIOR)(replace(frame, camera=camera), d)
+    assert a.status == b.status
+    torch.testing.assert_close(a.T_cam_obj, b.T_cam_obj, atol=1e-6, rtol=0)
+
+
+def test_intrinsics_of_one_and_of_many_frames() -> None:
+    K = STREET.frames.camera.K_left[0]
+    assert StereoCamera.from_intrinsics(K, 0.5).baseline.tolist() == [0.5]
+    both = StereoCamera.from_intrinsics(torch.stack([K, K]), torch.tensor([0.5, 0.6]))
+    assert both.baseline.tolist() == pytest.approx([0.5, 0.6])
+    torch.testing.assert_close(both.T_cam_ref, torch.eye(4).double().expand(2, 4, 4))
+    with pytest.raises(InputError, match=r"T_right_cam: .* swap the two cameras"):
+        StereoCamera.from_intrinsics(K, -0.5)
+    with pytest.raises(InputError, match=r"K: expected \[\[fx, s, cx\]"):
+        StereoCamera.from_intrinsics(K.T.contiguous(), 0.5)
+    with pytest.raises(InputError, match=r"baseline_m: expected a number, or 1"):
+        StereoCamera.from_intrinsics(K, torch.tensor([0.5, 0.6]))
+    with pytest.raises(InputError, match="K: expected floating point"):
+        StereoCamera.from_intrinsics(K.long(), 0.5)
+
+
+def test_images_may_be_bytes() -> None:
+    K = STREET.frames.camera.K_left[0].float()
+    image = torch.randint(0, 256, (2, 3, 20, 30), dtype=torch.uint8)
+    frames = FrameBatch.from_images(image, image, StereoCamera.from_intrinsics(K, 0.5), frame_ids=["a", "b"])
+    assert (frames.images_left * 255).round().byte().equal(image)
+    assert frames.frame_ids == ("a", "b")
+    assert frames.sizes.tolist() == [[20, 30]] * 2
+    with pytest.raises(InputError, match=r"images_left: expected shape .*image.permute"):
+        FrameBatch.from_images(image.permute(0, 2, 3, 1), image, StereoCamera.from_intrinsics(K, 0.5))
+
+
+@pytest.mark.parametrize("kind", [torch.bool, torch.uint8, torch.float32, torch.float64])
+def test_masks_of_any_kind(kind: torch.dtype) -> None:
+    left = STREET.detections.mask_left > 0.5
+    found = from_boxes(mask_left=left.to(kind), mask_right=None)
+    assert (found.mask_left > 0.5).equal(left)
+    assert not found.has_mask_right.any()
+    assert found.has_mask_left.all()
+    grey = from_boxes(mask_left=left.byte() * 255)
+    assert (grey.mask_left > 0.5).equal(left)
+
+
+def test_masks_of_some_of_the_cars() -> None:
+    left, right = STREET.detections.mask_left, STREET.detections.mask_right
+    found = from_boxes(mask_left=[None, left[1]], mask_right=[right[0], None])
+    assert found.has_mask_left.tolist() == [False, True]
+    assert found.has_mask_right.tolist() == [True, False]
+    v, u = (left[1] > 0.5).nonzero().unbind(1)
+    assert found.box_2d[1].tolist() == [u.min(), v.min(), u.max(), v.max()]
+    v, u = (right[0] > 0.5).nonzero().unbind(1)
+    assert found.box_2d[0].tolist() == [u.min(), v.min(), u.max(), v.max()]
+    statuses = DirectShapeRefiner(PRIOR)(STREET.frames, found).status
+    assert all(status.name != "no_mask" for status in statuses)
+    nothing = from_boxes(mask_left=torch.zeros_like(left), mask_right=None)
+    assert nothing.box_2d.isnan().all()
+    assert {status.name for status in DirectShapeRefiner(PRIOR)(STREET.frames, nothing).status} == {"no_mask"}
+
+
+def test_masks_are_asked_for_by_name() -> None:
+    with pytest.raises(InputError, match="mask_left: expected masks of 2 cars in one image at least"):
+        from_boxes(mask_left=None, mask_right=None)
+    with pytest.raises(InputError, match=r"mask_left: expected 2 masks of one size"):
+        from_boxes(mask_left=[None])
+    with pytest.raises(InputError, match=r"mask_left: expected 2 masks of one size .*\(3, 4\), \(3, 5\)"):
+        from_boxes(mask_left=[torch.zeros(3, 4), torch.zeros(3, 5)])
+    with pytest.raises(InputError, match="mask_left: expected bool"):
+        from_boxes(mask_left=STREET.detections.mask_left.long())
+    with pytest.raises(InputError, match=r"mask_left: expected shape \(2, H, W\)"):
+        from_boxes(mask_left=torch.zeros(1, 3, 4, dtype=torch.uint8))
+
+
+def test_results_are_indexed_like_tensors() -> None:
+    result = refined()
+    assert len(result) == 2
+    for index, rows in ((1, [1]), (-1, [1]), (slice(None), [0, 1]), (slice(0, 0), []), ([1, 0], [1, 0])):
+        part = result[index]
+        torch.testing.assert_close(part.T_cam_obj, result.T_cam_obj[rows])
+        torch.testing.assert_close(part.quality.mask_iou_left, result.quality.mask_iou_left[rows])
+        assert part.profile.offsets_px.equal(result.profile.offsets_px)
+        assert len(part.ground_source) == len(part.status) == len(rows)
+        assert part.term_names == result.term_names
+    good = torch.tensor([False, True])
+    assert result[good].code.equal(result.code[1:])
+    assert result[good.numpy()].code.equal(result.code[1:])
+    assert [one.status[0] for one in result] == result.status
+    for wrong in (2, -3, [2], good[:1], torch.tensor([0.5])):
+        with pytest.raises(InputError, match="index: expected"):
+            result[wrong]
+
+
+def test_boxes_in_conventions_and_frames() -> None:
+    result, boxes = refined(), refined().boxes()
+    kitti = result.to_boxes("kitti", frame="ref")
+    torch.testing.assert_close(kitti[:, :3], boxes.location_ref)
+    torch.testing.assert_close(kitti[:, 3:6], boxes.dimensions_hwl)
+    torch.testing.assert_close(kitti[:, 6], boxes.rotation_y)
+    in_cam = result.to_boxes("kitti")
+    torch.testing.assert_close(in_cam[:, :3] - kitti[:, :3], result.t_cam_ref)
+    # A car that was refined has its axes within a tilt of upright: the corners enclose its middle.
+    corners = result.corners()
+    torch.testing.assert_close(corners.mean(dim=1), result.to_boxes("opencv")[:, :3], atol=1e-6, rtol=0)
+    torch.testing.assert_close(corners - result.corners("ref"), result.t_cam_ref[:, None].expand(-1, 8, -1))
+    again = Detections.from_boxes(result.to_boxes("mmdet3d_camera"), "mmdet3d_camera", mask_left=torch.ones(2, 9, 9))
+    torch.testing.assert_close(again.dimensions_hwl, boxes.dimensions_hwl)
+    with pytest.raises(InputError, match="T_cam_boxes: expected the rigid motion"):
+        result.to_boxes("nuscenes")
+    with pytest.raises(InputError, match="frame: expected 'cam' or 'ref', got 'world'"):
+        result.to_boxes("kitti", frame="world")  # type: ignore[arg-type]
+
+
+def test_results_move_and_give_arrays() -> None:
+    result = refined()
+    single = result.to(dtype=torch.float32)
+    assert single.T_cam_obj.dtype == single.boxes().location_ref.dtype == torch.float32
+    assert single.covariance.dtype == single.quality.mask_iou_left.dtype == torch.float64
+    assert single.prior.origin.dtype == torch.float32
+    assert result.prior.origin.dtype == torch.float64  # the refiner's own shapes stay
+    assert result.cpu().prior is result.prior
+    attached = replace(result, T_cam_obj=result.T_cam_obj.clone().requires_grad_())
+    assert not attached.detach().T_cam_obj.requires_grad
+    arrays = attached.numpy()
+    assert arrays["status"].tolist() == [status.name for status in result.status]
+    assert arrays["boxes.rotation_y"].shape == (2,)
+    assert arrays["term_names"].tolist() == list(result.term_names)
+    np.testing.assert_array_equal(arrays["T_cam_obj"], result.T_cam_obj.numpy())
+
+
+def test_results_are_stored_without_pickles() -> None:
+    result = refined()
+    state = result.state_dict()
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    buffer.seek(0)
+    for read in (torch.load(buffer, weights_only=True), load(save(state))):
+        again = RefinementResult.from_state_dict(read, PRIOR)
+        assert again.state_dict().keys() == state.keys()
+        assert all(again.state_dict()[name].equal(value) or value.isnan().any() for name, value in state.items())
+        assert again.status == result.status
+        assert (again.term_names, again.ground_source) == (result.term_names, result.ground_source)
+        torch.testing.assert_close(again.boxes().location_ref, result.boxes().location_ref)
+    assert RefinementResult.from_state_dict(result[:0].state_dict(), PRIOR).ground_source == ()
+    with pytest.raises(InputError, match=r"state: expected the tensor 'quality\.evidence'"):
+        RefinementResult.from_state_dict({k: v for k, v in state.items() if k != "quality.evidence"}, PRIOR)
+    with pytest.raises(InputError, match=r"prior: expected the prior of the result, with \d codes"):
+        RefinementResult.from_state_dict(replace(result, code=result.code[:, :1]).state_dict(), PRIOR)
+
+
+def test_state_of_the_module_is_stored_without_pickles() -> None:
+    """With what is known of the rig, which is extra state beside the tensors of the shapes."""
+    rig = RigEstimate.of_frames(STREET.frames)
+    rig.update(STREET.frames, STREET.detections)
+    refiner, other = (DirectShapeRefiner(PRIOR, rig=each) for each in (rig, RigEstimate.of_frames(STREET.frames)))
+    buffer = io.BytesIO()
+    torch.save(refiner.state_dict(), buffer)
+    buffer.seek(0)
+    other.load_state_dict(torch.load(buffer, weights_only=True))
+    torch.testing.assert_close(other.rig.mean, rig.mean)
+    plain = DirectShapeRefiner(PRIOR)
+    DirectShapeRefiner(PRIOR).load_state_dict(load(save(plain.state_dict())))
+
+
+def test_meshes_of_all_cars(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = refined()
+    surfaces = result.meshes()
+    assert [mesh.is_watertight for mesh in surfaces] == [True, True]
+    monkeypatch.setitem(sys.modules, "pytorch3d", None)
+    with pytest.raises(MissingDependencyError, match="needs the package 'pytorch3d'"):
+        result.meshes("pytorch3d")
+    structures = ModuleType("pytorch3d.structures")
+    structures.Meshes = lambda verts, faces: SimpleNamespace(verts=verts, faces=faces)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "pytorch3d", ModuleType("pytorch3d"))
+    monkeypatch.setitem(sys.modules, "pytorch3d.structures", structures)
+    batch = result.meshes("pytorch3d")
+    assert [len(vertices) for vertices in batch.verts] == [len(mesh.vertices) for mesh in surfaces]
+    assert batch.verts[0].dtype == torch.float64
+    assert batch.faces[0].dtype == torch.int64
+    with pytest.raises(InputError, match="kind: expected 'trimesh' or 'pytorch3d'"):
+        result.meshes("blender")  # type: ignore[arg-type]
+
+
+def test_a_result_prints_itself_in_ten_lines() -> None:
+    result = refined()
+    many = result[[0, 1] * 8]
+    lines = repr(many).splitlines()
+    assert lines[0] == "RefinementResult of 16 cars (torch.float64, cpu)"
+    assert lines[-1] == "  and 10 more"
+    assert len(lines) == 10
+    assert "converged" in lines[1]
+    assert repr(result[:0]).splitlines()[1:] == ["  no cars"]
