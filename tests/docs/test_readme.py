@@ -81,3 +81,12 @@ def test_every_relative_link_leads_to_a_heading_of_a_file() -> None:
         text = (ROOT / name).read_bytes() if name else README.encode()
         headings = re.findall(r"^#+ (.+)$", text.decode(errors="ignore"), re.MULTILINE)
         assert not anchor or anchor in {re.sub(r"[^\w -]", "", h).lower().replace(" ", "-") for h in headings}, link
+
+
+def test_every_figure_of_the_results_is_in_the_docs() -> None:
+    table = README[README.index("## Results") : README.index("## Limits")]
+    figures = re.findall(r"\b0\.\d{3}\b", table)
+    known = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("results.md", "your_rig.md"))
+
+    assert len(figures) == 16
+    assert not [figure for figure in figures if figure not in known]
