@@ -56,7 +56,7 @@ def test_the_ten_lines_refine_tensors() -> None:
     assert result.code.shape == (6, 8)
     assert all(status.is_refined for status in result.status)
     assert bool((torch.nan_to_num(result.quality.mask_iou_left) > 0.85).all())
-    assert sum(bool(line) for line in code.splitlines()) == 10
+    assert sum(bool(line) for line in code.splitlines()) <= 10
 
 
 @pytest.mark.parametrize("name", ["demo", "tests"])
