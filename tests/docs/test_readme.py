@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
 
 import pytest
 import torch
 
 from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.cli.main import make_parser
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import poses_cam
 
@@ -65,11 +63,6 @@ def test_each_marked_command_is_one_shell_line(name: str) -> None:
 
     assert command.strip().count("\n") == 0
     assert command.startswith("python3 -m venv")
-
-
-def test_the_command_for_a_folder_is_understood() -> None:
-    (command,) = re.findall(r"^directshape (refine .*)$", README, re.MULTILINE)
-    assert make_parser().parse_args(shlex.split(command)).rig == "auto"
 
 
 def test_every_relative_link_leads_to_a_heading_of_a_file() -> None:
