@@ -18,7 +18,6 @@ from directshape_torch.io.kitti_labels import read_objects
 from paper_tables.ablation_rows import REFERENCE, ROWS, Row
 from paper_tables.data_sets import DataSet
 from paper_tables.experiment import Experiment, share_percent
-from paper_tables.plots import IntervalLine, write_interval_plot
 from paper_tables.refinements import Run
 from paper_tables.report import Table, few_cars_note, interval
 from paper_tables.settings import DEFAULT
@@ -52,8 +51,6 @@ def make_ablation_table(experiment: Experiment, rows: tuple[Row, ...] = ROWS) ->
         experiment.report.add(_table(data_set, main, judged))
         csv_rows += [_csv_row(data_set, entry) for entry in judged]
         experiment.report.write_csv("rows", csv_rows)
-        lines = [IntervalLine(f"{e.row.group}: {e.row.name}", _after(e), e.row is REFERENCE) for e in judged]
-        write_interval_plot(experiment.plots / f"ablation_{data_set.name}.png", lines, data_set.name, "BEV IoU, mean")
 
 
 def _main_detections(experiment: Experiment, data_set: DataSet) -> Path | None:

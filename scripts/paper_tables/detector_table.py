@@ -9,7 +9,6 @@ from typing import Any
 from paper_tables.average_precision import ap_scores, long_rows, paper_columns, paper_row
 from paper_tables.data_sets import DataSet
 from paper_tables.experiment import Experiment
-from paper_tables.plots import IntervalLine, write_interval_plot
 from paper_tables.report import FEW_CARS, Table, interval
 from paper_tables.settings import DEFAULT
 
@@ -19,13 +18,12 @@ _BOX_COLUMNS = ("set", "detector", "frames", "n (cars)", "input", "BEV IoU, mean
 def make_detector_table(experiment: Experiment) -> None:
     """All folders of detections with the default settings."""
     rows: list[tuple[str, ...]] = []
-    lines: list[IntervalLine] = []
     csv_rows: list[dict[str, Any]] = []
     ap_rows: list[tuple[str, ...]] = []
     for data_set in experiment.data_sets:
         for name, detections in experiment.detectors_of(data_set).items():
             if experiment.frames_of(data_set, detections):
-                rows += _box_rows(experiment, data_set, name, detections, lines)
+                rows += _box_rows(experiment, data_set, name, detections)
                 found, figures = _ap_rows(experiment, data_set, name, detections)
                 ap_rows += found
                 csv_rows += figures
@@ -34,22 +32,15 @@ def make_detector_table(experiment: Experiment) -> None:
     experiment.report.add(Table("Every detector, default settings", _BOX_COLUMNS, tuple(rows), notes))
     title = "AP (area under the curve) before and after"
     experiment.report.add(Table(title, ("", *paper_columns()), tuple(ap_rows)))
-    write_interval_plot(experiment.plots / "detectors.png", lines, "before and after", "BEV IoU, mean")
     experiment.report.write_csv("ap", csv_rows)
 
 
-def _box_rows(
-    experiment: Experiment, data_set: DataSet, name: str, detections: Path, lines: list[IntervalLine]
-) -> list[tuple[str, ...]]:
+def _box_rows(experiment: Experiment, data_set: DataSet, name: str, detections: Path) -> list[tuple[str, ...]]:
     run = experiment.run(data_set, detections, DEFAULT)
     overall = experiment.compare(data_set, run, experiment.masked_lines(data_set, detections)).overall
     if not overall.num_detections:
         return []
     bev, box = overall.metrics["bev_iou_mean"], overall.metrics["iou_3d_mean"]
-    lines += [
-        IntervalLine(f"{data_set.name} {name}: input", bev.before),
-        IntervalLine(f"{data_set.name} {name}: refined", bev.after),
-    ]
     assert overall.worse_share is not None
     counts = f"{overall.num_detections} ({overall.num_cars})"
     figures = (interval(bev.before), interval(bev.after), interval(bev.change), f"{box.after.value:.3f}")

@@ -185,7 +185,6 @@ def test_ablation_table(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     boxes = found["2D boxes for masks"]
     assert float(boxes["difference"]) == pytest.approx(float(boxes["bev_iou"]) - reference)
     assert float(found["default settings, every result"]["time_ratio"]) == 1.0
-    assert (tmp_path / "plots" / f"ablation_{data.name}.png").is_file()
 
 
 def test_detector_table(data: Path, tmp_path: Path) -> None:
