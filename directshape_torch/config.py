@@ -97,8 +97,9 @@ class StageConfig(Settings):
     )
     over_relaxation: float = setting(
         1.0,
-        "length of steps in those of Gauss-Newton, but after one that did not pay. Reweighted terms bend less than "
-        "their matrix says, so that plain steps (1, the paper's) stop short; at 2 no quadratic energy would fall",
+        "length of a step, as a multiple of Gauss-Newton's; after a step that did not pay the next one is plain. With "
+        "robust weights the Gauss-Newton matrix overestimates the curvature, so plain steps (1, the paper's) stop "
+        "short of the minimum; a quadratic energy falls below 2 only",
         at_least=1,
         at_most=1.99,
     )

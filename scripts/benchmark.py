@@ -1,4 +1,4 @@
-"""How long refinements take, what memory they need, and whether that has become worse (docs/benchmarking.md).
+"""How long refinements take, what memory they need, and whether that has become worse (docs/performance.md).
 
     python scripts/benchmark.py                                  # times, operations, compilation, scaling
     python scripts/benchmark.py --suite cpu --json out/benchmark.json

@@ -3,7 +3,7 @@
     python scripts/build_bundled_prior.py [--num-cars 600 --num-codes 8 --out PATH]
 
 No mesh goes in: every car comes from `directshape_torch.shape.parametric_cars`. The ranges of its measures were
-adjusted by hand while looking at the errors that `judge_prior.py` reports, so those figures are of a development set.
+adjusted by hand while looking at how the prior fits real car meshes (`directshape inspect --prior FILE --meshes DIR`).
 """
 
 from __future__ import annotations

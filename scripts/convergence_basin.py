@@ -10,8 +10,6 @@ Success: the centre of the refined box within 0.2 m and its heading within 3 deg
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import math
 import sys
 from collections.abc import Sequence
@@ -28,9 +26,8 @@ from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
-from directshape_torch.files.atomic_files import write_bytes, write_text
+from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry.box3d import rotation_about_y
-from directshape_torch.io.figure_files import figure_png, new_figure
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
@@ -46,13 +43,10 @@ YAW_LIMIT_DEG = 3.0
 class Trial:
     """One car refined from one start."""
 
-    frame_id: str
-    detection_line: int
     start_position_m: float
     start_yaw_deg: float
     centre_m: float
     yaw_deg: float
-    status: str
 
     @property
     def success(self) -> bool:
@@ -98,18 +92,10 @@ def trials_of_frame(
         start = perturbed(loaded.detections.T_cam_obj, direction, sign, position_m, yaw_deg)
         result = refiner(loaded.frame, replace(loaded.detections, T_cam_obj=start))
         errors = pose_errors(result_boxes(result)[used], true_boxes)
-        for index, k in enumerate(used):
-            trials.append(
-                Trial(
-                    frame_id=loaded.frame_id,
-                    detection_line=loaded.input_objects[rows[k]].line_number,
-                    start_position_m=position_m,
-                    start_yaw_deg=yaw_deg,
-                    centre_m=float(errors.centre_m[index]),
-                    yaw_deg=float(errors.yaw_deg[index]),
-                    status=result.status[k].name,
-                )
-            )
+        trials += [
+            Trial(position_m, yaw_deg, float(centre), float(yaw))
+            for centre, yaw in zip(errors.centre_m, errors.yaw_deg, strict=True)
+        ]
     return trials
 
 
@@ -157,45 +143,12 @@ def markdown_table(
     return "\n".join(lines) + "\n"
 
 
-def csv_text(trials: Sequence[Trial]) -> str:
-    """One line for each trial."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["frame_id", "detection_line", "start_position_m", "start_yaw_deg", "centre_m", "yaw_deg", "success", "status"]
-    )
-    for t in trials:
-        errors = [f"{t.centre_m:.4f}", f"{t.yaw_deg:.3f}", int(t.success), t.status]
-        writer.writerow([t.frame_id, t.detection_line, t.start_position_m, t.start_yaw_deg, *errors])
-    return text.getvalue()
-
-
-def plot_png(table: NDArray[np.float64], positions_m: Sequence[float], yaws_deg: Sequence[float]) -> bytes:
-    """A heat map of the success as PNG.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
-    figure = new_figure(6, 4.5, "the plot of the convergence basin")
-    axes = figure.add_subplot()
-    picture = axes.imshow(100 * table, origin="lower", vmin=0, vmax=100, cmap="viridis", aspect="auto")
-    axes.set_xticks(range(len(yaws_deg)), [f"{yaw:g}" for yaw in yaws_deg])
-    axes.set_yticks(range(len(positions_m)), [f"{position:g}" for position in positions_m])
-    axes.set_xlabel("yaw error of the start [deg]")
-    axes.set_ylabel("position error of the start [m]")
-    axes.set_title("cars refined to the truth [%]")
-    for (i, j), share in np.ndenumerate(table):
-        axes.text(j, i, f"{100 * share:.0f}", ha="center", va="center", color="black" if share > 0.6 else "white")
-    figure.colorbar(picture)
-    return figure_png(figure)
-
-
 # Where the iterations end is asked, not what is made of it.
 EVERY_RESULT = "acceptance.min_probability_better=0"
 
 
 def run(args: argparse.Namespace) -> None:
-    """Refine all frames from all starts and write table, CSV and plot; partial results are written after each frame."""
+    """Refine all frames from all starts; print and write the table."""
     refiner = DirectShapeRefiner(config=load_config(args.config, [EVERY_RESULT, *args.set])).to(args.device)
     dataset = KittiStereoDataset(args.data, args.detections, args.masks, frames=args.frames)
     cells = [(position, yaw) for position in args.positions for yaw in args.yaws]
@@ -204,13 +157,11 @@ def run(args: argparse.Namespace) -> None:
         loaded = dataset.load(frame_id)
         loaded = replace(loaded, frame=loaded.frame.to(args.device), detections=loaded.detections.to(args.device))
         trials += trials_of_frame(refiner, loaded, cells, args.seed)
-        write_text(args.out / "convergence_basin.csv", csv_text(trials))
         print(f"{number}/{len(dataset)} {frame_id}: {sum(t.success for t in trials)}/{len(trials)}", file=sys.stderr)
     table = success_table(trials, args.positions, args.yaws)
     report = markdown_table(table, args.positions, args.yaws, len(trials) // max(1, len(cells)))
     write_text(args.out / "convergence_basin.md", report)
     print(report)
-    write_bytes(args.out / "convergence_basin.png", plot_png(table, args.positions, args.yaws))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

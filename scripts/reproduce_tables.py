@@ -4,7 +4,7 @@
     python scripts/reproduce_tables.py pose          # AP before and after: ours, the geometric baseline, both together
     python scripts/reproduce_tables.py shape         # completeness, accuracy, F1 and RMSE over tau
     python scripts/reproduce_tables.py ablation      # scripts/paper_tables/ablation_rows.py, row by row
-    python scripts/reproduce_tables.py detectors     # every detector, and counterparts of the paper's four
+    python scripts/reproduce_tables.py detectors     # every detector
 
 Which folders a data set has: scripts/paper_tables/data_sets.py. Written to --out: NAME.md, NAME_*.csv, plots,
 NAME_manifest.json (options, seeds, versions, hashes of the runs), and under runs/ every refinement, as `directshape
@@ -79,13 +79,11 @@ def run(args: argparse.Namespace) -> None:
     torch.set_num_threads(args.threads)
     data_sets = chosen_data_sets(args)
     fields = {d.name: stereo_field(d, args.stereo_bias, args.table, args.out / "fields") for d in data_sets}
-    root = Path(args.data or os.environ["DIRECTSHAPE_DATA"])
-    meshes = args.meshes or (root / "meshes" if (root / "meshes").is_dir() else None)
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
-    for name in ("data", "out", "masks", "meshes"):
+    for name in ("data", "out", "masks"):
         # Results do not depend on where the files lie.
         options.pop(name)
-    refinery = Refinery(args.out, fields, meshes, args.device)
+    refinery = Refinery(args.out, fields, args.device)
     experiment = Experiment(
         data_sets=data_sets,
         refinery=refinery,
@@ -95,7 +93,6 @@ def run(args: argparse.Namespace) -> None:
         bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
         seed=args.seed,
         quick=args.quick,
-        skipped_rows=tuple(args.skip_rows),
         only_groups=tuple(args.groups),
     )
     try:
@@ -115,14 +112,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--detections", nargs="+", metavar="NAME", help="folders of detections/; default the table's")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
     parser.add_argument("--masks", type=Path, metavar="DIR", help="instead of the data set's own")
-    parser.add_argument("--meshes", type=Path, metavar="DIR", help="real car meshes; default ROOT/meshes")
     parser.add_argument(
         "--stereo-bias", default="auto", metavar="FILE|auto|none", help="auto fits it, where all frames are of one rig"
     )
     parser.add_argument("--quick", action="store_true", help="two frames of each detector, one row of each group")
-    parser.add_argument(
-        "--skip-rows", nargs="+", default=[], metavar="NAME", help="rows of the ablation to leave out, such as dense"
-    )
     parser.add_argument(
         "--groups",
         nargs="+",

@@ -24,7 +24,7 @@ _FORMATS = ("glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun")
 _DESCRIPTION = """
 Write the finished frames of an output folder of 'directshape refine' for other programs: surfaces as GLB or PLY and
 points as PLY, coloured by the left image, boxes as KITTI, COCO-3D or nuScenes files, and all of it as a recording for
-Rerun's viewer. OUT itself is only read. docs/exports.md says what is in which frame.
+Rerun's viewer. OUT itself is only read. docs/outputs.md says what is in which frame.
 """
 
 

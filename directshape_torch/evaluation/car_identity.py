@@ -18,7 +18,7 @@ from directshape_torch.files import atomic_files
 from directshape_torch.files.read_files import read_json
 
 TRACKS_SCHEMA_VERSION = 1
-_CURE = "write it with scripts/link_kitti_tracks.py"
+_CURE = "see --tracks in docs/file_formats.md"
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from directshape_torch.export.rerun_recording import RerunExporter
 from directshape_torch.export.run_folder import RunFolder
 
 ExportFormat = Literal["glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun"]
-"""What `export_run` can write (docs/exports.md)."""
+"""What `export_run` can write (docs/outputs.md)."""
 
 _FRAMEWISE = {
     "glb": exporters.write_glb,
@@ -32,7 +32,7 @@ def export_run(
     inputs: ExportInputs,
     observer: RunObserver | None = None,
 ) -> None:
-    """Write the finished frames of a run in other formats (docs/exports.md). The run itself is only read.
+    """Write the finished frames of a run in other formats (docs/outputs.md). The run itself is only read.
 
     Args:
         run: which frames of which output folder.

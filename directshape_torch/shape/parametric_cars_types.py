@@ -107,7 +107,7 @@ class BodyTypeStatistics:
 
 
 # Typical measures of passenger cars of each class, adjusted by hand to how the resulting prior fits real cars
-# (scripts/judge_prior.py); no single model. The shares make the
+# (`directshape inspect --prior FILE --meshes DIR`); no single model. The shares make the
 # mixture's length, width and height those of KITTI's labelled cars (3.88, 1.63, 1.53 m).
 _STATISTICS: Mapping[str, BodyTypeStatistics] = {
     "city": BodyTypeStatistics(

@@ -37,7 +37,6 @@ _SAMPLINGS = {
         "both rounds in the right image too": "adaptive",
         "round one only": "round_one",
         "uniform": "uniform",
-        "dense": "dense",
     }.items()
 }
 
@@ -53,10 +52,8 @@ def _steps(coarse: int, fine: int, over_relaxation: float) -> tuple[str, ...]:
 
 _STEPS = {
     "6 and 6 plain steps": _steps(6, 6, 1.0),
-    "10 and 12 plain steps": _steps(10, 12, 1.0),
     "10 and 12 over-relaxed steps": _steps(10, 12, 1.6),
     "30 and 30 plain steps": _steps(30, 30, 1.0),
-    "10 and 12 plain steps, both rounds in both images": (*_steps(10, 12, 1.0), "sampling.mode_right=as_left"),
 }
 
 
@@ -85,7 +82,7 @@ _EXPOSURES: tuple[Exposure, ...] = ("flatter", "vignetted")
 
 _RAYS = {
     "marched at every state": ("solver.rays=marched",),
-    "followed, converged below a decrease of 1e-4": ("solver.cost_tolerance=0.0001",),
+    "tracked, converged below a decrease of 1e-4": ("solver.cost_tolerance=0.0001",),
     "marched, converged below a decrease of 1e-4": ("solver.rays=marched", "solver.cost_tolerance=0.0001"),
 }
 
@@ -131,7 +128,6 @@ ROWS: tuple[Row, ...] = (
     Row("shape", "mean shape, pose only", Settings((f"stages=[{_COARSE_POSE}, {_FINE_POSE}]",))),
     *(Row("shape", f"K = {number}", Settings(prior=f"pca:{number}")) for number in (1, 2, 3, 5)),
     Row("prior", "network (neural)", Settings(prior="neural")),
-    Row("prior", "built from real meshes, K = 5", Settings(prior="meshes")),
     Row("masks", "degraded", Settings(masks="degraded")),
     *(Row("masks", f"trusted to {1 - floor:g} only", Settings(_floor(floor))) for floor in _FLOORS),
     *(

@@ -18,11 +18,10 @@ from directshape_torch.io.kitti_labels import read_objects
 from paper_tables.ablation_rows import REFERENCE, ROWS, Row
 from paper_tables.data_sets import DataSet
 from paper_tables.experiment import Experiment, share_percent
-from paper_tables.plots import IntervalLine, write_interval_plot
 from paper_tables.refinements import Run
 from paper_tables.report import Table, few_cars_note, interval
 from paper_tables.settings import DEFAULT
-from paper_tables.simulated_detector import NoiseModel, write_detections
+from paper_tables.simulated_detector import write_detections
 
 CENTRE_LIMIT_M, YAW_LIMIT_DEG = 0.2, 3.0
 _COLUMNS = ("group", "", "n", "input", "BEV IoU, mean", "against default", "worse", "reached", "iterations", "time")
@@ -52,8 +51,6 @@ def make_ablation_table(experiment: Experiment, rows: tuple[Row, ...] = ROWS) ->
         experiment.report.add(_table(data_set, main, judged))
         csv_rows += [_csv_row(data_set, entry) for entry in judged]
         experiment.report.write_csv("rows", csv_rows)
-        lines = [IntervalLine(f"{e.row.group}: {e.row.name}", _after(e), e.row is REFERENCE) for e in judged]
-        write_interval_plot(experiment.plots / f"ablation_{data_set.name}.png", lines, data_set.name, "BEV IoU, mean")
 
 
 def _main_detections(experiment: Experiment, data_set: DataSet) -> Path | None:
@@ -80,16 +77,12 @@ def _judge_all(experiment: Experiment, data_set: DataSet, main: Path, rows: tupl
 
 def _why_not(experiment: Experiment, data_set: DataSet, row: Row) -> str:
     """Why a row says nothing about a data set; empty where it does."""
-    if row.name in experiment.skipped_rows:
-        return "by --skip-rows"
     if experiment.only_groups and row is not REFERENCE and row.group not in experiment.only_groups:
         return "by --groups"
     if not row.settings.with_field and experiment.refinery.fields.get(data_set.name) is None:
         return "no residual disparity field"
     if row.settings.masks == "degraded" and data_set.masks_degraded is None:
         return "no degraded masks"
-    if row.settings.prior == "meshes" and experiment.refinery.meshes is None:
-        return "no car meshes beside the data sets"
     if row.start == "mono" and not any("mono" in name for name in data_set.detections):
         return "no mono-like detections"
     return ""
@@ -105,7 +98,7 @@ def _start(experiment: Experiment, data_set: DataSet, main: Path, start: str) ->
         raise InputError("start", "main, mono or noise:SCALE", start)
     labels = {frame_id: read_objects(data_set.labels / f"{frame_id}.txt") for frame_id in data_set.frames_of(main)}
     folder = experiment.refinery.out / "simulated" / data_set.name / f"noise-{scale}-seed{experiment.seed}"
-    return write_detections(folder, labels, NoiseModel(float(scale), 1.0, 1.0, experiment.seed))
+    return write_detections(folder, labels, float(scale), experiment.seed)
 
 
 def _judge(experiment: Experiment, data_set: DataSet, start: Path, row: Row) -> Judged:

@@ -18,11 +18,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from link_kitti_tracks import link_drive
-
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks
 from directshape_torch.evaluation.shape_error_scores import TruthKind
+from paper_tables.physical_cars import link_drive
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,6 @@ class Experiment:
         bootstrap: of the intervals.
         seed: of simulated detections.
         quick: a few frames and rows, to try everything.
-        skipped_rows: names of rows of the ablation to leave out.
         only_groups: the groups of the ablation to run beside the reference; empty for all.
     """
 
@@ -41,7 +40,6 @@ class Experiment:
     bootstrap: BootstrapSettings
     seed: int
     quick: bool
-    skipped_rows: tuple[str, ...] = ()
     only_groups: tuple[str, ...] = ()
 
     @property

@@ -78,7 +78,6 @@ class Refinery:
     Attributes:
         out: folder of everything that the tables write.
         fields: residual disparity field by data set, or None.
-        meshes: folder of real car meshes, or None.
         device: of the refiner.
         used: folder of each run that was asked for, for the record.
         runs: those of this call, by folder and frames.
@@ -86,7 +85,6 @@ class Refinery:
 
     out: Path
     fields: dict[str, Path | None]
-    meshes: Path | None = None
     device: str = "auto"
     used: list[Path] = field(default_factory=list)
     runs: dict[tuple[Path, tuple[str, ...]], Run] = field(default_factory=dict)
@@ -97,7 +95,7 @@ class Refinery:
         Raises:
             DirectShapeError: unusable settings or files; a folder whose files have changed since.
         """
-        prior = prior_for(settings.prior, self.meshes, self.out / "priors")
+        prior = prior_for(settings.prior)
         refiner = DirectShapeRefiner(prior, load_config(settings.config, settings.all_overrides))
         refiner = refiner.to(find_device(self.device))
         dataset = ExposedDataset(

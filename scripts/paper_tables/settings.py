@@ -19,7 +19,7 @@ class Settings:
     Attributes:
         overrides: `key=value`, as for `directshape refine --set`.
         config: bundled settings that they change.
-        prior: "pca", "neural", "pca:K" (its first K components), "meshes" (built from real car meshes), or a file.
+        prior: "pca", "neural", "pca:K" (its first K components), or a file.
         masks: "true" (the data set's own), "left" (those of the left images alone), "boxes" (the detector's 2D boxes,
             filled) or "degraded".
         with_field: use the residual disparity field where there is one.

@@ -11,16 +11,12 @@ import numpy as np
 import pytest
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.kitti_folder import write_data_set
-from helpers.priors import prior_of
 
 from directshape_torch.cli.main import main
 from directshape_torch.io.result_files import SHAPES_SCHEMA_VERSION
 from directshape_torch.io.run_manifest import MANIFEST_SCHEMA_VERSION
-from directshape_torch.shape.kernel_pca_prior import SCHEMA as KERNEL_SCHEMA
-from directshape_torch.shape.neural_prior import SCHEMA as NEURAL_SCHEMA
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.prior_file import SCHEMA as PRIOR_SCHEMA
-from directshape_torch.shape.tensor_file import read_tensors
 from directshape_torch.status import Status
 
 TEXT = (Path(__file__).parent.parent.parent / "docs" / "file_formats.md").read_text(encoding="utf-8")
@@ -89,21 +85,6 @@ def test_prior(tmp_path: Path) -> None:
         assert table_names(text) == set(file.files)
     for field in fields(PriorProvenance):
         assert f"`{field.name}`" in text
-
-
-@pytest.mark.parametrize(
-    ("heading", "kind", "schema"),
-    [("Neural prior", "neural", NEURAL_SCHEMA), ("Kernel PCA prior", "kernel_pca", KERNEL_SCHEMA)],
-)
-def test_priors_of_other_kinds(heading: str, kind: str, schema: str, tmp_path: Path) -> None:
-    text = section(heading)
-    assert schema in text
-    prior = prior_of(kind)
-    prior.save(tmp_path / "prior.safetensors")
-    tensors, description = read_tensors(tmp_path / "prior.safetensors", schema)
-    assert all(f"`{name}`" in text for name in description)
-    written = {re.sub(r"^subspace\..*", "subspace.*", re.sub(r"\d+", "i", name)) for name in tensors}
-    assert table_names(text) == written
 
 
 def test_disparity_field() -> None:

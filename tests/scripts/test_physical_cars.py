@@ -3,10 +3,11 @@
 import os
 from pathlib import Path
 
-import link_kitti_tracks as script
 import pytest
+from paper_tables.physical_cars import link_drive
 
-from directshape_torch.evaluation.car_identity import CarIdentity, read_tracks
+from directshape_torch.errors import DataFormatError
+from directshape_torch.evaluation.car_identity import CarIdentity
 
 
 def _tracking_line(frame: int, track: int, x: float, z: float) -> str:
@@ -25,24 +26,22 @@ def test_frames_and_cars_are_found(tmp_path: Path):
     known = [f"{box} -4.00 1.90 30.00 -1.54", f"{box} 9.00 1.90 9.00 0", f"{box} 1.30 1.90 19.50 -1.54"]
     (training / "label_2" / "000123.txt").write_text("\n".join(known) + "\n")
     (training / "label_2" / "000124.txt").write_text(f"{box} 1.30 1.90 19.60 -1.54\n")
-    out = tmp_path / "tracks.json"
-    assert script.main(["--object", str(training), "--tracking", str(sequence), "--out", str(out)]) == 0
-    assert read_tracks(out).identities == {
+    assert link_drive(training, sequence) == {
         ("000123", 1): CarIdentity("0042/8", "0042"),
         ("000123", 3): CarIdentity("0042/3", "0042"),
     }
 
 
-def test_a_damaged_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_a_damaged_file_is_named(tmp_path: Path):
     (tmp_path / "label_02.txt").write_text("Car 0 0\n")
-    assert script.main(["--object", str(tmp_path), "--tracking", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
-    assert "label_02.txt, line 1: does not start with a frame number" in capsys.readouterr().err
+    with pytest.raises(DataFormatError, match=r"label_02\.txt, line 1: does not start with a frame number"):
+        link_drive(tmp_path, tmp_path)
 
 
 @pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: KITTI frames needed")
 def test_far_drive():
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
-    identities = script.link_drive(root / "training", root / "tracking" / "0005")
+    identities = link_drive(root / "training", root / "tracking" / "0005")
     assert len({frame for frame, _ in identities}) == 15
     # The data's own table: object frame 000516 is tracking frame 11; its cars 0, 1, 3 (from 0) are tracks 0, 1, 31.
     assert [identities["000516", line].car for line in (1, 2, 4)] == ["0005/0", "0005/1", "0005/31"]

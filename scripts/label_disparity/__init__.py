@@ -1,1 +1,0 @@
-"""How far labels and images disagree in disparity, car by car (see judge_label_disparity.py)."""
