@@ -94,7 +94,7 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
     Raises:
         CompilationError: in mode "on" where there is no working C++ compiler.
 
-    Example:
+    Examples:
         >>> with compiling("auto", num_cars=1):
         ...     will_compile(torch.ones(2))  # one car is not worth it
         False
@@ -116,7 +116,7 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
 def cars_ahead(num_cars: int) -> Iterator[None]:
     """Tell the `compiling` regions inside how many cars their job has in all, at least roughly.
 
-    Example:
+    Examples:
         >>> with cars_ahead(5000), compiling("off", num_cars=7):
         ...     pass
     """
@@ -148,7 +148,7 @@ def _is_fit(tensor: Tensor) -> bool:
 def num_forms() -> int:
     """How many forms of functions this process has compiled, or loaded from the disk.
 
-    Example:
+    Examples:
         >>> num_forms()
         0
     """
@@ -159,7 +159,7 @@ def num_forms() -> int:
 def compiler_problem() -> str | None:
     """Why nothing can be compiled here, or None if it can; tried once with a function of one line.
 
-    Example:
+    Examples:
         >>> problem = compiler_problem()
         >>> problem is None or isinstance(problem, str)
         True
@@ -243,7 +243,7 @@ def compilable(sizes: Mapping[str, int]) -> Callable[[Callable[_P, _R]], Compila
     Raises:
         CompilationError: by the marked function, in mode "on", where its first compilation fails.
 
-    Example:
+    Examples:
         >>> @compilable(sizes={"points": 0})
         ... def distances(points: torch.Tensor) -> torch.Tensor:
         ...     return points.norm(dim=-1)

@@ -40,7 +40,7 @@ def setting(default: _T, description: str, **limits: Unpack[Limits]) -> _T:
 def limits_in_words(limits: Mapping[str, float | str], group: Settings | None = None) -> str:
     """Such as "above 0 and at most 1"; of a group, with the values of its settings that are limits of others.
 
-    Example:
+    Examples:
         >>> limits_in_words({"at_least": "min_pixels"}, SamplingConfig())
         'at least min_pixels = 400'
     """

@@ -33,7 +33,7 @@ def config_from_mapping(cls: type[_GroupT], mapping: Mapping[str, Any], where: s
     Raises:
         ConfigError: an unknown key (naming the nearest one), or a value of the wrong kind or out of range.
 
-    Example:
+    Examples:
         >>> config_from_mapping(RefinerConfig, {"silhouette": {"weight": 6}}).silhouette.weight
         6.0
     """
@@ -124,7 +124,7 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
     Raises:
         ConfigError: unreadable file, unknown key, a value of the wrong kind or out of range; names file and overrides.
 
-    Example:
+    Examples:
         >>> load_config(None, ["solver.max_code=2.5"]).solver.max_code
         2.5
         >>> load_config("paper").silhouette.form
@@ -176,7 +176,7 @@ def _override(mapping: dict[str, Any], override: str) -> None:
 def config_to_mapping(config: Any) -> Any:
     """Nested plain values of a configuration, for YAML, JSON and hashes.
 
-    Example:
+    Examples:
         >>> config_to_mapping(RefinerConfig())["stages"][0]["image_level"]
         1
     """

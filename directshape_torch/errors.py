@@ -79,7 +79,7 @@ class MissingDependencyError(DirectShapeError, ImportError):
 def shortened(text: str, most: int = _LONGEST_PART) -> str:
     """A text whose middle is left out where it is longer than `most` characters.
 
-    Example:
+    Examples:
         >>> shortened("abcdefghijklmnopqrstuvwxyz", 16)
         'abcdefgh .. wxyz'
     """

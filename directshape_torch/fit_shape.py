@@ -65,7 +65,7 @@ def fit_shape(
     Raises:
         InputError: other shapes or types.
 
-    Example:
+    Examples:
         >>> ring = torch.linspace(0, 2 * math.pi, 200)
         >>> points = torch.stack([2.0 * ring.cos(), 0.8 * ring.sin(), torch.full_like(ring, -0.9)], dim=1)
         >>> fit = fit_shape(points, torch.tensor([[0.0, 0.0, -1.6, 4.2, 1.7, 1.5, 0.0]]))

@@ -457,7 +457,7 @@ def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: T
 def method_stages(config: RefinerConfig) -> list[StageConfig]:
     """The stages of `config.method`: rounds of its own for "geometric", else those of the configuration.
 
-    Example:
+    Examples:
         >>> from directshape_torch.config_files import load_config
         >>> stages = method_stages(load_config(None, ["method=geometric", "point_cloud.rounds=2"]))
         >>> [stage.unknowns for stage in stages]

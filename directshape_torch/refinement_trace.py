@@ -135,7 +135,7 @@ def _ends(minimum: Minimum[CarState]) -> list[CarState]:
 def without_photometry(refiner: DirectShapeRefiner) -> DirectShapeRefiner:
     """The same refiner with silhouettes and priors alone, whose poses drift (paper, fig. of the projection's drift).
 
-    Example:
+    Examples:
         >>> without_photometry(DirectShapeRefiner()).config.photometric.weight
         0.0
     """

@@ -64,7 +64,7 @@ class DirectShapeRefiner(nn.Module):
         InputError: a prior without the members or derivatives that `ShapePrior` lists; settings that are no
             `RefinerConfig`; extra terms for the method "box_alignment".
 
-    Example:
+    Examples:
         >>> refiner = DirectShapeRefiner()
         >>> refiner.prior.num_codes == refiner.prior.basis.shape[-1]
         True

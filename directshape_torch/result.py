@@ -87,7 +87,7 @@ class RefinementResult(CarRecord):
         prior: the shapes.
         has_shape: the shape was refined, so that boxes are measured on it; False for the method "box_alignment".
 
-    Example:
+    Examples:
         >>> import pathlib
         >>> import directshape_torch as ds
         >>> from directshape_torch.io.kitti_dataset import KittiStereoDataset

@@ -66,7 +66,7 @@ class Rows(NamedTuple):
     def of_sorted(cls, car: Tensor, num_cars: int) -> Rows:
         """Blocks of rows whose cars (P,) ascend.
 
-        Example:
+        Examples:
             >>> rows = Rows.of_sorted(torch.tensor([0, 0, 2]), 3)
             >>> rows.blocks.owner, rows.row[:, :3]
             (tensor([0, 2]), tensor([[0, 1, 0],
@@ -101,7 +101,7 @@ class CarSums(NamedTuple):
     def of(cls, owner: Tensor, num_cars: int) -> CarSums:
         """Of blocks of cars (M,).
 
-        Example:
+        Examples:
             >>> CarSums.of(torch.tensor([0, 2, 0]), 3)
             CarSums(by_car=tensor([0, 2, 1]), first=tensor([0, 2, 2]))
         """
@@ -111,7 +111,7 @@ class CarSums(NamedTuple):
     def sum(self, table: Tensor, weight: Tensor | None = None) -> Tensor:
         """Sums (B, ...) of the entries (M, ...) of each car, times weights (M,); no entry enters another car's sum.
 
-        Example:
+        Examples:
             >>> CarSums.of(torch.tensor([0, 2, 0]), 3).sum(torch.tensor([1.0, 2.0, 4.0]))
             tensor([5., 0., 2.])
         """

@@ -103,7 +103,7 @@ class StereoCamera(TensorRecord):
             InputError: other shapes or types, intrinsics that are not `[[fx, s, cx], [0, fy, cy], [0, 0, 1]]` with
                 positive focal lengths, or a baseline that is not above 0.
 
-        Example:
+        Examples:
             >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
             >>> StereoCamera.from_intrinsics(K, 0.54).baseline
             tensor([0.5400])
@@ -131,7 +131,7 @@ class StereoCamera(TensorRecord):
             InputError: wrong shapes or types, a K that has no inverse, or a right camera that is not to the right of
                 the left one.
 
-        Example:
+        Examples:
             >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
             >>> shift = torch.tensor([[-378.0], [0.0], [0.0]])
             >>> P_left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
@@ -175,7 +175,7 @@ class StereoCamera(TensorRecord):
                 cameras that are not rectified (turned by more than 1e-4 radians, or displaced by more than 5 % of the
                 baseline in height or depth), or a right camera that is not to the right of the left one.
 
-        Example:
+        Examples:
             >>> K, T_right_cam = torch.eye(4)[None], torch.eye(4)[None].clone()
             >>> K[0, 0, 0] = K[0, 1, 1] = 700.0
             >>> T_right_cam[0, 0, 3] = -0.54
@@ -246,7 +246,7 @@ class GroundPlane(TensorRecord):
         Raises:
             InputError: a height that is not above 0, or infinite.
 
-        Example:
+        Examples:
             >>> GroundPlane.from_camera_height(1.65).offset
             tensor([1.6500])
         """
@@ -320,7 +320,7 @@ class FrameBatch(TensorRecord):
         Raises:
             InputError: what the class raises.
 
-        Example:
+        Examples:
             >>> K = torch.tensor([[700.0, 0.0, 200.0], [0.0, 700.0, 60.0], [0.0, 0.0, 1.0]])
             >>> image = torch.zeros(3, 120, 400, dtype=torch.uint8)
             >>> frames = FrameBatch.from_images(image, image, StereoCamera.from_intrinsics(K, 0.54), ground=1.65)
@@ -468,7 +468,7 @@ class Detections(TensorRecord):
             InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, corners that make no box, and what the class
                 raises.
 
-        Example:
+        Examples:
             >>> boxes = torch.tensor([[1.0, 0.85, 20.0, 4.0, 1.6, 1.5, 0.3]])
             >>> mask = torch.zeros(1, 120, 400, dtype=torch.uint8)
             >>> mask[0, 50:80, 100:180] = 255

@@ -16,7 +16,7 @@ from directshape_torch.shape.shape_prior import ShapePrior
 def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
     """The sha256 (hexadecimal) of named tensors: name, shape and values as float64, little-endian, in order of name.
 
-    Example:
+    Examples:
         >>> hash_tensors({"a": torch.zeros(2)}) == hash_tensors({"a": torch.zeros(2, dtype=torch.float64)})
         True
     """

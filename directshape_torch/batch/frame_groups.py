@@ -35,7 +35,7 @@ def frame_groups(frame_ids: Sequence[str], size: int, finished: Collection[str])
     A group of which some frames are finished is refined as a whole again, so that the others get the bytes that they
     would have got without the interruption.
 
-    Example:
+    Examples:
         >>> [group.frame_ids for group in frame_groups("abcde", 2, finished={"a", "b", "c"})]
         [('c', 'd'), ('e',)]
     """

@@ -56,7 +56,7 @@ class Journal:
         out_dir: the output folder.
         run_id: of the run, so that the journals of one run can be told from those of another.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> folder = Path(tempfile.mkdtemp())
         >>> Journal(folder, "r1").add(FrameRecord("000107", {}, {"state": "done"}))

@@ -23,7 +23,7 @@ class RefineOptions:
     Raises:
         InputError: an unknown mesh format, or a batch without frames.
 
-    Example:
+    Examples:
         >>> RefineOptions(meshes="ply", overlays=True).outputs
         ('data', 'shapes', 'meshes_ply', 'overlays')
     """
@@ -59,7 +59,7 @@ class WorkerOptions:
     Raises:
         InputError: less than one worker or thread, or negative retries.
 
-    Example:
+    Examples:
         >>> WorkerOptions(workers=4).threads_per_worker
         1
         >>> WorkerOptions().in_this_process

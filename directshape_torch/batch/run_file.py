@@ -122,7 +122,7 @@ def versions() -> dict[str, str]:
 def digit_warnings(before: RunFile | None, now: RunFile) -> tuple[str, ...]:
     """What differs from the previous run so that the last digits of further results may differ too.
 
-    Example:
+    Examples:
         >>> run = RunFile("r", "finished", 0.0, {"torch": "2.13.0"}, "x", {}, {"threads": 1}, 5)
         >>> digit_warnings(run, replace(run, work={"threads": 2}))
         ('threads: 1 in the previous run, 2 now; the last digits of results may differ',)

@@ -56,7 +56,7 @@ def count_statuses(frames: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
 def find_warnings(frames: Mapping[str, Mapping[str, Any]], classes: Sequence[str]) -> tuple[str, ...]:
     """Signs that a run was given the wrong things.
 
-    Example:
+    Examples:
         >>> find_warnings({"000001": {"state": "done", "lines": 2, "cars": 0, "statuses": {}}}, ["Car"])
         ('none of the 2 input lines is of class Car with a 3D box: nothing was refined',)
     """

@@ -54,7 +54,7 @@ def check_dataset(
 def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
     """At most `count` of the frames, evenly spread, the first among them.
 
-    Example:
+    Examples:
         >>> spread("abcdefgh", 3)
         ('a', 'c', 'f')
     """

@@ -15,7 +15,7 @@ from directshape_torch.errors import InputError
 class CarRecord:
     """Base of frozen dataclasses of tensors (B, ...), of such records, and of words and other values.
 
-    Example:
+    Examples:
         >>> from dataclasses import dataclass
         >>> @dataclass(frozen=True)
         ... class Depths(CarRecord):
@@ -105,7 +105,7 @@ class CarRecord:
 def placed(values: Tensor, rows: Tensor, count: int) -> Tensor:
     """Figures (R, ...) of the cars `rows` (R,), ascending, among `count` cars; NaN for the others.
 
-    Example:
+    Examples:
         >>> placed(torch.tensor([5.0]), torch.tensor([1]), 2)
         tensor([nan, 5.])
     """
@@ -117,7 +117,7 @@ def placed(values: Tensor, rows: Tensor, count: int) -> Tensor:
 def kept(values: Tensor, condition: Tensor) -> Tensor:
     """The figures (B, ...) of cars where the condition (B,) holds, NaN elsewhere.
 
-    Example:
+    Examples:
         >>> kept(torch.tensor([4.0, 5.0]), torch.tensor([True, False]))
         tensor([4., nan])
     """

@@ -125,7 +125,7 @@ def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
     Raises:
         InputError: no positive range and step, or a range below two steps.
 
-    Example:
+    Examples:
         >>> profile_offsets(1.0, 0.5)
         tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
     """
@@ -247,7 +247,7 @@ def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> Pro
         cost: (B, n).
         num_pixels: (B,) whose mean the cost is.
 
-    Example:
+    Examples:
         >>> offsets = profile_offsets()
         >>> figures = profile_figures(offsets, 2 + (offsets - 0.4)[None] ** 2, torch.tensor([100.0]))
         >>> figures.offset_px, figures.sigma_px, figures.in_basin

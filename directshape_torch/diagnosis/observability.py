@@ -35,7 +35,7 @@ def without_offset(information: Tensor, num_kept: int) -> Tensor:
 
     Schur's complement; an offset of which nothing is known has nothing to share.
 
-    Example:
+    Examples:
         >>> without_offset(torch.tensor([[[2.0, 1.0], [1.0, 1.0]]]), 1)
         tensor([[[1.]]])
     """
@@ -106,7 +106,7 @@ class Observability(CarRecord):
     def words(self) -> list[str]:
         """The weakest direction of each car, largest part first; empty for cars that were not refined.
 
-        Example:
+        Examples:
             >>> direction = torch.tensor([0.45, 0.0, 0.0, 0.0, 0.89, 0.0, 0.0]).expand(1, 7, 7)
             >>> Observability(torch.full((1, 7), 0.6), direction, torch.tensor([-math.pi / 2])).words()
             ['rear view: length and depth trade 1 to 0.5 (sigma 0.60 m)']
@@ -121,7 +121,7 @@ class Observability(CarRecord):
 def view_in_words(alpha_rad: float) -> str:
     """From where a car is seen at KITTI's observation angle, in steps of 45 degrees.
 
-    Example:
+    Examples:
         >>> [view_in_words(math.radians(a)) for a in (-90, -50, 0, 90)]
         ['rear view', 'rear quarter view', 'side view', 'front view']
     """
@@ -136,7 +136,7 @@ def view_in_words(alpha_rad: float) -> str:
 def direction_in_words(direction: Sequence[float]) -> str:
     """The largest parts of a direction (7,); a minus says that the one falls as the other grows.
 
-    Example:
+    Examples:
         >>> direction_in_words([0.0, 0.02, 0.0, 0.0, 0.1, 0.99, 0.0])
         'width alone'
     """

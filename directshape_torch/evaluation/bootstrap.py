@@ -28,7 +28,7 @@ class Estimate:
 def weighted_mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of `values` (N,) under each row of `weights` (R, N): (R,).
 
-    Example:
+    Examples:
         >>> weighted_mean(np.array([1.0, 4.0]), np.array([[1.0, 1.0], [2.0, 1.0]]))
         array([2.5, 2. ])
     """
@@ -38,7 +38,7 @@ def weighted_mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """Median of `values` (N,) under each row of `weights` (R, N): (R,); between two middle values their mean.
 
-    Example:
+    Examples:
         >>> weighted_median(np.array([3.0, 1.0, 2.0, 10.0]), np.array([[1.0, 1.0, 1.0, 1.0], [3.0, 1.0, 0.0, 0.0]]))
         array([2.5, 3. ])
     """
@@ -65,7 +65,7 @@ class CarBootstrap:
     Raises:
         InputError: no rows, shapes that differ, or a setting out of range.
 
-    Example:
+    Examples:
         >>> boot = CarBootstrap(np.array([0, 0, 1, 2]), seed=0)
         >>> boot.estimate(np.array([1.0, 1.0, 1.0, 1.0]), weighted_mean)
         Estimate(value=1.0, low=1.0, high=1.0)

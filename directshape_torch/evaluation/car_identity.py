@@ -42,7 +42,7 @@ class CarTracks:
     def identity(self, frame_id: str, label_line: int) -> CarIdentity:
         """The car of a label line; a label that is not listed is a car of its own.
 
-        Example:
+        Examples:
             >>> CarTracks({}).identity("000007", 2)
             CarIdentity(car='000007:2', drive=None)
         """

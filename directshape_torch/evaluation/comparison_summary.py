@@ -126,7 +126,7 @@ def summarise(
         settings: of the confidence intervals.
         cars_weigh_equally: one vote for each physical car, instead of one for each detection.
 
-    Example:
+    Examples:
         >>> summarise("nothing", [], BootstrapSettings()).num_detections
         0
     """

@@ -54,7 +54,7 @@ class BoxTable:
 def make_box_table(frames: Sequence[Sequence[KittiObject]]) -> BoxTable:
     """The objects of each frame as one table.
 
-    Example:
+    Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
         >>> from directshape_torch.files.text_files import Line
         >>> car = parse_object("labels", Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.6 20 0", ""))

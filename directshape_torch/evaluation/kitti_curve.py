@@ -87,7 +87,7 @@ def score_thresholds(scores: Floats, num_labels: int) -> Floats:
     Returns:
         At most 41 scores, falling; fewer than 41 labels give no more scores than labels.
 
-    Example:
+    Examples:
         >>> score_thresholds(np.array([0.2, 0.9]), num_labels=3)
         array([0.9, 0.2])
     """
@@ -107,7 +107,7 @@ def score_thresholds(scores: Floats, num_labels: int) -> Floats:
 def average_precision(sampled: Floats, recall_points: Literal[11, 40]) -> float:
     """Mean, in percent, of a curve (41,) over 11 recall points (0, 0.1 .. 1) or over 40 (without 0).
 
-    Example:
+    Examples:
         >>> average_precision(np.ones(41), recall_points=40), average_precision(np.eye(41)[0], recall_points=40)
         (100.0, 0.0)
     """

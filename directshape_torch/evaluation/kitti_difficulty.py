@@ -43,7 +43,7 @@ DIFFICULTIES = (Difficulty("easy", 40, 0, 0.15), Difficulty("moderate", 25, 1, 0
 def neighbour_of(object_type: str) -> str | None:
     """The class whose labels are ignored when `object_type` is judged, in lower case, or None.
 
-    Example:
+    Examples:
         >>> neighbour_of("Car")
         'van'
     """

@@ -34,7 +34,7 @@ class CountedLabels:
     def counts(self, label: KittiObject) -> bool:
         """Whether a label counts.
 
-        Example:
+        Examples:
             >>> from directshape_torch.io.kitti_labels import parse_object
             >>> from directshape_torch.files.text_files import Line
             >>> line = Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.6 20 0", "")
@@ -57,7 +57,7 @@ def box_iou_2d(
 ) -> Tensor:
     """Intersection over union (N, M) of image boxes (u_min, v_min, u_max, v_max), as areas in pixels.
 
-    Example:
+    Examples:
         >>> box_iou_2d(torch.tensor([[0.0, 0.0, 2.0, 2.0]]), torch.tensor([[1.0, 0.0, 3.0, 2.0]]))
         tensor([[0.3333]])
     """
@@ -82,7 +82,7 @@ def match_by_iou(
     Raises:
         InputError: `iou` is no matrix, or `minimum` is not within (0, 1].
 
-    Example:
+    Examples:
         >>> match_by_iou(torch.tensor([[0.9, 0.6], [0.8, 0.5], [0.1, 0.2]]))
         [0, 1, -1]
     """

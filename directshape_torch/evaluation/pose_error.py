@@ -39,7 +39,7 @@ class PoseErrors:
 def boxes_of(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64) -> Tensor:
     """Boxes (N, 7) of label or result lines: x, y, z of the bottom centre, height, width, length, rotation_y.
 
-    Example:
+    Examples:
         >>> boxes_of([]).shape
         torch.Size([0, 7])
     """
@@ -56,7 +56,7 @@ def pose_errors(
     Raises:
         InputError: a shape other than (N, 7), or two different N.
 
-    Example:
+    Examples:
         >>> true = torch.tensor([[0.0, 1.6, 10.0, 1.5, 1.7, 4.0, 0.0]])
         >>> found = torch.tensor([[0.3, 1.6, 10.4, 1.5, 1.7, 4.0, 3.1415927]])
         >>> errors = pose_errors(found, true)
@@ -80,7 +80,7 @@ def pose_errors(
 def box_centres(boxes: Tensor) -> Tensor:
     """Centres (*, 3) of boxes (*, 7) whose place is that of their bottom face; y points down.
 
-    Example:
+    Examples:
         >>> box_centres(torch.tensor([[0.0, 1.6, 10.0, 1.5, 1.7, 4.0, 0.0]]))
         tensor([[ 0.0000,  0.8500, 10.0000]])
     """

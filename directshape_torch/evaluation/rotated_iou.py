@@ -20,7 +20,7 @@ _BOX_LAYOUT = "columns are x, y, z (bottom centre), height, width, length, rotat
 def bev_boxes(boxes: Tensor) -> Tensor:
     """Footprints (*, 5) x, z, length, width, rotation_y of KITTI boxes (*, 7) x, y, z, height, width, length, yaw.
 
-    Example:
+    Examples:
         >>> bev_boxes(torch.tensor([[1.0, 1.6, 20.0, 1.5, 1.7, 4.0, 0.0]]))
         tensor([[ 1.0000, 20.0000,  4.0000,  1.7000,  0.0000]])
     """
@@ -39,7 +39,7 @@ def bev_iou(
     Raises:
         InputError: a shape other than (N, 5), or two different N.
 
-    Example:
+    Examples:
         >>> a = torch.tensor([[0.0, 10.0, 4.0, 2.0, 0.0]])
         >>> bev_iou(a, a + torch.tensor([2.0, 0.0, 0.0, 0.0, 0.0]))
         tensor([0.3333])
@@ -60,7 +60,7 @@ def iou_3d(
     Raises:
         InputError: a shape other than (N, 7), or two different N.
 
-    Example:
+    Examples:
         >>> a = torch.tensor([[0.0, 1.6, 10.0, 1.5, 2.0, 4.0, 0.3]])
         >>> iou_3d(a, a + torch.tensor([0.0, 0.75, 0.0, 0.0, 0.0, 0.0, 0.0]))
         tensor([0.3333])

@@ -84,7 +84,7 @@ def shape_error(
     Raises:
         InputError: no true points, a wrong shape, numbers that are not finite, or a tau that is not above 0.
 
-    Example:
+    Examples:
         >>> error = shape_error(np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 0, 0.3]]), taus_m=(0.2, 0.5))
         >>> error.completeness, error.accuracy, error.rmse_m
         (array([0. , 0.5]), array([0., 1.]), array([nan, 0.3]))

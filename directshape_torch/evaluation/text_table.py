@@ -11,7 +11,7 @@ from directshape_torch.evaluation.bootstrap import Estimate
 def align(rows: Sequence[Sequence[str]]) -> str:
     """Rows of equally many cells as lines with aligned columns, the first ruled off as the heading.
 
-    Example:
+    Examples:
         >>> print(align([["metric", "value"], ["F1", "0.5"]]))
         metric  value
         ------  -----
@@ -31,7 +31,7 @@ def number(unit: str, value: float, sign: bool = False) -> str:
         value: a share for "%"; what is not finite is a dash.
         sign: whether a positive figure has a plus.
 
-    Example:
+    Examples:
         >>> number("%", 0.125), number("m", 0.5, sign=True), number("", 0.75), number("m", math.nan)
         ('12.5 %', '+0.500 m', '0.750', '-')
     """
@@ -47,7 +47,7 @@ def number(unit: str, value: float, sign: bool = False) -> str:
 def with_interval(unit: str, estimate: Estimate, sign: bool = False) -> str:
     """An estimate as `number` writes it, and its interval in brackets where it has one.
 
-    Example:
+    Examples:
         >>> with_interval("%", Estimate(0.5, 0.25, 0.75))
         '50.0 % [25.0, 75.0]'
     """

@@ -134,7 +134,7 @@ def _projected_boxes(
 def image_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
     """KITTI's frame numbers as image ids, or 1, 2, .. where the ids are no numbers.
 
-    Example:
+    Examples:
         >>> image_numbers(["000107", "007322"])
         {'000107': 107, '007322': 7322}
     """

@@ -60,7 +60,7 @@ def car_extras(one: ExportedObject, frame: RefinedFrame) -> dict[str, Any]:
 def srgb_to_linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """Image colours as the linear ones (0..65535) that glTF asks for at vertices.
 
-    Example:
+    Examples:
         >>> srgb_to_linear(np.array([0, 188, 255], dtype=np.uint8)).tolist()
         [0, 32957, 65535]
     """

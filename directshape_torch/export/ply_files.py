@@ -36,7 +36,7 @@ def points_ply(
 ) -> bytes:
     """Points as PLY: x y z, normals where there are any, red green blue, `color_source` where it is known.
 
-    Example:
+    Examples:
         >>> content = points_ply(np.zeros((2, 3)), np.zeros((2, 3), np.uint8))
         >>> len(content.split(b"end_header" + bytes([10]), 1)[1])
         30

@@ -29,7 +29,7 @@ def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None
     Raises:
         OSError: the folder cannot be made or written; the old file, if any, is then untouched.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> folder = tempfile.mkdtemp()
         >>> write_bytes(Path(folder) / "a.txt", b"done")
@@ -52,7 +52,7 @@ def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
     Raises:
         OSError: the folder cannot be made or written.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> target = Path(tempfile.mkdtemp()) / "a.bin"
         >>> with replaced_file(target) as file:
@@ -95,7 +95,7 @@ def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
     Raises:
         ValueError: an array of Python objects, which would need pickle.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> file = Path(tempfile.mkdtemp()) / "a.npz"
         >>> write_npz(file, {"codes": np.zeros((2, 5))})

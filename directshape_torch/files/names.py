@@ -13,7 +13,7 @@ _MOST_BYTES = 200
 def check_frame_id(argument: str, frame_id: object) -> None:
     """Raise `InputError` unless a frame's name can be that of its files: printable, and one part of a path.
 
-    Example:
+    Examples:
         >>> check_frame_id("frames", "000107")
         >>> check_frame_id("frames", "../107")
         Traceback (most recent call last):
@@ -32,7 +32,7 @@ def check_frame_id(argument: str, frame_id: object) -> None:
 def is_frame_id(frame_id: object) -> bool:
     """Whether a frame's name can be that of its files.
 
-    Example:
+    Examples:
         >>> is_frame_id("000107"), is_frame_id("/etc/passwd"), is_frame_id("..")
         (True, False, False)
     """

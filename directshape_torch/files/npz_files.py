@@ -28,7 +28,7 @@ def read_npz(path: Path | str, cure: str = "") -> dict[str, NDArray[Any]]:
     Raises:
         DataFormatError: the file is missing, damaged, no npz, larger than 512 MiB unpacked, or holds Python objects.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> from directshape_torch.files.atomic_files import write_npz
         >>> file = Path(tempfile.mkdtemp()) / "a.npz"

@@ -30,7 +30,7 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the 
     Raises:
         DataFormatError: it is missing, cannot be read, is a folder, a pipe or a device, or larger than `most`.
 
-    Example:
+    Examples:
         >>> read_bytes("/dev/zero")
         Traceback (most recent call last):
         ...
@@ -90,7 +90,7 @@ def parse_json(path: Path | str, text: str | bytes, cure: str = "", problem: str
         DataFormatError: it is no JSON, nested too deeply, or holds a number that is not finite or has more than 18
             digits before its point.
 
-    Example:
+    Examples:
         >>> parse_json("a.json", "[1, 1e999]")
         Traceback (most recent call last):
         ...

@@ -20,7 +20,7 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
     Raises:
         DataFormatError: a field is missing, unknown, or not of its type; names file, field, type and value.
 
-    Example:
+    Examples:
         >>> from directshape_torch.batch.run_lock import LockOwner
         >>> record_of("a.json", LockOwner, {"host": "here", "pid": 7, "started_at": 0.5}).pid
         7

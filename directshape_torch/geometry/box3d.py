@@ -17,7 +17,7 @@ from directshape_torch.geometry.se3 import from_rotation_translation, transform
 def rotation_about_y(angle: Tensor) -> Tensor:
     """Rotation matrices (*, 3, 3) by angles (*,) in radians about the y axis, in KITTI's sense.
 
-    Example:
+    Examples:
         >>> rotation_about_y(torch.tensor(0.0))[0]
         tensor([1., 0., 0.])
     """
@@ -33,7 +33,7 @@ def pose_from_kitti(
 ) -> Tensor:
     """`T_a_obj` (*, 4, 4) of a KITTI box, in the frame a of its location (`ref` for labels and result files).
 
-    Example:
+    Examples:
         >>> pose_from_kitti(torch.tensor([1.0, 1.6, 20.0]), torch.tensor(0.3))[:3, 3]
         tensor([ 1.0000,  1.6000, 20.0000])
     """
@@ -43,7 +43,7 @@ def pose_from_kitti(
 def rotation_y_from_pose(T: Tensor) -> Tensor:
     """KITTI's heading (*,) of poses (*, 4, 4): `atan2(-R[2, 0], R[0, 0])`, the direction of the car's x axis.
 
-    Example:
+    Examples:
         >>> rotation_y_from_pose(pose_from_kitti(torch.zeros(3), torch.tensor(0.3)))
         tensor(0.3000)
     """
@@ -53,7 +53,7 @@ def rotation_y_from_pose(T: Tensor) -> Tensor:
 def wrap_angle(angle: Tensor) -> Tensor:
     """Angles brought into [-pi, pi).
 
-    Example:
+    Examples:
         >>> wrap_angle(torch.tensor(2 * math.pi + 0.5))
         tensor(0.5000)
     """
@@ -66,7 +66,7 @@ def alpha_from_kitti(
 ) -> Tensor:
     """KITTI's observation angle (*,): `wrap(rotation_y - atan2(x, z))`.
 
-    Example:
+    Examples:
         >>> alpha_from_kitti(torch.tensor([10.0, 1.6, 10.0]), torch.tensor(0.0))
         tensor(-0.7854)
     """
@@ -81,7 +81,7 @@ def box_corners(
 
     Order: the four ground corners (front right of travel first, then round), then the four above them.
 
-    Example:
+    Examples:
         >>> corners = box_corners(torch.eye(4), torch.tensor([1.5, 1.6, 4.0]))
         >>> corners[0]
         tensor([ 2.0000,  0.0000, -0.8000])

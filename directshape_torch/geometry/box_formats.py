@@ -77,7 +77,7 @@ def boxes_to_poses(
         InputError: an unknown convention, another shape, a frame with z up without `T_cam_boxes`, or corners that
             make no box in the convention's order.
 
-    Example:
+    Examples:
         >>> T_cam_obj, hwl = boxes_to_poses(torch.tensor([[1.0, 1.6, 20.0, 1.5, 1.6, 4.0, 0.3]]), "kitti")
         >>> hwl
         tensor([[1.5000, 1.6000, 4.0000]])
@@ -105,7 +105,7 @@ def poses_to_boxes(
     Raises:
         InputError: an unknown convention, or a frame with z up without `T_cam_boxes`.
 
-    Example:
+    Examples:
         >>> T_cam_obj, hwl = boxes_to_poses(torch.tensor([[1.0, 1.6, 20.0, 1.5, 1.6, 4.0, 0.3]]), "kitti")
         >>> poses_to_boxes(T_cam_obj, hwl, "opencv")
         tensor([[ 1.0000,  0.8500, 20.0000,  4.0000,  1.6000,  1.5000,  0.3000]])

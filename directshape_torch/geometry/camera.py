@@ -20,7 +20,7 @@ def rays_from_pixels(
 ) -> Tensor:  # (*, 3)
     """Viewing rays of unit depth: `K^-1 [u, v, 1]`, so that `point_cam = depth * ray_cam`.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
         >>> rays_from_pixels(torch.tensor([600.0, 180.0]), K)
         tensor([0., 0., 1.])
@@ -36,7 +36,7 @@ def project(
 ) -> Tensor:  # (*, 2)
     """Pixels of points in the camera frame; meaningless for points with z <= 0, which the caller must exclude.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
         >>> project(torch.tensor([1.0, 0.0, 10.0]), K)
         tensor([670., 180.])
@@ -63,7 +63,7 @@ def warp_to_right(
 ) -> RightPixels:
     """Warp left pixels into the right image (paper, supplement, `warp(p, d)` and its derivative by d).
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
         >>> T_right_cam = torch.eye(4)
         >>> T_right_cam[0, 3] = -0.5
@@ -107,7 +107,7 @@ def right_rays(
 ) -> RightRays:
     """Rays of right-image pixels, in the left camera frame; the inverse of the crossing done by `warp_to_right`.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
         >>> T_right_cam = torch.eye(4)
         >>> T_right_cam[0, 3] = -0.5
@@ -137,7 +137,7 @@ def depth_from_disparity(
     so a right camera with another principal point, a shift in depth or a rotation is exact. With a field the disparity
     is first freed of the rig's bias.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
         >>> T_right_cam = torch.eye(4)
         >>> T_right_cam[0, 3] = -0.5
@@ -164,7 +164,7 @@ def points_from_disparity(
 ) -> Tensor:  # (*, 3)
     """Points in the left camera frame, metres; NaN where there is no depth.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
         >>> T_right_cam = torch.eye(4)
         >>> T_right_cam[0, 3] = -0.5
@@ -184,7 +184,7 @@ def disparity_of_depth(
 ) -> Tensor:  # (*, 2)
     """True displacement `uv_left - uv_right` of left pixels of known depth: disparity and row shift, pixels.
 
-    Example:
+    Examples:
         >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
         >>> T_right_cam = torch.eye(4)
         >>> T_right_cam[0, 3] = -0.5

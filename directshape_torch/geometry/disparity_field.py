@@ -45,7 +45,7 @@ def polynomial_basis(
 ) -> Tensor:  # (*, 10)
     """Values of the basis functions at left pixels; the image is mapped to [-1, 1] in both directions.
 
-    Example:
+    Examples:
         >>> polynomial_basis(torch.tensor([100.0, 50.0]), (101, 101))
         tensor([1., 1., 0., 1., 0., 0., 1., 0., 0., 1.])
     """
@@ -61,7 +61,7 @@ def nearest_in_convex_polygon(
 ) -> Tensor:  # (*, 2)
     """The points themselves where they lie in the polygon, else the nearest point of its border.
 
-    Example:
+    Examples:
         >>> square = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
         >>> nearest_in_convex_polygon(torch.tensor([[1.0, 2.0], [9.0, 2.0]]), square)
         tensor([[1., 2.],
@@ -146,7 +146,7 @@ class DisparityField:
     ) -> DisparityField:
         """The same bias at every pixel.
 
-        Example:
+        Examples:
             >>> K, T = torch.eye(3), torch.eye(4)
             >>> DisparityField.constant(-0.4, (1242, 375), K, K, T).bias(torch.tensor([[10.0, 20.0]]))
             tensor([-0.4000])
@@ -169,7 +169,7 @@ class DisparityField:
     ) -> Tensor:  # (*,)
         """Measured minus true disparity, pixels, in the dtype of `uv_left`; beyond the hull that of its nearest point.
 
-        Example:
+        Examples:
             >>> K, T = torch.eye(3), torch.eye(4)
             >>> DisparityField.constant(0.25, (640, 480), K, K, T).bias(torch.zeros(2, 3, 2)).shape
             torch.Size([2, 3])
@@ -182,7 +182,7 @@ class DisparityField:
     ) -> Tensor:  # (*,)
         """Measured minus predicted row in the right image, pixels; beyond the hull that of its nearest point.
 
-        Example:
+        Examples:
             >>> K, T = torch.eye(3), torch.eye(4)
             >>> DisparityField.constant(0.25, (640, 480), K, K, T).vertical(torch.zeros(1, 2))
             tensor([0.])
@@ -195,7 +195,7 @@ class DisparityField:
     ) -> tuple[Tensor, Tensor]:  # (*,), (*,)
         """`bias` and `vertical` in little more time than one of them.
 
-        Example:
+        Examples:
             >>> K, T = torch.eye(3), torch.eye(4)
             >>> DisparityField.constant(0.25, (640, 480), K, K, T).offsets(torch.zeros(1, 2))
             (tensor([0.2500]), tensor([0.]))
@@ -214,7 +214,7 @@ class DisparityField:
     ) -> Tensor:  # (*,)
         """Standard deviation of `bias`, pixels; beyond the hull that of the place itself, for nobody has looked there.
 
-        Example:
+        Examples:
             >>> K, T = torch.eye(3), torch.eye(4)
             >>> DisparityField.constant(0.25, (640, 480), K, K, T).sigma(torch.zeros(1, 2))
             tensor([0.])

@@ -12,7 +12,7 @@ def plane_ref_to_cam(
 ) -> Tensor:  # (*,)
     """Offset of a plane in camera coordinates, given in KITTI's reference frame: `d_cam = d_ref - n . t_cam_ref`.
 
-    Example:
+    Examples:
         >>> import torch
         >>> up = torch.tensor([0.0, -1.0, 0.0])
         >>> plane_ref_to_cam(up, torch.tensor(1.65), torch.tensor([0.06, 0.01, 0.0]))
@@ -28,7 +28,7 @@ def height_above(
 ) -> Tensor:  # (*,)
     """Signed distance of points from the plane, positive above the ground, metres.
 
-    Example:
+    Examples:
         >>> import torch
         >>> height_above(torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]), torch.tensor(1.65))
         tensor(1.6500)

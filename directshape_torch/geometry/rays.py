@@ -27,7 +27,7 @@ def ray_box_interval(
     Rays that touch the box only behind `minimum` miss it; `near` is never below `minimum`. Directions with zero
     components are exact: they are inside a slab or not.
 
-    Example:
+    Examples:
         >>> bounds = torch.tensor([[-1.0, -1.0, 4.0], [1.0, 1.0, 6.0]])
         >>> ray_box_interval(torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), bounds)[:2]
         (tensor(4.), tensor(6.))

@@ -31,7 +31,7 @@ def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | 
     Returns:
         :math:`(6, 4, 4)`.
 
-    Example:
+    Examples:
         >>> generators()[0, 0, 3]
         tensor(1., dtype=torch.float64)
     """
@@ -81,7 +81,7 @@ def exp(twist: Tensor, max_angle: float = math.inf) -> Tensor:
     Returns:
         Rigid transforms :math:`(*, 4, 4)`.
 
-    Example:
+    Examples:
         >>> exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3]
         tensor([1., 2., 3.])
     """
@@ -99,7 +99,7 @@ def exp(twist: Tensor, max_angle: float = math.inf) -> Tensor:
 def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
     """Homogeneous transforms :math:`(*, 4, 4)` from rotations :math:`(*, 3, 3)` and translations :math:`(*, 3)`.
 
-    Example:
+    Examples:
         >>> from_rotation_translation(torch.eye(3), torch.ones(3))[:3, 3]
         tensor([1., 1., 1.])
     """
@@ -111,7 +111,7 @@ def from_rotation_translation(R: Tensor, t: Tensor) -> Tensor:
 def inverse(T: Tensor) -> Tensor:
     """Inverse of rigid transforms :math:`(*, 4, 4)`, by transposition of the rotation.
 
-    Example:
+    Examples:
         >>> T = exp(torch.tensor([1.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
         >>> torch.allclose(inverse(T) @ T, torch.eye(4), atol=1e-6)
         True
@@ -123,7 +123,7 @@ def inverse(T: Tensor) -> Tensor:
 def transform(T_b_a: Tensor, points_a: Tensor) -> Tensor:
     """Points :math:`(*, 3)` in frame a moved to frame b by :math:`(*, 4, 4)`; leading dimensions broadcast.
 
-    Example:
+    Examples:
         >>> transform(exp(torch.tensor([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])), torch.zeros(5, 3)).shape
         torch.Size([5, 3])
     """
@@ -139,7 +139,7 @@ def from_kornia(motion: Se3) -> Tensor:
     Raises:
         InputError: not an `Se3`.
 
-    Example:
+    Examples:
         >>> from_kornia(Se3.trans_z(torch.tensor([20.0])))[0, :3, 3].detach()
         tensor([ 0.,  0., 20.])
     """
@@ -156,7 +156,7 @@ def to_kornia(T: Tensor) -> Se3:
     Raises:
         InputError: not :math:`(*, 4, 4)`.
 
-    Example:
+    Examples:
         >>> T = exp(torch.tensor([[1.0, -2.0, 0.5, 0.1, 0.2, -0.3]]))
         >>> to_kornia(T).log()
         tensor([[ 1.0000, -2.0000,  0.5000,  0.1000,  0.2000, -0.3000]])

@@ -29,7 +29,7 @@ def grey_levels(
     Raises:
         InputError: not (*, 3, H, W) or not floating point.
 
-    Example:
+    Examples:
         >>> grey_levels(torch.ones(1, 3, 1, 2, dtype=torch.float64))
         tensor([[[255., 255.]]], dtype=torch.float64)
     """
@@ -49,7 +49,7 @@ def length_2d(
     A length that is not finite has no derivative either: 0 and not NaN, which a product with the 0 of whoever does not
     use it would spread over the image.
 
-    Example:
+    Examples:
         >>> flat = torch.zeros(1, requires_grad=True)
         >>> length_2d(flat, flat).backward()
         >>> flat.grad
@@ -80,7 +80,7 @@ def gradient_magnitude_of_part(
     Returns:
         (v1 - v0, u1 - u0), grey levels per pixel.
 
-    Example:
+    Examples:
         >>> ramp = torch.arange(40.0).expand(3, 40, 40) / 255
         >>> gradient_magnitude_of_part(ramp, (40, 40), (0, 8, 3, 9))
         tensor([[0.5000, 1.0000, 1.0000]])
@@ -113,7 +113,7 @@ def gradient_magnitude_at(
     Returns:
         (P,), grey levels per pixel.
 
-    Example:
+    Examples:
         >>> ramp = torch.arange(40.0).expand(1, 3, 40, 40) / 255
         >>> gradient_magnitude_at(ramp, torch.tensor([[40, 40]]), torch.tensor([0, 0]), torch.tensor([[0, 8], [1, 8]]))
         tensor([0.5000, 1.0000])
@@ -151,7 +151,7 @@ def halve(
     Raises:
         InputError: not four axes, or a side below 2 pixels.
 
-    Example:
+    Examples:
         >>> halve(torch.arange(8.0).reshape(1, 1, 2, 4))
         tensor([[[[2.5000, 4.5000]]]])
     """
@@ -170,7 +170,7 @@ def halve_sizes(
 
     A side of one pixel stays one: a lookup must find a pixel in every frame of a batch.
 
-    Example:
+    Examples:
         >>> halve_sizes(torch.tensor([[375, 1242]]))
         tensor([[187, 621]])
     """

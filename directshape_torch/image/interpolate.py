@@ -36,7 +36,7 @@ def bilinear_with_gradient(
     Raises:
         InputError: wrong shapes.
 
-    Example:
+    Examples:
         >>> image = torch.tensor([[[0.0, 2.0], [10.0, 12.0]]])
         >>> value, gradient, inside = bilinear_with_gradient(image, torch.tensor([0]), torch.tensor([[0.5, 0.25]]))
         >>> value, gradient, inside

@@ -34,7 +34,7 @@ def decode_segmentation(path: Path, where: str, segmentation: Any, size_hw: tupl
         MaskSizeError: run lengths of another size than the image.
         DataFormatError: neither form, runs that do not add up to the size, or polygons far beyond the image.
 
-    Example:
+    Examples:
         >>> rle = {"size": [2, 3], "counts": [2, 3, 1]}  # down the columns: 2 off, 3 on, 1 off
         >>> decode_segmentation(Path("masks.json"), "entry 0", rle, (2, 3)).astype(int).tolist()
         [[0, 1, 1], [0, 1, 0]]

@@ -43,7 +43,7 @@ def new_figure(width_inches: float, height_inches: float, purpose: str) -> Any:
     Raises:
         MissingDependencyError: matplotlib is not installed.
 
-    Example:
+    Examples:
         >>> figure = new_figure(4, 3, "an example")
         >>> line = figure.add_subplot().plot([0, 1], [1, 0])
         >>> figure_png(figure)[1:4]
@@ -73,7 +73,7 @@ def figure_png(figure: Any) -> bytes:
 def figure_picture(figure: Any) -> NDArray[np.uint8]:
     """A figure of `new_figure` as pixels (h, w, 3), RGB, for animations.
 
-    Example:
+    Examples:
         >>> figure_picture(new_figure(2, 1, "an example")).shape
         (80, 160, 3)
     """
@@ -94,7 +94,7 @@ def write_animation(path: Path | str, frames: Sequence[NDArray[np.uint8]], secon
         InputError: no frames, frames of several sizes, or not one duration each.
         MissingDependencyError: Pillow is not installed.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "blink.gif"
         >>> write_animation(path, [np.full((8, 8, 3), level, np.uint8) for level in (0, 255)], [0.5, 0.5])

@@ -69,7 +69,7 @@ def file_of_frame(directory: Path, name: str) -> Path:
 def tight_box(probability: NDArray[Any]) -> tuple[float, float, float, float] | None:
     """The smallest box around the pixels above one half, or None where there are none.
 
-    Example:
+    Examples:
         >>> tight_box(np.eye(4) > 0)
         (0.0, 0.0, 3.0, 3.0)
     """

@@ -132,7 +132,7 @@ def poses_cam(
 ) -> Tensor:
     """`T_cam_obj` (B, 4, 4) of the 3D boxes, with the dtype and device of `t_cam_ref`; float64 inside.
 
-    Example:
+    Examples:
         >>> line = Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0", "")
         >>> poses_cam([parse_object("labels", line)], torch.tensor([0.06, 0.0, 0.0]))[0, :3, 3]
         tensor([ 1.0600,  1.6000, 20.0000])
@@ -147,7 +147,7 @@ def box_corners_cam(
 ) -> Tensor:
     """Corners (B, 8, 3) of the 3D boxes in the left camera frame, float64, in the order of `box_corners`.
 
-    Example:
+    Examples:
         >>> line = Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0", "")
         >>> box_corners_cam([parse_object("labels", line)], torch.tensor([0.06, 0.0, 0.0])).mean(dim=1)
         tensor([[ 1.0600,  0.8500, 20.0000]], dtype=torch.float64)

@@ -39,7 +39,7 @@ def match_one_to_one(
 ) -> MaskMatches:
     """The assignment of largest total overlap (Hungarian) that uses pairs of at least `min_overlap` only.
 
-    Example:
+    Examples:
         >>> match_one_to_one(np.array([[0.9, 0.8], [0.7, 0.1]])).mask_of_detection.tolist()
         [1, 0]
     """

@@ -44,7 +44,7 @@ class RefinedBox:
 def result_line(source: KittiObject, refined: RefinedBox) -> str:
     """The input line with its 3D box and alpha replaced; every other column keeps the text it had.
 
-    Example:
+    Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
         >>> from directshape_torch.files.text_files import Line
         >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"

@@ -80,7 +80,7 @@ class RunManifest:
 def hash_bytes(content: bytes) -> str:
     """The sha256 of some bytes, hexadecimal.
 
-    Example:
+    Examples:
         >>> hash_bytes(b"")[:8]
         'e3b0c442'
     """
@@ -180,7 +180,7 @@ def check_inputs(previous: RunManifest, frame_id: str, hashes: Mapping[str, str]
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings as one level with dotted names.
 
-    Example:
+    Examples:
         >>> flatten({"solver": {"iterations": 20}, "device": "cpu"})
         {'solver.iterations': 20, 'device': 'cpu'}
     """

@@ -114,7 +114,7 @@ class SceneMasks:
 def names_of(frame_id: str) -> tuple[str, ...]:
     """What the files of a pair may be called.
 
-    Example:
+    Examples:
         >>> names_of("000046_10"), names_of("000046_11")
         (('000046_10', '000046'), ('000046_11',))
     """

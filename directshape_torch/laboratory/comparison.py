@@ -81,7 +81,7 @@ class Comparison:
     def broken_bounds(self) -> list[str]:
         """One sentence for each bound that does not hold.
 
-        Example:
+        Examples:
             >>> bad = Comparison("warp", "typical", 2, 2, {}, 0, 0, {"analytic-numeric": PairError(0.5, 0.5)})
             >>> bad.broken_bounds()
             ['warp, typical: analytic-numeric error 5.0e-01 above 1e-06']
@@ -167,7 +167,7 @@ def _pair_error(error: Tensor) -> PairError:
 def quantile(values: Tensor, share: float) -> float:
     """The value that a share of all values does not exceed, without the size limit of `torch.quantile`.
 
-    Example:
+    Examples:
         >>> quantile(torch.arange(1001.0), 0.999)
         999.0
     """

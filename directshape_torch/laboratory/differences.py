@@ -63,7 +63,7 @@ def sweep(evaluate: Evaluate, units: Tensor, seed: int = 0) -> list[DifferenceSw
         units: (D,) the length that a step of one stands for in each unknown.
         seed: of the jitter that measures the noise.
 
-    Example:
+    Examples:
         >>> found = sweep(lambda delta: [torch.sin(1 + delta)], torch.ones(1, dtype=torch.float64))[0]
         >>> bool(abs(found.extrapolated[2, 0, 0] - torch.cos(torch.tensor(1.0, dtype=torch.float64))) < 1e-10)
         True
@@ -129,7 +129,7 @@ def choose(found: DifferenceSweep, needed: Tensor) -> Choice:
         The derivatives and the exclusions: under `UNRESOLVED` where the rounding of no stencil permits the error, else
         under `KINK` where the best estimate is worse. A function that is no number is not excluded.
 
-    Example:
+    Examples:
         >>> found = sweep(lambda delta: [(delta + 1e-9).abs()], torch.ones(1, dtype=torch.float64))[0]
         >>> choose(found, torch.full((1,), 1e-6, dtype=torch.float64)).excluded[KINK]
         tensor([[True]])

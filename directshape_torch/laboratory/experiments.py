@@ -76,7 +76,7 @@ def factor_experiment(
         analytic: hand-derived Jacobians.
         block: see `Subject`; default all m outputs.
 
-    Example:
+    Examples:
         >>> x = torch.tensor([[2.0], [3.0]], dtype=torch.float64)
         >>> squares = factor_experiment("square", lambda x: x**2, x, 2 * x[:, None])
         >>> squares.subjects[0].autograd
@@ -91,7 +91,7 @@ def factor_experiment(
 def forward_mode_columns(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
     """Jacobians (P, m, n) of a row-wise function by `torch.func.jvp`, one unknown at a time for all rows.
 
-    Example:
+    Examples:
         >>> forward_mode_columns(torch.sin, torch.zeros(1, 1))
         tensor([[[1.]]])
     """

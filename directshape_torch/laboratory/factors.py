@@ -53,7 +53,7 @@ def exponential(bench: Bench) -> Experiment:
 def left_jacobian(twist: Tensor) -> Tensor:
     """Left Jacobian (*, 6, 6) of SE(3), `sum_n ad(xi)^n / (n + 1)!`: exact for any angle, without a division by it.
 
-    Example:
+    Examples:
         >>> left_jacobian(torch.zeros(6)).diagonal()
         tensor([1., 1., 1., 1., 1., 1.])
     """

@@ -194,7 +194,7 @@ def regimes_named(names: list[str] | None) -> list[Regime]:
     Raises:
         InputError: an unknown name; lists the names.
 
-    Example:
+    Examples:
         >>> [r.name for r in regimes_named(["far_80m"])]
         ['far_80m']
     """

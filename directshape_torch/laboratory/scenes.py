@@ -53,7 +53,7 @@ def load_scene(
         DataFormatError: a folder is missing or damaged.
         InputError: no frame with a car that has masks.
 
-    Example:
+    Examples:
         >>> load_scene().detections.T_cam_obj.dtype
         torch.float64
     """

@@ -96,7 +96,7 @@ def paper_depth_errors(bench: Bench) -> list[StepError]:
 def row_factors(gradient: Tensor, direction: Tensor) -> dict[str, Tensor]:
     """By what each approximation multiplies the exact rows (...), from gradients and rays of unit depth (3, ...).
 
-    Example:
+    Examples:
         >>> float(row_factors(torch.tensor([0.0, 0.0, 0.8]), torch.tensor([0.0, 0.75, 1.0]))[PAPER])
         1.0
     """
@@ -150,7 +150,7 @@ def first_step(bench: Bench, rows: Mapping[str, Linear]) -> Tensor:
 def angle_deg(a: Tensor, b: Tensor) -> Tensor:
     """Angles (B,) between vectors (B, D).
 
-    Example:
+    Examples:
         >>> angle_deg(torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 2.0]]))
         tensor([90.])
     """
@@ -188,7 +188,7 @@ def single_precision_rows(bench: Bench) -> dict[str, Linear]:
 def to_dtype(value: Any, dtype: torch.dtype) -> Any:
     """A copy of nested frozen dataclasses and named tuples with every floating tensor in another precision.
 
-    Example:
+    Examples:
         >>> to_dtype((torch.zeros(1).double(), "text"), torch.float32)[0].dtype
         torch.float32
     """

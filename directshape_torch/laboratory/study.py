@@ -51,7 +51,7 @@ def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
     Raises:
         InputError: an unknown name; lists the names.
 
-    Example:
+    Examples:
         >>> subjects_named(["transform"])
         ('transform',)
     """

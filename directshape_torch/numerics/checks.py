@@ -43,7 +43,7 @@ def check_shape(
 ) -> None:
     """Raise `InputError` unless `tensor` is a dense tensor of the expected shape and kind; letters stand for any size.
 
-    Example:
+    Examples:
         >>> import torch
         >>> check_shape("points", torch.zeros(7, 3), ("P", 3))
     """
@@ -82,7 +82,7 @@ def check_stored(name: str, tensor: Tensor) -> None:
 def check_positive(name: str, value: object, cure: str = "") -> None:
     """Raise `InputError` unless `value` is a finite number above 0.
 
-    Example:
+    Examples:
         >>> check_positive("height_m", 1.65)
     """
     try:
@@ -96,7 +96,7 @@ def check_positive(name: str, value: object, cure: str = "") -> None:
 def check_size_wh(name: str, size: object) -> None:
     """Raise `InputError` unless `size` is a width and a height in whole pixels.
 
-    Example:
+    Examples:
         >>> check_size_wh("size_wh", (1242, 375))
     """
     fits = isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and int(n) > 0 for n in size)
@@ -109,7 +109,7 @@ def is_no_rotation(
 ) -> Tensor:  # (N,) bool
     """Where the upper left part of a transform is no rotation.
 
-    Example:
+    Examples:
         >>> import torch
         >>> is_no_rotation(torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))[None])
         tensor([True])
@@ -126,7 +126,7 @@ def check_rotation(
 ) -> None:
     """Raise `InputError` unless the upper left part of every transform is a rotation.
 
-    Example:
+    Examples:
         >>> import torch
         >>> check_rotation("T_cam_obj", torch.eye(4)[None])
     """
@@ -148,7 +148,7 @@ def check_sigmas(
 ) -> None:
     """Raise `InputError` unless every standard deviation is above 0; infinity is.
 
-    Example:
+    Examples:
         >>> import torch
         >>> check_sigmas("pose_sigma", torch.tensor([[0.5, torch.inf]]))
     """
@@ -187,7 +187,7 @@ class TensorRecord:
         InputError: a tensor is none, not dense, or of another shape or kind; floating-point ones differ in dtype or
             device.
 
-    Example:
+    Examples:
         >>> from directshape_torch.scene import GroundPlane
         >>> GroundPlane(torch.zeros(5, 3), torch.ones(4), ("file",) * 5)
         Traceback (most recent call last):

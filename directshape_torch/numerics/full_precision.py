@@ -93,7 +93,7 @@ def full_precision(device_type: str) -> Iterator[None]:
     Args:
         device_type: of the tensors, as in `torch.autocast`.
 
-    Example:
+    Examples:
         >>> with torch.autocast("cpu"), full_precision("cpu"):
         ...     (torch.eye(2) @ torch.eye(2)).dtype
         torch.float32

@@ -16,7 +16,7 @@ _R = TypeVar("_R")
 def nothing_is_differentiated() -> bool:
     """Whether neither gradients nor a forward mode are on; `torch.func` enables gradients or opens a level of its own.
 
-    Example:
+    Examples:
         >>> with torch.no_grad():
         ...     nothing_is_differentiated()
         True
@@ -30,7 +30,7 @@ def nothing_is_differentiated() -> bool:
 def is_forward_mode() -> bool:
     """Whether this is inside a region of forward-mode differentiation.
 
-    Example:
+    Examples:
         >>> with torch.autograd.forward_ad.dual_level():
         ...     is_forward_mode()
         True
@@ -43,7 +43,7 @@ def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     `torch.no_grad` holds back gradients alone: the tangents of a forward mode pass through it.
 
-    Example:
+    Examples:
         >>> @as_constant
         ... def doubled(x: torch.Tensor) -> torch.Tensor:
         ...     return 2 * x
@@ -63,7 +63,7 @@ def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
 def map_tensors(change: Callable[..., Tensor], value: Any, *others: Any) -> Any:
     """A tensor, or the tensors of nested named tuples, changed: each together with its counterparts in the others.
 
-    Example:
+    Examples:
         >>> map_tensors(torch.add, torch.ones(1), torch.ones(1))
         tensor([2.])
     """
@@ -80,7 +80,7 @@ def is_plain(tensor: Tensor) -> bool:
     Only such ones may be kept for later, and asked for numbers: the others mean nothing outside of the call that made
     them. Of code that is being compiled none is.
 
-    Example:
+    Examples:
         >>> is_plain(torch.ones(1)), torch.func.grad(lambda x: x * is_plain(x))(torch.tensor(2.0)).item()
         (True, 0.0)
     """

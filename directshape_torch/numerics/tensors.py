@@ -19,7 +19,7 @@ def take(
 ) -> Tensor:
     """The entries (*,) of a flat tensor at indices of any shape.
 
-    Example:
+    Examples:
         >>> take(torch.tensor([5.0, 6.0, 7.0]), torch.tensor([[2, 0]]))
         tensor([[7., 5.]])
     """
@@ -37,7 +37,7 @@ def occurrences(
 
     `bincount` would let the host wait for a graphics card, to learn the largest number.
 
-    Example:
+    Examples:
         >>> occurrences(torch.tensor([2, 0, 2]), 4)
         tensor([1, 0, 2, 0])
     """
@@ -50,7 +50,7 @@ _T = TypeVar("_T")
 def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
     """The numbers (n,) as a tensor of the dtype and on the device of another; not to be written to.
 
-    Example:
+    Examples:
         >>> constant_like((0.5, 2.0), torch.zeros(1))
         tensor([0.5000, 2.0000])
     """
@@ -60,7 +60,7 @@ def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
 def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tensor], _T]:
     """For a function that makes constants of a dtype on a device: one that gives those like a tensor.
 
-    Example:
+    Examples:
         >>> @made_once
         ... def ramp(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
         ...     return torch.arange(3, dtype=dtype, device=device)
@@ -107,7 +107,7 @@ def _kept(
 def length(vectors: Tensor, dim: int) -> Tensor:
     """Euclidean length along an axis; at zero its derivative is NaN.
 
-    Example:
+    Examples:
         >>> length(torch.tensor([[3.0], [4.0]]), dim=0)
         tensor([5.])
     """
@@ -117,7 +117,7 @@ def length(vectors: Tensor, dim: int) -> Tensor:
 def all_along(flags: Tensor, dim: int) -> Tensor:
     """`flags.all(dim)` of an axis with few entries.
 
-    Example:
+    Examples:
         >>> all_along(torch.tensor([[True, False], [True, True]]), dim=0)
         tensor([ True, False])
     """
@@ -129,7 +129,7 @@ def all_along(flags: Tensor, dim: int) -> Tensor:
 def cross(left: Tensor, right: Tensor) -> Tensor:
     """Cross products (*, 3) of vectors (*, 3).
 
-    Example:
+    Examples:
         >>> cross(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
         tensor([0., 0., 1.])
     """
@@ -155,7 +155,7 @@ def pixels_at_once(device: torch.device) -> int:
 def portions(amounts: Sequence[int], most: int) -> list[slice]:
     """Consecutive entries whose amounts add up to at most so many, or single ones of more; none is left out.
 
-    Example:
+    Examples:
         >>> portions([3, 3, 9, 0, 2], most=7)
         [slice(0, 2, None), slice(2, 3, None), slice(3, 5, None)]
     """

@@ -36,7 +36,7 @@ class PointSamples:
     def of_objects(self, keep: Tensor) -> PointSamples:
         """The points of the objects where `keep` (B,) holds, renumbered.
 
-        Example:
+        Examples:
             >>> points = PointSamples(torch.tensor([0, 1, 1]), torch.zeros(3, 3), torch.tensor([1, 2]))
             >>> points.of_objects(torch.tensor([False, True])).object_index
             tensor([0, 0])

@@ -209,7 +209,7 @@ def lower_medians(
     Returns:
         (C,), one of the values of each row.
 
-    Example:
+    Examples:
         >>> lower_medians(torch.tensor([[4.0, 1.0, 3.0, 2.0], [7.0, torch.inf, torch.nan, 9.0]]))
         tensor([2., 7.])
     """

@@ -95,7 +95,7 @@ def mask_extents(
     Raises:
         InputError: wrong shapes, or values above 1.5 in a row of pixels without NaN.
 
-    Example:
+    Examples:
         >>> mask = torch.zeros(1, 6, 8)
         >>> mask[0, 2:4, 3:8] = 0.9
         >>> (extents,) = mask_extents([mask], [torch.tensor([True])])

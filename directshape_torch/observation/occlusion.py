@@ -262,7 +262,7 @@ def instance_crops(
         frame_index: (N,) integer.
         num_frames: F.
 
-    Example:
+    Examples:
         >>> masks = torch.zeros(2, 4, 6)
         >>> masks[0, 1, 1:4], masks[1, 1:3, 3:5] = 1.0, 1.0
         >>> boxes = torch.tensor([[1, 1, 4, 2], [3, 1, 5, 3]])

@@ -72,7 +72,7 @@ def region_pixels(
     Returns:
         object_index (A,) and uv (A, 2), integer.
 
-    Example:
+    Examples:
         >>> object_index, uv = region_pixels(torch.tensor([[5, 2, 7, 3], [0, 0, 1, 2]]))
         >>> object_index.tolist(), uv.tolist()
         ([0, 0, 1, 1], [[5, 2], [6, 2], [0, 0], [0, 1]])

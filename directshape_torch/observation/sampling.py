@@ -181,7 +181,7 @@ def selected_pixels(
 ) -> PixelSelection:
     """The pixels of one image before hidden ones leave, with the round that each comes from: for figures.
 
-    Example:
+    Examples:
         >>> ramp = (torch.arange(40.0) / 20).square().expand(1, 3, 40, 40)
         >>> frame, region = torch.tensor([0]), torch.tensor([[5, 5, 25, 25]])
         >>> settings = SamplingConfig(min_pixels=100, max_pixels=100)
@@ -211,7 +211,7 @@ def even_pixels(
         regions: (B, 4) integer (u0, v0, u1, v1), half open.
         settings: density; its mode is not asked for.
 
-    Example:
+    Examples:
         >>> chosen = even_pixels(torch.tensor([[5, 2, 11, 6]]), SamplingConfig(min_pixels=6, max_pixels=6))
         >>> chosen.u.tolist(), chosen.v.tolist()
         ([5, 7, 9, 5, 7, 9], [2, 2, 2, 4, 4, 4])

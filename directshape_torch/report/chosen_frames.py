@@ -24,7 +24,7 @@ def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
 def choose_frames(rows: Sequence[CarRow], num_frames: int, most: int) -> list[int]:
     """Numbers of the frames to show, ascending: those of the worst and best cars first, then evenly over the run.
 
-    Example:
+    Examples:
         >>> choose_frames([], 10, 3)
         [0, 3, 6]
     """

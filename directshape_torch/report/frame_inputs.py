@@ -182,7 +182,7 @@ def _plane_from_stereo(left: NDArray[np.uint8], right: NDArray[np.uint8], camera
 def _words(role: str) -> str:
     """A role of the summary's inputs as one reads it.
 
-    Example:
+    Examples:
         >>> _words("image_left"), _words("masks_0")
         ('left image', 'masks')
     """

@@ -13,7 +13,7 @@ import numpy.typing as npt
 def known(value: float | np.floating[Any] | None, decimals: int = 4) -> float | None:
     """A number as JSON can hold it: rounded, and None where it is not finite.
 
-    Example:
+    Examples:
         >>> known(0.123456), known(float("nan"))
         (0.1235, None)
     """
@@ -23,7 +23,7 @@ def known(value: float | np.floating[Any] | None, decimals: int = 4) -> float | 
 def numbers(values: Sequence[float] | npt.NDArray[np.floating[Any]], decimals: int = 5) -> list[float | None]:
     """Several of them.
 
-    Example:
+    Examples:
         >>> numbers(np.array([0.123456, np.inf]), 2)
         [0.12, None]
     """

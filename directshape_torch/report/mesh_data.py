@@ -28,7 +28,7 @@ def mesh_data(mesh: ObjectMesh) -> dict[str, str]:
 def packed(numbers: npt.NDArray[np.integer[Any]]) -> str:
     """Whole numbers as text: neighbours of a mesh differ by little, and small differences deflate well.
 
-    Example:
+    Examples:
         >>> unpacked(packed(np.array([3, 5, -70000]))).tolist()
         [3, 5, -70000]
     """

@@ -77,7 +77,7 @@ def _filled(template: str, values: Mapping[str, str]) -> str:
 def data_block(name: str, value: object) -> str:
     """JSON that the page reads by name; no text in it can end its element.
 
-    Example:
+    Examples:
         >>> data_block("cars", ["</script>"]).count("<")
         2
     """

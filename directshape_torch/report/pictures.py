@@ -20,7 +20,7 @@ def data_url(picture: Picture, quality: int = _SMALL_QUALITY) -> str:
     Raises:
         OSError: OpenCV cannot encode it.
 
-    Example:
+    Examples:
         >>> data_url(np.zeros((4, 6, 3), np.uint8)).split(",")[0]
         'data:image/webp;base64'
     """
@@ -46,7 +46,7 @@ def car_window(
     Returns:
         None where the image does not show them.
 
-    Example:
+    Examples:
         >>> K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
         >>> car_window(np.zeros((100, 100, 3), np.uint8), K, np.array([[-1.0, -1, 10], [1, 1, 10]]))
         (35, 38, 65, 62)

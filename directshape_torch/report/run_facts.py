@@ -79,7 +79,7 @@ def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
 def problem_notes(problems: Mapping[str, Collection[str]], num_frames: int) -> list[str]:
     """What could not be used, as sentences.
 
-    Example:
+    Examples:
         >>> problem_notes({"left image not found": {"000003", "000004"}}, 5)
         ['left image not found (2 of 5 frames)']
     """

@@ -50,7 +50,7 @@ def compare_fields(
     Raises:
         InputError: they belong to different rigs, or their hulls have nothing in common.
 
-    Example:
+    Examples:
         >>> K, T = torch.eye(3), torch.eye(4)
         >>> a, b = (DisparityField.constant(value, (640, 480), K, K, T) for value in (0.25, 0.0))
         >>> compare_fields(a, b).rms_px

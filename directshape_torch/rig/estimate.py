@@ -51,7 +51,7 @@ class RigEstimate(nn.Module):
         K_left, K_right: (3, 3) intrinsics, pixels.
         T_right_cam: (4, 4) left to right camera, metres.
 
-    Example:
+    Examples:
         >>> K, T_right_cam = torch.tensor([[700.0, 0, 620], [0, 700, 180], [0, 0, 1]]), torch.eye(4)
         >>> T_right_cam[0, 3] = -0.54
         >>> rig = RigEstimate((1242, 375), K, K, T_right_cam)

@@ -75,7 +75,7 @@ def chosen_frames(known: Sequence[str], frames: Sequence[int | str] | None) -> l
     Raises:
         InputError: one of them is not known.
 
-    Example:
+    Examples:
         >>> chosen_frames(["000107", "007322"], [107])
         ['000107']
     """

@@ -66,7 +66,7 @@ def depth_of_near_side(
 ) -> Tensor:  # (P,)
     """Depth at left pixels of the band of bumpers and doors, 10 cm within the car's box; NaN where a ray misses it.
 
-    Example:
+    Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
         >>> from directshape_torch.files.text_files import Line
         >>> car = parse_object("labels", Line(1, "Car 0 0 0 0 0 9 9 1.5 1.6 4.0 0 1.6 22 -1.5708", ""))

@@ -25,7 +25,7 @@ def near_side_depth(
 ) -> Tensor:  # (P,)
     """Depth at left pixels of the band of bumpers and doors, 10 cm within a box; NaN where a ray misses it.
 
-    Example:
+    Examples:
         >>> K, T_cam_obj = torch.tensor([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), torch.eye(4)
         >>> T_cam_obj[:3, 3] = torch.tensor([0.0, 1.6, 22.0])
         >>> near_side_depth(T_cam_obj, torch.tensor([1.5, 1.6, 4.0]), torch.tensor([[600.0, 215], [100, 215]]), K)

@@ -90,7 +90,7 @@ def rig_of_frame(rigs: list[RigEstimate], frame: FrameBatch) -> RigEstimate:
 def _evenly(frame_ids: Sequence[str]) -> list[str]:
     """All of them, so that the first N are spread over the whole: in the order of their bit-reversed numbers.
 
-    Example:
+    Examples:
         >>> "".join(_evenly("abcdefgh"))
         'aecgbfdh'
     """

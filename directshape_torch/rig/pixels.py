@@ -87,7 +87,7 @@ def pixel_evidence(observations: DisparityObservations, size_wh: tuple[int, int]
 def hull(uv: Tensor) -> Tensor:  # (P, 2) -> (M, 2)
     """Convex polygon of at most 24 corners round pixels, never beyond them.
 
-    Example:
+    Examples:
         >>> len(hull(torch.tensor([[0.0, 0], [9, 0], [9, 9], [5, 5], [0, 9]])))
         4
     """

@@ -59,7 +59,7 @@ def solve_offsets(
 ) -> Posterior:
     """Mean and covariance of all unknowns; without any evidence those of the priors.
 
-    Example:
+    Examples:
         >>> nothing = torch.zeros(10, 10).double(), torch.zeros(10).double()
         >>> found = solve_offsets(torch.zeros(0, 8).double(), (1242, 375), 387.0, *nothing)
         >>> round(float(found.covariance[0, 0].sqrt()), 3)

@@ -102,7 +102,7 @@ def disparity_slope(
 ) -> Tensor:  # (P,)
     """Derivative of the true disparity by the inverse depth, pixels x metres.
 
-    Example:
+    Examples:
         >>> K, T = torch.tensor([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), torch.eye(4)
         >>> T[0, 3] = -0.5
         >>> disparity_slope(torch.tensor([[600.0, 180.0]]), torch.tensor([0.1]), K, K, T)

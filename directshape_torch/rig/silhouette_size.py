@@ -28,7 +28,7 @@ def size_error(
     Returns:
         0 where it is not known: the image ends there, the mask is small, or something else hides or extends it (20 %).
 
-    Example:
+    Examples:
         >>> K, T_cam_obj = torch.tensor([[700.0, 0, 100], [0, 700, 50], [0, 0, 1]]), torch.eye(4)
         >>> T_cam_obj[:3, 3] = torch.tensor([0.0, 1.6, 30.0])
         >>> mask = torch.zeros(120, 200, dtype=torch.bool)

@@ -145,7 +145,7 @@ def fit_rows(
 
     The slopes are fitted by least squares with points beyond three deviations left out, five times.
 
-    Example:
+    Examples:
         >>> uv = np.random.default_rng(0).uniform(0, 100, (50, 2))
         >>> _, across, down, _ = fit_rows(uv, 0.02 * (uv[:, 0] - 50), (100, 100))
         >>> f"{across:.3f} px more at the right edge, {abs(down):.3f} px at the bottom"

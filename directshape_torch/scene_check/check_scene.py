@@ -40,7 +40,7 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
     Returns:
         The findings; printed, it says what was measured, what was expected, and how to mend it.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from directshape_torch import StereoCamera
         >>> K = torch.tensor([[360.0, 0.0, 300.0], [0.0, 360.0, 90.0], [0.0, 0.0, 1.0]])

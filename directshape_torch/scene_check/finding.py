@@ -38,7 +38,7 @@ class Finding:
 def unreadable(check: str, where: str, expected: str, error: Exception, cure: str) -> Finding:
     """A file that cannot be used, in the words of its error, which ends with a cure of its own or is given one.
 
-    Example:
+    Examples:
         >>> unreadable("mask_file", "frame 1", "a list", ValueError("a.json: is empty; write it"), "?").cure
         'write it'
     """
@@ -79,7 +79,7 @@ class CheckReport:
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Errors, then warnings, then notes; else in their order.
 
-    Example:
+    Examples:
         >>> note, error = (Finding("a", severity, "", "", "", "") for severity in ("note", "error"))
         >>> [finding.severity for finding in by_severity([note, error])]
         ['error', 'note']

@@ -20,7 +20,7 @@ def box_iou(
 ) -> NDArray[np.float64]:  # (A, B)
     """Intersection over union of image boxes; boxes without an area overlap nothing.
 
-    Example:
+    Examples:
         >>> box_iou(np.array([[0.0, 0.0, 2.0, 2.0]]), np.array([[1.0, 0.0, 3.0, 2.0]])).round(3)
         array([[0.333]])
     """

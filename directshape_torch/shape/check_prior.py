@@ -24,7 +24,7 @@ def check_prior(prior: ShapePrior, by_autograd: bool = False) -> None:
         InputError: members are missing, derivatives have other shapes than their definitions say, are not finite, or
             (by autograd) do not reach points or code, or come from inference mode.
 
-    Example:
+    Examples:
         >>> from directshape_torch.shape.pca_prior import PCAShapePrior
         >>> check_prior(PCAShapePrior.load_bundled(), by_autograd=True)
     """

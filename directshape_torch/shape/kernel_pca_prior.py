@@ -39,7 +39,7 @@ class KernelPCAShapePrior(nn.Module):
     Raises:
         InputError: shapes that do not fit together, or a width that is not positive.
 
-    Example:
+    Examples:
         >>> x = torch.linspace(-1, 1, 9)
         >>> radius = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1).norm(dim=-1)
         >>> balls = torch.stack([radius - r for r in torch.linspace(0.4, 0.7, 7)])

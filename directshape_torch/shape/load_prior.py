@@ -34,7 +34,7 @@ def load_prior(source: Path | str) -> ShapePrior:
     Raises:
         DataFormatError: no such file, or not a whole file of any kind that is known.
 
-    Example:
+    Examples:
         >>> load_prior("pca").num_codes == load_prior("neural").num_codes
         True
     """

@@ -45,7 +45,7 @@ class GridSpec:
     def for_cars(cls, spacing_m: float = 0.1) -> GridSpec:
         """Room for a car 5.2 m long, 2 m high and 2 m wide with 0.2 m or more around it, below the ground too.
 
-        Example:
+        Examples:
             >>> GridSpec.for_cars().shape
             (59, 26, 27)
         """
@@ -143,7 +143,7 @@ def mesh_to_sdf(
     Raises:
         MeshError: the mesh cannot be made solid, or does not fit into the grid.
 
-    Example:
+    Examples:
         >>> import trimesh
         >>> box = trimesh.creation.box((4.0, 1.5, 1.6))
         >>> sdf = mesh_to_sdf(box.apply_translation((0, -0.75, 0)), GridSpec.for_cars(0.2), MeshOptions(voxel_m=0.05))

@@ -61,7 +61,7 @@ class NeuralShapePrior(nn.Module):
     Raises:
         InputError: no hidden layer, or a grid without extent.
 
-    Example:
+    Examples:
         >>> prior = NeuralShapePrior.load_bundled()
         >>> shape = prior.bind(prior.initial_code(2))
         >>> at = shape.value_and_derivatives(torch.tensor([[0.0, -0.7, 0.0]]), torch.tensor([1]))

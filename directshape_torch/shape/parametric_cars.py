@@ -64,7 +64,7 @@ def car_mesh(parameters: CarParameters, spacing_m: float = 0.03) -> trimesh.Trim
     Raises:
         InputError: spacing not within 5 mm to 0.2 m.
 
-    Example:
+    Examples:
         >>> mesh = car_mesh(sample_car(3, "city"), spacing_m=0.08)
         >>> bool(mesh.is_watertight), bool(mesh.volume > 3.0)
         (True, True)
@@ -83,7 +83,7 @@ def car_sdf(parameters: CarParameters, points_obj: Array) -> Array:
     Distances are to the tangent plane of the nearest of densely sampled surface points when they are near, so that
     they are right to a few millimetres; the solid's implicit function is no distance where its parts are bent.
 
-    Example:
+    Examples:
         >>> car = sample_car(3, "city")
         >>> bool(car_sdf(car, np.array([[0.0, -0.6, 0.0]]))[0] < -0.2)
         True

@@ -27,7 +27,7 @@ def car_part_labels(car: CarParameters, points_obj: Array) -> NDArray[np.int64]:
     Returns:
         (N,) of `PAINT, GLASS, TYRE, RIM, LIGHT, PLATE, TRIM`; `PART_NAMES[label]` is the word.
 
-    Example:
+    Examples:
         >>> from directshape_torch.shape.parametric_cars import sample_car
         >>> car = sample_car(0, "saloon")
         >>> PART_NAMES[car_part_labels(car, np.array([[0.5 * car.length, -0.02 - car.ground_clearance, 0.0]]))[0]]

@@ -173,7 +173,7 @@ def sample_car(seed: int | np.random.Generator, body_type: str | None = None) ->
     Raises:
         InputError: unknown body type.
 
-    Example:
+    Examples:
         >>> sample_car(0, "saloon").body_type
         'saloon'
         >>> sample_car(7) == sample_car(7)

@@ -46,7 +46,7 @@ class PCAShapePrior(nn.Module):
         InputError: shapes, dtypes or devices that do not fit together, numbers that are not finite, or a spacing that
             is not positive.
 
-    Example:
+    Examples:
         >>> prior = PCAShapePrior.load_bundled()
         >>> code = prior.initial_code(2)
         >>> prior.values(code).shape[0], prior.bind(code).value(torch.zeros(1, 3), torch.tensor([1])).shape
@@ -136,7 +136,7 @@ class PCAShapePrior(nn.Module):
     def dimensions_hwl(self, code: Tensor) -> Tensor:
         """Height, width and length (B, 3), metres, that codes (B, K) have by the linear map of the training cars.
 
-        Example:
+        Examples:
             >>> prior = PCAShapePrior.load_bundled()
             >>> bool((prior.dimensions_hwl(prior.initial_code(1)) == prior.dimensions_mean_hwl).all())
             True
@@ -192,7 +192,7 @@ class PCAShapePrior(nn.Module):
         Raises:
             InputError: too few samples, or non-finite ones.
 
-        Example:
+        Examples:
             >>> x = torch.linspace(-1, 1, 9)
             >>> radius = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1).norm(dim=-1)
             >>> spheres = torch.stack([radius - r for r in (0.5, 0.6, 0.7)])

@@ -37,7 +37,7 @@ def fit_code(prior: PCAShapePrior, sdf: Tensor, near_surface_m: float = NEAR_SUR
     Raises:
         InputError: another grid than the prior's, or fewer nodes near the surface than components.
 
-    Example:
+    Examples:
         >>> prior = PCAShapePrior.load_bundled()
         >>> code = torch.zeros(1, prior.num_codes)
         >>> code[0, 1] = 1.5

@@ -33,7 +33,7 @@ class GridShape:
         origin: position of node (0, 0, 0) in the object frame, (3,), metres.
         spacing_m: distance between nodes, metres.
 
-    Example:
+    Examples:
         >>> import torch
         >>> height_above_ground = -torch.arange(-2.0, 2.0)[None, None, :, None].expand(1, 3, 4, 3)
         >>> shape = GridShape(height_above_ground, torch.zeros(3, 4, 3, 1), torch.tensor([0.0, -2.0, 0.0]), 1.0)
@@ -266,7 +266,7 @@ def zero_level_extents(
     Raises:
         InputError: `values` is not (B, nx, ny, nz).
 
-    Example:
+    Examples:
         >>> x = torch.arange(-3.0, 4.0)
         >>> sphere = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1).norm(dim=-1) - 2.5
         >>> zero_level_extents(sphere[None], torch.full((3,), -3.0), 1.0)[0, 1]

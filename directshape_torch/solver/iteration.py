@@ -35,7 +35,7 @@ def damped_step(
         The steps (B, D), zero where there is none, and `solvable` (B,): false where the system is singular or not
         finite. Never raises and never synchronises with the device.
 
-    Example:
+    Examples:
         >>> step, solvable = damped_step(torch.eye(2)[None], torch.ones(1, 2), torch.zeros(1))
         >>> step
         tensor([[-1., -1.]])
@@ -73,7 +73,7 @@ def step_lengths(stretched: Tensor, over_relaxation: float) -> Tensor:
     Returns:
         Factors (B,), of the default type.
 
-    Example:
+    Examples:
         >>> step_lengths(torch.tensor([True, False]), 1.5)
         tensor([1.5000, 1.0000])
     """
@@ -83,7 +83,7 @@ def step_lengths(stretched: Tensor, over_relaxation: float) -> Tensor:
 def is_finite(sums: Tensor) -> Tensor:
     """Where sums are finite, and with them everything that was added: two small operations, `isfinite` is four.
 
-    Example:
+    Examples:
         >>> is_finite(torch.tensor([1.0, torch.inf, torch.nan]))
         tensor([ True, False, False])
     """
@@ -97,7 +97,7 @@ def limit_step(
 ) -> Tensor:
     """The whole step scaled so that no unknown moves by more than its limit: direction is kept.
 
-    Example:
+    Examples:
         >>> limit_step(torch.tensor([[1.0, 4.0]]), torch.tensor([1.0, 1.0]))
         tensor([[0.2500, 1.0000]])
     """
@@ -107,7 +107,7 @@ def limit_step(
 def limited_step(step: Tensor, limits: Tensor) -> tuple[Tensor, Tensor]:
     """`limit_step`, and the size (B,) of what it returns as a share of the limits, at most 1.
 
-    Example:
+    Examples:
         >>> limited_step(torch.tensor([[0.1, 0.2]]), torch.tensor([1.0, 1.0]))[1]
         tensor([0.2000])
     """
@@ -169,7 +169,7 @@ class Progress(Generic[StateT]):
 def has_failed(ended: Tensor) -> Tensor:
     """Whether each problem (B,) ended and did not converge.
 
-    Example:
+    Examples:
         >>> has_failed(torch.tensor([RUNNING, Status.converged.code, Status.singular.code]))
         tensor([False, False,  True])
     """

@@ -42,7 +42,7 @@ def match_disparity(
     Raises:
         InputError: the images are not a pair of RGB uint8 images, or `num_disparities` is not a multiple of 16.
 
-    Example:
+    Examples:
         >>> texture = np.random.default_rng(0).integers(0, 255, (40, 80, 3), dtype=np.uint8)
         >>> disparity = match_disparity(texture, np.roll(texture, -4, axis=1), num_disparities=16)
         >>> float(disparity[20, 40])
@@ -81,7 +81,7 @@ def match_disparity(
 def check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8]) -> None:
     """Raise `InputError` unless both are RGB images (H, W, 3) of uint8 and of one size.
 
-    Example:
+    Examples:
         >>> check_pair(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5, 3), np.uint8))
     """
     for name, image in (("image_left", image_left), ("image_right", image_right)):
@@ -141,7 +141,7 @@ def with_disparity(frames: FrameBatch, matcher: Literal["sgbm", "elas"], needed:
     Raises:
         MissingDependencyError: "elas" without its package.
 
-    Example:
+    Examples:
         >>> from directshape_torch.scene import GroundPlane, StereoCamera
         >>> K = torch.tensor([[[700.0, 0, 40], [0, 700.0, 20], [0, 0, 1]]])
         >>> T_right_cam = torch.eye(4)[None].clone()

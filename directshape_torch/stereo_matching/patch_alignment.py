@@ -42,7 +42,7 @@ def align_patches(
     Returns:
         pixels (P, 2) in the other image, and (P,) bool: converged near the start, textured, inside of both images.
 
-    Example:
+    Examples:
         >>> u, v = torch.meshgrid(torch.arange(60.0), torch.arange(20.0), indexing="xy")
         >>> first, other = (100 + 50 * torch.sin((u - shift) / 3) + 30 * torch.cos(v / 2) for shift in (0.0, 2.3))
         >>> uv = torch.tensor([[30.0, 10.0]])

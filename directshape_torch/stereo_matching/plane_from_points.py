@@ -75,7 +75,7 @@ def fit_ground_plane(
     Returns:
         unit normal (3,) pointing up and offset (), or None, as `estimate_ground_plane`.
 
-    Example:
+    Examples:
         >>> x, z = torch.meshgrid(torch.linspace(-5, 5, 30).double(), torch.linspace(5, 35, 30).double(), indexing="ij")
         >>> road = torch.stack([x, 1.65 - 0.01 * z, z], dim=-1).reshape(-1, 3)
         >>> normal, offset = fit_ground_plane(road)

@@ -34,7 +34,7 @@ def refine_disparity(
 ) -> RefinedDisparity:
     """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset.
 
-    Example:
+    Examples:
         >>> u = torch.arange(60, dtype=torch.float64)
         >>> rows = 30 * torch.cos(u[:20, None] / 2)
         >>> left, right = (100 + 50 * torch.sin((u + shift) / 3) + rows for shift in (0.0, 7.3))

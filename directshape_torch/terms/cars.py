@@ -27,7 +27,7 @@ class CarState(NamedTuple):
     def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
         """Cars of a pose (B, 4, 4) and a shape (B, K), where the rig's disparity is as it is calibrated.
 
-        Example:
+        Examples:
             >>> CarState.of(torch.eye(4)[None], torch.zeros(1, 2), num_offsets=1).offset_px
             tensor([[0.]])
         """
@@ -59,7 +59,7 @@ def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_ang
         max_code: largest magnitude of a code component.
         max_angle: no rotation is larger, radians (see `se3.exp`).
 
-    Example:
+    Examples:
         >>> state = CarState.of(torch.eye(4)[None], torch.zeros(1, 2))
         >>> retract(state, torch.tensor([[1.0, 0, 0, 0, 0, 0, 0.5, 9.0]]), max_code=3.0).code
         tensor([[0.5000, 3.0000]])

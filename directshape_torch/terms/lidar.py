@@ -42,7 +42,7 @@ class LidarPoints:
         weight: of the mean over the points of a car, per square metre.
         huber_m: corner of the Huber norm.
 
-    Example:
+    Examples:
         >>> LidarPoints()
         LidarPoints(weight=300.0, huber_m=0.1)
     """

@@ -266,7 +266,7 @@ def matched_brightness(
     factor and an offset. Moments need no pixel to lie on its counterpart; a regression of one image on the other would
     take contrast off at every pose that is not yet right.
 
-    Example:
+    Examples:
         >>> left, weight, owner = torch.tensor([[[90.0, 110.0]]]), torch.ones(1, 1, 2), torch.tensor([0])
         >>> matched_brightness("gain", left, 1.1 * left, weight, owner, 1)
         tensor([[[ 99., 121.]]])

@@ -296,7 +296,7 @@ def patch_residual(
     right one the contrast of the left one. A contrast counts as at least the floor, so that noise is not blown up where
     there is no texture.
 
-    Example:
+    Examples:
         >>> left, weight = torch.tensor([[90.0, 110.0]]), torch.ones(1, 2)
         >>> brighter = 0.5 * left + 30
         >>> patch_residual(brighter - left, left, weight, "zero_mean", 1e-3)
@@ -325,7 +325,7 @@ def patch_derivative(
     With the right neighbourhood x, its mean taken off, and c its contrast: `d(x / c) = (dx - y mean(y dx)) / c` where
     `y = x / c`, whatever the floor.
 
-    Example:
+    Examples:
         >>> J, left, weight = torch.tensor([[1.0, 3.0]]), torch.zeros(1, 2), torch.ones(1, 2)
         >>> patch_derivative(J, left, left, weight, "zero_mean", 1.0)
         tensor([[-1.,  1.]])

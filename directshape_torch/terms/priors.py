@@ -146,7 +146,7 @@ def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
 def shape_prior(code: Tensor) -> PriorResidual:
     """Pulls the whitened code (B, K) to the mean shape (paper, E_shape; sigma is folded into the basis).
 
-    Example:
+    Examples:
         >>> shape_prior(torch.ones(1, 2)).J_residual_state[0, 0]
         tensor([0., 0., 0., 0., 0., 0., 1., 0.])
     """
@@ -204,7 +204,7 @@ def dimensions_prior(
 
     A car seen from behind does not show its length: the detector's dimensions are information (not in the paper).
 
-    Example:
+    Examples:
         >>> shape = DimensionsDerivative(torch.zeros(1, 3), torch.zeros(1, 3, 2))
         >>> dimensions_prior(shape, torch.ones(1, 3), torch.ones(3)).residual
         tensor([[-1., -1., -1.]])
@@ -224,7 +224,7 @@ def pose_prior(
     The axes are those of the detector's viewing ray, so they stay while the car moves; the heading is the angle about
     the camera's y axis from the detector's x axis to the car's, in (-pi, pi].
 
-    Example:
+    Examples:
         >>> T_cam_obj = torch.eye(4)[None].clone()
         >>> T_cam_obj[:, 2, 3] = 10.0
         >>> nearer = T_cam_obj.clone()
@@ -261,7 +261,7 @@ def rig_prior(cars: CarBatch, state: CarState) -> PriorResidual:
 def viewing_axes(origin_cam: Tensor) -> Tensor:
     """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down.
 
-    Example:
+    Examples:
         >>> viewing_axes(torch.tensor([[0.0, 1.6, 10.0]]))[0, 0]
         tensor([0., 0., 1.])
     """

@@ -20,7 +20,7 @@ class RobustValue(NamedTuple):
 def quadratic(residual: Tensor) -> RobustValue:
     """`rho = r^2 / 2`.
 
-    Example:
+    Examples:
         >>> quadratic(torch.tensor(2.0)).rho
         tensor(2.)
     """
@@ -31,7 +31,7 @@ def quadratic(residual: Tensor) -> RobustValue:
 def huber(residual: Tensor, corner: float) -> RobustValue:
     """Huber's norm: `r^2 / 2` inside the corner, `corner (|r| - corner / 2)` outside.
 
-    Example:
+    Examples:
         >>> huber(torch.tensor(3.0), 2.0).rho
         tensor(4.)
     """
@@ -45,7 +45,7 @@ def huber(residual: Tensor, corner: float) -> RobustValue:
 def truncated_huber(residual: Tensor, corner: float, limit: float) -> RobustValue:
     """Huber's norm that stays constant beyond `limit`: a reflection is no worse than a pixel that is lost.
 
-    Example:
+    Examples:
         >>> truncated_huber(torch.tensor(99.0), 2.0, 3.0).rho
         tensor(4.)
     """
@@ -61,7 +61,7 @@ def identity(residual: Tensor, floor: float) -> RobustValue:
 
     The information of such a row, a negative log-likelihood, is its squared slope: weight 1.
 
-    Example:
+    Examples:
         >>> identity(torch.tensor(0.5), 0.01).hessian_weight
         tensor(2.)
     """

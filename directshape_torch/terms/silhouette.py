@@ -267,7 +267,7 @@ def closest_approach_residual(
     1 - pi the smaller one is a quotient and no difference, so the likelihood `A = pi p_fg + (1 - pi) p_bg` loses no
     digit. `d r / d sdf = zeta pi (1 - pi) (p_fg - p_bg) / A`.
 
-    Example:
+    Examples:
         >>> on_contour = (torch.zeros(1), torch.full((1,), 2.0), torch.full((1,), 0.75))
         >>> closest_approach_residual(*on_contour)
         (tensor([0.6931]), tensor([0.5000]))
@@ -360,7 +360,7 @@ def product_residual(
     `log (1 - pi) = -sum_s softplus(-zeta sdf_s)`, `d pi / d sdf_s = -zeta (1 - pi) sigmoid(-zeta sdf_s)` and
     `d r / d pi = -(p_fg - p_bg) / A` (paper, supplement, eqs. for dA/dpi, dpi/dPhi and dC/dPhi; Phi = -sdf).
 
-    Example:
+    Examples:
         >>> product_residual(torch.zeros(1, 1), torch.ones(1), torch.full((1,), 0.99))[0]
         tensor([0.6931])
     """
@@ -376,7 +376,7 @@ def product_residual(
 def log_one_minus_exp(x: Tensor) -> Tensor:
     """`log(1 - exp(x))` for x < 0 without cancellation (Maechler's two branches), finite for x -> 0.
 
-    Example:
+    Examples:
         >>> log_one_minus_exp(torch.tensor(-0.6931472))
         tensor(-0.6931)
     """

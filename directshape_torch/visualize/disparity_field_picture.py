@@ -35,7 +35,7 @@ def draw_disparity_field(
     Raises:
         InputError: `uv_left` and `bias_px` do not belong together.
 
-    Example:
+    Examples:
         >>> K, T = torch.eye(3), torch.eye(4)
         >>> field = DisparityField.constant(-0.3, (320, 96), K, K, T)
         >>> draw_disparity_field(field, torch.tensor([[50.0, 40.0]]), torch.tensor([-0.4])).shape

@@ -43,7 +43,7 @@ def write_profile_picture(path: Path | str, profile: DisparityProfile, names: Se
         InputError: no cars, or not one name each.
         MissingDependencyError: matplotlib is not installed.
 
-    Example:
+    Examples:
         >>> import tempfile, torch
         >>> from directshape_torch.diagnosis.disparity_profile import profile_offsets
         >>> offsets, path = profile_offsets(), Path(tempfile.mkdtemp()) / "profiles.png"

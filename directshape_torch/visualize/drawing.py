@@ -31,7 +31,7 @@ _FARTHEST_PX = 1e5
 def picture_of(image: Tensor) -> Picture:
     """An image (3, h, w) in [0, 1] as a picture (h, w, 3); what is not a number is black.
 
-    Example:
+    Examples:
         >>> picture_of(torch.tensor([0.0, 0.5, torch.nan]).view(3, 1, 1)).tolist()
         [[[0, 128, 0]]]
     """
@@ -61,7 +61,7 @@ class View:
     ) -> View:
         """The window (u_min, v_min, u_max, v_max), half open, of an image, enlarged; beyond the image it is black.
 
-        Example:
+        Examples:
             >>> view = View.of_window(np.zeros((4, 6, 3), np.uint8), np.eye(3), (1, 1, 5, 3), 2.0)
             >>> view.picture.shape, view.K[0].tolist()
             ((4, 8, 3), [2.0, 0.0, -1.5])
@@ -142,7 +142,7 @@ def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour
 def clip_at_near_plane(first_cam: Array, second_cam: Array) -> Array | None:
     """The part (2, 3) of a segment that lies in front of the camera, or None.
 
-    Example:
+    Examples:
         >>> clip_at_near_plane(np.array([0.0, 0.0, -0.7]), np.array([2.0, 0.0, 1.3])).round(6).tolist()
         [[1.0, 0.0, 0.3], [2.0, 0.0, 1.3]]
     """

@@ -23,7 +23,7 @@ def ground_grid(
 ) -> trimesh.Trimesh:
     """Lines of constant x and z on the plane `normal . x_cam + offset = 0`, seen from both sides.
 
-    Example:
+    Examples:
         >>> import torch
         >>> grid = ground_grid(torch.tensor([0.0, -1.0, 0.0]), 1.65)
         >>> bool((grid.vertices[:, 1] == 1.65).all())

@@ -44,7 +44,7 @@ def write_recall_plot(path: Path | str, panels: Sequence[RecallPanel], title: st
         InputError: there are no panels.
         MissingDependencyError: matplotlib is not installed.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "curves.png"
         >>> panel = RecallPanel("3D, IoU > 0.7", "precision", (RecallCurve("easy", np.linspace(1, 0, 41)),))

@@ -29,7 +29,7 @@ def prior_picture(prior: PCAShapePrior, num_sigma: float = 2.0) -> Image:
     Returns:
         (H, W, 3) uint8, BGR, as OpenCV writes it.
 
-    Example:
+    Examples:
         >>> picture = prior_picture(PCAShapePrior.load_bundled().with_num_codes(1))
         >>> picture.shape[2], bool((picture < 128).any())
         (3, True)

@@ -17,7 +17,7 @@ def draw_rigs(
 
     The offsets are less the detector's own bias.
 
-    Example:
+    Examples:
         >>> import torch
         >>> K, T_right_cam = torch.eye(3), torch.eye(4)
         >>> T_right_cam[0, 3] = -0.5

@@ -54,7 +54,7 @@ def write_tau_plot(path: Path | str, panels: Sequence[TauPanel], title: str) -> 
         InputError: there are no panels.
         MissingDependencyError: matplotlib is not installed.
 
-    Example:
+    Examples:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "curves.png"
         >>> curve = TauCurve("after", np.array([0.1, 0.2]), np.array([0.5, 0.9]))

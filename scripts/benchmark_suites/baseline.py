@@ -39,7 +39,7 @@ class Expected:
     def limit(self) -> float:
         """The worst value that passes.
 
-        Example:
+        Examples:
             >>> Expected(4.0, "ratio", "higher", 0.25).limit, Expected(2.0, "slope", "lower", 0.5).limit
             (3.0, 2.5)
         """

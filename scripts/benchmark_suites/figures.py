@@ -82,7 +82,7 @@ class Row:
     def meets_goal(self) -> bool | None:
         """None without a goal, or where there is no figure.
 
-        Example:
+        Examples:
             >>> Row("cpu", "per car", 9.5, "ms", "time", goal=10.0).meets_goal
             True
         """

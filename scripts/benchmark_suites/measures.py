@@ -20,7 +20,7 @@ class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
     What is compiled elsewhere runs in its plain form inside.
 
-    Example:
+    Examples:
         >>> with OperationCount() as count:
         ...     _ = torch.ones(3) + 1
         >>> count.by_name
@@ -60,7 +60,7 @@ def peak_tensor_bytes(call: Callable[[], object], device: torch.device | None = 
         call: is called once, much slower than usual where it runs on a CPU.
         device: None or a CPU, or the graphics card whose memory counts.
 
-    Example:
+    Examples:
         >>> peak_tensor_bytes(lambda: torch.zeros(1000, dtype=torch.float64))
         8000
     """

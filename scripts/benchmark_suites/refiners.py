@@ -35,7 +35,7 @@ def make_refiner(preset: str, mode: str, overrides: Sequence[str] = ()) -> Direc
         mode: of `MODES`.
         overrides: `key=value`.
 
-    Example:
+    Examples:
         >>> make_refiner("fast", "eager", ["silhouette.weight=6"]).config.silhouette.weight
         6.0
     """

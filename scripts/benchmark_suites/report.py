@@ -18,7 +18,7 @@ from directshape_torch.files.atomic_files import write_json
 def format_suite(result: SuiteResult) -> str:
     """A suite's rows as an aligned table, its notes below.
 
-    Example:
+    Examples:
         >>> print(format_suite(SuiteResult("cpu", (Row("cpu", "a", 2.5, "ms", "time", goal=2),))))
         cpu  value   spread  n  goal             note
         ---  ------  ------  -  ---------------  ----

@@ -54,7 +54,7 @@ def run_scaling(settings: SuiteSettings) -> SuiteResult:
 def slope(x: Sequence[float], y: Sequence[float]) -> float:
     """Slope of the least-squares line through (log x, log y): 1 where y is proportional to x.
 
-    Example:
+    Examples:
         >>> round(slope([1, 2, 4], [3, 12, 48]), 6)
         2.0
     """

@@ -35,7 +35,7 @@ class Repetitions:
 class Spread:
     """Median and quartiles of a sample.
 
-    Example:
+    Examples:
         >>> Spread.of([3.0, 1.0, 2.0, 4.0, 5.0])
         Spread(median=3.0, low=2.0, high=4.0, count=5)
     """
@@ -74,7 +74,7 @@ class InterleavedTimes:
     def ratio(self, numerator: str, denominator: str) -> Spread:
         """How many times longer one takes than another, by the ratios within the rounds.
 
-        Example:
+        Examples:
             >>> InterleavedTimes({"a": (4.0, 8.0), "b": (2.0, 4.0)}).ratio("a", "b").median
             2.0
         """

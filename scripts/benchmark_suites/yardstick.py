@@ -18,7 +18,7 @@ _LOOKUPS = 1_000_000
 class Yardstick:
     """The work, with its own inputs; each call does the same.
 
-    Example:
+    Examples:
         >>> Yardstick()().shape
         torch.Size([6, 11, 11])
     """

@@ -54,7 +54,7 @@ class SceneLayout:
 def pose_on_road(x_m: float, z_m: float, rotation_y_rad: float) -> Array:
     """`T_road_obj` (4, 4) of a car on the ground, heading by KITTI's `rotation_y` (-pi/2 drives away).
 
-    Example:
+    Examples:
         >>> bool(np.allclose(pose_on_road(0.0, 9.0, -np.pi / 2)[:3, 0], [0.0, 0.0, 1.0]))
         True
     """

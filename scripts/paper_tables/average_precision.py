@@ -27,7 +27,7 @@ def ap_scores(labels: Path, results: Path, frames: Sequence[str]) -> KittiScores
 def paper_columns() -> tuple[str, ...]:
     """Headings of the twelve columns.
 
-    Example:
+    Examples:
         >>> paper_columns()[:2]
         ('BEV 0.5 E', 'M')
     """

@@ -32,7 +32,7 @@ class ExposedDataset(KittiStereoDataset):
 def exposed(images: Tensor, exposure: Exposure) -> Tensor:
     """Images (F, 3, H, W) in [0, 1] with other brightness, in bytes as a camera gives them.
 
-    Example:
+    Examples:
         >>> (255 * exposed(torch.full((1, 3, 1, 1), 100 / 255), "flatter")[0, 0]).round()
         tensor([[105.]])
     """

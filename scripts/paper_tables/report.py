@@ -42,7 +42,7 @@ class Table:
     def markdown(self) -> str:
         """The table with its heading and notes.
 
-        Example:
+        Examples:
             >>> print(Table("Cars", ("n",), (("3",),)).markdown())
             ## Cars
             <BLANKLINE>
@@ -106,7 +106,7 @@ class Report:
 def interval(estimate: Estimate, digits: int = 3) -> str:
     """A figure with its interval, where there is one.
 
-    Example:
+    Examples:
         >>> interval(Estimate(0.5, 0.25, 0.75), 2), interval(Estimate(0.5, None, None), 2)
         ('0.50 [0.25, 0.75]', '0.50')
     """

@@ -46,7 +46,7 @@ class Settings:
     def slug(self) -> str:
         """A short name for folders, readable rather than unique.
 
-        Example:
+        Examples:
             >>> Settings(("silhouette.weight=0",), masks="degraded").slug
             'default-silhouette.weight-0-degraded'
         """

@@ -78,7 +78,7 @@ class Outcome:
 def folds_of(frame_ids: Sequence[str], num_folds: int, seed: int) -> dict[str, int]:
     """Which fold each frame belongs to: a seeded shuffle dealt out in turn.
 
-    Example:
+    Examples:
         >>> sorted(folds_of(["a", "b", "c", "d"], 2, 0).values())
         [0, 0, 1, 1]
     """

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.kitti_labels import poses_cam
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -22,24 +22,15 @@ def tensors_of_the_bundled_frame() -> dict[str, object]:
         DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training" / "masks"
     ).load("000000")
     frame, found = loaded.frame, loaded.detections
-    lines = [loaded.input_objects[row] for row in loaded.row_of_detection]
-    t_left = frame.camera.t_cam_ref[..., None]
-    t_right = t_left + frame.camera.T_right_cam[:, :3, 3:]
     return {
+        "K": frame.camera.K_left[0],
+        "baseline_m": float(frame.camera.baseline),
         "images_left": frame.images_left,
         "images_right": frame.images_right,
-        "sizes": frame.sizes,
-        "frame_ids": frame.frame_ids,
-        "P_left": torch.cat([frame.camera.K_left, frame.camera.K_left @ t_left], dim=-1),
-        "P_right": torch.cat([frame.camera.K_right, frame.camera.K_right @ t_right], dim=-1),
-        "frame_index": found.frame_index,
-        "bottom_centres": poses_cam(lines, frame.camera.t_cam_ref[0])[:, :3, 3],
-        "rotation_y": torch.tensor([line.rotation_y for line in lines]),
-        "dimensions_hwl": found.dimensions_hwl,
-        "boxes_2d": found.box_2d,
-        "scores": found.score,
+        "boxes_3d": poses_to_boxes(found.T_cam_obj, found.dimensions_hwl, "kitti"),
         "masks_left": found.mask_left,
         "masks_right": found.mask_right,
+        "frame_index": found.frame_index,
     }
 
 
@@ -50,8 +41,9 @@ def test_the_ten_lines_refine_tensors() -> None:
     exec(compile(code, "README.md", "exec"), names)
 
     result = names["result"]
-    assert result.T_cam_obj.shape == (6, 4, 4)
-    assert result.code.shape == (6, 8)
+    assert names["refined"].shape == (6, 7)
+    assert names["spread"].shape == (6, 4)
+    assert len(names["surfaces"]) == 6
     assert all(status.is_refined for status in result.status)
     assert bool((torch.nan_to_num(result.quality.mask_iou_left) > 0.85).all())
     assert sum(bool(line) for line in code.splitlines()) <= 10

@@ -27,7 +27,7 @@ def costs_of_car(view: CarView) -> dict[str, NDArray[np.float64]]:
 def stage_beginnings(stage: Sequence[int]) -> list[float]:
     """Places between the states where a later stage than the first begins.
 
-    Example:
+    Examples:
         >>> stage_beginnings([-1, 0, 0, 1, 1])
         [2.5]
     """

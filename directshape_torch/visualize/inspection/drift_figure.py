@@ -78,7 +78,7 @@ def _draw_contours(row: Any, view: CarView) -> None:
 def three_places(count: int) -> tuple[int, int, int]:
     """The first, an early and the last of so many states; most is done in the first few steps.
 
-    Example:
+    Examples:
         >>> three_places(12), three_places(2)
         ((0, 3, 11), (0, 1, 1))
     """

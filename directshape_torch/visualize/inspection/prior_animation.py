@@ -28,7 +28,7 @@ _LARGEST, _STEPS_A_CODE, _SECONDS_A_STEP = 2.0, 12, 0.12
 def code_path(num_codes: int, steps_a_code: int = _STEPS_A_CODE) -> Tensor:
     """Codes (K steps, K) that go to +2, to -2 and back to the mean shape, one code after the other.
 
-    Example:
+    Examples:
         >>> code_path(2, steps_a_code=4).round().int().tolist()
         [[0, 0], [2, 0], [0, 0], [-2, 0], [0, 0], [0, 2], [0, 0], [0, -2]]
     """

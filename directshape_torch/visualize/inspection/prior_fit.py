@@ -40,7 +40,7 @@ class FittedCar:
 def grid_of(prior: ShapePrior) -> GridSpec:
     """The grid on which a prior's surfaces are measured.
 
-    Example:
+    Examples:
         >>> from directshape_torch.shape.pca_prior import PCAShapePrior
         >>> grid_of(PCAShapePrior.load_bundled()).shape
         (59, 26, 27)

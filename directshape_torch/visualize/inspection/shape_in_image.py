@@ -44,7 +44,7 @@ class PixelGrid:
     def covering(cls, window: Window, most: int = _MOST_PIXELS) -> PixelGrid:
         """A grid over the window (u0, v0, u1, v1), half open, as fine as so many points allow.
 
-        Example:
+        Examples:
             >>> PixelGrid.covering((10, 20, 30, 30), most=50)
             PixelGrid(first_uv=(10.0, 20.0), step_px=2.0, shape=(5, 10))
         """
@@ -96,7 +96,7 @@ def zero_contours(grid: PixelGrid, closest_sdf: Tensor) -> list[Array]:
 def level_lines(values: Array, level: float) -> list[Array]:
     """Lines (n, 2), in rows and columns, along which an image (h, w) has a value, by linear interpolation.
 
-    Example:
+    Examples:
         >>> level_lines(np.array([[0.0, 1.0], [0.0, 1.0]]), 0.25)[0].tolist()
         [[1.0, 0.25], [0.0, 0.25]]
     """
