@@ -75,7 +75,6 @@ class CarProblem:
         factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
         num_extra: how many of the terms, the last ones, are a user's own.
         num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
-        marches: every ray is marched at every state of the iterations, not tracked.
     """
 
     prior: ShapePrior
@@ -86,7 +85,6 @@ class CarProblem:
     factors: Tensor | None = None
     num_extra: int = 0
     num_offsets: int = 0
-    marches: bool = False
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -148,10 +146,7 @@ class CarProblem:
         terms += extra
         if not terms:
             raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
-        # What is differentiated afterwards is the marched energy, so its minimum must be found.
-        is_differentiated = config.backward.mode != "none" and torch.is_grad_enabled()
-        marches = config.solver.rays == "marched" or is_differentiated
-        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets, marches)
+        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets)
         if extra:
             code = prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
             sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
@@ -262,7 +257,9 @@ class CarStage:
     def start(self, sight: Sight) -> tuple[CarIterations, Evaluation]:
         """What the iterations work on, and the energy where they begin."""
         problem = self.problem
-        if problem.marches:
+        # What is differentiated afterwards is the marched energy, so its minimum must be found: under `no_grad`
+        # too, for evaluation gives the results of training.
+        if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
             terms, rest = self.terms, None
             wheres = tuple(term.where(sight) for term in terms)
         else:

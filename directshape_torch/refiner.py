@@ -19,6 +19,7 @@ from directshape_torch.diagnosis.outcome import Outcome, judged, outcome_of, out
 from directshape_torch.errors import InputError, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
+from directshape_torch.numerics.gradient_mode import is_plain
 from directshape_torch.observation.car_points import PointSamples, car_points
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
@@ -142,6 +143,8 @@ class DirectShapeRefiner(nn.Module):
         when = self.config.check
         if when == "off" or (when == "first" and self._has_checked) or not len(detections):
             return
+        if not is_plain(frames.camera.K_left + 0):
+            return  # within a transform of `torch.func` nobody can read numbers
         self._has_checked = True
         for finding in check_scene(frames, detections, match_images=False).findings:
             if finding.severity != "note":

@@ -39,7 +39,7 @@ def lower_by(metres: Tensor | float) -> Callable[[CarBatch, CarState], PriorResi
 
 
 def made(kind: type[PriorTerm] = PriorTerm, residual_of: Any = None, weight: float = 1e5) -> TermFactory:
-    return lambda *scene: kind("user", weight, scene[2], residual_of or lower_by(0.3), 1)
+    return lambda *scene: kind("user", weight, scene[2], residual_of or lower_by(0.1), 1)
 
 
 def refine(
@@ -57,7 +57,7 @@ def test_a_prior_of_ones_own_counts_like_ours() -> None:
     assert result.refined.all()
     assert result.term_names[-1] == "user"
     lower = result.T_cam_obj[:, 1, 3] - refine(config=DEFAULT).T_cam_obj[:, 1, 3]
-    torch.testing.assert_close(lower, torch.full((2,), 0.3).double(), rtol=0, atol=0.1)
+    torch.testing.assert_close(lower, torch.full((2,), 0.1).double(), rtol=0, atol=0.04)
 
 
 def test_points_of_a_lidar_beside_the_images_are_the_combined_method() -> None:

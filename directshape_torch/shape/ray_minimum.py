@@ -37,7 +37,6 @@ class RayMinimum(NamedTuple):
     """The least signed distance along rays (M, R), near where it was looked for."""
 
     depth: Tensor  # (M, R) metres
-    found: Tensor  # (M, R) bool; where not, the search has come to `depth` and the distance still falls there
     face_obj: Tensor  # (3, M, R) normal of the face on which the minimum is a kink; zero where it is smooth
 
 
@@ -61,7 +60,8 @@ def minimum_in_grids(
 ) -> RayMinimum:
     """Downhill from cell to cell until the distance grows again, `max_cells` at most.
 
-    A minimum at `near` or `far` counts as smooth here: the caller knows what lies there. A ray whose `near` is its
+    A minimum at `near` or `far` counts as smooth here: the caller knows what lies there. What is not found by then
+    waits on the face that it came to, and goes on from there when the ray is tracked next. A ray whose `near` is its
     `far` stays there.
     """
     step, node, place = _cells_along(field, owner, centre_obj, direction_obj, depth)
@@ -101,8 +101,8 @@ def minimum_in_grids(
         limit = torch.where(running, limit, come)
         crossed = [((x == exit_at) & running).to(depth.dtype) for x in to_face]
         face = [torch.where(running, x, before) for x, before in zip(crossed, face, strict=True)]
-    kink_face = torch.stack([torch.where(is_kink, x, 0.0) for x in face])
-    return RayMinimum(torch.addcmul(depth, sign, come), ~running, kink_face)
+    has_face = is_kink | running
+    return RayMinimum(torch.addcmul(depth, sign, come), torch.stack([torch.where(has_face, x, 0.0) for x in face]))
 
 
 def curvature_in_grids(
@@ -175,7 +175,7 @@ def minimum_by_values(
         depth = depth + vertex.clamp(-_MAX_SAMPLE_DISTANCES, _MAX_SAMPLE_DISTANCES) * step
         depth = torch.minimum(torch.maximum(depth, near), far)
         step = step / _FINER
-    return RayMinimum(depth, torch.ones_like(depth, dtype=torch.bool), torch.zeros_like(direction_obj))
+    return RayMinimum(depth, torch.zeros_like(direction_obj))
 
 
 def curvature_by_values(value_at: Callable[[Tensor], Tensor], direction_obj: Tensor, depth: Tensor) -> Tensor:

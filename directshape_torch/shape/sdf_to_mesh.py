@@ -37,6 +37,7 @@ def sdf_to_mesh(
         MeshError: the field does not cross the level.
 
     Examples:
+        >>> import torch
         >>> x = torch.linspace(-1, 1, 21)
         >>> radius = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), -1).norm(dim=-1)
         >>> ball = sdf_to_mesh(radius - 0.5, torch.full((3,), -1.0), 0.1)

@@ -223,8 +223,6 @@ class Silhouettes:
         at = field.derivatives(points, self.rows.rays.owner, constant)
         gradient = along_face(at.gradient, rays.direction_obj, now.face_obj)
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
-        # The envelope theorem speaks of minima: where a search still goes on the residual is a constant of this step.
-        J_residual_sdf = torch.where(now.found, J_residual_sdf, 0.0)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
 
     def residual(self, field: Field, state: CarState, where: Where) -> Tensor:
@@ -236,7 +234,7 @@ class Silhouettes:
         off_face = (where.face_obj * (points - where.points_obj)).sum(0)
         depth = where.depth - torch.where(is_kink, off_face / torch.where(is_kink, across, 1.0), 0.0)
         sdf = field.value(rays.at(depth), self.rows.rays.owner)
-        return self._of_distance(torch.where(where.found, sdf, sdf.detach()), where.crosses)[0][..., None]
+        return self._of_distance(sdf, where.crosses)[0][..., None]
 
     def norm(self, residual: Tensor) -> robust.RobustValue:
         return robust.identity(residual, _RESIDUAL_FLOOR)

@@ -166,7 +166,6 @@ _SIZES = {
     "depth": 0,
     "depths": 1,
     "crosses": 0,
-    "found": 0,
     "on_surface": 0,
     "usable": 0,
 }
