@@ -117,7 +117,7 @@ def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> Re
     prior.mean = prior.mean + at["prior mean"]
     prior.basis = prior.basis * (1 + at["prior basis"])
     refiner = DirectShapeRefiner(prior, config)
-    weighted = "points" if config.method == "geometric" else "silhouette_left"
+    weighted = "point_cloud" if config.method == "geometric" else "silhouette_left"
     return refiner(frames, detections, {weighted: (1 + at["term weight"]).expand(len(d))})
 
 
