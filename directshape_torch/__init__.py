@@ -16,10 +16,11 @@ from directshape_torch.errors import (
 )
 from directshape_torch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
 from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
+from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
 from directshape_torch.scene_check.check_scene import check_scene
 from directshape_torch.scene_check.finding import CheckReport, Finding
 from directshape_torch.shape.pca_prior import PCAShapePrior

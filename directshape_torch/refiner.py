@@ -19,7 +19,7 @@ from directshape_torch.diagnosis.outcome import Outcome, judged, outcome_of, out
 from directshape_torch.errors import InputError, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
-from directshape_torch.numerics.gradient_mode import is_plain
+from directshape_torch.numerics.gradient_mode import is_within_transform
 from directshape_torch.observation.car_points import PointSamples, car_points
 from directshape_torch.observation.mask_extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
@@ -27,7 +27,6 @@ from directshape_torch.observation.refinable import check_fit, check_no_tangents
 from directshape_torch.problem import CarProblem, TermFactory
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.scene_check.check_scene import check_scene
 from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -141,10 +140,12 @@ class DirectShapeRefiner(nn.Module):
     def _warn_of(self, frames: FrameBatch, detections: Detections) -> None:
         """Mistakes that the tensors of this call show, as the setting `check` asks."""
         when = self.config.check
-        if when == "off" or (when == "first" and self._has_checked) or not len(detections):
+        is_due = when == "always" or (when == "first" and not self._has_checked)
+        if not is_due or not len(detections) or is_within_transform():
             return
-        if not is_plain(frames.camera.K_left + 0):
-            return  # within a transform of `torch.func` nobody can read numbers
+        # Here, for it is needed once in a process that asks for it.
+        from directshape_torch.scene_check.check_scene import check_scene
+
         self._has_checked = True
         for finding in check_scene(frames, detections, match_images=False).findings:
             if finding.severity != "note":

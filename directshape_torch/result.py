@@ -272,7 +272,8 @@ class RefinementResult(CarRecord):
         """Calibrated standard deviations (B, 4) of the box's place in `ref` and of its heading, metres and radians.
 
         NaN for cars that were not refined. Calibrated with the default settings on rendered frames; a rig's own
-        disparity error is in them as far as `rig.disparity_sigma_px` or `Detections.offset_sigma_px` says.
+        disparity error is in them as far as the covariance of its field, `rig.disparity_sigma_px` or
+        `Detections.offset_sigma_px` says.
         """
         covariance = bundled_trust_model().calibrated_covariance(self.covariance_xyz_yaw, self.T_cam_obj[:, :3, 3])
         return covariance.diagonal(dim1=1, dim2=2).sqrt()

@@ -1,4 +1,4 @@
-"""What a refinement is given: cameras, ground planes, frames and detections, as plain tensors.
+"""What a refinement is given: ground planes, frames and detections, as plain tensors.
 
 Knows no data set and no solver. Frames of a call are numbered `0 .. F-1`; objects carry the number of their frame.
 Everything is in the left camera frame (`cam`): x right, y down, z forward, metres; pixels are (u, v) = (column, row)
@@ -14,22 +14,19 @@ from types import NoneType
 from typing import Annotated
 
 import torch
-from kornia.geometry import camera as kornia_camera
 from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
-from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.se3 import from_rotation_translation
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import (
     Dense,
     TensorRecord,
-    check_alike,
     check_positive,
     check_rotation,
     check_shape,
     check_sigmas,
-    check_stored,
+    check_type,
     is_no_rotation,
 )
 
@@ -39,175 +36,6 @@ Masks = Tensor | Sequence[Tensor | None]
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
 _DARKEST = -0.5
-# Of rectified cameras: 1e-4 radians move a pixel by 0.07 at a focal length of 700, and KITTI's stand askew by 0.5 %.
-_LARGEST_TURN = 1e-4
-_LARGEST_OFFSET = 0.05  # of the baseline
-
-
-@dataclass(frozen=True)
-class StereoCamera(TensorRecord):
-    """Calibration of the F rectified stereo frames of a call.
-
-    Attributes:
-        K_left: intrinsics of the left camera, (F, 3, 3), pixels.
-        K_right: intrinsics of the right camera, (F, 3, 3), pixels.
-        T_right_cam: left camera to right camera, (F, 4, 4), metres. Any rigid transform: KITTI's right camera is also
-            2.7 mm off vertically.
-        t_cam_ref: `x_cam = x_ref + t_cam_ref`, (F, 3): `ref` is the frame of labels and result files (KITTI: rectified
-            camera 0). Zero where there is no such frame.
-        disparity_field: residual disparity of the rig (measured minus true), or None.
-
-    Raises:
-        InputError: wrong shapes, numbers that are not finite, a rotation that is none, or a right camera that is not
-            to the right of the left one.
-    """
-
-    K_left: Annotated[Tensor, Dense("F", 3, 3)]
-    K_right: Annotated[Tensor, Dense("F", 3, 3)]
-    T_right_cam: Annotated[Tensor, Dense("F", 4, 4)]
-    t_cam_ref: Annotated[Tensor, Dense("F", 3)]
-    disparity_field: DisparityField | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_type("disparity_field", self.disparity_field, (DisparityField, NoneType))
-        for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref"):
-            if not bool(getattr(self, name).isfinite().all()):
-                raise InputError(name, "finite numbers", "NaN or infinity", "check the calibration of every frame")
-        check_rotation("T_right_cam", self.T_right_cam)
-        if (self.baseline <= 0).any():
-            raise InputError(
-                "T_right_cam",
-                "a right camera to the right of the left one (positive baseline)",
-                f"baseline {self.baseline.min().item():.4f} m",
-                "swap the two cameras, or the sign of the baseline",
-            )
-
-    @classmethod
-    def from_intrinsics(
-        cls,
-        K: Tensor,  # (3, 3) or (F, 3, 3)
-        baseline_m: float | Tensor,  # or (F,)
-        K_right: Tensor | None = None,
-        disparity_field: DisparityField | None = None,
-    ) -> StereoCamera:
-        """Of an ideal rectified pair: parallel cameras side by side, and labels in the frame of the left one.
-
-        Args:
-            K: intrinsics of the images, pixels; one matrix for one frame, or one for each of F frames.
-            baseline_m: distance of the two cameras, metres, positive.
-            K_right: of the right images where they differ.
-            disparity_field: residual disparity of the rig (measured minus true), or None.
-
-        Raises:
-            InputError: other shapes or types, intrinsics that are not `[[fx, s, cx], [0, fy, cy], [0, 0, 1]]` with
-                positive focal lengths, or a baseline that is not above 0.
-
-        Examples:
-            >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
-            >>> StereoCamera.from_intrinsics(K, 0.54).baseline
-            tensor([0.5400])
-        """
-        K_left = _intrinsics("K", K)
-        of_right = K_left.clone() if K_right is None else _intrinsics("K_right", K_right).expand_as(K_left).clone()
-        baseline = torch.as_tensor(baseline_m, dtype=K_left.dtype, device=K_left.device)
-        if baseline.ndim > 1 or (baseline.ndim == 1 and len(baseline) != len(K_left)):
-            got = str(tuple(baseline.shape))
-            raise InputError("baseline_m", f"a number, or {len(K_left)} of them", f"shape {got}", "in metres")
-        T_right_cam = torch.eye(4).to(K_left).repeat(len(K_left), 1, 1)
-        T_right_cam[:, 0, 3] = -baseline
-        return cls(K_left.clone(), of_right, T_right_cam, torch.zeros_like(K_left[:, 0]), disparity_field)
-
-    @classmethod
-    def from_projections(
-        cls,
-        P_left: Tensor,  # (F, 3, 4)
-        P_right: Tensor,  # (F, 3, 4)
-        disparity_field: DisparityField | None = None,
-    ) -> StereoCamera:
-        """From KITTI's P2 and P3: `K = P[:, :3]`, `t_left = K^-1 P2[:, 3]`, `T_right_cam = [I, t_right - t_left]`.
-
-        Raises:
-            InputError: wrong shapes or types, a K that has no inverse, or a right camera that is not to the right of
-                the left one.
-
-        Examples:
-            >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
-            >>> shift = torch.tensor([[-378.0], [0.0], [0.0]])
-            >>> P_left = torch.cat([K, torch.zeros(3, 1)], dim=1)[None]
-            >>> P_right = torch.cat([K, shift], dim=1)[None]
-            >>> StereoCamera.from_projections(P_left, P_right).baseline
-            tensor([0.5400])
-        """
-        check_shape("P_left", P_left, ("F", 3, 4))
-        check_shape("P_right", P_right, (len(P_left), 3, 4))
-        if P_left.dtype not in (torch.float32, torch.float64):
-            raise InputError("P_left", "float32 or float64", str(P_left.dtype), "convert it with .float() or .double()")
-        check_alike("P_right", P_right, "P_left", P_left)
-        check_stored("P_left", P_left)
-        K_left, K_right = P_left[..., :3], P_right[..., :3]
-        t_left, t_right = _translation("P_left", P_left), _translation("P_right", P_right)
-        T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
-        T_right_cam[:, :3, 3] = t_right - t_left
-        return cls(K_left.clone(), K_right.clone(), T_right_cam, t_left, disparity_field)
-
-    @classmethod
-    def from_kornia(
-        cls,
-        left: kornia_camera.PinholeCamera | kornia_camera.StereoCamera,
-        right: kornia_camera.PinholeCamera | None = None,
-        disparity_field: DisparityField | None = None,
-    ) -> StereoCamera:
-        """From a rectified pair of kornia's `PinholeCamera`, or from its `StereoCamera`, of F frames each.
-
-        Pixels and axes are the same there: centres at integers, x right, y down, z forward. Extrinsics (world to
-        camera) and projections are taken to be in metres. Of a pair, `T_right_cam` is kept and the world is not: `ref`
-        is the left camera itself. The height and width of the images belong to `FrameBatch.sizes`. Dtype, device and
-        gradients are kept.
-
-        Args:
-            left: of the left images: a `StereoCamera`, which has both, or intrinsics and extrinsics (F, 4, 4).
-            right: likewise of the right images; None beside a `StereoCamera`.
-            disparity_field: residual disparity of the rig (measured minus true), or None.
-
-        Raises:
-            InputError: other types, a pair whose batch, image size, dtype or device differ, a rotation that is none,
-                cameras that are not rectified (turned by more than 1e-4 radians, or displaced by more than 5 % of the
-                baseline in height or depth), or a right camera that is not to the right of the left one.
-
-        Examples:
-            >>> K, T_right_cam = torch.eye(4)[None], torch.eye(4)[None].clone()
-            >>> K[0, 0, 0] = K[0, 1, 1] = 700.0
-            >>> T_right_cam[0, 0, 3] = -0.54
-            >>> height, width = torch.tensor([375]), torch.tensor([1242])
-            >>> left = kornia_camera.PinholeCamera(K, torch.eye(4)[None], height, width)
-            >>> right = kornia_camera.PinholeCamera(K, T_right_cam, height, width)
-            >>> StereoCamera.from_kornia(left, right).baseline
-            tensor([0.5400])
-        """
-        if isinstance(left, kornia_camera.StereoCamera):
-            if right is not None:
-                raise InputError("right", "None beside kornia's StereoCamera, which has both", type(right).__name__)
-            return cls.from_projections(left.rectified_left_camera, left.rectified_right_camera, disparity_field)
-        pair = _pinhole("left", left), _pinhole("right", right)
-        _check_alike(*pair)
-        T_right_cam = _between_rectified(*pair)
-        K_left, K_right = (camera.intrinsics[:, :3, :3].clone() for camera in pair)
-        return cls(K_left, K_right, T_right_cam, torch.zeros_like(T_right_cam[:, :3, 3]), disparity_field)
-
-    @property
-    def num_frames(self) -> int:
-        return len(self.K_left)
-
-    @property
-    def baseline(self) -> Tensor:
-        """Distance of the right camera along the left camera's x axis, (F,), metres, positive."""
-        return -self.T_right_cam[:, 0, 3]
-
-    @property
-    def T_cam_ref(self) -> Tensor:
-        """The frame of labels and result files to the left camera, (F, 4, 4)."""
-        return from_rotation_translation(torch.eye(3).to(self.t_cam_ref).expand_as(self.K_left), self.t_cam_ref)
 
 
 @dataclass(frozen=True)
@@ -287,8 +115,8 @@ class FrameBatch(TensorRecord):
         _check_brightness("images_left", self.images_left)
         _check_brightness("images_right", self.images_right)
         _check_words("frame_ids", self.frame_ids, num_frames, "names")
-        _check_type("camera", self.camera, (StereoCamera,))
-        _check_type("ground", self.ground, (GroundPlane,))
+        check_type("camera", self.camera, (StereoCamera,))
+        check_type("ground", self.ground, (GroundPlane,))
         for name, count in (("camera", self.camera.num_frames), ("ground", len(self.ground.normal))):
             if count != num_frames:
                 raise InputError(name, f"{num_frames} frames", f"{count}")
@@ -413,7 +241,7 @@ class Detections(TensorRecord):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_type("occluders", self.occluders, (Occluders, NoneType))
+        check_type("occluders", self.occluders, (Occluders, NoneType))
         has_pose = self.T_cam_obj.isfinite().flatten(1).all(dim=1)
         T_known = torch.where(has_pose[:, None, None], self.T_cam_obj, torch.eye(4).to(self.T_cam_obj))
         # One wait for the device for both. Dimensions that are NaN pass: they fail their own car.
@@ -547,22 +375,6 @@ def boxes_around(
     return torch.where(inside.flatten(1).any(dim=1)[:, None], box, torch.nan)
 
 
-def _intrinsics(name: str, K: Tensor) -> Tensor:
-    """Of F frames, (F, 3, 3)."""
-    shape = (3, 3) if isinstance(K, Tensor) and K.ndim == 2 else ("F", 3, 3)
-    check_shape(name, K, shape, kind="floating")
-    K = K if K.ndim == 3 else K[None]
-    last_row = K.new_tensor([0.0, 0.0, 1.0])
-    if not bool(((K[:, 2] == last_row).all(1) & (K[:, 1, 0] == 0) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)).all()):
-        raise InputError(name, "[[fx, s, cx], [0, fy, cy], [0, 0, 1]], pixels", f"{K.tolist()}", "mind its transpose")
-    return K
-
-
-def _check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:
-    if not isinstance(value, kinds):
-        raise InputError(name, f"a {kinds[0].__name__}", type(value).__name__)
-
-
 def _check_words(name: str, words: object, count: int, what: str) -> None:
     if not isinstance(words, (tuple, list)) or not all(isinstance(word, str) for word in words):
         raise InputError(name, f"a tuple of {count} {what}", type(words).__name__)
@@ -577,58 +389,6 @@ def _raise_not_positive(
     row = int((dimensions <= 0).any(dim=1).int().argmax())
     got = f"{dimensions[row].tolist()} in row {row}"
     raise InputError(name, "height, width and length above 0, metres", got, "leave out objects without a 3D box")
-
-
-def _translation(
-    name: str,
-    P: Tensor,  # (F, 3, 4)
-) -> Tensor:
-    """`K^-1 P[:, 3]`, (F, 3)."""
-    try:
-        t: Tensor = torch.linalg.solve(P[..., :3], P[..., 3:])[..., 0]
-        return t
-    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
-        cure = "give the projections of the rectified cameras (KITTI: P2 and P3)"
-        raise InputError(name, "intrinsics K = P[:, :3] that can be inverted", "a singular K", cure) from error
-
-
-def _pinhole(name: str, camera: object) -> kornia_camera.PinholeCamera:
-    if not isinstance(camera, kornia_camera.PinholeCamera):
-        expected = "kornia's PinholeCamera" + (" beside the left one" if name == "right" else " or StereoCamera")
-        raise InputError(name, expected, type(camera).__name__, "for matrices there is from_projections")
-    check_shape(f"{name}.intrinsics", camera.intrinsics, ("F", 4, 4), "give one camera a frame")
-    check_shape(f"{name}.rt_matrix", camera.rt_matrix, (len(camera.intrinsics), 3, 4), "give one camera a frame")
-    if camera.intrinsics.dtype not in (torch.float32, torch.float64):
-        raise InputError(name, "float32 or float64", str(camera.intrinsics.dtype), "convert its matrices")
-    check_rotation(name, camera.rt_matrix)
-    return camera
-
-
-def _check_alike(left: kornia_camera.PinholeCamera, right: kornia_camera.PinholeCamera) -> None:
-    for what, of in (
-        ("frames", lambda camera: camera.batch_size),
-        ("dtype", lambda camera: camera.intrinsics.dtype),
-        ("device", lambda camera: camera.device()),
-        ("(height, width)", lambda camera: torch.stack([camera.height, camera.width], dim=1).tolist()),
-    ):
-        if of(left) != of(right):
-            cure = "give both cameras of every frame, of images rectified to one size"
-            raise InputError("right", f"the {what} of the left camera: {of(left)}", f"{of(right)}", cure)
-
-
-def _between_rectified(left: kornia_camera.PinholeCamera, right: kornia_camera.PinholeCamera) -> Tensor:
-    """`T_right_cam` (F, 4, 4), in float64 on the way: their world may be far away."""
-    R = right.rotation_matrix.double() @ left.rotation_matrix.double().mT
-    t = (right.translation_vector.double() - R @ left.translation_vector.double())[..., 0]
-    turn = (R - torch.eye(3).to(R)).detach().abs().amax(dim=(1, 2))
-    offset = t.detach()[:, 1:].abs().amax(dim=1)
-    askew = (turn > _LARGEST_TURN) | (offset > _LARGEST_OFFSET * t.detach()[:, 0].abs())
-    if askew.any():
-        row = int(askew.int().argmax())
-        got = f"a turn by {turn[row]:.2g} and a translation by {[round(x, 4) for x in t[row].tolist()]} m in row {row}"
-        cure = "rectify the images, and give the cameras of the rectified ones (cv2.stereoRectify)"
-        raise InputError("right", "a rectified pair: parallel cameras, side by side", got, cure)
-    return from_rotation_translation(R, t).to(right.intrinsics.dtype)
 
 
 def _check_brightness(name: str, images: Tensor) -> None:

@@ -23,8 +23,9 @@ from directshape_torch.errors import (
 )
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import project
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
-from directshape_torch.scene import GroundPlane, Occluders, StereoCamera
+from directshape_torch.scene import GroundPlane, Occluders
 from directshape_torch.status import Status
 
 

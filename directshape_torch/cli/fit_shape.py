@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
     from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
     from directshape_torch.fit_shape import fit_shape
+    from directshape_torch.io.velodyne import read_points
     from directshape_torch.shape.load_prior import load_prior
 
     points, boxes = (torch.from_numpy(read(path)) for read, path in ((read_points, args.points), (_boxes, args.boxes)))
@@ -78,34 +79,6 @@ def run(args: argparse.Namespace) -> int:
             write_bytes(args.out / "meshes" / f"{row:03d}.ply", export_ply(cars.mesh(row)))
     print(f"results  {args.out}")
     return 0
-
-
-def read_points(path: Path) -> NDArray[np.float64]:
-    """Points (P, 3) of a file.
-
-    Raises:
-        DataFormatError: it is missing, empty or damaged.
-    """
-    import io
-
-    import numpy as np
-
-    from directshape_torch.errors import DataFormatError
-    from directshape_torch.files.read_files import read_bytes
-
-    content = read_bytes(path)
-    try:
-        if path.suffix == ".bin":
-            points = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
-        else:
-            points = np.load(io.BytesIO(content), allow_pickle=False)
-        xyz = np.asarray(points, dtype=np.float64)[:, :3]
-    except (ValueError, IndexError, EOFError, OSError) as error:
-        cure = "give an array (P, 3) saved by numpy.save, or KITTI's float32 x y z reflectance"
-        raise DataFormatError(path, f"holds no points ({error})", cure=cure) from error
-    if not len(xyz) or xyz.shape[1] != 3 or not np.isfinite(xyz).all():
-        raise DataFormatError(path, "holds no points (P, 3) of finite numbers")
-    return xyz
 
 
 def _boxes(path: Path) -> NDArray[np.float64]:

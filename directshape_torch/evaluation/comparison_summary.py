@@ -24,6 +24,9 @@ class CarErrors:
     yaw_axis_deg: float
     bev_iou: float
     iou_3d: float
+    along_m: float
+    across_m: float
+    length_m: float
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ class PoseErrors:
         yaw_axis_deg: the same without regard to front and back, 0 .. 90 degrees (modulo 180).
         bev_iou: overlap of the footprints.
         iou_3d: overlap of the boxes.
+        along_m, across_m: of the centre seen from above, along the viewing ray of the true box (above 0: too far) and
+            across it (above 0: to the right).
+        length_m: above 0 where a box is too long.
     """
 
     centre_m: Tensor
@@ -34,6 +37,9 @@ class PoseErrors:
     yaw_axis_deg: Tensor
     bev_iou: Tensor
     iou_3d: Tensor
+    along_m: Tensor
+    across_m: Tensor
+    length_m: Tensor
 
 
 def boxes_of(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64) -> Tensor:
@@ -62,10 +68,13 @@ def pose_errors(
         >>> errors = pose_errors(found, true)
         >>> errors.centre_m, errors.yaw_deg, errors.yaw_axis_deg
         (tensor([0.5000]), tensor([180.]), tensor([0.]))
+        >>> errors.along_m, errors.across_m
+        (tensor([0.4000]), tensor([0.3000]))
     """
     check_shape("boxes", boxes, ("N", 7))
     check_shape("true_boxes", true_boxes, (len(boxes), 7))
     offset = box_centres(boxes) - box_centres(true_boxes)
+    ray = true_boxes[:, [0, 2]] / true_boxes[:, [0, 2]].norm(dim=-1, keepdim=True).clamp_min(1e-9)
     yaw = wrap_angle(boxes[:, 6] - true_boxes[:, 6]).abs()
     return PoseErrors(
         centre_m=offset.norm(dim=-1),
@@ -74,6 +83,9 @@ def pose_errors(
         yaw_axis_deg=torch.rad2deg(torch.minimum(yaw, math.pi - yaw)),
         bev_iou=bev_iou(bev_boxes(boxes), bev_boxes(true_boxes)),
         iou_3d=iou_3d(boxes, true_boxes),
+        along_m=(offset[:, [0, 2]] * ray).sum(dim=-1),
+        across_m=offset[:, 0] * ray[:, 1] - offset[:, 2] * ray[:, 0],
+        length_m=boxes[:, 5] - true_boxes[:, 5],
     )
 
 

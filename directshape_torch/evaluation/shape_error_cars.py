@@ -20,13 +20,13 @@ from directshape_torch.evaluation.shape_error_segment import FOLDER, SegmentSour
 from directshape_torch.evaluation.shape_error_summary import SurfaceSummary, summarise_surface
 from directshape_torch.evaluation.shape_error_surface import SurfaceSource
 from directshape_torch.files.text_files import read_lines
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam, read_objects
 from directshape_torch.io.mask_files import mask_source
 from directshape_torch.io.refinement_files import shapes_path
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
-from directshape_torch.scene import StereoCamera
 from directshape_torch.shape.shape_prior import ShapePrior
 
 

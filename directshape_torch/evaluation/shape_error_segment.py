@@ -15,11 +15,11 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.shape_error import Points, ShapeError, shape_error
 from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
 from directshape_torch.geometry.camera import points_from_disparity
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.mask_matching import match_masks
-from directshape_torch.scene import StereoCamera
 
 FOLDER = "disp_occ_0"
 

@@ -15,9 +15,9 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.shape_error import Points, ShapeError, shape_error
 from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
 from directshape_torch.files.npz_files import read_npz
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.scene import StereoCamera
 
 NUM_ESTIMATED_POINTS = 4000
 # Sets of fewer visible points say nothing about a surface.

@@ -1,8 +1,9 @@
-"""Read npz files and refuse what is none, without ever unpickling an object."""
+"""Read npz and npy files and refuse what is none, without ever unpickling an object."""
 
 from __future__ import annotations
 
 import io
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -45,6 +46,33 @@ def read_npz(path: Path | str, cure: str = "") -> dict[str, NDArray[Any]]:
     # Of an archive damaged on purpose numpy and zipfile raise whatever they come across.
     except Exception as error:
         raise DataFormatError(path, f"is no readable npz file ({error})", cure=cure) from error
+
+
+def read_npy(path: Path | str, cure: str = "save it with numpy.save") -> NDArray[Any]:
+    """The array of an npy file, read-only.
+
+    Raises:
+        DataFormatError: the file is missing, damaged, no npy, larger than 512 MiB, or holds Python objects.
+
+    Examples:
+        >>> import tempfile
+        >>> file = Path(tempfile.mkdtemp()) / "a.npy"
+        >>> np.save(file, np.zeros((2, 5)))
+        >>> read_npy(file).shape
+        (2, 5)
+    """
+    content = read_bytes(path, _MOST_BYTES, cure)
+    stream = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(stream)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, is_fortran, dtype = header(stream)
+        # What the header promises is asked of the bytes that are there: nothing is allocated for it.
+        array = np.frombuffer(content, dtype, math.prod(shape), stream.tell())
+        return array.reshape(shape, order="F" if is_fortran else "C")
+    # As above.
+    except Exception as error:
+        raise DataFormatError(path, f"is no readable npy file ({error})", cure=cure) from error
 
 
 def _check_entries(content: io.BytesIO) -> None:

@@ -11,8 +11,9 @@ from torch.nn.functional import pad
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders, StereoCamera
+from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
 
 
 def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField, field_of_rig
-from directshape_torch.scene import StereoCamera
+from directshape_torch.geometry.stereo_camera import StereoCamera
 
 # The name of each matrix in the object, the tracking and the raw layout, and its shape.
 _LAYOUTS: dict[str, tuple[str, tuple[int, int]]] = {

@@ -17,6 +17,7 @@ from directshape_torch.files.names import check_frame_id
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.io.frame_detections import build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
@@ -26,7 +27,7 @@ from directshape_torch.io.kitti_calibration import camera_of_rig, to_stereo_came
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
 from directshape_torch.io.velodyne import in_image, read_scan
-from directshape_torch.scene import FrameBatch, GroundPlane, StereoCamera
+from directshape_torch.scene import FrameBatch, GroundPlane
 
 DEFAULT_CAMERA_HEIGHT_M = 1.65
 

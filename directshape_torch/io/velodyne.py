@@ -1,4 +1,4 @@
-"""LiDAR scans in KITTI's format (`velodyne/NNNNNN.bin`) as points in the left camera frame."""
+"""Points of a LiDAR: KITTI's scans (`velodyne/NNNNNN.bin`) and arrays of points."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
+from directshape_torch.files.npz_files import read_npy
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.geometry.camera import project
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
-from directshape_torch.scene import StereoCamera
 
 _BYTES_A_POINT = 16
 _NEAREST_M = 1.0
@@ -22,32 +24,49 @@ def read_scan(path: Path | str, calibration: KittiCalibration, camera: StereoCam
     """All points of a scan (P, 3), float64, metres, in the left camera frame.
 
     Args:
-        path: little-endian float32, four a point: x, y, z, reflectance.
+        path: see `read_points`.
         calibration: with R0_rect and Tr_velo_to_cam.
         camera: of the one frame.
 
     Raises:
-        DataFormatError: the file is empty, cut or holds coordinates that are not finite; the calibration does not say
-            where the scanner is.
+        DataFormatError: as `read_points`; the calibration does not say where the scanner is.
     """
     if calibration.R0_rect is None or calibration.Tr_velo_to_cam is None:
         missing = "R0_rect" if calibration.R0_rect is None else "Tr_velo_to_cam"
         raise DataFormatError(
             calibration.path, f"has no line {missing}:", cure="LiDAR needs R0_rect and Tr_velo_to_cam"
         )
-    content = read_bytes(path)
-    if len(content) == 0 or len(content) % _BYTES_A_POINT:
-        raise DataFormatError(path, f"expected 16 bytes a point (x, y, z, reflectance), got {len(content)} bytes")
-    points_velo = np.frombuffer(content, dtype="<f4").reshape(-1, 4)[:, :3].astype(np.float64)
-    is_finite = np.isfinite(points_velo).all(axis=1)
-    if not is_finite.all():
-        number = int(is_finite.argmin())
-        raise DataFormatError(
-            path, f"expected finite coordinates, got {points_velo[number].tolist()} in point {number}"
-        )
+    points_velo = read_points(path)
     rotation = calibration.R0_rect @ calibration.Tr_velo_to_cam[:, :3]
     points_ref = points_velo @ rotation.T + calibration.R0_rect @ calibration.Tr_velo_to_cam[:, 3]
     return torch.from_numpy(points_ref) + camera.t_cam_ref[0].double()
+
+
+def read_points(path: Path | str) -> NDArray[np.float64]:
+    """Points (P, 3), metres, in the frame of the file.
+
+    Args:
+        path: KITTI's `.bin`, little-endian float32, four a point: x, y, z, reflectance; or `.npy`, an array (P, 3 or
+            more).
+
+    Raises:
+        DataFormatError: the file is empty, damaged, cut, or holds coordinates that are not finite.
+    """
+    if Path(path).suffix == ".npy":
+        points = read_npy(path)
+        if points.ndim != 2 or points.shape[1] < 3 or not len(points) or points.dtype.kind not in "fiu":
+            raise DataFormatError(path, f"expected numbers (P, 3), got {points.dtype} of shape {points.shape}")
+    else:
+        content = read_bytes(path)
+        if len(content) == 0 or len(content) % _BYTES_A_POINT:
+            raise DataFormatError(path, f"expected 16 bytes a point (x, y, z, reflectance), got {len(content)} bytes")
+        points = np.frombuffer(content, dtype="<f4").reshape(-1, 4)
+    xyz: NDArray[np.float64] = points[:, :3].astype(np.float64)
+    is_finite = np.isfinite(xyz).all(axis=1)
+    if not is_finite.all():
+        number = int(is_finite.argmin())
+        raise DataFormatError(path, f"expected finite coordinates, got {xyz[number].tolist()} in point {number}")
+    return xyz
 
 
 def in_image(points_cam: Tensor, size_hw: tuple[int, int], camera: StereoCamera) -> Tensor:

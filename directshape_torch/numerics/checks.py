@@ -104,6 +104,12 @@ def check_size_wh(name: str, size: object) -> None:
         raise InputError(name, "(width, height) in pixels, whole and above 0", shown(size))
 
 
+def check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:
+    """Raise `InputError` unless `value` is of one of some types, the first of which is named."""
+    if not isinstance(value, kinds):
+        raise InputError(name, f"a {kinds[0].__name__}", type(value).__name__)
+
+
 def is_no_rotation(
     transform: Tensor,  # (N, 4, 4), finite
 ) -> Tensor:  # (N,) bool

@@ -38,6 +38,16 @@ def is_forward_mode() -> bool:
     return torch.autograd.forward_ad._current_level >= 0
 
 
+def is_within_transform() -> bool:
+    """Whether a transform of `torch.func` is at work: what is computed now has no numbers that could be read.
+
+    Examples:
+        >>> torch.func.grad(lambda x: x * is_within_transform())(torch.tensor(2.0)).item(), is_within_transform()
+        (1.0, False)
+    """
+    return torch._C._functorch.maybe_current_level() is not None
+
+
 def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Mark a function whose result, a tensor or a named tuple of some, is a constant to whoever differentiates.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.image_files import read_rgb
@@ -20,7 +21,7 @@ from directshape_torch.io.instance_masks import InstanceMask, MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_manifest import RunManifest, hash_file
-from directshape_torch.scene import GroundPlane, StereoCamera
+from directshape_torch.scene import GroundPlane
 
 
 @dataclass(frozen=True)

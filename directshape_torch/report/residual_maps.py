@@ -17,10 +17,10 @@ from torch import Tensor
 from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import rays_from_pixels, warp_to_right
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.report.pictures import Window
-from directshape_torch.scene import StereoCamera
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.silhouette import ZETA_BOUNDS, closest_approach_residual

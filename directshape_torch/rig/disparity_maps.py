@@ -8,9 +8,9 @@ import torch
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.camera import depth_from_disparity
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.rig.disparity_observations import KnownDepth
-from directshape_torch.scene import StereoCamera
 
 FOLDERS = ("disp_noc_0", "disp_occ_0")
 

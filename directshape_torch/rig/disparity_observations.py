@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.camera import disparity_of_depth
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
-from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.disparity import match_disparity
 from directshape_torch.stereo_matching.subpixel import refine_disparity
 

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import torch
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
@@ -24,7 +25,6 @@ from directshape_torch.rig.estimate import RigEstimate, rig_among
 from directshape_torch.rig.labels import known_depth_from_labels
 from directshape_torch.rig.lidar import known_depth_from_lidar
 from directshape_torch.rig.pixels import pixel_evidence
-from directshape_torch.scene import StereoCamera
 
 TruthSource = Literal["disparity", "lidar", "labels"]
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.camera import disparity_of_depth, project
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.velodyne import read_scan
 from directshape_torch.rig.disparity_observations import KnownDepth
-from directshape_torch.scene import StereoCamera
 
 _DEPTH_RANGE_M = (3.0, 80.0)
 # The scanner stands higher than the camera and looks over things. A point is hidden where a neighbour within this many

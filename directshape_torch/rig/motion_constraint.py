@@ -20,6 +20,7 @@ from torch import Tensor
 from directshape_torch.geometry.camera import depth_from_disparity, disparity_of_depth, project, rays_from_pixels
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
 from directshape_torch.geometry.se3 import exp
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.disparity_observations import DisparityObservations
 from directshape_torch.rig.field_constraint import (
     PATCH_SIGMA_PX,
@@ -29,7 +30,6 @@ from directshape_torch.rig.field_constraint import (
 )
 from directshape_torch.rig.motion_tracks import TrackedFeatures
 from directshape_torch.rig.road_constraint import disparity_slope
-from directshape_torch.scene import StereoCamera
 
 _TRACK_SIGMA_PX = 0.12
 _DEPTH_ITERATIONS = 3

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from directshape_torch.geometry.camera import depth_from_disparity, project, rays_from_pixels
 from directshape_torch.geometry.se3 import from_rotation_translation, transform
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
-from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.disparity import match_disparity
 from directshape_torch.stereo_matching.patch_alignment import PatchLimits, align_patches
 from directshape_torch.stereo_matching.subpixel import refine_disparity

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from directshape_torch.geometry.camera import disparity_of_depth, rays_from_pixels
 from directshape_torch.geometry.disparity_field import polynomial_basis
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.disparity_observations import DisparityObservations
 from directshape_torch.rig.field_constraint import (
     PATCH_SIGMA_PX,
@@ -24,7 +25,6 @@ from directshape_torch.rig.field_constraint import (
     tukey_weight,
 )
 from directshape_torch.rig.road_pixels import RoadPixels
-from directshape_torch.scene import StereoCamera
 
 # Roads are even to about this share of the camera's height, and so is the disparity on them.
 _UNEVENNESS = 0.01

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.camera import depth_from_disparity, disparity_of_depth, rays_from_pixels
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.motion_tracks import matched_pixels
-from directshape_torch.scene import StereoCamera
 from directshape_torch.stereo_matching.plane_from_points import fit_ground_plane
 
 _SPACING_PX = 8

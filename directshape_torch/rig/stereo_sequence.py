@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.rig.frames_with_truth import chosen_frames
-from directshape_torch.scene import StereoCamera
 
 _ENDINGS = (".png", ".jpg", ".jpeg")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.scene import StereoCamera
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene_check.check_stereo import swapped
 from directshape_torch.scene_check.finding import Finding, Severity
 from directshape_torch.scene_check.pair_matches import PairMatches, match_pair, mirror

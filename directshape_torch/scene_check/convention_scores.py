@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.scene import StereoCamera
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene_check.box_conventions import AXES, ORDERS, YAWS, BoxConvention, all_conventions
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.image_boxes import box_iou, project_boxes

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from directshape_torch.geometry.box3d import BOX_EDGES, box_corners
 from directshape_torch.geometry.camera import project, rays_from_pixels, warp_to_right
-from directshape_torch.scene import StereoCamera
+from directshape_torch.geometry.stereo_camera import StereoCamera
 
 _NEAR_PLANE_M = 0.5
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.camera import points_from_disparity
-from directshape_torch.scene import StereoCamera
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.stereo_matching.disparity import match_disparity
 
 _DEPTH_RANGE_M = (3.0, 40.0)

@@ -16,9 +16,9 @@ from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.data_check.check_times import check_times
 from directshape_torch.data_check.frame_parts import numbers_of
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.open_dataset import open_dataset
-from directshape_torch.scene import StereoCamera
 from directshape_torch.scene_check.box_conventions import AS_DOCUMENTED, BoxConvention, all_conventions
 from directshape_torch.scene_check.car_evidence import CarBoxes
 from directshape_torch.scene_check.check_calibration import check_calibration

@@ -24,6 +24,16 @@ def test_centre_is_that_of_the_box_not_of_its_bottom():
     assert box_centres(TRUE)[0].tolist() == pytest.approx([1.0, 0.85, 20.0])
 
 
+def test_errors_along_and_across_the_ray_have_signs():
+    # Seen at 3 m to the right and 4 m ahead, 0.5 m too far; then 0.5 m further to the right; 0.2 m too long.
+    true = torch.tensor([[3.0, 1.6, 4.0, 1.5, 1.7, 4.0, 0.2]], dtype=torch.float64).repeat(2, 1)
+    found = true + torch.tensor([[0.3, 0, 0.4, 0, 0, 0.2, 0], [0.4, 0, -0.3, 0, 0, 0.2, 0]], dtype=torch.float64)
+    errors = pose_errors(found, true)
+    assert errors.along_m.tolist() == pytest.approx([0.5, 0.0], abs=1e-12)
+    assert errors.across_m.tolist() == pytest.approx([0.0, 0.5], abs=1e-12)
+    assert errors.length_m.tolist() == pytest.approx([0.2, 0.2], abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("turn_deg", "full", "axis"),
     [(0, 0, 0), (5, 5, 5), (-5, 5, 5), (90, 90, 90), (100, 100, 80), (175, 175, 5), (180, 180, 0), (350, 10, 10)],

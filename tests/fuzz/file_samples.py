@@ -33,7 +33,7 @@ from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
-from directshape_torch.io.velodyne import read_scan
+from directshape_torch.io.velodyne import read_points, read_scan
 from directshape_torch.report.frame_inputs import InputSources
 from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
@@ -88,6 +88,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     calibration = folder / "lidar_calibration.txt"
     calibration.write_text((root / "training" / "calib" / f"{FRAME}.txt").read_text() + VELODYNE)
     np.linspace(-9, 9, 40, dtype="<f4").tofile(folder / "scan.bin")
+    np.save(folder / "points.npy", np.linspace(-9, 9, 30).reshape(10, 3))
     for name in ("neural_prior.safetensors", "trust_model.json", "configs/fast.yaml"):
         shutil.copyfile(ASSETS / name, folder / Path(name).name)
     corners = "v 0 0 0\nv 4 0 0\nv 0 2 0\nv 0 0 2\n"
@@ -106,6 +107,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "rigs": (folder / "rigs.json", lambda path: [(each.field, str(each)) for each in load_rigs(path)]),
         "split": (folder / "split.txt", lambda path: dataset(root, split=path).frame_ids),
         "scan": (folder / "scan.bin", scan),
+        "points": (folder / "points.npy", read_points),
         "network": (folder / "neural_prior.safetensors", load_prior),
         "prior": (root / "prior.npz", load_prior),
         "mesh": (folder / "mesh.obj", load_mesh_obj),

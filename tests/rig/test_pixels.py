@@ -16,13 +16,13 @@ from directshape_torch.cli import calibrate_rig
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import polynomial_basis
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.rig.disparity_observations import DisparityObservations, concatenate
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.labels import known_depth_from_labels
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs
-from directshape_torch.scene import StereoCamera
 
 SIZE = (400, 160)
 FOCAL_PX, BASELINE_M = 300.0, 0.5

@@ -13,6 +13,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.camera import disparity_of_depth, project, rays_from_pixels
 from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
 from directshape_torch.geometry.se3 import exp
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.field_constraint import FieldConstraint, Linearisation
 from directshape_torch.rig.motion_constraint import MotionConstraint
@@ -20,7 +21,6 @@ from directshape_torch.rig.motion_tracks import TrackedFeatures
 from directshape_torch.rig.road_constraint import RoadConstraint
 from directshape_torch.rig.road_pixels import RoadPixels
 from directshape_torch.rig.self_calibration import SelfCalibration, self_calibrate
-from directshape_torch.scene import StereoCamera
 
 SIZE = (1242, 375)
 HEIGHT_M = 1.65

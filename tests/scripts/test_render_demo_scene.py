@@ -13,7 +13,7 @@ import render_demo_scene
 import torch
 from demo_scene import camera, car_surfaces, frame_files, labels, layout, sensor, surfaces
 
-from directshape_torch.scene import StereoCamera
+from directshape_torch.geometry.stereo_camera import StereoCamera
 
 # pycocotools' decode predates numpy 2's protocol.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")

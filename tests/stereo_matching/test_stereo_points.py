@@ -10,7 +10,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import depth_from_disparity, disparity_of_depth, points_from_disparity
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.scene import StereoCamera
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane, fit_ground_plane
 
 K_LEFT = torch.tensor([[721.5, 0.0, 609.6], [0.0, 721.5, 172.9], [0.0, 0.0, 1.0]], dtype=torch.float64)

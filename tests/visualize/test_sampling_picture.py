@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.observation.sampling import PixelSelection
-from directshape_torch.scene import Detections, FrameBatch, GroundPlane, StereoCamera
+from directshape_torch.scene import Detections, FrameBatch, GroundPlane
 from directshape_torch.visualize.sampling_picture import (
     GREEN,
     OCCLUDER_COLOURS,
