@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from directshape_torch.errors import DirectShapeError, ResumeError
 
 FORMATS = (
-    "times", "tracking", "tracks", "shapes", "disparity", "field", "rigs", "split", "scan", "network", "prior", "mesh",
+    "times", "tracking", "tracks", "shapes", "disparity", "field", "rigs", "split", "points",
+    "scan", "network", "prior", "mesh",
     "trust", "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
     "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "run", "journal",
 )  # fmt: skip
