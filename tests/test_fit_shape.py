@@ -112,4 +112,4 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "line 1: expected seven numbers: '1 2 3'" in capsys.readouterr().err
     (tmp_path / "points.npy").write_bytes(b"nothing")
     assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
-    assert "points.npy: holds no points" in capsys.readouterr().err
+    assert "points.npy: is no readable npy file" in capsys.readouterr().err
