@@ -217,11 +217,13 @@ class Detections(TensorRecord):
         offset_sigma_px: (B,) standard deviation of the rig's disparity at each car about its calibration, pixels of
             full resolution; 0 where it is known. None: the settings' (`rig.disparity_sigma_px`); collated with frames
             that have some, 0 stands for none.
+        track_id: (B,) int64 or int32: detections of one number are views of one car in several frames, which get one
+            shape (docs/tracks.md); below 0: a car by itself. None: all of them are.
 
     Raises:
         InputError: wrong shapes or types, a rotation that is none, dimensions or standard deviations that are not
-            above 0, or an `offset_sigma_px` that is below 0 or not finite. Masks with values above 1.5 (logits, 0..255)
-            are refused when they are read, in a refinement.
+            above 0, an `offset_sigma_px` that is below 0 or not finite, or two views of one track in one frame. Masks
+            with values above 1.5 (logits, 0..255) are refused when they are read, in a refinement.
     """
 
     frame_index: Annotated[Tensor, Dense("B", kind="index")]
@@ -238,6 +240,7 @@ class Detections(TensorRecord):
     occluders: Occluders | None = None
     pose_sigma: Annotated[Tensor | None, Dense("B", 4)] = None
     offset_sigma_px: Annotated[Tensor | None, Dense("B")] = None
+    track_id: Annotated[Tensor | None, Dense("B", kind="index")] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -256,6 +259,8 @@ class Detections(TensorRecord):
                 got = f"{float(self.offset_sigma_px[wrong[0]]):g} in row {wrong[0]}"
                 cure = "give 0 for cars at which the rig's disparity is known"
                 raise InputError("offset_sigma_px", "finite standard deviations of at least 0, pixels", got, cure)
+        if self.track_id is not None:
+            _check_tracks(self.track_id, self.frame_index)
 
     @classmethod
     def from_boxes(
@@ -273,6 +278,7 @@ class Detections(TensorRecord):
         T_cam_boxes: Tensor | None = None,
         occluders: Occluders | None = None,
         pose_sigma: Tensor | None = None,
+        track_id: Tensor | None = None,
     ) -> Detections:
         """From boxes as a detector writes them, and the masks that there are.
 
@@ -290,7 +296,7 @@ class Detections(TensorRecord):
             T_cam_boxes: rigid motion from the frame of the boxes to the left camera, (4, 4) or (B, 4, 4). Camera
                 conventions do without where the boxes are in the left camera's frame; boxes in KITTI's own frame of
                 labels bring `camera.T_cam_ref`; LiDAR boxes need camera_from_lidar.
-            occluders, pose_sigma: as in the class.
+            occluders, pose_sigma, track_id: as in the class.
 
         Raises:
             InputError: no masks at all, LiDAR boxes without `T_cam_boxes`, corners that make no box, and what the class
@@ -330,6 +336,7 @@ class Detections(TensorRecord):
             has_mask_right=has_right,
             occluders=occluders,
             pose_sigma=pose_sigma,
+            track_id=track_id,
         )
 
     def __len__(self) -> int:
@@ -380,6 +387,18 @@ def _check_words(name: str, words: object, count: int, what: str) -> None:
         raise InputError(name, f"a tuple of {count} {what}", type(words).__name__)
     if len(words) != count:
         raise InputError(name, f"{count} {what}", f"{len(words)}")
+
+
+def _check_tracks(
+    track_id: Tensor,  # (B,)
+    frame_index: Tensor,  # (B,)
+) -> None:
+    seen: dict[tuple[int, int], int] = {}
+    for row, view in enumerate(zip(track_id.tolist(), frame_index.tolist(), strict=True)):
+        if view[0] >= 0 and view in seen:
+            got = f"track {view[0]} in rows {seen[view]} and {row} of frame {view[1]}"
+            raise InputError("track_id", "one view of a track in a frame", got, "give -1 to cars by themselves")
+        seen[view] = row
 
 
 def _raise_not_positive(

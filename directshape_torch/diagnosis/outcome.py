@@ -23,7 +23,6 @@ from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.problem import CarProblem, CarStage
 from directshape_torch.solver.gauss_newton import Minimum
-from directshape_torch.solver.iteration import damped_step
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
@@ -91,7 +90,9 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     stage: CarStage = minimum.stage
     before, after = minimum.before, _of_calibrated_rig(problem, minimum.after)
     num_kept = 6 + end.code.shape[1]
-    covariance = covariance_of(after.information.sum(dim=1))[:, :num_kept, :num_kept] + _of_field(end, cars)
+    # What the other views of a track say of its shape.
+    information = problem.sharing.with_others(after.information.sum(dim=1), refined)
+    covariance = covariance_of(information)[:, :num_kept, :num_kept] + _of_field(end, cars)
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
     course = Course(
         before=initial,
@@ -108,7 +109,9 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         detector_sigma=detector_pose_sigma(problem.config.priors, cars)[:, 0].detach(),
     )
     seen = stage.information_of_measurements(after)
-    unseen = observability_of(problem.prior, end, None if seen is None else without_offset(seen, num_kept))
+    if seen is not None:
+        seen = without_offset(problem.sharing.with_others(seen, refined), num_kept)
+    unseen = observability_of(problem.prior, end, seen)
     return Outcome(
         state=minimum.state,
         status=minimum.status,
@@ -189,8 +192,9 @@ def promised_decrease(minimum: Minimum[CarState]) -> Tensor:
     after = minimum.after
     gradient, hessian = after.gradient.sum(dim=1), after.hessian.sum(dim=1)
     at = minimum.stage.without_held(Evaluation(after.cost, gradient, hessian, ()))
-    step, solvable = damped_step(at.hessian, at.gradient, torch.zeros_like(at.cost))
-    promised = -0.5 * (at.gradient * step).sum(dim=1) / at.cost
+    share, members = minimum.stage.problem.sharing, is_refined(minimum.status)
+    step, solvable = share.damped_step(at.hessian, at.gradient, torch.zeros_like(at.cost), members)
+    promised = -0.5 * share.total((at.gradient * step).sum(dim=1), members) / share.total(at.cost, members)
     return torch.where(solvable, promised, torch.inf)
 
 

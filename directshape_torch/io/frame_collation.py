@@ -132,14 +132,15 @@ def _detections(parts: Sequence[Detections], size_hw: tuple[int, int]) -> Detect
         mask_left=_padded([part.mask_left for part in parts], size_hw),
         mask_right=_padded([part.mask_right for part in parts], size_hw),
         occluders=_occluders(occluders, size_hw),
-        pose_sigma=_sigmas([(p.pose_sigma, p.T_cam_obj.new_full((len(p), 4), torch.inf)) for p in parts]),
-        offset_sigma_px=_sigmas([(p.offset_sigma_px, torch.zeros_like(p.T_cam_obj[:, 0, 0])) for p in parts]),
+        pose_sigma=_known_rows([(p.pose_sigma, p.T_cam_obj.new_full((len(p), 4), torch.inf)) for p in parts]),
+        offset_sigma_px=_known_rows([(p.offset_sigma_px, torch.zeros_like(p.T_cam_obj[:, 0, 0])) for p in parts]),
+        track_id=_known_rows([(p.track_id, torch.full_like(p.frame_index, -1)) for p in parts]),
         **rows,
     )
 
 
-def _sigmas(parts: Sequence[tuple[Tensor | None, Tensor]]) -> Tensor | None:
-    """Those of all frames, the second of each pair for the frames without; None without any."""
+def _known_rows(parts: Sequence[tuple[Tensor | None, Tensor]]) -> Tensor | None:
+    """Rows of all frames, the second of each pair for the frames without; None without any."""
     if all(given is None for given, _ in parts):
         return None
     return torch.cat([none if given is None else given for given, none in parts])

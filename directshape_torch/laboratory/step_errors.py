@@ -23,7 +23,7 @@ from directshape_torch.laboratory.experiments import jacobian
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.solver.iteration import damped_step, limit_step
+from directshape_torch.solver.damped_solve import damped_step, limit_step, step_size
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.term import Evaluation, Linear, Term, linear_of, part_of, summed
@@ -144,7 +144,7 @@ def first_step(bench: Bench, rows: Mapping[str, Linear]) -> Tensor:
     at = _evaluated(bench, rows)
     damping = torch.full_like(at.cost, bench.problem.config.solver.initial_damping)
     step, _ = damped_step(at.hessian, at.gradient, damping)
-    return limit_step(step, bench.stage.step_limits().to(step))
+    return limit_step(step, step_size(step, bench.stage.step_limits().to(step)))
 
 
 def angle_deg(a: Tensor, b: Tensor) -> Tensor:

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from directshape_torch.solver.damped_solve import limit_step, step_size
 from directshape_torch.solver.gauss_newton import Iteration, Minimum
-from directshape_torch.solver.iteration import damped_step, limit_step
 from directshape_torch.solver.problem import (
     DifferentiableProblem,
     DifferentiableStage,
@@ -75,7 +75,7 @@ def unrolled_state(
             # Where the repeated steps have led to it, the state at which a stage begins is a function too.
             began = where_rows(led_here, _with_values(began, state), began)
             stage = problem.begin(stages[begun], problem.look(began))
-        state = where_rows(taken, _step(stage, state, iteration), state)
+        state = where_rows(taken, _step(problem, stage, state, iteration), state)
         led_here = led_here | taken
     return _with_values(take_rows(minimum.state, rows), state)
 
@@ -136,16 +136,12 @@ def implicit_state(
     at, J = _gradient_and_its_jacobian(stage, state, delta, exact)
     both = free[:, :, None] & free[:, None, :]
     J = torch.where(both, J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
-    factor, pivots, info = torch.linalg.lu_factor_ex(J)
-    gradient = torch.where(free, at.gradient, torch.zeros_like(at.gradient))
-    remaining = torch.linalg.lu_solve(factor, pivots, gradient.detach()[..., None])[..., 0]
-    size = (remaining.abs() / stage.step_limits().to(remaining)).amax(dim=-1)
-    stationary = (info == 0) & size.isfinite() & (size <= max_remaining_step)
+    step, has_step = problem.sharing.newton_step(J, torch.where(free, at.gradient, torch.zeros_like(at.gradient)))
+    everybody = torch.ones_like(has_step)
+    size = problem.sharing.largest(step_size(step.detach(), stage.step_limits().to(step)), everybody)
+    stationary = has_step & (size <= max_remaining_step)  # a comparison with NaN is false
     _warn_of_the_others(stationary, rows if names is None else names)
-    # The graph runs through the gradient alone; where it is not used the system is replaced, so that no NaN passes.
-    safe = torch.where(stationary[:, None, None], J, torch.eye(J.shape[-1], dtype=J.dtype, device=J.device))
-    gradient = torch.where(stationary[:, None], gradient, torch.zeros_like(gradient))
-    step = -torch.linalg.solve(safe, gradient[..., None])[..., 0]
+    step = torch.where(stationary[:, None], step, 0.0)
     return _with_values(state, stage.retract(state, step - step.detach()))
 
 
@@ -189,11 +185,18 @@ def _listed(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers[:10])) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
 
 
-def _step(stage: DifferentiableStage[StateT], state: StateT, iteration: Iteration[StateT]) -> StateT:
-    at = stage.linearise_differentiably(state)
-    step, _ = damped_step(at.hessian, at.gradient, iteration.damping)
+def _step(
+    problem: DifferentiableProblem[StateT],
+    stage: DifferentiableStage[StateT],
+    state: StateT,
+    iteration: Iteration[StateT],
+) -> StateT:
+    """The step of one iteration; who took it together with others says the trajectory."""
+    at, together = stage.linearise_differentiably(state), iteration.accepted
+    step, _ = problem.sharing.damped_step(at.hessian, at.gradient, iteration.damping, together)
     step = step * iteration.lengths[:, None]
-    return stage.retract(state, limit_step(step, stage.step_limits().to(step)))
+    size = problem.sharing.largest(step_size(step, stage.step_limits().to(step)), together)
+    return stage.retract(state, limit_step(step, size))
 
 
 def _rows_of(iteration: Iteration[StateT], rows: Tensor) -> Iteration[StateT]:

@@ -1,4 +1,4 @@
-"""One damped Gauss-Newton iteration of a batch of problems, its linear solve first, without a word to the host."""
+"""One damped Gauss-Newton iteration of a batch of problems, without a word to the host."""
 
 from __future__ import annotations
 
@@ -10,51 +10,9 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig
+from directshape_torch.solver.damped_solve import is_finite, limit_step, step_size
 from directshape_torch.solver.problem import EnergyAt, StageProblem, StateT, put_rows, take_rows, where_rows
 from directshape_torch.status import Status
-
-# Smallest diagonal entry that damping acts on, relative to the largest: directions that the data do not see at all
-# are damped as well.
-_RELATIVE_DIAGONAL_FLOOR = 1e-9
-# Of the scaled system's factor, whose diagonal is 1 where unknowns are independent.
-_SMALLEST_PIVOT = 1e-7
-
-
-def damped_step(
-    hessian: Tensor,  # (B, D, D) float64
-    gradient: Tensor,  # (B, D)
-    damping: Tensor,  # (B,) Marquardt's mu
-) -> tuple[Tensor, Tensor]:
-    """Solve `(H + mu diag(H)) step = -g` (Marquardt) by Cholesky.
-
-    Args:
-        hessian: symmetric; the lower triangle is read.
-        gradient, damping: see above.
-
-    Returns:
-        The steps (B, D), zero where there is none, and `solvable` (B,): false where the system is singular or not
-        finite. Never raises and never synchronises with the device.
-
-    Examples:
-        >>> step, solvable = damped_step(torch.eye(2)[None], torch.ones(1, 2), torch.zeros(1))
-        >>> step
-        tensor([[-1., -1.]])
-    """
-    diagonal = hessian.diagonal(dim1=1, dim2=2)
-    floored = torch.maximum(diagonal, _RELATIVE_DIAGONAL_FLOOR * diagonal.amax(dim=1, keepdim=True))
-    # Jacobi scaling: metres, radians and standard deviations differ by orders of magnitude in curvature. What is
-    # scaled to 1 has the damping itself on its diagonal.
-    scale = floored.rsqrt()
-    identity = torch.eye(hessian.shape[-1], dtype=hessian.dtype, device=hessian.device)
-    scaled = torch.addcmul(hessian * scale.unsqueeze(2) * scale.unsqueeze(1), damping.view(-1, 1, 1), identity)
-    factor, info = torch.linalg.cholesky_ex(scaled)
-    # Whatever is not finite makes the factor so, or ends it early: a comparison with NaN is false.
-    regular = (factor.diagonal(dim1=1, dim2=2).amin(dim=1) > _SMALLEST_PIVOT) & (info == 0)
-    # Solved all the same where there is no factor, for a batch has no branches, and then thrown away.
-    factor = torch.where(regular.view(-1, 1, 1), factor, identity)
-    step = scale * torch.cholesky_solve((scale * -gradient).unsqueeze(2), factor).squeeze(2)
-    solvable = regular & is_finite(step.sum(dim=1))
-    return torch.where(solvable.unsqueeze(1), step, 0.0), solvable
 
 
 def step_lengths(stretched: Tensor, over_relaxation: float) -> Tensor:
@@ -78,41 +36,6 @@ def step_lengths(stretched: Tensor, over_relaxation: float) -> Tensor:
         tensor([1.5000, 1.0000])
     """
     return torch.where(stretched, over_relaxation, 1.0)
-
-
-def is_finite(sums: Tensor) -> Tensor:
-    """Where sums are finite, and with them everything that was added: two small operations, `isfinite` is four.
-
-    Examples:
-        >>> is_finite(torch.tensor([1.0, torch.inf, torch.nan]))
-        tensor([ True, False, False])
-    """
-    zeros = sums - sums
-    return torch.eq(zeros, zeros)
-
-
-def limit_step(
-    step: Tensor,  # (B, D)
-    limits: Tensor,  # (D,) largest trusted magnitude of each unknown
-) -> Tensor:
-    """The whole step scaled so that no unknown moves by more than its limit: direction is kept.
-
-    Examples:
-        >>> limit_step(torch.tensor([[1.0, 4.0]]), torch.tensor([1.0, 1.0]))
-        tensor([[0.2500, 1.0000]])
-    """
-    return limited_step(step, limits)[0]
-
-
-def limited_step(step: Tensor, limits: Tensor) -> tuple[Tensor, Tensor]:
-    """`limit_step`, and the size (B,) of what it returns as a share of the limits, at most 1.
-
-    Examples:
-        >>> limited_step(torch.tensor([[0.1, 0.2]]), torch.tensor([1.0, 1.0]))[1]
-        tensor([0.2000])
-    """
-    size = (step.abs() / limits).amax(dim=1)
-    return step / size.clamp_min(1).unsqueeze(1), size.clamp_max(1)
 
 
 # Of a problem that goes on; else the code of the status with which it ended.
@@ -208,47 +131,44 @@ def iterate(
         limits: (D,) largest trusted step of each unknown.
         over_relaxation: of the stage.
     """
-    step, solvable = damped_step(p.at_state.hessian, p.at_state.gradient, p.damping)
+    share, running = problem.sharing, p.ended < 0
+    step, solvable = share.damped_step(p.at_state.hessian, p.at_state.gradient, p.damping, running)
     if over_relaxation != 1:
         step = step * step_lengths(p.stretched, over_relaxation).to(step.dtype).unsqueeze(1)
-    step, size = limited_step(step, limits)
+    size = share.largest(step_size(step, limits), running)
+    step = limit_step(step, size)
     candidate = problem.retract(p.state, step)
     at_candidate = problem.evaluate(candidate, p.at_state)
-    running = p.ended < 0
-    usable = running & solvable
-    decrease = p.at_state.cost - at_candidate.cost
-    takeable = usable & _is_finite(at_candidate)
-    downhill = takeable & (at_candidate.cost <= p.at_state.cost)
+    finite = _is_finite(at_candidate)
+    takeable = running & solvable & finite
+    decrease = share.total(p.at_state.cost - at_candidate.cost, takeable)
+    downhill = takeable & (decrease >= 0)
     accepted = takeable if config.accept_every_step else downhill
     # Undamped, a singular system stays singular; damped, more damping may help until the limit is reached.
     at_limit = p.damping >= _MOST_DAMPING
     p.iterations = p.iterations + running
-    small_decrease = decrease <= config.cost_tolerance * p.at_state.cost.abs()
+    little = config.cost_tolerance * share.total(p.at_state.cost.abs(), takeable)
+    small_decrease = decrease <= little
     if config.accept_every_step:
         small_decrease = small_decrease & downhill
-    has_settled = accepted & small_decrease
+    has_settled, exhausted = accepted & small_decrease, ~accepted & at_limit
     if over_relaxation != 1:
         # A longer step may end beyond the minimum and about as high: it is for a plain one to say that this is all.
-        at_rest = takeable & ~accepted & _changes_little(p.at_state, step, decrease, config)
-        has_settled, at_limit = ~p.stretched & (has_settled | at_rest), at_limit & ~p.stretched
+        promised = share.total(-0.5 * (p.at_state.gradient * step).sum(dim=1), takeable)
+        changes_little = (promised <= _FLAT * little) & (-decrease <= _FLAT * little)
+        at_rest = takeable & ~accepted & changes_little
+        has_settled, exhausted = ~p.stretched & (has_settled | at_rest), exhausted & ~p.stretched
         p.stretched = downhill & ~small_decrease
-    settled = usable & ((size < config.step_tolerance) | has_settled | ~accepted & at_limit)
+    settled = running & solvable & ((size < config.step_tolerance) | has_settled | exhausted)
     p.ended = torch.where(settled, Status.converged.code, p.ended)
-    hopeless = running & ~solvable
-    if config.initial_damping > 0:
-        hopeless = hopeless & at_limit
-    p.ended = torch.where(hopeless, Status.singular.code, p.ended)
-    if config.accept_every_step:
-        p.ended = torch.where(usable & ~takeable, Status.non_finite.code, p.ended)
+    # A group does not wait for those who cannot go along.
+    left = running & ~takeable & share.any(takeable)
+    hopeless = left | running & at_limit if config.initial_damping > 0 else running
+    p.ended = torch.where(hopeless & ~solvable, Status.singular.code, p.ended)
+    astray = running if config.accept_every_step else left
+    p.ended = torch.where(astray & solvable & ~finite, Status.non_finite.code, p.ended)
     improved = _move(problem, p, candidate, at_candidate, accepted, config)
     return Outcome(running, accepted, improved)
-
-
-def _changes_little(at: EnergyAt, step: Tensor, decrease: Tensor, config: SolverConfig) -> Tensor:
-    """Where (B,) a step that was refused promised next to nothing, and raised the cost by no more than that."""
-    little = _FLAT * config.cost_tolerance * at.cost.abs()
-    promised = -0.5 * (at.gradient * step).sum(dim=1)
-    return (promised <= little) & (-decrease <= little)
 
 
 def _move(
@@ -270,7 +190,7 @@ def _move(
         # Nothing uphill is taken: the present state is the best one.
         p.best_state, p.best_cost = p.state, p.at_state.cost
         return accepted
-    better: Tensor = accepted & (at_candidate.cost <= p.best_cost)
+    better = accepted & (problem.sharing.total(p.best_cost - at_candidate.cost, accepted) >= 0)
     p.best_state = where_rows(better, candidate, p.best_state)
     p.best_cost = torch.where(better, at_candidate.cost, p.best_cost)
     return better

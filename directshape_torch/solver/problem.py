@@ -1,4 +1,4 @@
-"""What the solver sees of a batch of B independent least-squares problems of D unknowns each.
+"""What the solver sees of a batch of B least-squares problems of D unknowns each.
 
 A problem is looked at, at a state; there a stage begins, whose iterations evaluate state after state, each near the
 one before. All of these are values: whoever needs one later keeps it.
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import StageConfig
+from directshape_torch.solver.sharing import Sharing
 
 StateT = TypeVar("StateT", bound=tuple[Tensor, ...])
 
@@ -35,6 +36,11 @@ class EnergyAt(Protocol):
 
 class StageProblem(Protocol[StateT]):
     """What the iterations of a stage see of B problems, and of fewer and fewer of them."""
+
+    @property
+    def sharing(self) -> Sharing:
+        """What the problems have in common."""
+        ...
 
     def evaluate(self, state: StateT, near: Any) -> Any:
         """The `EnergyAt` a state next to that of another evaluation."""
@@ -73,7 +79,12 @@ class BegunStage(Protocol[StateT]):
 
 
 class Problem(Protocol[StateT]):
-    """B problems that share nothing but the batch."""
+    """B problems, by themselves or in groups that share unknowns."""
+
+    @property
+    def sharing(self) -> Sharing:
+        """What the problems have in common."""
+        ...
 
     def stages(self) -> Sequence[StageConfig]: ...
 

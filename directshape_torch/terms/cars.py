@@ -121,6 +121,7 @@ class CarBatch:
         detector_pose_sigma: (B, 4) its standard deviations, see `Detections`, or None.
         offset_sigma_px: (B,) standard deviation of the unknown offset of the disparity; None where no car has one.
         field_sigma_px: (B,) that of the rig's disparity field at the car; 0 where the offset is an unknown.
+        track_id: (B,) see `Detections`, or None.
     """
 
     detection_row: Tensor
@@ -136,6 +137,7 @@ class CarBatch:
     detector_pose_sigma: Tensor | None
     offset_sigma_px: Tensor | None
     field_sigma_px: Tensor
+    track_id: Tensor | None
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
@@ -161,6 +163,7 @@ class CarBatch:
             detector_pose_sigma=detections.pose_sigma,
             offset_sigma_px=offset_sigma_px,
             field_sigma_px=_field_sigma_px(frames, detections, offset_sigma_px),
+            track_id=detections.track_id,
         )
 
     def __len__(self) -> int:

@@ -27,7 +27,8 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.problem import CarIterations, CarProblem, CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.solver.iteration import damped_step, iterate
+from directshape_torch.solver.damped_solve import damped_step
+from directshape_torch.solver.iteration import iterate
 from directshape_torch.terms import cars, term
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.priors import PriorTerm

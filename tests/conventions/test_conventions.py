@@ -34,7 +34,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.shape.shape_prior import DimensionsDerivative
-from directshape_torch.solver.iteration import damped_step
+from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.terms.cars import CarState, retract
 from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from directshape_torch.terms.priors import dimensions_prior, height_prior, shape_prior

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from directshape_torch.config import StageConfig
 from directshape_torch.solver.problem import take_rows, where_rows
+from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 
 
 class Vector(NamedTuple):
@@ -36,6 +37,7 @@ class VectorProblem:
     def __init__(self, stages: Sequence[StageConfig], num_unknowns: int, limit: float = 1e6) -> None:
         self.stage_configs, self.num_unknowns, self.limit = list(stages), num_unknowns, limit
         self.begun: list[StageConfig] = []
+        self.sharing: Sharing = INDEPENDENT
 
     def energy(self, x: Tensor) -> Energy:
         """At points (B, D)."""
@@ -119,7 +121,8 @@ class ResidualProblem(VectorProblem):
     def part(self, index: Tensor) -> Self:
         self.compactions.append(len(index))
         part = type(self).__new__(type(self))
-        part.__dict__ = {**self.__dict__, "identity": self.identity[index]}
+        sharing = self.sharing.of_problems(index.tolist())
+        part.__dict__ = {**self.__dict__, "identity": self.identity[index], "sharing": sharing}
         return part
 
 

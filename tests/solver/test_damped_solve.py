@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.solver.iteration import damped_step, limit_step
+from directshape_torch.solver.damped_solve import damped_step, limit_step, step_size
 
 
 def _systems(count: int, size: int = 5) -> tuple[torch.Tensor, torch.Tensor]:
@@ -79,7 +79,7 @@ def test_an_all_zero_system_is_singular() -> None:
 def test_the_whole_step_is_scaled() -> None:
     limits = torch.tensor([0.5, 0.5, 0.15], dtype=torch.float64)
     steps = torch.tensor([[0.1, 0.2, 0.05], [2.0, 0.1, 0.0], [0.1, 0.0, -0.6]], dtype=torch.float64)
-    limited = limit_step(steps, limits)
+    limited = limit_step(steps, step_size(steps, limits))
     # Untouched; a quarter of it; a quarter of it.
     expected = torch.stack([steps[0], steps[1] / 4, steps[2] / 4])
     torch.testing.assert_close(limited, expected)

@@ -15,8 +15,8 @@ from directshape_torch.config import SolverConfig, StageConfig
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import ConfigError
 from directshape_torch.problem import method_stages
+from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import minimise
-from directshape_torch.solver.iteration import damped_step
 
 DAMPED = SolverConfig()
 PURE = SolverConfig(initial_damping=0.0, accept_every_step=True, cost_tolerance=0.0, step_tolerance=0.0)

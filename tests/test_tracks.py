@@ -1,0 +1,105 @@
+"""The same car in several frames: one shape, many poses, and nothing changed for cars by themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, disturbed, joined_detections, joined_frames, select, street
+from torch import Tensor
+
+from directshape_torch.errors import InputError
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.status import Status
+
+HEADINGS = (0.3, 1.2, 2.4)
+
+
+@cache
+def drive() -> tuple[FrameBatch, Detections, Tensor]:
+    """Three frames of a car that turns and of another one that stands: frames, boxes that are off, the true codes."""
+    prior = ellipsoid_prior()
+    code = torch.tensor([[0.9, -0.4, 0.5], [-0.8, 0.3, -0.4]], dtype=torch.float64)
+    height = CAMERA_HEIGHT_M
+    seen: list[Street] = [
+        street(prior, [(-1.3, height, 8.0 + n), (2.1, height, 12.0 - n)], [heading, -1.2], code)
+        for n, heading in enumerate(HEADINGS)
+    ]
+    frames = joined_frames([view.frames for view in seen])
+    detections = joined_detections([view.detections for view in seen], (120, 160))
+    mean = prior.dimensions_and_derivative(torch.zeros_like(detections.T_cam_obj[:, :3, 0])).hwl
+    return frames, replace(disturbed(detections), dimensions_hwl=mean), code.repeat(len(seen), 1)
+
+
+def refined(detections: Detections, track_id: list[int] | None = None) -> RefinementResult:
+    ids = None if track_id is None else torch.tensor(track_id)
+    return DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(drive()[0], replace(detections, track_id=ids))
+
+
+def assert_same(one: RefinementResult, other: RefinementResult) -> None:
+    first, second = one.state_dict(), other.state_dict()
+    for name, values in first.items():
+        assert torch.equal(torch.nan_to_num(values), torch.nan_to_num(second[name])), name
+
+
+@pytest.mark.parametrize("track_id", [[4, -1, 9, -1, 2, -7], [-1] * 6])
+def test_tracks_of_one_view_are_cars_by_themselves_to_the_bit(track_id: list[int]) -> None:
+    _, detections, _ = drive()
+    assert_same(refined(detections, track_id), refined(detections))
+
+
+def test_cars_beside_a_track_are_refined_as_by_themselves_to_the_bit() -> None:
+    _, detections, _ = drive()
+    alone, mixed = refined(detections), refined(detections, [4, -1, 4, -1, 4, 3])
+    for row in (1, 3, 5):
+        assert torch.equal(mixed.T_cam_obj[row], alone.T_cam_obj[row])
+        assert torch.equal(mixed.code[row], alone.code[row])
+
+
+def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
+    _, detections, code = drive()
+    alone, together = refined(detections), refined(detections, [0, 1] * 3)
+    assert together.status == [Status.converged] * 6
+    for track in (0, 1):
+        views = together.code[track::2]
+        assert (views == views[0]).all()
+    errors = [(result.code - code)[0::2].square().mean().sqrt() for result in (alone, together)]
+    assert errors[1] < 0.7 * errors[0]
+    # What the other views say counts: no direction is known less.
+    variances = [result.covariance.diagonal(dim1=1, dim2=2)[:, 6:] for result in (alone, together)]
+    assert (variances[1] < variances[0]).all()
+
+
+def test_a_batch_of_tracks_equals_a_loop() -> None:
+    _, detections, _ = drive()
+    together = refined(detections, [7, 1, 7, 1, 7, -1])
+    for track_id, rows in (([3, -1, 3, -1, 3, -1], [0, 2, 4]), ([-1, 3, -1, 3, -1, -1], [1, 3])):
+        one = refined(detections, track_id)
+        torch.testing.assert_close(together.T_cam_obj[rows], one.T_cam_obj[rows], rtol=0, atol=1e-9)
+        torch.testing.assert_close(together.code[rows], one.code[rows], rtol=0, atol=1e-9)
+
+
+def test_a_view_without_a_mask_touches_nothing_else() -> None:
+    _, detections, _ = drive()
+    unmasked = replace(
+        detections, has_mask_left=detections.has_mask_left.clone(), has_mask_right=detections.has_mask_right.clone()
+    )
+    unmasked.has_mask_left[2] = unmasked.has_mask_right[2] = False
+    broken = refined(unmasked, [0, 1] * 3)
+    assert broken.status[2] == Status.no_mask
+    assert torch.equal(broken.T_cam_obj[2], detections.T_cam_obj[2])
+    whole = refined(select(detections, torch.tensor([0, 1, 3, 4, 5])), [0, 1, 1, 0, 1])
+    rows = [0, 1, 3, 4, 5]
+    torch.testing.assert_close(broken.T_cam_obj[rows], whole.T_cam_obj, rtol=0, atol=1e-9)
+
+
+def test_two_views_of_a_track_in_one_frame_are_refused() -> None:
+    _, detections, _ = drive()
+    with pytest.raises(InputError, match="track 5 in rows 0 and 1 of frame 0"):
+        replace(detections, track_id=torch.tensor([5, 5, 1, 1, 2, 3]))
