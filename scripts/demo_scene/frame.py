@@ -1,23 +1,26 @@
-"""One frame from its seed: layout, surfaces, both views, exact masks, labels and detections."""
+"""Frames from a seed: layout, surfaces, both views, exact masks, labels and detections."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from demo_scene import sensor
-from demo_scene.camera import Array
-from demo_scene.car_surfaces import car_model, car_surfaces
+from demo_scene.camera import Array, transform
+from demo_scene.car_surfaces import CarModel, car_model, car_surfaces
 from demo_scene.frame_files import Frame
-from demo_scene.labels import StereoNoise, noisy_detection, true_label
+from demo_scene.labels import CarLabel, StereoNoise, noisy_detection, true_label
 from demo_scene.layout import SceneLayout
 from demo_scene.rendering import Light, PixelTruth, Renderer
 from demo_scene.sky import sky_radiance
 from demo_scene.street import street
-from demo_scene.surfaces import Surface
+from demo_scene.surfaces import Picture, Surface
 
 _RIGHT_GAIN_DEVIATION = 0.02
+# A car gets a label from this many visible pixels on, where all of it is this far before the camera.
+_FEWEST_PIXELS, _NEAREST_M = 300, 0.8
 
 
 @dataclass(frozen=True)
@@ -31,30 +34,60 @@ class RenderSettings:
 
 def render_frame(layout: SceneLayout, settings: RenderSettings) -> Frame:
     """Render a scene; randomness comes from `layout.seed` alone."""
-    rngs = dict(zip(("street", "sky", "sensor", "detector"), _generators(layout.seed, 4), strict=True))
-    models = [car_model(car) for car in layout.cars]
-    car_parts = [car_surfaces(c, m, k) for k, (c, m) in enumerate(zip(layout.cars, models, strict=True))]
-    surfaces = street(rngs["street"]) + [surface for parts in car_parts for surface in parts]
-    renderer = Renderer(surfaces, scene_light(rngs["sky"], layout), settings.variant)
-    views = (layout.camera.T_cam_road, layout.camera.T_right_road)
+    return next(render_sequence([layout], settings))
+
+
+def render_sequence(layouts: Sequence[SceneLayout], settings: RenderSettings) -> Iterator[Frame]:
+    """Render one scene at several times: the street and the cars' surfaces are made once."""
+    first = layouts[0]
+    rngs = dict(zip(("street", "sky", "sensor", "detector"), _generators(first.seed, 4), strict=True))
+    still, light = street(rngs["street"]), scene_light(rngs["sky"], first)
+    models = [car_model(car) for car in first.cars]
+    for number, layout in enumerate(layouts):
+        car_parts = [car_surfaces(c, m, k) for k, (c, m) in enumerate(zip(layout.cars, models, strict=True))]
+        surfaces = still + [surface for parts in car_parts for surface in parts]
+        left, right = _pictures(Renderer(surfaces, light, settings.variant), layout, number, rngs["sensor"], settings)
+        truth = Renderer(surfaces, None, settings.variant)
+        truth_left, truth_right = (truth.pixel_truth(view) for view in _views(layout))
+        labels = _labels(layout, models, car_parts, truth_left, settings.variant)
+        detections = {k: noisy_detection(rngs["detector"], label, StereoNoise()) for k, label in labels.items()}
+        yield Frame(layout, left, right, truth_left.instance, truth_right.instance, labels, detections)
+
+
+def _views(layout: SceneLayout) -> tuple[Array, Array]:
+    return layout.camera.T_cam_road, layout.camera.T_right_road
+
+
+def _pictures(
+    renderer: Renderer, layout: SceneLayout, number: int, rng: np.random.Generator, settings: RenderSettings
+) -> tuple[Picture, Picture]:
+    seed = 2 * (layout.seed + number)
     radiance = [
-        sensor.denoise(renderer.path_trace(view, settings.paths_per_pixel, 2 * layout.seed + k, settings.scale))
-        for k, view in enumerate(views)
+        sensor.denoise(renderer.path_trace(view, settings.paths_per_pixel, seed + k, settings.scale))
+        for k, view in enumerate(_views(layout))
     ]
     exposure = sensor.exposure_for(radiance[0])
-    gains = (1.0, float(np.exp(_RIGHT_GAIN_DEVIATION * rngs["sensor"].standard_normal())))
-    left, right = (
-        sensor.develop(rngs["sensor"], picture, exposure, gain) for picture, gain in zip(radiance, gains, strict=True)
-    )
-    truth = Renderer(surfaces, None, settings.variant)
-    truth_left, truth_right = (truth.pixel_truth(view) for view in views)
-    shares = _visible_shares(layout, car_parts, truth_left, settings.variant)
-    labels = tuple(
-        true_label(layout.camera, car, model.vertices, share)
-        for car, model, share in zip(layout.cars, models, shares, strict=True)
-    )
-    detections = tuple(noisy_detection(rngs["detector"], label, StereoNoise()) for label in labels)
-    return Frame(layout, left, right, truth_left.instance, truth_right.instance, labels, detections)
+    gain = float(np.exp(_RIGHT_GAIN_DEVIATION * rng.standard_normal()))
+    return sensor.develop(rng, radiance[0], exposure, 1.0), sensor.develop(rng, radiance[1], exposure, gain)
+
+
+def _labels(
+    layout: SceneLayout,
+    models: Sequence[CarModel],
+    car_parts: list[list[Surface]],
+    truth: PixelTruth,
+    variant: str,
+) -> dict[int, CarLabel]:
+    """Of the cars in view, by their number."""
+    labels = {}
+    for k, (car, model) in enumerate(zip(layout.cars, models, strict=True)):
+        pixels = int((truth.instance == k).sum())
+        depths = transform(layout.camera.T_cam_road @ car.T_road_obj, model.vertices)[:, 2]
+        if pixels >= _FEWEST_PIXELS and depths.min() > _NEAREST_M:
+            alone = Renderer(car_parts[k], None, variant).pixel_truth(layout.camera.T_cam_road)
+            share = pixels / int((alone.instance == k).sum())
+            labels[k] = true_label(layout.camera, car, model.vertices, share)
+    return labels
 
 
 def scene_light(rng: np.random.Generator, layout: SceneLayout) -> Light:
@@ -69,12 +102,3 @@ def scene_light(rng: np.random.Generator, layout: SceneLayout) -> Light:
 def _generators(seed: int, count: int) -> list[np.random.Generator]:
     # Streams of their own: more detail in the street must not move the detections.
     return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)]
-
-
-def _visible_shares(layout: SceneLayout, car_parts: list[list[Surface]], truth: PixelTruth, variant: str) -> Array:
-    """Visible pixels of each car over its pixels when it stands alone."""
-    shares = []
-    for k, parts in enumerate(car_parts):
-        alone = Renderer(parts, None, variant).pixel_truth(layout.camera.T_cam_road)
-        shares.append((truth.instance == k).sum() / max((alone.instance == k).sum(), 1))
-    return np.array(shares)

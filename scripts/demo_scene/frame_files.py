@@ -1,8 +1,9 @@
-"""Writes one frame in KITTI's folder layout."""
+"""Writes frames in the folder layouts of KITTI's object and tracking benchmarks."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from demo_scene.camera import CameraPose, projection
+from demo_scene.camera import T_CAM_REF, CameraPose, projection
 from demo_scene.labels import CarLabel, label_line, result_line
 from demo_scene.layout import SceneLayout
 from demo_scene.surfaces import Indices, Picture
@@ -20,15 +21,19 @@ _COCO_CAR = 3
 
 @dataclass(frozen=True)
 class Frame:
-    """All that is written of a frame; instance maps hold the number of the car, -1 elsewhere."""
+    """All that is written of a frame; instance maps hold the number of the car, -1 elsewhere.
+
+    Attributes:
+        labels, detections: of the cars in view, by the car's number.
+    """
 
     layout: SceneLayout
     image_left: Picture
     image_right: Picture
     instance_left: Indices
     instance_right: Indices
-    labels: tuple[CarLabel, ...]
-    detections: tuple[CarLabel, ...]
+    labels: dict[int, CarLabel]
+    detections: dict[int, CarLabel]
 
 
 def write_frame(root: Path, name: str, frame: Frame) -> None:
@@ -37,13 +42,45 @@ def write_frame(root: Path, name: str, frame: Frame) -> None:
     _write_png(training / "image_2" / f"{name}.png", frame.image_left)
     _write_png(training / "image_3" / f"{name}.png", frame.image_right)
     _write_text(training / "calib" / f"{name}.txt", calibration_text())
-    _write_text(training / "label_2" / f"{name}.txt", "".join(label_line(x) + "\n" for x in frame.labels))
+    _write_text(training / "label_2" / f"{name}.txt", "".join(label_line(x) + "\n" for x in frame.labels.values()))
     _write_text(training / "planes" / f"{name}.txt", plane_text(frame.layout.camera))
     masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
     _write_text(training / "masks" / f"{name}.json", json.dumps(masks))
     detections = root / "detections" / "noisy_stereo" / "data" / f"{name}.txt"
-    _write_text(detections, "".join(result_line(x, 0.9) + "\n" for x in frame.detections))
+    _write_text(detections, "".join(result_line(x, 0.9) + "\n" for x in frame.detections.values()))
     _write_text(training / "meta" / f"{name}.json", json.dumps(scene_description(frame.layout), indent=1) + "\n")
+
+
+def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: float) -> None:
+    """Write frames of one scene in the layout of KITTI's tracking benchmark; a car's number is its track.
+
+    Beside what a frame has: `poses/NAME.txt` (camera 0 of each frame in that of the first, rows of 12 as in KITTI's
+    odometry benchmark) and the times in the descriptions.
+    """
+    training = root / "training"
+    for number, frame in enumerate(frames):
+        stem = f"{number:06d}"
+        _write_png(training / "image_02" / name / f"{stem}.png", frame.image_left)
+        _write_png(training / "image_03" / name / f"{stem}.png", frame.image_right)
+        _write_text(training / "planes" / name / f"{stem}.txt", plane_text(frame.layout.camera))
+        masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
+        _write_text(training / "masks" / name / f"{stem}.json", json.dumps(masks))
+        description = {"time_s": number * interval_s, **scene_description(frame.layout)}
+        _write_text(training / "meta" / name / f"{stem}.json", json.dumps(description, indent=1) + "\n")
+    lines = [(f"{n} {k}", frame.labels[k], frame.detections[k]) for n, frame in enumerate(frames) for k in frame.labels]
+    _write_text(training / "calib" / f"{name}.txt", calibration_text())
+    _write_text(training / "poses" / f"{name}.txt", "".join(pose_lines([f.layout.camera for f in frames])))
+    _write_text(training / "label_02" / f"{name}.txt", "".join(f"{n} {label_line(x)}\n" for n, x, _ in lines))
+    found = "".join(f"{n} {result_line(x, 0.9)}\n" for n, _, x in lines)
+    _write_text(root / "detections" / "noisy_stereo" / f"{name}.txt", found)
+
+
+def pose_lines(cameras: Sequence[CameraPose]) -> list[str]:
+    """`T_first_ref` of each camera 0, rows of 12 numbers."""
+    T_ref_cam = np.eye(4)
+    T_ref_cam[:3, 3] = -T_CAM_REF
+    T_ref_road = [T_ref_cam @ camera.T_cam_road for camera in cameras]
+    return [_numbers((T_ref_road[0] @ np.linalg.inv(T))[:3].ravel()) + "\n" for T in T_ref_road]
 
 
 def calibration_text() -> str:

@@ -11,7 +11,7 @@ from directshape_torch.shape.parametric_cars import CarParameters, sample_car
 
 # Lateral measures of the street, metres in the road frame; traffic keeps to the right.
 LEFT_KERB_M, LEFT_LANE_M, CENTRE_LINE_M, RIGHT_LANE_M, RIGHT_KERB_M = -7.55, -5.3, -1.75, 1.75, 4.0
-_EGO_LANE_M, _ONCOMING_LANE_M, _PARKED_RIGHT_M, _PARKED_LEFT_M = 0.0, -3.5, 2.93, -6.5
+EGO_LANE_M, ONCOMING_LANE_M, PARKED_RIGHT_M, PARKED_LEFT_M = 0.0, -3.5, 2.93, -6.5
 
 _BODY_TYPES = ("city", "hatchback", "saloon", "estate", "suv", "van", "coupe")
 _BODY_TYPE_SHARES = (0.12, 0.28, 0.18, 0.16, 0.12, 0.07, 0.07)
@@ -69,32 +69,37 @@ def sample_layout(seed: int, num_cars: int | None = None) -> SceneLayout:
     """Draw a scene of 4 to 6 cars, at least one partly hidden and none nearly hidden; the same seed, the same scene."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(4, 7)) if num_cars is None else num_cars
-    camera = CameraPose(
+    camera = draw_camera(rng)
+    while True:
+        poses = _draw_poses(rng, count)
+        cars = tuple(dress(rng, pose) for pose in poses)
+        shares = visible_column_shares(camera, cars)
+        if shares.min() > 0.45 and 0.45 < np.sort(shares)[0] < 0.85:
+            break
+    return SceneLayout(seed, camera, cars, *draw_sun(rng))
+
+
+def draw_camera(rng: np.random.Generator) -> CameraPose:
+    """KITTI's camera on its car, which leans a little."""
+    return CameraPose(
         height_m=float(rng.normal(1.65, 0.02)),
         pitch_rad=float(np.radians(rng.normal(0.4, 0.3))),
         roll_rad=float(np.radians(rng.normal(0.0, 0.3))),
     )
-    while True:
-        poses = _draw_poses(rng, count)
-        cars = tuple(_dress(rng, pose) for pose in poses)
-        shares = visible_column_shares(camera, cars)
-        if shares.min() > 0.45 and 0.45 < np.sort(shares)[0] < 0.85:
-            break
-    return SceneLayout(
-        seed=seed,
-        camera=camera,
-        cars=cars,
-        sun_elevation_rad=float(np.radians(rng.uniform(36.0, 55.0))),
-        sun_azimuth_rad=float(np.radians(rng.uniform(110.0, 160.0) * rng.choice([-1.0, 1.0]))),
-    )
+
+
+def draw_sun(rng: np.random.Generator) -> tuple[float, float]:
+    """Elevation and azimuth in radians."""
+    elevation = float(np.radians(rng.uniform(36.0, 55.0)))
+    return elevation, float(np.radians(rng.uniform(110.0, 160.0) * rng.choice([-1.0, 1.0])))
 
 
 def _draw_poses(rng: np.random.Generator, count: int) -> list[Array]:
     """One car ahead, one oncoming, the others parked on both sides in slots of 6 m that no two share."""
     away, towards = -0.5 * np.pi, 0.5 * np.pi
     poses = [
-        pose_on_road(_EGO_LANE_M + rng.normal(0, 0.15), rng.uniform(11.5, 20.0), away + rng.normal(0, 0.03)),
-        pose_on_road(_ONCOMING_LANE_M + rng.normal(0, 0.15), rng.uniform(14.0, 32.0), towards + rng.normal(0, 0.05)),
+        pose_on_road(EGO_LANE_M + rng.normal(0, 0.15), rng.uniform(11.5, 20.0), away + rng.normal(0, 0.03)),
+        pose_on_road(ONCOMING_LANE_M + rng.normal(0, 0.15), rng.uniform(14.0, 32.0), towards + rng.normal(0, 0.05)),
     ]
     right_slots = [("right", z) for z in np.arange(9.0, 33.0, 6.0) + rng.uniform(-0.3, 1.2)]
     left_slots = [("left", z) for z in np.arange(11.5, 33.0, 6.0) + rng.uniform(0.0, 1.5)]
@@ -102,13 +107,14 @@ def _draw_poses(rng: np.random.Generator, count: int) -> list[Array]:
     later_slots = right_slots[1:] + left_slots
     order = rng.permutation(len(later_slots))
     for side, z in [right_slots[0], *(later_slots[k] for k in order)][: count - 2]:
-        x = _PARKED_RIGHT_M if side == "right" else _PARKED_LEFT_M
+        x = PARKED_RIGHT_M if side == "right" else PARKED_LEFT_M
         heading = away if side == "right" or rng.random() < 0.25 else towards
         poses.append(pose_on_road(x + rng.normal(0, 0.06), z + rng.uniform(-0.3, 0.3), heading + rng.normal(0, 0.035)))
     return poses
 
 
-def _dress(rng: np.random.Generator, T_road_obj: Array) -> PlacedCar:
+def dress(rng: np.random.Generator, T_road_obj: Array) -> PlacedCar:
+    """A car of the traffic drawn at random, at this pose."""
     parameters = sample_car(rng, str(rng.choice(_BODY_TYPES, p=_BODY_TYPE_SHARES)))
     paint, metallic = _PAINTS[int(rng.integers(len(_PAINTS)))]
     shade = rng.uniform(0.85, 1.15)
