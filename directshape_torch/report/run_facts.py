@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from directshape_torch.evaluation.comparison_summary import WORSE_BY_BEV_IOU
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_manifest import flatten
 from directshape_torch.report.car_rows import CarRow
@@ -73,7 +74,11 @@ def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
     for side in ("before", "after"):
         overlaps = columns[f"iou_{side}"]
         means[f"share_over_0.7_{side}"] = None if None in overlaps else statistics.fmean(v > 0.7 for v in overlaps)
-    return {"cars": len(counted), **means}
+    changes = [
+        row.iou_after - row.iou_before for row in counted if row.iou_before is not None and row.iou_after is not None
+    ]
+    worse = sum(change < -WORSE_BY_BEV_IOU for change in changes) if changes else None
+    return {"cars": len(counted), "worse": worse, "worse_by_iou": WORSE_BY_BEV_IOU, **means}
 
 
 def problem_notes(problems: Mapping[str, Collection[str]], num_frames: int) -> list[str]:

@@ -96,7 +96,7 @@ def _draw_grid(picture: Picture, ground: _Map) -> None:
         v = round(float(ground.pixels(np.array([[0.0, z]]))[0, 1]))
         cv2.line(picture, (0, v), (width, v), _GRID, 1)
         # On the right: a legend stands on the left.
-        draw_text(picture, f"{z} m", (width - 40, v - 3), GREY, 0.38)
+        draw_text(picture, f"{z} m", (width - 70, v - 4), GREY, 0.7)
     for x in _multiples(step, ground.middle_x_m - breadth / 2, ground.middle_x_m + breadth / 2):
         u = round(float(ground.pixels(np.array([[x, 0.0]]))[0, 0]))
         cv2.line(picture, (u, 0), (u, height), _GRID, 1)
@@ -119,4 +119,4 @@ def _draw_footprint(picture: Picture, ground: _Map, footprint: Footprint) -> Non
     draw_polygon(picture, ground.pixels(np.stack([middle, front])), footprint.colour, footprint.thickness)
     if footprint.label:
         pixels = ground.pixels(corners)
-        draw_text(picture, footprint.label, (pixels[:, 0].max() + 4, pixels[:, 1].mean() + 4), footprint.colour)
+        draw_text(picture, footprint.label, (pixels[:, 0].max() + 4, pixels[:, 1].mean() + 8), footprint.colour, 0.9)

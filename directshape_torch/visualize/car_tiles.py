@@ -17,24 +17,25 @@ from directshape_torch.visualize.drawing import (
     View,
     draw_contour,
     draw_text,
+    text_size_for,
 )
 
 _TILE_HEIGHTS_PX = (150, 135, 120)
 # Width of a tile as a share of its height.
 _LEAST_ASPECT, _LARGEST_ASPECT = 0.95, 2.2
-_CAPTION_PX = 18
+_CAPTION_LINE_PX = 26
 _GAP_PX = 6
 _GROUND = 24
 
 
 @dataclass(frozen=True)
 class CarTile:
-    """One car in two states, the colour of the second, and what is said about it."""
+    """One car in two states, the colour of the second, and the lines of its caption."""
 
     before: Surface
     after: Surface
     colour_after: Colour
-    caption: str
+    caption: tuple[str, ...]
 
 
 def tile_strip(
@@ -94,8 +95,10 @@ def _tile(image: Picture, K: Array, tile: CarTile, height_px: int) -> Picture | 
         view = View.of_window(image, K, window, scale)
         draw_contour(view, surface, colour, 1)
         views.append(view.picture)
-    caption = np.full((_CAPTION_PX, views[0].shape[1], 3), _GROUND, np.uint8)
-    draw_text(caption, tile.caption, (3, 13), size=0.38)
+    width = views[0].shape[1]
+    caption = np.full((_CAPTION_LINE_PX * len(tile.caption) + 4, width, 3), _GROUND, np.uint8)
+    for line, text in enumerate(tile.caption):
+        draw_text(caption, text, (3, _CAPTION_LINE_PX * (line + 1) - 5), size=text_size_for(text, width - 6, 0.8))
     return np.concatenate([caption, *views])
 
 

@@ -174,17 +174,24 @@ def draw_text(
         cv2.putText(picture, drawable, (u + du, v + dv), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
 
 
+def text_size_for(text: str, width_px: float, largest: float) -> float:
+    """The size at which a text is as wide as that at most."""
+    wide = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, largest, 1)[0][0]
+    return largest * min(1.0, width_px / max(wide, 1))
+
+
 def draw_legend(
     picture: Picture, entries: Sequence[tuple[str, Colour]], position: tuple[int, int], size: float = 0.45
 ) -> None:
     """Coloured strokes with their meaning, one a line, from the upper left corner on."""
     u, v = position
-    picture[v - 6 : v + 18 * len(entries) + 6, u - 6 : u + 140] //= 3
+    line = round(40 * size)
+    picture[v - 6 : v + line * len(entries) + 6, u - 6 : u + 30 + round(270 * size)] //= 3
     for row, (text, colour) in enumerate(entries):
-        middle = v + 9 + 18 * row
+        middle = v + line * row + line // 2
         for ink, thickness in ((BLACK, 5), (colour, 3)):
             cv2.line(picture, (u, middle), (u + 22, middle), ink, thickness, cv2.LINE_AA)
-        draw_text(picture, text, (u + 30, middle + 5), WHITE, size)
+        draw_text(picture, text, (u + 30, middle + round(11 * size)), WHITE, size)
 
 
 def _fixed_point(pixels: Array) -> npt.NDArray[np.int32]:

@@ -10,10 +10,26 @@ from directshape_torch.config import SamplingConfig
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.sampling import sampling_settings, selected_pixels
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.visualize.sampling_picture import occlusion_picture, sampling_picture
+from directshape_torch.visualize.drawing import WHITE, draw_text, text_size_for
+from directshape_torch.visualize.sampling_picture import (
+    BLUE,
+    GREEN,
+    RED,
+    YELLOW,
+    occlusion_picture,
+    sampling_picture,
+)
 
 Picture = NDArray[np.uint8]
 _HEIGHT_PX = 320
+_LEGEND_PX, _SWATCH_PX = 30, 18
+_LEGEND = (
+    ("strong gradient", GREEN),
+    ("strongest of its cell", RED),
+    ("region", YELLOW),
+    ("mask of the car", BLUE),
+    ("hidden by a nearer car", WHITE),
+)
 
 
 def observation_sheet(
@@ -27,7 +43,7 @@ def observation_sheet(
         config: how pixels are sampled; default the refiner's.
 
     Returns:
-        (320, w, 3) RGB uint8.
+        (350, w, 3) RGB uint8: pixels, image, masks and occlusion mask, with a legend below.
 
     Raises:
         InputError: no such car, or one without pixels in the left image.
@@ -41,7 +57,21 @@ def observation_sheet(
         sampling_picture(frames, detections, left, chosen, object_number, order=order),
         occlusion_picture(frames, detections, left, object_number, order=order),
     ]
-    return np.concatenate([_of_height(panel) for panel in panels], axis=1)
+    sheet = np.concatenate([_of_height(panel) for panel in panels], axis=1)
+    return np.concatenate([sheet, _legend(sheet.shape[1])])
+
+
+def _legend(width: int) -> Picture:
+    """What the colours mean, in one line."""
+    strip = np.full((_LEGEND_PX, width, 3), 24, np.uint8)
+    names = "   ".join(name for name, _ in _LEGEND)
+    size = text_size_for(names, width - 20 - _SWATCH_PX * len(_LEGEND), 0.7)
+    u = 10
+    for name, colour in _LEGEND:
+        cv2.circle(strip, (u + 5, _LEGEND_PX // 2), 5, colour, -1, cv2.LINE_AA)
+        draw_text(strip, name, (u + 16, _LEGEND_PX // 2 + 7), size=size)
+        u += _SWATCH_PX + cv2.getTextSize(name + "   ", cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0]
+    return strip
 
 
 def _of_height(picture: Picture) -> Picture:

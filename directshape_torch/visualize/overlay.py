@@ -29,6 +29,7 @@ from directshape_torch.visualize.drawing import (
     draw_legend,
     draw_text,
     picture_of,
+    text_size_for,
 )
 
 _LEAST_WIDTH_PX = 1000
@@ -45,7 +46,7 @@ class DrawnCar:
         corners_cam: (8, 3) of its box, in the order of `box_corners`, metres.
         surface: its shape.
         label: the number of its line.
-        note: what is said about it.
+        note: what is said about it, below its distance.
         is_refined: whether the state comes from a refinement.
     """
 
@@ -54,6 +55,11 @@ class DrawnCar:
     label: str
     note: str = ""
     is_refined: bool = True
+
+    @property
+    def distance_m(self) -> float:
+        """Depth of its middle."""
+        return float(self.corners_cam[:, 2].mean())
 
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult, first_row: int = 0) -> Picture:
@@ -103,7 +109,7 @@ def overlay_picture(
         _image_row(image, K, after, BLUE, f"{title}  after: refined box and shape"),
     ]
     tiles = [
-        CarTile(b.surface, a.surface, BLUE if a.is_refined else GREY, f"{a.label}:  {a.note}")
+        CarTile(b.surface, a.surface, BLUE if a.is_refined else GREY, (f"{a.label}: {a.distance_m:.1f} m", a.note))
         for b, a in zip(before, after, strict=True)
     ]
     left = np.concatenate([*rows, tile_strip(image, K, tiles, rows[0].shape[1])])
@@ -112,7 +118,7 @@ def overlay_picture(
     legend: list[tuple[str, Colour]] = [("before", ORANGE), ("after", BLUE)]
     legend += [("ground truth", GREEN)] if truth_corners_cam else []
     legend += [("not refined", GREY)] if any(not car.is_refined for car in after) else []
-    draw_legend(right, legend, (12, 10))
+    draw_legend(right, legend, (12, 10), 0.9)
     return np.concatenate([left, right], axis=1)
 
 
@@ -120,25 +126,24 @@ def _image_row(image: Picture, K: Array, cars: Sequence[DrawnCar], colour: Colou
     height, width = image.shape[:2]
     view = View.of_window(image, K, (0, 0, width, height), max(1.0, _LEAST_WIDTH_PX / width))
     # Far cars first, so that near ones are drawn over them.
-    for car in sorted(cars, key=lambda car: -float(car.corners_cam[:, 2].mean())):
+    for car in sorted(cars, key=lambda car: -car.distance_m):
         ink = colour if car.is_refined else GREY
         draw_box(view, car.corners_cam, ink)
         draw_contour(view, car.surface, ink, 2 if _height_px(view, car) > _TALL_PX else 1)
         _draw_label(view, car, ink)
-    draw_text(view.picture, title, (8, 20), size=0.55)
+    draw_text(view.picture, title, (8, 32), size=text_size_for(title, view.picture.shape[1] - 16, 1.0))
     return view.picture
 
 
 def _height_px(view: View, car: DrawnCar) -> float:
-    depth = max(float(car.corners_cam[:, 2].mean()), 1.0)
-    return float(view.K[1, 1]) * float(np.ptp(car.corners_cam[:, 1])) / depth
+    return float(view.K[1, 1]) * float(np.ptp(car.corners_cam[:, 1])) / max(car.distance_m, 1.0)
 
 
 def _draw_label(view: View, car: DrawnCar, colour: Colour) -> None:
     roof = car.corners_cam[4:].mean(axis=0, keepdims=True)
     if roof[0, 2] > 1:
         u, v = view.project(roof)[0]
-        draw_text(view.picture, car.label, (u - 4, max(v - 8, 12)), colour, 0.5)
+        draw_text(view.picture, car.label, (u - 8, max(v - 8, 22)), colour, 0.9)
 
 
 def _footprints(
@@ -176,8 +181,7 @@ def _refined_cars(loaded: LoadedFrame, result: RefinementResult, first_row: int)
     cars = []
     for car, initial in enumerate(_initial_cars(loaded, result)):
         row = first_row + car
-        depth = float(result.T_cam_obj[row, 2, 3])
-        note = f"{depth:.1f} m  {statuses[row].name}"
+        note = statuses[row].name
         if refined[row]:
             mesh = result.mesh(row)
             cars.append(DrawnCar(corners[row], Surface(mesh.vertices, mesh.faces), initial.label, note))

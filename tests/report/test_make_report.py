@@ -78,6 +78,8 @@ def test_table_says_what_the_files_say(run: FinishedRun, tmp_path: Path) -> None
         assert row["iou_after"] == pytest.approx(car.after.bev_iou, abs=1e-4)
         assert row["centre_after_m"] == pytest.approx(car.after.centre_m, abs=1e-4)
     assert data["run"]["errors"]["cars"] == len(compared.cars)
+    worse = sum(car.after.bev_iou < car.before.bev_iou - 0.05 for car in compared.cars)
+    assert data["run"]["errors"]["worse"] == worse
     assert data["run"]["errors"]["iou_after"] == pytest.approx(
         np.mean([car.after.bev_iou for car in compared.cars]), abs=1e-4
     )

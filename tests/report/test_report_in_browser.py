@@ -228,6 +228,36 @@ def test_a_phone_is_wide_enough(opened: Chrome, width: int) -> None:
     assert opened.execute_script(overflow) <= 0
 
 
+def test_the_table_of_cars_fits_a_desk_and_becomes_cards_on_a_phone(opened: Chrome) -> None:
+    inside = "const box = document.querySelector('.scroller'); return box.scrollWidth - box.clientWidth"
+    set_viewport(opened, 1600)
+    assert opened.execute_script(inside) <= 0
+    set_viewport(opened, 400, 844)
+    assert opened.execute_script(inside) <= 0
+    first = find(opened, "#car-rows tr")
+    for title in ("IoU before", "IoU after", "IoU change", "Probably better"):
+        cell = first.find_element("css selector", f"td[data-title='{title}']")
+        assert cell.is_displayed()
+        assert cell.rect["x"] + cell.rect["width"] <= 400
+    from selenium.webdriver.support.ui import Select
+
+    Select(find(opened, "#sort-choice")).select_by_visible_text("Distance [m]")
+    distances = [float(text) for text in texts(opened, "#car-rows td:nth-child(4)")]
+    assert distances == sorted(distances, reverse=True)
+
+
+def test_figures_that_became_worse_are_red(opened: Chrome) -> None:
+    cells = opened.execute_script(
+        """const cells = document.querySelectorAll("td[data-title='IoU change']");
+        return [...cells].map((cell) => [cell.textContent, cell.className]);"""
+    )
+    known = [(float(text), tone) for text, tone in cells if text != "–"]
+    assert known
+    for change, tone in known:
+        if abs(change) > 0.01:
+            assert ("good" if change > 0 else "bad") in tone.split()
+
+
 def test_dark_and_light(opened: Chrome) -> None:
     def lightness(element: Any) -> float:
         return float(np.median(screenshot_of(element)))

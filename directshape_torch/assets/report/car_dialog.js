@@ -2,7 +2,7 @@
 
 import { element } from "report/dom";
 import { mapsOf, thumbnailsOf } from "report/data";
-import { carName, change, costChange, number, percent } from "report/format";
+import { carName, change, costChange, iouChange, number, percent, signed, tone } from "report/format";
 import { curves } from "report/charts";
 import { factTable } from "report/summary";
 import { showCarInFrame } from "report/frame_view";
@@ -75,18 +75,21 @@ function figures(car, maps) {
   const rows = [
     ["Length, width, height", `${number(car.length_m)}, ${number(car.width_m)}, ${number(car.height_m)} m`],
     ["Probably better than the input", percent(car.probability_better)],
-    ["Overlap with the mask", number(car.mask_iou)],
+    ["IoU with the mask", number(car.mask_iou)],
     ["Difference of the images", `${number(car.photometric_error_grey, 1)} grey levels`],
     ["Standard deviation of x, y, z", `${sigmas.slice(0, 3).map((sigma) => number(sigma)).join(", ")} m`],
     ["Standard deviation of the heading", sigmas[3] === null ? "–" : `${number(sigmas[3] * 180 / Math.PI, 1)}°`],
     ["Least seen", car.unseen || "–"],
+    ["Score of the detector", number(car.score)],
     ["Iterations", String(car.iterations)],
     ["Cost", `${change(car.cost_before, car.cost_after)} (${percent(costChange(car))})`],
   ];
   if (car.iou_after !== null) {
-    rows.push(["Bird's-eye overlap with the label", change(car.iou_before, car.iou_after)],
-      ["Centre error", `${change(car.centre_before_m, car.centre_after_m)} m`],
-      ["Heading error", `${change(car.yaw_before_deg, car.yaw_after_deg, 1)}°`]);
+    const judged = (words, ...compared) => element("span", { class: tone(...compared) }, words);
+    const iou = `${change(car.iou_before, car.iou_after)}${car.iou_before === null ? "" : ` (${signed(iouChange(car))})`}`;
+    rows.push(["Bird's-eye IoU with the label", judged(iou, car.iou_before, car.iou_after, true)],
+      ["Centre error", judged(`${change(car.centre_before_m, car.centre_after_m)} m`, car.centre_before_m, car.centre_after_m)],
+      ["Heading error", judged(`${change(car.yaw_before_deg, car.yaw_after_deg, 1)}°`, car.yaw_before_deg, car.yaw_after_deg, false, 0.05)]);
   }
   return factTable(rows, ["Figure", "Value"]);
 }

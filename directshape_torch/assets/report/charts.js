@@ -2,7 +2,7 @@
 
 import { element, svg, byId } from "report/dom";
 import { cars, run, hasLabels } from "report/data";
-import { costChange, number } from "report/format";
+import { costChange, iouChange, number } from "report/format";
 
 const WIDTH = 340, HEIGHT = 180;
 const MARGIN = { left: 36, right: 10, top: 8, bottom: 30 };
@@ -17,7 +17,8 @@ export function showDistributions() {
   const judged = cars.filter((car) => car.counts);
   if (hasLabels && judged.length) {
     charts.append(
-      histogram("Bird's-eye overlap with the label (more is better)", judged, "iou_before", "iou_after", 0, 1, ""),
+      histogram("Bird's-eye IoU with the label (more is better)", judged, "iou_before", "iou_after", 0, 1, ""),
+      changes(judged.map(iouChange).filter((value) => value !== null)),
       histogram("Centre error", judged, "centre_before_m", "centre_after_m", 0, null, "m"),
     );
   } else {
@@ -41,6 +42,14 @@ function histogram(title, rows, first, second, low, high, unit, keys = KEYS, sta
   const counts = series.map((values) => binned(values, low, top, 14));
   return figure(title, unit, keys.filter((_, index) => series[index].length),
     drawnBars(counts, keys, low, top, open, stacked), describe(title, unit, keys, series));
+}
+
+// Losses to the left of 0 and red, gains to the right.
+function changes(values) {
+  if (!values.length) return "";
+  const most = niceCeiling(Math.max(...values.map(Math.abs)));
+  const rows = values.map((value) => ({ lost: value < 0 ? value : null, gained: value < 0 ? null : value }));
+  return histogram("Change of the IoU", rows, "lost", "gained", -most, most, "", [["bad", "worse"], ["good", "better"]], true);
 }
 
 function plainHistogram(title, values, low, high, unit) {

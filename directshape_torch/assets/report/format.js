@@ -14,6 +14,22 @@ export function change(before, after, decimals = 2) {
   return before === null || before === undefined ? number(after, decimals) : `${number(before, decimals)} → ${number(after, decimals)}`;
 }
 
+// Signed, so that a loss is seen as one.
+export function signed(value, decimals = 2) {
+  if (value === null || value === undefined) return MISSING;
+  const digits = Math.abs(value).toFixed(decimals);
+  return Number(digits) === 0 ? digits : `${value > 0 ? "+" : "-"}${digits}`;
+}
+
+// "good", "bad" or nothing: is `after` better than `before`, by more than is shown? Small is good but for overlaps.
+export function tone(before, after, moreIsBetter = false, least = 0.005) {
+  if (before === null || before === undefined || after === null || after === undefined) return null;
+  const gained = moreIsBetter ? after - before : before - after;
+  return Math.abs(gained) < least ? null : gained > 0 ? "good" : "bad";
+}
+
+export const iouChange = (car) => (car.iou_before === null || car.iou_after === null ? null : car.iou_after - car.iou_before);
+
 export const carName = (car) => `${car.frameId}, line ${car.line}`;
 
 export const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
@@ -28,5 +44,5 @@ export function costChange(car) {
 export function gain(car, byLabels) {
   if (!car.refined) return null;
   if (!byLabels) return car.probability_better;
-  return car.iou_before === null || car.iou_after === null ? null : car.iou_after - car.iou_before;
+  return iouChange(car);
 }

@@ -2,7 +2,7 @@
 
 import { element, byId } from "report/dom";
 import { cars, hasErrorsBefore } from "report/data";
-import { carName, change, gain, number, percent } from "report/format";
+import { carName, change, gain, iouChange, number, percent, signed, tone } from "report/format";
 import { pair } from "report/thumbnails";
 import { openCar } from "report/car_dialog";
 
@@ -17,7 +17,7 @@ export function showHighlights() {
     return;
   }
   const rule = hasErrorsBefore
-    ? "By the change of the bird's-eye overlap with the label."
+    ? "By the change of the bird's-eye IoU with the label."
     : "By the calibrated probability that the result is better than the input.";
   const better = ranked.filter((car) => !hasErrorsBefore || value(car) > 0).length;
   const half = Math.min(COUNT, Math.ceil(ranked.length / 2));
@@ -35,7 +35,7 @@ function cards(chosen, none) {
 
 function figures(car) {
   const words = car.iou_before !== null && car.iou_after !== null
-    ? [`overlap ${change(car.iou_before, car.iou_after)}`, car.iou_after >= car.iou_before ? "good" : "bad"]
+    ? [`IoU ${change(car.iou_before, car.iou_after)} (${signed(iouChange(car))})`, tone(car.iou_before, car.iou_after, true)]
     : [`probably better: ${percent(car.probability_better)}`, null];
   return element("span", {}, element("span", { class: words[1] }, words[0]), `, ${number(car.distance_m, 1)} m, ${car.status}`);
 }

@@ -2,7 +2,7 @@
 
 import { element, byId } from "report/dom";
 import { run } from "report/data";
-import { change, counted, percent } from "report/format";
+import { change, counted, percent, tone } from "report/format";
 
 export function showSummary() {
   byId("title").textContent = `Refined cars: ${run.name}`;
@@ -15,18 +15,18 @@ export function showSummary() {
 function tiles() {
   const failed = Object.keys(run.failed).length;
   const entries = [
-    ["Frames done", String(run.frames_done)],
-    ["Frames failed", String(failed), failed ? "bad" : null],
+    ["Frames", failed ? `${run.frames_done} done, ${failed} failed` : String(run.frames_done), failed ? "bad" : null],
     ["Cars", String(run.cars)],
     ["Refined", run.cars ? `${run.refined} (${percent(run.refined / run.cars)})` : "0"],
   ];
   const errors = run.errors;
   if (errors !== null) {
     entries.push(
-      [`Bird's-eye overlap, mean of ${errors.cars}`, change(errors.iou_before, errors.iou_after)],
-      ["Overlap above 0.7", shares(errors)],
-      ["Centre error, mean", `${change(errors.centre_before_m, errors.centre_after_m)} m`],
-      ["Heading error, mean", `${change(errors.yaw_before_deg, errors.yaw_after_deg, 1)}°`],
+      [`BEV IoU, mean of ${errors.cars}`, change(errors.iou_before, errors.iou_after), tone(errors.iou_before, errors.iou_after, true)],
+      ["BEV IoU above 0.7", shares(errors), tone(errors["share_over_0.7_before"], errors["share_over_0.7_after"], true)],
+      ["Centre error, mean", `${change(errors.centre_before_m, errors.centre_after_m)} m`, tone(errors.centre_before_m, errors.centre_after_m)],
+      ["Heading error, mean", `${change(errors.yaw_before_deg, errors.yaw_after_deg, 1)}°`, tone(errors.yaw_before_deg, errors.yaw_after_deg, false, 0.05)],
+      ...(errors.worse === null ? [] : [[`IoU worse by ${errors.worse_by_iou}`, `${errors.worse} of ${errors.cars} cars`, errors.worse ? "bad" : "good"]]),
     );
   }
   return element("dl", { class: "tiles" }, ...entries.map(([name, value, kind]) =>

@@ -2,30 +2,30 @@
 
 import { element, byId } from "report/dom";
 import { cars, run, hasLabels, hasErrorsBefore } from "report/data";
-import { MISSING, carName, costChange, number, percent } from "report/format";
+import { MISSING, costChange, iouChange, number, percent, signed, tone } from "report/format";
 import { thumbnail } from "report/thumbnails";
 import { openCar } from "report/car_dialog";
 
 const ROWS_AT_ONCE = 100;
 
-const numeric = (title, value, text = (car) => number(value(car))) => ({ title, value, text, kind: "number" });
+const numeric = (title, value, text = (car) => number(value(car)), toneOf = () => null) => ({ title, value, text, toneOf, kind: "number" });
 const words = (title, value) => ({ title, value, text: value, kind: "words" });
 
+const iouTone = (car) => tone(car.iou_before, car.iou_after, true);
 const columns = [
   numeric("Distance [m]", (car) => car.distance_m, (car) => number(car.distance_m, 1)),
   { title: "Status", value: (car) => car.status, text: (car) => car.status, kind: "word" },
-  ...(hasErrorsBefore ? [numeric("Overlap before", (car) => car.iou_before)] : []),
-  ...(hasLabels ? [numeric("Overlap after", (car) => car.iou_after)] : []),
+  ...(hasErrorsBefore ? [numeric("IoU before", (car) => car.iou_before)] : []),
+  ...(hasLabels ? [numeric("IoU after", (car) => car.iou_after, undefined, iouTone)] : []),
+  ...(hasErrorsBefore ? [numeric("IoU change", iouChange, (car) => signed(iouChange(car)), iouTone)] : []),
   ...(hasErrorsBefore ? [numeric("Centre error before [m]", (car) => car.centre_before_m)] : []),
-  ...(hasLabels ? [numeric("Centre error after [m]", (car) => car.centre_after_m)] : []),
+  ...(hasLabels ? [numeric("Centre error after [m]", (car) => car.centre_after_m, undefined, (car) => tone(car.centre_before_m, car.centre_after_m))] : []),
   numeric("Cost change", costChange, (car) => percent(costChange(car))),
   numeric("Probably better", (car) => car.probability_better, (car) => percent(car.probability_better)),
-  numeric("Mask overlap", (car) => car.mask_iou),
+  numeric("Mask IoU", (car) => car.mask_iou),
   numeric("Image difference [grey]", (car) => car.photometric_error_grey, (car) => number(car.photometric_error_grey, 1)),
   numeric("Sigma of depth [m]", (car) => car.sigma_depth_m),
   numeric("Length [m]", (car) => car.length_m),
-  numeric("Score", (car) => car.score),
-  numeric("Iterations", (car) => car.iterations, (car) => String(car.iterations)),
   { title: "Type", value: (car) => car.type, text: (car) => car.type, kind: "word" },
   words("Least seen", (car) => car.unseen),
 ];
@@ -52,7 +52,14 @@ function controls() {
   const choose = element("select", { id: "status-filter", onchange: (event) => { state.status = event.target.value; restart(); } },
     element("option", { value: "" }, "all"), ...run.statuses.map((status) => element("option", { value: status.name }, status.name)));
   return element("div", { class: "controls" },
-    element("label", {}, "Frame or type", search), element("label", {}, "Status", choose));
+    element("label", {}, "Frame or type", search), element("label", {}, "Status", choose),
+    element("label", { class: "narrow" }, "Sort by", sortChoice()));
+}
+
+// The table's head has no room on a phone.
+function sortChoice() {
+  const options = [nameColumn, ...columns].map((column, index) => element("option", { value: index }, column.title));
+  return element("select", { id: "sort-choice", onchange: (event) => sortBy([nameColumn, ...columns][Number(event.target.value)]) }, ...options);
 }
 
 function restart() {
@@ -105,6 +112,6 @@ function row(car) {
   return element("tr", {},
     element("td", { class: "name" }, element("button", { type: "button", class: "open-car", onclick: () => openCar(car) },
       element("span", {}, car.frameId), " ", element("span", { class: "quiet" }, `line ${car.line}`))),
-    element("td", {}, thumbnail(car, "before")), element("td", {}, thumbnail(car, "after")),
-    ...columns.map((column) => element("td", { class: column.kind }, column.text(car) || MISSING)));
+    element("td", { class: "picture" }, thumbnail(car, "before")), element("td", { class: "picture" }, thumbnail(car, "after")),
+    ...columns.map((column) => element("td", { class: [column.kind, column.toneOf?.(car)].filter(Boolean).join(" "), "data-title": column.title }, column.text(car) || MISSING)));
 }

@@ -55,14 +55,16 @@ def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) ->
     for row, (name, view) in zip(axes, views.items(), strict=True):
         _draw_from_above(row[0], name, view, all_footprints)
         _draw_contours(row[1:], view)
+    _draw_legend(left, [*axes[0], *axes[1]])
     _draw_distances(right.subplots(), views)
     write_figure(path, figure)
 
 
 def _draw_from_above(axes: Any, name: str, view: CarView, others: list[Any]) -> None:
     show_birds_eye(axes, view, others)
+    names = {view.steps[0]: "input", view.steps[-1]: "last iteration"}
     for number, ink in zip(view.steps, iteration_inks(len(view.steps)), strict=True):
-        draw_footprint(axes, view.footprint(number), ink, linewidth=1.1)
+        draw_footprint(axes, view.footprint(number), ink, names.get(number), linewidth=1.1)
     axes.set_title(name, fontsize=10, color=_INKS[name])
 
 
@@ -71,7 +73,7 @@ def _draw_contours(row: Any, view: CarView) -> None:
     for axes, place in zip(row, three_places(len(view.steps)), strict=True):
         title = f"iteration {view.steps[place]}"
         show_crop(axes, view.image("left"), view.window("left"), title)
-        draw_lines(axes, view.mask_lines("left"), MASK_INK, linewidth=1.3, linestyle=":")
+        draw_lines(axes, view.mask_lines("left"), MASK_INK, "mask", linewidth=1.3, linestyle=":")
         draw_lines(axes, view.contours("left", view.steps[place]), inks[place], linewidth=1.8)
 
 
@@ -83,6 +85,22 @@ def three_places(count: int) -> tuple[int, int, int]:
         ((0, 3, 11), (0, 1, 1))
     """
     return 0, min(max(count // 4, 1), count - 1), count - 1
+
+
+def _draw_legend(figure: Any, all_axes: list[Any]) -> None:
+    """One for all panels below them: colours mean the same in each."""
+    labelled = [pair for axes in all_axes for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in reversed(labelled)}
+    names = [name for name in ("input", "last iteration", "ground truth", "mask") if name in handles]
+    figure.legend(
+        [handles[name] for name in names],
+        names,
+        loc="outside lower center",
+        ncols=len(names),
+        fontsize=9,
+        facecolor="0.3",
+        labelcolor="white",
+    )
 
 
 def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:
