@@ -14,7 +14,7 @@ const words = (title, value) => ({ title, value, text: value, kind: "words" });
 const iouTone = (car) => tone(car.iou_before, car.iou_after, true);
 const columns = [
   numeric("Distance [m]", (car) => car.distance_m, (car) => number(car.distance_m, 1)),
-  { title: "Status", value: (car) => car.status, text: (car) => car.status, kind: "word" },
+  { title: "Status", value: (car) => car.status, text: (car) => car.status, kind: "status" },
   ...(hasErrorsBefore ? [numeric("IoU before", (car) => car.iou_before)] : []),
   ...(hasLabels ? [numeric("IoU after", (car) => car.iou_after, undefined, iouTone)] : []),
   ...(hasErrorsBefore ? [numeric("IoU change", iouChange, (car) => signed(iouChange(car)), iouTone)] : []),
@@ -26,7 +26,7 @@ const columns = [
   numeric("Image difference [grey]", (car) => car.photometric_error_grey, (car) => number(car.photometric_error_grey, 1)),
   numeric("Sigma of depth [m]", (car) => car.sigma_depth_m),
   numeric("Length [m]", (car) => car.length_m),
-  { title: "Type", value: (car) => car.type, text: (car) => car.type, kind: "word" },
+  { title: "Type", value: (car) => car.type, text: (car) => car.type, kind: "type" },
   words("Least seen", (car) => car.unseen),
 ];
 const nameColumn = { title: "Car", value: (car) => `${car.frameId} ${String(car.line).padStart(4, "0")}` };
