@@ -15,8 +15,8 @@ from directshape_torch import DirectShapeRefiner
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
-from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import result_path, shapes_path
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"  # holds training/image_2, image_3, calib, ...
 

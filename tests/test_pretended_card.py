@@ -88,7 +88,7 @@ def test_the_demo_writes_the_same_files(found: dict[str, Any]) -> None:
     demo = _of(found, "demo")
     assert len(demo["names"]) > 10
     # These name the device, and what it took.
-    assert demo["differ"] == ["run.json", "timings.json"]
+    assert demo["differ"] == ["run.jsonl", "timings.json"]
 
 
 def test_tensors_of_both_devices_do_not_mix_and_waits_are_noted(found: dict[str, Any]) -> None:

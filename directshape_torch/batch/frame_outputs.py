@@ -1,23 +1,27 @@
-"""All files of one refined frame, and its entry in `summary.json`."""
+"""All files of one refined frame, and what its last one says of the others."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from directshape_torch.batch.options import RefineOptions
+from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
-from directshape_torch.io.run_manifest import hash_bytes
+from directshape_torch.io.refinement_files import write_refinement
+from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import (
+    FrameRecord,
+    frame_entry,
+    overlay_path,
+    read_record,
+    result_path,
+    shapes_path,
+)
+from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
-
-
-def overlay_path(out_dir: Path, frame_id: str) -> Path:
-    """The picture of a frame."""
-    return out_dir / "overlays" / f"{frame_id}.png"
 
 
 def write_frame_outputs(
@@ -25,23 +29,24 @@ def write_frame_outputs(
     loaded: LoadedFrame,
     result: RefinementResult,
     first_row: int,
-    prior_sha256: str,
+    made_of: tuple[str, str, Mapping[str, str]],
     options: RefineOptions,
-) -> dict[str, str]:
-    """Write what the options ask for; the result file comes last, so that where it exists the frame is complete.
+) -> FrameEntry:
+    """Write what the options ask for; the shapes come last, so that where they exist the frame is complete.
 
     Args:
         out_dir: the output folder.
         loaded: the frame.
         result: of a call with this frame's detections, alone or in a batch.
         first_row: where the frame's detections begin in `result`.
-        prior_sha256: of the shape prior.
+        made_of: hashes of the run, of the shape prior and of the frame's input files.
         options: kinds of files.
 
     Returns:
-        The sha256 of each file, by its path in the output folder.
+        The frame's entry in `summary.json`.
     """
-    files = [result_path(out_dir, loaded.frame_id), shapes_path(out_dir, loaded.frame_id)]
+    run, prior_sha256, inputs = made_of
+    files = [result_path(out_dir, loaded.frame_id)]
     if options.meshes is not None:
         from directshape_torch.batch.mesh_files import write_car_meshes
 
@@ -51,30 +56,28 @@ def write_frame_outputs(
 
         files.append(overlay_path(out_dir, loaded.frame_id))
         write_png(files[-1], overlay_of_frame(loaded, result, first_row))
-    write_refinement(out_dir, loaded, result, prior_sha256, first_row)
-    return {path.relative_to(out_dir).as_posix(): hash_bytes(path.read_bytes()) for path in files}
+    earlier = _earlier_record(shapes_path(out_dir, loaded.frame_id), run, inputs)
+
+    def record() -> FrameRecord:
+        hashes = {path.relative_to(out_dir).as_posix(): hash_bytes(path.read_bytes()) for path in files}
+        outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
+        # Those of an earlier run stay.
+        if earlier is not None:
+            hashes, outputs = {**earlier.files, **hashes}, outputs.union(earlier.outputs)
+        return FrameRecord(run, inputs, sorted(outputs), hashes, len(loaded.input_objects), masks_right)
+
+    shapes = write_refinement(out_dir, loaded, result, prior_sha256, first_row, lambda: record().text())
+    return frame_entry(shapes, record())
 
 
-def frame_entry(
-    loaded: LoadedFrame, result: RefinementResult, first_row: int, options: RefineOptions, files: Mapping[str, str]
-) -> dict[str, Any]:
-    """The entry of a finished frame; its files are those of `write_frame_outputs`."""
-    num_cars = len(loaded.detections)
-    statuses = Counter(status.name for status in result.status[first_row : first_row + num_cars])
-    return {
-        "state": "done",
-        "lines": len(loaded.input_objects),
-        "cars": num_cars,
-        "masks_left": int(loaded.detections.has_mask_left.sum()),
-        "masks_right": int(loaded.detections.has_mask_right.sum()),
-        "ground_source": loaded.frame.ground.source[0],
-        "statuses": dict(statuses),
-        "outputs": sorted(options.outputs),
-        "mesh_files": sorted(name for name in files if name.startswith("meshes/")),
-        "files": dict(files),
-    }
+def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRecord | None:
+    """Of files that were made of the same."""
+    with suppress(DataFormatError):
+        record = read_record(path, read_shapes(path))
+        return record if (record.run, record.inputs) == (run, inputs) else None
+    return None
 
 
-def failed_entry(reason: str) -> dict[str, Any]:
+def failed_entry(reason: str) -> FrameEntry:
     """The entry of a frame that could not be refined."""
     return {"state": "failed", "reason": reason}

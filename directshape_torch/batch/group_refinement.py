@@ -1,8 +1,7 @@
-"""The work itself, the same in every process: read a group of frames, refine it, write its files, note it down."""
+"""The work itself, the same in every process: read a group of frames, refine it, write its files."""
 
 from __future__ import annotations
 
-import errno
 import gc
 import time
 from collections.abc import Iterator, Sequence
@@ -13,26 +12,20 @@ from pathlib import Path
 import torch
 
 from directshape_torch.batch.frame_groups import FrameGroup
-from directshape_torch.batch.frame_outputs import failed_entry, frame_entry, write_frame_outputs
-from directshape_torch.batch.journal import FrameRecord, Journal
+from directshape_torch.batch.frame_outputs import failed_entry, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
+from directshape_torch.batch.run_log import OutputLostError
 from directshape_torch.batch.timing import CallTiming, RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig
-from directshape_torch.io.run_manifest import hash_files
+from directshape_torch.io.run_manifest import FrameEntry, hash_files
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 
-
-class _OutputLostError(DirectShapeError):
-    """The output folder takes nothing more."""
-
-
 # What is true of every frame: going on would only fail them one after another.
-_STOPS_THE_RUN = (CompilationError, MissingDependencyError, _OutputLostError)
-_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+_STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)
 
 
 @dataclass(frozen=True)
@@ -44,19 +37,31 @@ class RunJob:
         refiner: on its device.
         out_dir: the output folder.
         options: kinds of outputs.
-        prior_sha256: of the shape prior.
+        run, prior_sha256: hashes of the manifest and of the shape prior.
         expected_cars: about how many the whole run has, from which every process draws the same conclusion whether to
             compile.
-        run_id: names the run's journals.
     """
 
     dataset: StereoDataset
     refiner: DirectShapeRefiner
     out_dir: Path
     options: RefineOptions
+    run: str
     prior_sha256: str
     expected_cars: int
-    run_id: str
+
+
+@dataclass(frozen=True)
+class FrameEnd:
+    """How a frame ended: what `summary.json` says of it."""
+
+    frame_id: str
+    entry: FrameEntry
+
+    @property
+    def failure(self) -> str | None:
+        """Why it failed, or None."""
+        return self.entry.get("reason")
 
 
 @dataclass
@@ -64,7 +69,7 @@ class GroupReport:
     """What became of a group.
 
     Attributes:
-        records: of its frames, in the order in which they ended.
+        ends: of its frames, in the order in which they ended.
         calls: of the refiner.
         num_halved: calls that did not work and were tried again with half of the frames.
         cpu_s: time that the processor spent on it, reading and writing included, whatever else the machine did.
@@ -73,7 +78,7 @@ class GroupReport:
         stopped: why no other frame could be refined either, or None.
     """
 
-    records: list[FrameRecord] = field(default_factory=list)
+    ends: list[FrameEnd] = field(default_factory=list)
     calls: list[CallTiming] = field(default_factory=list)
     num_halved: int = 0
     cpu_s: float = 0.0
@@ -83,7 +88,7 @@ class GroupReport:
 
     def has(self, frame_id: str) -> bool:
         """Whether a frame has ended."""
-        return any(record.frame_id == frame_id for record in self.records)
+        return any(end.frame_id == frame_id for end in self.ends)
 
 
 @dataclass(frozen=True)
@@ -99,11 +104,10 @@ class GroupRefiner:
 
     def __init__(self, job: RunJob) -> None:
         self._job = job
-        self._journal = Journal(job.out_dir, job.run_id)
 
     def refine(self, group: FrameGroup) -> GroupReport:
-        """Refine a group; errors of a frame are in its record, those of the whole run in `stopped`."""
-        step, cpu_start_s = _GroupStep(self._job, self._journal, group), time.process_time()
+        """Refine a group; errors of a frame are in its end, those of the whole run in `stopped`."""
+        step, cpu_start_s = _GroupStep(self._job, group), time.process_time()
         try:
             step.refine(group.frame_ids)
         except _STOPS_THE_RUN as error:
@@ -117,8 +121,8 @@ class GroupRefiner:
 class _GroupStep:
     """One group on its way."""
 
-    def __init__(self, job: RunJob, journal: Journal, group: FrameGroup) -> None:
-        self.job, self.journal, self.group = job, journal, group
+    def __init__(self, job: RunJob, group: FrameGroup) -> None:
+        self.job, self.group = job, group
         self.report = GroupReport()
 
     def refine(self, frame_ids: Sequence[str]) -> None:
@@ -182,35 +186,23 @@ class _GroupStep:
 
     def _write(self, ready: _Ready, result: RefinementResult, first_row: int) -> None:
         loaded, job = ready.loaded, self.job
+        made_of = job.run, job.prior_sha256, ready.inputs
         try:
-            files = write_frame_outputs(job.out_dir, loaded, result, first_row, job.prior_sha256, job.options)
+            entry = write_frame_outputs(job.out_dir, loaded, result, first_row, made_of, job.options)
         except _STOPS_THE_RUN:
             raise
         except (DirectShapeError, OSError) as error:
-            if isinstance(error, OSError) and error.errno in _DISK_IS_FULL:
-                raise self._lost(error) from error
+            lost = OutputLostError.told_by(error, job.out_dir) if isinstance(error, OSError) else None
+            if lost is not None:
+                raise lost from error
             self._fail(loaded.frame_id, _reason(error))
             return
-        entry = frame_entry(loaded, result, first_row, job.options, files)
-        self._note(FrameRecord(loaded.frame_id, ready.inputs, entry))
+        self.report.ends.append(FrameEnd(loaded.frame_id, entry))
 
     def _fail(self, frame_id: str, reason: str) -> None:
         # A finished frame that was only to keep the others company stays finished.
         if frame_id in self.group.wanted:
-            self._note(FrameRecord(frame_id, {}, failed_entry(reason)))
-
-    def _note(self, record: FrameRecord) -> None:
-        try:
-            self.journal.add(record)
-        except OSError as error:
-            raise self._lost(error) from error
-        self.report.records.append(record)
-
-    def _lost(self, error: OSError) -> _OutputLostError:
-        return _OutputLostError(
-            f"cannot write to {self.job.out_dir} any more ({error.strerror or error}): make room there and run the "
-            "same command again; what is finished stays finished"
-        )
+            self.report.ends.append(FrameEnd(frame_id, failed_entry(reason)))
 
 
 def load_job(content: bytes) -> GroupRefiner:

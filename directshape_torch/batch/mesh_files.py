@@ -10,6 +10,7 @@ import numpy as np
 
 from directshape_torch.batch.options import MeshFormat
 from directshape_torch.files.atomic_files import write_bytes
+from directshape_torch.io.run_folder import mesh_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 
@@ -18,11 +19,6 @@ if TYPE_CHECKING:
 
 # glTF demands y up and the viewer in front of +z; the camera has y down and looks along +z.
 T_GLTF_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-def mesh_path(out_dir: Path, frame_id: str, line_number: int, mesh_format: MeshFormat) -> Path:
-    """The mesh file of one car; lines are counted from 1."""
-    return out_dir / "meshes" / f"{frame_id}_{line_number}.{mesh_format}"
 
 
 def car_mesh_paths(

@@ -6,6 +6,7 @@ All machines must see the input and the output folder under the same paths, and 
 from __future__ import annotations
 
 import os
+import uuid
 from typing import Any
 
 from directshape_torch.batch.frame_groups import FrameGroup
@@ -57,7 +58,7 @@ class RayWorkers:
             num_cpus=self._threads, num_gpus=1 if needs_gpu else 0, max_retries=options.retries, retry_exceptions=False
         )
         self._refine = remote(refine_in_ray)
-        self._job, self._run_id = self._ray.put(dump_job(job)), job.run_id
+        self._job, self._run_id = self._ray.put(dump_job(job)), uuid.uuid4().hex
         self._busy: dict[Any, FrameGroup] = {}
 
     @property

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
-import os
-import platform
 import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -16,17 +14,16 @@ import torch
 from directshape_torch.batch.content_hashes import hash_fields, hash_prior
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.frame_outputs import failed_entry
-from directshape_torch.batch.group_refinement import GroupRefiner, GroupReport, RunJob, limited_threads
-from directshape_torch.batch.journal import FrameRecord, Journal, read_journals, remove_journals
+from directshape_torch.batch.group_refinement import FrameEnd, GroupRefiner, GroupReport, RunJob, limited_threads
 from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver, WorkerOptions
-from directshape_torch.batch.run_file import RunFile, digit_warnings, read_run_file, run_path, versions
-from directshape_torch.batch.run_lock import RunLock
-from directshape_torch.batch.run_record import RunRecord, remove_results, remove_unfinished_files
+from directshape_torch.batch.resumption import EarlierResults, remove_results, remove_unfinished_files
+from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, find_warnings
 from directshape_torch.batch.timing import RunTimings, write_timings
 from directshape_torch.batch.workers import GroupDispatch, ThisProcess, Workers
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import RunManifest
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.problem import TermFactory
@@ -56,7 +53,7 @@ def refine_dataset(
     Args:
         dataset: the frames, in the dtype of the refiner.
         refiner: on any device.
-        out_dir: gets `data`, `shapes`, `summary.json`, `run.json`, `timings.json` and what the options ask for.
+        out_dir: gets `data`, `shapes`, `summary.json`, `run.jsonl`, `timings.json` and what the options ask for.
         options: kinds of outputs and frames in a call.
         observer: is told of each frame.
         workers: other processes, or a cluster; default this process.
@@ -70,12 +67,12 @@ def refine_dataset(
     """
     out_dir, options, workers = Path(out_dir), options or RefineOptions(), workers or WorkerOptions()
     _check_out_dir(dataset, out_dir)
-    with RunLock(out_dir), limited_threads(workers.threads if workers.in_this_process else None):
+    with RunLog(out_dir) as log, limited_threads(workers.threads if workers.in_this_process else None):
         remove_unfinished_files(out_dir)
-        is_cleared = fresh and remove_results(out_dir, (_TIMINGS, run_path(out_dir).name))
+        is_cleared = fresh and remove_results(out_dir, (_TIMINGS,))
         manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
-        record = RunRecord(out_dir, manifest, is_cleared)
-        return _Run(dataset, refiner, record, options, observer or SilentObserver(), workers).execute()
+        earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
+        return _Run(dataset, refiner, earlier, log, options, observer or SilentObserver(), workers).execute()
 
 
 class _Run:
@@ -85,35 +82,38 @@ class _Run:
         self,
         dataset: StereoDataset,
         refiner: DirectShapeRefiner,
-        record: RunRecord,
+        earlier: EarlierResults,
+        log: RunLog,
         options: RefineOptions,
         observer: RunObserver,
         who: WorkerOptions,
     ) -> None:
-        self.dataset, self.record, self.options, self.observer, self.who = dataset, record, options, observer, who
-        self.out_dir, manifest = record.out_dir, record.manifest
+        self.dataset, self.earlier, self.log, self.options = dataset, earlier, log, options
+        self.observer, self.who, self.out_dir = observer, who, earlier.out_dir
         self.timings = RunTimings(refiner.prior.origin.device)
+        manifest = earlier.manifest
         # Of all frames, also of those that are finished: after an interruption the decision must be the same.
         num_cars = expected_cars(dataset, dataset.frame_ids)
         prior_sha256 = manifest.sha256["prior"] or ""
-        self.job = RunJob(dataset, refiner, self.out_dir, options, prior_sha256, num_cars, _new_run_id())
-        before, self.file = read_run_file(self.out_dir), self._run_file(manifest)
-        self.digit_warnings = digit_warnings(before, self.file)
+        self.job = RunJob(dataset, refiner, self.out_dir, options, manifest.hash, prior_sha256, num_cars)
+        self.failed: dict[str, str] = {}
+        self.digit_warnings: tuple[str, ...] = ()
         self.num_halved = 0
 
     def execute(self) -> RunSummary:
-        self.file.write(self.out_dir)
-        resumed = self.record.finished_frames(self.dataset, self.options.outputs)
-        groups = frame_groups(self.dataset.frame_ids, self.options.batch_frames, resumed)
-        todo = [frame_id for group in groups for frame_id in group.frame_ids if frame_id in group.wanted]
-        self.file = self.file.refining(len(resumed), todo)
-        self.file.write(self.out_dir)
-        self.observer.started(todo)
+        before, now = read_log(self.out_dir), RunBeginning(self._work(), len(self.dataset.frame_ids))
+        self.digit_warnings = digit_warnings(None if before is None else before.beginning, now)
+        self.log.begin(now)
+        resumed: list[str] = []
         try:
+            resumed += self.earlier.finished_frames(self.dataset)
+            groups = frame_groups(self.dataset.frame_ids, self.options.batch_frames, resumed)
+            self.log.refining(len(resumed))
+            self.observer.started([name for group in groups for name in group.frame_ids if name in group.wanted])
             self._refine(groups)
         except BaseException as error:
-            # What is finished stays finished. On a full disk even this fails, and the journals tell the next run.
-            with contextlib.suppress(OSError):
+            # What is finished stays finished. On a full disk even this fails, and the files tell the next run.
+            with contextlib.suppress(OSError, DirectShapeError):
                 self._end(resumed, str(error) or type(error).__name__)
             raise
         return self._end(resumed, None)
@@ -132,7 +132,8 @@ class _Run:
         finally:
             workers.close()
             self.timings.wall_s = time.perf_counter() - start
-        self._note_lost(dispatch.lost)
+        for frame_id, reason in dispatch.lost.items():
+            self._note(FrameEnd(frame_id, failed_entry(reason)))
 
     def _workers(self) -> Workers:
         who, threads = self.who, self.who.threads_per_worker
@@ -154,49 +155,59 @@ class _Run:
         self.timings.add(report.calls, report.peak_memory_mb, report.peak_device_memory_mb)
         self.timings.cpu_s += report.cpu_s
         self.num_halved += report.num_halved
-        for record in report.records:
-            self.observer.finished(record.frame_id, record.failure)
+        for end in report.ends:
+            self._note(end)
         if report.stopped is not None:
             raise DirectShapeError(report.stopped)
 
-    def _finished(self, frame_ids: Collection[str]) -> Collection[str]:
-        """Which frames this run's journals know to have ended; for the group of a worker that died."""
-        records = read_journals(self.out_dir, self.job.run_id).records
-        ended = [record for record in records if record.frame_id in frame_ids]
-        for record in ended:
-            self.observer.finished(record.frame_id, record.failure)
-        return [record.frame_id for record in ended]
+    def _note(self, end: FrameEnd) -> None:
+        self.earlier.manifest.frames[end.frame_id] = end.entry
+        if end.failure is not None:
+            self.failed[end.frame_id] = end.failure
+        self.log.frame(end.frame_id, end.failure)
+        self.observer.finished(end.frame_id, end.failure)
 
-    def _note_lost(self, lost: dict[str, str]) -> None:
-        journal = Journal(self.out_dir, self.job.run_id)
-        for frame_id, reason in lost.items():
-            journal.add(FrameRecord(frame_id, {}, failed_entry(reason)))
-            self.observer.finished(frame_id, reason)
+    def _finished(self, frame_ids: Collection[str]) -> Collection[str]:
+        """Which frames are finished after all; for the group of a worker that died."""
+        entries = ((frame_id, self.earlier.entry(frame_id)) for frame_id in sorted(frame_ids))
+        found = [FrameEnd(frame_id, entry) for frame_id, entry in entries if entry is not None]
+        for end in found:
+            self._note(end)
+        return [end.frame_id for end in found]
 
     def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
-        """Write what is known at the end of the run, whatever end that is; only then the journals go."""
-        ended = self.dataset.frame_ids if reason is None else ()
-        self.record.take_in_journals(ended, self.options.outputs)
+        """Write what is known at the end of the run, whatever end that is."""
+        if reason is None:
+            self._look_for_files()
+        else:
+            # Workers have ended the frames that they had, and nobody heard of it.
+            self.earlier.take_in(set(done_frames(self.out_dir)).intersection(self.dataset.frame_ids))
         if self.timings.calls:
             write_timings(self.out_dir / _TIMINGS, self.timings)
+        self.earlier.write()
         summary = self._summary(resumed)
-        num_done = len(summary.frames) - len(summary.failed)
-        self.file.ended(num_done, summary.failed, reason).write(self.out_dir)
-        remove_journals(self.out_dir)
+        self.log.end(len(summary.frames) - len(summary.failed), summary.failed, reason)
         return summary
 
+    def _look_for_files(self) -> None:
+        """Every frame must have come to an end; one without files has failed."""
+        paths = [result_path, shapes_path, *([overlay_path] if self.options.overlays else [])]
+        for frame_id in self.dataset.frame_ids:
+            if frame_id not in self.failed and not all(path(self.out_dir, frame_id).is_file() for path in paths):
+                reason = f"its files are not in {self.out_dir}: was the folder moved or emptied during the run?"
+                self.failed[frame_id] = reason
+                self.earlier.manifest.frames[frame_id] = failed_entry(reason)
+
     def _summary(self, resumed: Sequence[str]) -> RunSummary:
-        entries = self.record.manifest.frames
+        entries = self.earlier.manifest.frames
         frames = {frame_id: entries[frame_id] for frame_id in self.dataset.frame_ids if frame_id in entries}
-        failed = {
-            frame_id: entry.get("reason", "unknown") for frame_id, entry in frames.items() if entry["state"] == "failed"
-        }
-        warnings = (*find_warnings(frames, sorted(self.dataset.classes)), *self._own_warnings())
+        warnings = (*find_warnings(frames, sorted(self.dataset.classes)), *self._own_warnings(bool(resumed)))
+        failed = {frame_id: entry.get("reason", "") for frame_id, entry in frames.items() if entry["state"] == "failed"}
         return RunSummary(frames, tuple(resumed), failed, warnings, self.timings)
 
-    def _own_warnings(self) -> list[str]:
-        found = list(self.digit_warnings) if self.timings.calls and self.file.num_resumed else []
-        if remade := self.record.remade:
+    def _own_warnings(self, has_resumed: bool) -> list[str]:
+        found = list(self.digit_warnings) if self.timings.calls and has_resumed else []
+        if remade := self.earlier.remade:
             found.append(f"files of {len(remade)} finished frames were damaged or gone and made again: {_some(remade)}")
         if self.num_halved:
             found.append(
@@ -205,9 +216,9 @@ class _Run:
             )
         return found
 
-    def _run_file(self, manifest: RunManifest) -> RunFile:
+    def _work(self) -> dict[str, Any]:
         who = self.who
-        work: dict[str, Any] = {
+        return {
             "where": "this process" if who.in_this_process else who.ray or "processes",
             "workers": 1 if who.in_this_process else who.workers,
             "threads": who.threads_per_worker or torch.get_num_threads(),
@@ -215,14 +226,6 @@ class _Run:
             "batch_frames": self.options.batch_frames,
             "outputs": list(self.options.outputs),
         }
-        settings = {"config": manifest.config, "sha256": manifest.sha256}
-        machine = f"{platform.system()} {platform.machine()}"
-        num_frames = len(self.dataset.frame_ids)
-        return RunFile(self.job.run_id, "checking", time.time(), versions(), machine, settings, work, num_frames)
-
-
-def _new_run_id() -> str:
-    return f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{os.urandom(3).hex()}"
 
 
 def _some(frame_ids: Sequence[str]) -> str:

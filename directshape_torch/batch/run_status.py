@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from directshape_torch.batch.journal import FrameRecord, read_journals
-from directshape_torch.batch.run_file import RunFile, read_run_file
-from directshape_torch.batch.run_lock import LockOwner, read_lock_owner
+from directshape_torch.batch.run_log import LogContents, read_log
 from directshape_torch.errors import DataFormatError
 
 # Frames of which the rate is: enough for a mean, few enough to follow a change of load.
@@ -22,8 +20,8 @@ class RunStatus:
 
     Attributes:
         state: "checking", "running", "finished", "stopped", or "killed": the run ended without saying so.
-        owner: the process that runs, or None.
-        work: who works, from `run.json`.
+        owner: the process that runs, in words, or None.
+        work: who works, see `RunBeginning`.
         num_frames: of the data set.
         num_done: frames done, those of earlier runs included.
         num_resumed: these.
@@ -31,12 +29,11 @@ class RunStatus:
         frames_per_s: at present, or None where too few have ended.
         seconds_left: at this rate, or None where nobody knows.
         last_frame_at: when a frame last ended, seconds since 1970, or None.
-        num_damaged_lines: journal lines that are cut short: being written right now, or by a killed process.
         reason: why a stopped run was stopped, or None.
     """
 
     state: str
-    owner: LockOwner | None
+    owner: str | None
     work: Mapping[str, object]
     num_frames: int
     num_done: int
@@ -45,7 +42,6 @@ class RunStatus:
     frames_per_s: float | None
     seconds_left: float | None
     last_frame_at: float | None
-    num_damaged_lines: int
     reason: str | None
 
     @property
@@ -64,70 +60,35 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     Raises:
         DataFormatError: no run has been there.
     """
-    out_dir = Path(out_dir)
-    run = _latest_run(out_dir)
-    if run.has_ended:
-        return _ended(run)
-    status = _going_on(run, out_dir, time.time() if now is None else now)
-    # It may have ended meanwhile, and taken its lock and its journals away.
-    run = _latest_run(out_dir)
-    return _ended(run) if run.has_ended else status
-
-
-def _latest_run(out_dir: Path) -> RunFile:
-    run = read_run_file(out_dir)
+    run = read_log(Path(out_dir))
     if run is None:
-        raise DataFormatError(out_dir, "has no run.json, so no run of 'directshape refine' is or was here")
-    return run
-
-
-def _ended(run: RunFile) -> RunStatus:
+        raise DataFormatError(out_dir, "has no run.jsonl, so no run of 'directshape refine' is or was here")
+    has_ended = run.ended_at is not None
+    is_alive = not has_ended and run.beginning.is_alive is not False
+    times = sorted(line.at for line in run.frames.values())
+    rate = None if has_ended else _rate(run, times, (time.time() if now is None else now) if is_alive else None)
+    num_left = run.beginning.num_frames - run.num_done - len(run.failed)
     return RunStatus(
-        state=run.state,
-        owner=None,
-        work=run.work,
-        num_frames=run.num_frames,
+        state=run.state if has_ended or is_alive else "killed",
+        owner=run.beginning.owner if is_alive else None,
+        work=run.beginning.work,
+        num_frames=run.beginning.num_frames,
         num_done=run.num_done,
         num_resumed=run.num_resumed,
         failed=run.failed,
-        frames_per_s=None,
-        seconds_left=None,
-        last_frame_at=run.ended_at,
-        num_damaged_lines=0,
+        frames_per_s=rate,
+        seconds_left=num_left / rate if rate and is_alive else None,
+        last_frame_at=run.ended_at or max(times, default=None),
         reason=run.reason,
     )
 
 
-def _going_on(run: RunFile, out_dir: Path, now: float) -> RunStatus:
-    owner = read_lock_owner(out_dir)
-    is_alive = owner is not None and owner.is_alive is not False
-    journals = read_journals(out_dir, run.run_id)
-    latest = {record.frame_id: record for record in journals.records}
-    failed = {frame_id: record.failure for frame_id, record in latest.items() if record.failure is not None}
-    num_left = len(run.todo) - len(latest)
-    rate = _rate(run, list(latest.values()), now if is_alive else None)
-    return RunStatus(
-        state=run.state if is_alive else "killed",
-        owner=owner if is_alive else None,
-        work=run.work,
-        num_frames=run.num_frames,
-        num_done=run.num_resumed + len(latest) - len(failed),
-        num_resumed=run.num_resumed,
-        failed=failed,
-        frames_per_s=rate,
-        seconds_left=num_left / rate if rate and is_alive else None,
-        last_frame_at=max((record.finished_at for record in latest.values()), default=None),
-        num_damaged_lines=journals.num_damaged,
-        reason=None,
-    )
-
-
-def _rate(run: RunFile, records: Sequence[FrameRecord], now: float | None) -> float | None:
+def _rate(run: LogContents, all_times: Sequence[float], now: float | None) -> float | None:
     """Frames a second, of the latest ones; a run that is stuck becomes slower with every second that passes."""
-    times = sorted(record.finished_at for record in records)[-_RECENT_FRAMES:]
+    times = all_times[-_RECENT_FRAMES:]
     if not times or run.refining_since is None:
         return None
-    is_all = len(times) == len(records)
+    is_all = len(times) == len(all_times)
     start, count = (run.refining_since, len(times)) if is_all else (times[0], len(times) - 1)
     # The frames in work are between two ends, so the mean gap is past before a silence says anything.
     gap = (times[-1] - start) / count

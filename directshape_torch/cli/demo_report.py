@@ -14,8 +14,8 @@ from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
 from directshape_torch.files.atomic_files import write_bytes, write_png
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
-from directshape_torch.io.refinement_files import result_path, shapes_path
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior

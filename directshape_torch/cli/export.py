@@ -13,8 +13,8 @@ from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
     from directshape_torch.export.frame_source import ExportInputs
-    from directshape_torch.export.run_folder import RunFolder
     from directshape_torch.geometry.disparity_field import DisparityField
+    from directshape_torch.io.run_folder import RunFolder
     from directshape_torch.io.stereo_dataset import StereoDataset
     from directshape_torch.refiner import DirectShapeRefiner
     from directshape_torch.shape.shape_prior import ShapePrior
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.export.export_run import export_run
-    from directshape_torch.export.run_folder import RunFolder
+    from directshape_torch.io.run_folder import RunFolder
 
     folder = RunFolder(args.run_folder, args.frames)
     inputs = _make_inputs(args, folder)

@@ -11,8 +11,8 @@ from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, add_ri
 from directshape_torch.cli.run_inputs import check_data_is_not_needed, fields_of_run
 
 if TYPE_CHECKING:
+    from directshape_torch.io.run_folder import RunFolder
     from directshape_torch.report.frame_inputs import InputSources
-    from directshape_torch.report.run_folder import RunFolder
 
 _DESCRIPTION = """
 Write one self-contained HTML page about a run of 'directshape refine': summary, sortable table of cars, distributions,
@@ -51,13 +51,13 @@ def run(args: argparse.Namespace) -> int:
         DirectShapeError: wrong input; for the main program to show.
     """
     from directshape_torch.cli.progress import ProgressBar
+    from directshape_torch.io.run_folder import RunFolder
     from directshape_torch.report.make_report import ReportOptions, make_report
-    from directshape_torch.report.run_folder import RunFolder
     from directshape_torch.report.run_prior import prior_of_run
 
     page = args.out / "report.html" if args.html is None else args.html
     options = ReportOptions(args.frames, args.max_frames)
-    run_folder = RunFolder.open(args.out)
+    run_folder = RunFolder(args.out)
     prior, sources = prior_of_run(run_folder.manifest, args.prior), _sources(args, run_folder)
     with ProgressBar("report") as progress:
         outcome = make_report(args.out, page, sources, prior, options, progress)
@@ -76,19 +76,19 @@ def _sources(args: argparse.Namespace, run: RunFolder) -> InputSources:
     if args.data is None:
         check_data_is_not_needed(args, "detections", "masks", "masks_left", "masks_right", "rig")
         return InputSources()
-    if not run.done:
+    if not run.frame_ids:
         return InputSources()
     is_folder = args.layout == "folder"
     # Without detections a layout still needs a folder of them; the result files stand in, and are not read as such.
     stand_in = None if is_folder else args.out
     masks = mask_source(args)
-    fields = fields_of_run(args.rig, run.out_dir, run.manifest)
+    fields = fields_of_run(args.rig, run.path, run.manifest)
     dataset = open_dataset(
         args.layout,
         args.data,
         stand_in if args.detections is None else args.detections,
         masks,
-        frames=run.done,
+        frames=run.frame_ids,
         classes=run.classes,
         disparity_field=fields,
     )

@@ -36,14 +36,12 @@ def write_recording(path: Path, out_dir: Path, dataset: StereoDataset, refiner: 
         DirectShapeError: a file is missing or damaged.
     """
     from directshape_torch.batch.content_hashes import hash_prior
-    from directshape_torch.batch.run_results import read_run_results
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.export.frame_source import ExportInputs
     from directshape_torch.export.rerun_recording import record_run
-    from directshape_torch.export.run_folder import RunFolder
+    from directshape_torch.io.run_folder import RunFolder
 
-    manifest = read_run_results(out_dir)
-    done = [frame_id for frame_id in dataset.frame_ids if manifest.is_done(frame_id)]
+    done = [frame_id for frame_id in RunFolder(out_dir).frame_ids if frame_id in dataset.frame_ids]
     if not done:
         print("warning: no recording, for no frame was refined", file=sys.stderr)
         return

@@ -25,8 +25,8 @@ from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam, read_objects
 from directshape_torch.io.mask_files import mask_source
-from directshape_torch.io.refinement_files import shapes_path
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
+from directshape_torch.io.run_folder import shapes_path
 from directshape_torch.shape.shape_prior import ShapePrior
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.export.run_folder import ExportedObject, RefinedFrame
+from directshape_torch.io.run_folder import FrameResult, ResultObject
 from directshape_torch.io.stereo_dataset import LoadedFrame
 
 # Omni3D's order of the eight corners, in units of half (length, height, width) along x, y (down), z of the object.
@@ -29,7 +29,7 @@ class Coco3dDataset:
         self.images: list[dict[str, Any]] = []
         self.annotations: list[dict[str, Any]] = []
 
-    def add(self, frame: RefinedFrame, loaded: LoadedFrame, image_id: int, file_path: str) -> None:
+    def add(self, frame: FrameResult, loaded: LoadedFrame, image_id: int, file_path: str) -> None:
         """Add a frame.
 
         Args:
@@ -81,7 +81,7 @@ class Coco3dDataset:
         return {"info": info, "images": self.images, "categories": categories, "annotations": self.annotations}
 
 
-def _detection_fields(one: ExportedObject) -> dict[str, Any]:
+def _detection_fields(one: ResultObject) -> dict[str, Any]:
     """What plain COCO readers ask for, and what the detector and the refinement say."""
     u_min, v_min, u_max, v_max = one.line.box_2d
     return {
@@ -102,7 +102,7 @@ def _detection_fields(one: ExportedObject) -> dict[str, Any]:
 
 
 def _box_fields(
-    one: ExportedObject, centre_cam: NDArray[np.float64], K_left: NDArray[np.float64], size_wh: tuple[int, int]
+    one: ResultObject, centre_cam: NDArray[np.float64], K_left: NDArray[np.float64], size_wh: tuple[int, int]
 ) -> dict[str, Any]:
     height, width, length = one.hwl.tolist()
     corners_cam = centre_cam + 0.5 * (_CORNERS * [length, height, width]) @ one.R_ref_obj.T

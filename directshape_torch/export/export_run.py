@@ -12,7 +12,7 @@ from directshape_torch.export import exporters
 from directshape_torch.export.exporters import Exporter, FramewiseExporter, feed
 from directshape_torch.export.frame_source import ExportInputs
 from directshape_torch.export.rerun_recording import RerunExporter
-from directshape_torch.export.run_folder import RunFolder
+from directshape_torch.io.run_folder import RunFolder
 
 ExportFormat = Literal["glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun"]
 """What `export_run` can write (docs/outputs.md)."""
@@ -47,6 +47,8 @@ def export_run(
         InputError: an unknown format, or one that needs images which were not given.
         DataFormatError: a file of the run or of the data set is missing or damaged.
     """
+    if not run.frame_ids:
+        raise InputError("frames", f"finished frames of {run.path}", "none")
     feed([_make(one, Path(folder), run, inputs) for one in dict.fromkeys(formats)], run, inputs, observer)
 
 

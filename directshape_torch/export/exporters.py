@@ -14,11 +14,10 @@ from directshape_torch.export.gltf_scene import frame_glb
 from directshape_torch.export.kitti_files import kitti_json
 from directshape_torch.export.nuscenes_file import nuscenes_results
 from directshape_torch.export.ply_files import mesh_ply, points_ply
-from directshape_torch.export.run_folder import RefinedFrame, RunFolder
 from directshape_torch.export.stereo_points import stereo_points
 from directshape_torch.files.atomic_files import write_bytes, write_json
 from directshape_torch.files.read_files import read_bytes
-from directshape_torch.io.refinement_files import result_path
+from directshape_torch.io.run_folder import FrameResult, RunFolder, result_path
 
 
 class Exporter(Protocol):
@@ -84,7 +83,7 @@ class NuscenesExporter:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "nuscenes.json"
-        self.frames: list[RefinedFrame] = []
+        self.frames: list[FrameResult] = []
 
     def add(self, source: FrameSource) -> None:
         """Collect the frame's boxes."""

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.export.painted_cars import PaintedFrame
-from directshape_torch.export.run_folder import RefinedFrame, RunFolder
-from directshape_torch.io.refinement_files import shapes_path
+from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -53,7 +52,7 @@ class FrameSource:
         self.run, self.frame_id, self.inputs = run, frame_id, inputs
 
     @cached_property
-    def refined(self) -> RefinedFrame:
+    def refined(self) -> FrameResult:
         """Boxes, states and shapes."""
         return self.run.read(self.frame_id)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.batch.mesh_files import T_GLTF_CAM
 from directshape_torch.export.painted_cars import Paint, PaintedFrame
-from directshape_torch.export.run_folder import ExportedObject, RefinedFrame
+from directshape_torch.io.run_folder import FrameResult, ResultObject
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.visualize.ground_grid import ground_grid
 
@@ -45,7 +45,7 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
     return export(scene, include_normals=True, tree_postprocessor=_finish)
 
 
-def car_extras(one: ExportedObject, frame: RefinedFrame) -> dict[str, Any]:
+def car_extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
     """What is said of a car beside its surface, for `extras`."""
     return {
         "frame_id": frame.frame_id,

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from directshape_torch.export.run_folder import COPIED, RefinedFrame
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import COPIED, FrameResult
 
 KITTI_JSON_SCHEMA_VERSION = 1
 _FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 
 
-def kitti_json(frame: RefinedFrame) -> dict[str, Any]:
+def kitti_json(frame: FrameResult) -> dict[str, Any]:
     """All lines of the result file of a frame by the names of their columns, and how sure the refinement is."""
     return {
         "schema": "directshape kitti results",
@@ -38,7 +38,7 @@ def _columns(line: KittiObject) -> dict[str, Any]:
     }
 
 
-def _refinement(frame: RefinedFrame, line: KittiObject) -> dict[str, Any]:
+def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
     shapes = frame.shapes
     car = next((car for car, number in enumerate(shapes.input_lines) if number == line.line_number), None)
     if car is None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.export.run_folder import ExportedObject, RefinedFrame
+from directshape_torch.io.run_folder import FrameResult, ResultObject
 
 # nuScenes has ten classes; KITTI's other types (Tram, Misc) have no counterpart.
 DETECTION_NAMES = {
@@ -33,7 +33,7 @@ _FRAME = (
 )
 
 
-def nuscenes_results(frames: Iterable[RefinedFrame]) -> dict[str, Any]:
+def nuscenes_results(frames: Iterable[FrameResult]) -> dict[str, Any]:
     """The content of a nuScenes detection result file, one sample a frame, its id as token."""
     sensors = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
     return {
@@ -42,13 +42,13 @@ def nuscenes_results(frames: Iterable[RefinedFrame]) -> dict[str, Any]:
     }
 
 
-def _sample(frame: RefinedFrame) -> list[dict[str, Any]]:
+def _sample(frame: FrameResult) -> list[dict[str, Any]]:
     known = [one for one in frame.objects if one.line.type in DETECTION_NAMES]
     best = sorted(known, key=_score, reverse=True)[:_MOST_BOXES]
     return [_box(frame.frame_id, one) for one in best]
 
 
-def _box(token: str, one: ExportedObject) -> dict[str, Any]:
+def _box(token: str, one: ResultObject) -> dict[str, Any]:
     height, width, length = one.hwl.tolist()
     return {
         "sample_token": token,
@@ -70,5 +70,5 @@ def _quaternion_wxyz(R: NDArray[np.float64]) -> list[float]:
     return [w, x, y, z]
 
 
-def _score(one: ExportedObject) -> float:
+def _score(one: ResultObject) -> float:
     return 1.0 if one.line.score is None else one.line.score

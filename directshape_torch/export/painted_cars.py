@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
-from directshape_torch.export.run_folder import RefinedFrame
 from directshape_torch.export.visible_surface import FrameView, Points
+from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
@@ -72,7 +72,7 @@ class PaintedFrame:
         mirror: give a point that is not seen the colour of its mirror image where that is seen.
     """
 
-    def __init__(self, frame: RefinedFrame, prior: ShapePrior, loaded: LoadedFrame | None, mirror: bool = True) -> None:
+    def __init__(self, frame: FrameResult, prior: ShapePrior, loaded: LoadedFrame | None, mirror: bool = True) -> None:
         self.frame, self.prior, self.mirror = frame, prior, mirror
         self.objects = frame.refined_cars
         shapes = frame.shapes
@@ -125,7 +125,7 @@ class PaintedFrame:
         return np.asarray((points_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3])
 
 
-def frame_view(frame: RefinedFrame, loaded: LoadedFrame, cars: list[EstimatedCar]) -> FrameView:
+def frame_view(frame: FrameResult, loaded: LoadedFrame, cars: list[EstimatedCar]) -> FrameView:
     """The left image of a frame with its refined cars and the masks that were found for them."""
     masks = masks_of_lines(loaded)
     return FrameView(

@@ -12,7 +12,7 @@ from directshape_torch.export.frame_source import ExportInputs, FrameSource
 from directshape_torch.export.rerun_iterations import IterationLog
 from directshape_torch.export.rerun_scene import clear_cars, log_conventions, log_frame, log_painted_cars
 from directshape_torch.export.rerun_stream import RerunStream, import_rerun
-from directshape_torch.export.run_folder import RunFolder
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.inspection.residual_values import car_residuals

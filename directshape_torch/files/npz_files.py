@@ -42,7 +42,11 @@ def read_npz(path: Path | str, cure: str = "") -> dict[str, NDArray[Any]]:
     try:
         _check_entries(content)
         with np.load(content, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            arrays = {name: archive[name] for name in archive.files}
+        # Of an entry without the ending ".npy" numpy gives the bytes.
+        if others := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
+            raise ValueError(f"{others[0]} is no array")
+        return arrays
     # Of an archive damaged on purpose numpy and zipfile raise whatever they come across.
     except Exception as error:
         raise DataFormatError(path, f"is no readable npz file ({error})", cure=cure) from error

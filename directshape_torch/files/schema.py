@@ -21,13 +21,13 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
         DataFormatError: a field is missing, unknown, or not of its type; names file, field, type and value.
 
     Examples:
-        >>> from directshape_torch.batch.run_lock import LockOwner
-        >>> record_of("a.json", LockOwner, {"host": "here", "pid": 7, "started_at": 0.5}).pid
-        7
-        >>> record_of("a.json", LockOwner, {"host": "here", "pid": "7", "started_at": 0.5})
+        >>> from directshape_torch.batch.run_log import FrameLine
+        >>> record_of("a.json", FrameLine, {"frame": "000107", "at": 0.5}).frame
+        '000107'
+        >>> record_of("a.json", FrameLine, {"frame": 107, "at": 0.5})
         Traceback (most recent call last):
         ...
-        directshape_torch.errors.DataFormatError: a.json: pid: expected int, got '7'
+        directshape_torch.errors.DataFormatError: a.json: frame: expected str, got 107
     """
     if not isinstance(content, dict):
         raise DataFormatError(path, f"expected an object, got {shown(content)}", cure=cure)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +15,20 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import alpha_from_kitti
 from directshape_torch.io.result_files import RefinedBox, ShapeArrays, write_result_text, write_shapes
+from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 
 
-def result_path(out_dir: Path | str, frame_id: str) -> Path:
-    """The KITTI result file of a frame."""
-    return Path(out_dir) / "data" / f"{frame_id}.txt"
-
-
-def shapes_path(out_dir: Path | str, frame_id: str) -> Path:
-    """The file of states and shapes of a frame."""
-    return Path(out_dir) / "shapes" / f"{frame_id}.npz"
-
-
 def write_refinement(
-    out_dir: Path | str, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, first_row: int = 0
-) -> None:
-    """Write both files of a frame.
+    out_dir: Path | str,
+    loaded: LoadedFrame,
+    result: RefinementResult,
+    prior_sha256: str,
+    first_row: int = 0,
+    made_of: Callable[[], str] = str,
+) -> ShapeArrays:
+    """Write both files of a frame, and return the content of the second one.
 
     Args:
         out_dir: the output folder.
@@ -39,6 +36,7 @@ def write_refinement(
         result: of a call with this frame's detections, alone or in a batch (`collate`).
         prior_sha256: of the shape prior.
         first_row: where the frame's detections begin in `result`.
+        made_of: tells what goes into the shapes, once the result file is there.
 
     Raises:
         InputError: the result does not cover the frame's detections.
@@ -48,10 +46,12 @@ def write_refinement(
         raise InputError("result", f"at least {first_row + num_cars} cars", f"{len(result)}")
     rows = torch.arange(first_row, first_row + num_cars, device=result.T_cam_obj.device)
     shapes = shape_arrays(loaded, result, prior_sha256, rows)
-    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
-    # The text last: where it exists, the frame is complete.
     boxes = refined_boxes(loaded, shapes, result.refined[rows].tolist())
     write_result_text(result_path(out_dir, loaded.frame_id), loaded.input_objects, boxes)
+    # The shapes last: where they exist, the frame is complete.
+    shapes = replace(shapes, made_of=made_of())
+    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
+    return shapes
 
 
 def refined_boxes(loaded: LoadedFrame, shapes: ShapeArrays, refined: Sequence[bool]) -> dict[int, RefinedBox]:

@@ -1,7 +1,8 @@
-"""What a refinement leaves behind for each frame: a KITTI result file, and states with shapes as npz (schema 1)."""
+"""What a refinement leaves behind for each frame: a KITTI result file, and states with shapes as npz (schema 2)."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -16,7 +17,7 @@ from directshape_torch.files.npz_files import read_npz
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.status import Status
 
-SHAPES_SCHEMA_VERSION = 1
+SHAPES_SCHEMA_VERSION = 2
 _AGAIN = "refine the frame again"
 
 Floats = NDArray[np.floating[Any]]
@@ -120,6 +121,7 @@ class ShapeArrays:
         unseen_directions: (B, 7, 7) these directions, rows; columns `observability.CAR_QUANTITIES`.
         profile_offsets_px: (P,) offsets of disparity.
         profile_costs_before, profile_costs_after: (B, P) photometric cost there, see `DisparityProfile`.
+        made_of: `FrameRecord` as JSON text, by which a run knows its own files; "" outside of a run.
     """
 
     frame_id: str
@@ -154,6 +156,7 @@ class ShapeArrays:
     profile_offsets_px: Floats = field(metadata=_shape("P"))
     profile_costs_before: Floats = field(metadata=_shape("B", "P"))
     profile_costs_after: Floats = field(metadata=_shape("B", "P"))
+    made_of: str = ""
 
     def __post_init__(self) -> None:
         last = {"B": self.input_lines.shape, "K": self.codes.shape, "P": self.profile_offsets_px.shape}
@@ -167,27 +170,31 @@ class ShapeArrays:
 
 
 def write_shapes(path: Path | str, shapes: ShapeArrays) -> None:
-    """Write the states and shapes of a frame; equal content gives equal bytes, no pickle inside."""
+    """Write the states and shapes of a frame, and a checksum; equal content gives equal bytes, no pickle inside."""
     arrays: dict[str, NDArray[Any]] = {"schema_version": np.array(SHAPES_SCHEMA_VERSION)}
     for entry in fields(shapes):
         value = getattr(shapes, entry.name)
         arrays[entry.name] = np.array(value, dtype=np.str_) if isinstance(value, (str, tuple)) else np.asarray(value)
-    atomic_files.write_npz(path, arrays)
+    atomic_files.write_npz(path, {**arrays, "sha256": np.array(_hash_arrays(arrays))})
 
 
 def read_shapes(path: Path | str) -> ShapeArrays:
     """Read a file of `write_shapes`.
 
     Raises:
-        DataFormatError: it is no such file, or of another schema version.
+        DataFormatError: it is no such file, of another schema version, or changed since it was written.
     """
     arrays = read_npz(path, cure=_AGAIN)
+    sha256 = arrays.pop("sha256", None)
+    is_whole = sha256 is not None and sha256.tolist() == _hash_arrays(arrays)
     version = arrays.pop("schema_version", None)
     if version is None or version.tolist() != SHAPES_SCHEMA_VERSION:
         found = None if version is None else version.tolist()
         raise DataFormatError(
             path, f"has shape schema {shown(found)}, this version reads {SHAPES_SCHEMA_VERSION}", cure=_AGAIN
         )
+    if not is_whole:
+        raise DataFormatError(path, "has been changed since it was written", cure=_AGAIN)
     kinds = {entry.name: _KINDS[str(entry.type)] for entry in fields(ShapeArrays)}
     if set(arrays) != set(kinds):
         raise DataFormatError(path, f"has the fields {sorted(arrays)}, expected {sorted(kinds)}", cure=_AGAIN)
@@ -201,6 +208,16 @@ def read_shapes(path: Path | str) -> ShapeArrays:
     if unknown := set(shapes.statuses) - set(Status.__members__):
         raise DataFormatError(path, f"statuses hold {shown(min(unknown))}", cure=_AGAIN)
     return shapes
+
+
+def _hash_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:
+    """The sha256 of named arrays: name, type, shape and values."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _from_text(array: NDArray[Any]) -> Any:

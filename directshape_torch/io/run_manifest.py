@@ -1,9 +1,8 @@
-"""`summary.json` of a run (schema 1): what made its results, and how each frame ended, so that a run can resume.
+"""`summary.json` of a run (schema 2): what made its results, and how each frame ended, so that a run can resume.
 
-    {"schema_version": 1, "package_version": "0.1.0",
+    {"schema_version": 2, "package_version": "0.1.0",
      "config": {..},                      every setting of the run
      "sha256": {"prior": .., ..},         of the files that serve all frames
-     "inputs": {"000107": {"image_left": .., ..}, ..},     sha256 of the files of each frame
      "frames": {"000107": {"state": "done" | "failed", "reason": .., ..}, ..}}
 
 Nothing in it depends on the time, the machine or where the files lie.
@@ -12,7 +11,7 @@ Nothing in it depends on the time, the machine or where the files lie.
 from __future__ import annotations
 
 import hashlib
-import re
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -25,9 +24,7 @@ from directshape_torch.files.names import is_frame_id
 from directshape_torch.files.read_files import read_bytes, read_json
 from directshape_torch.files.schema import check_type, record_of
 
-MANIFEST_SCHEMA_VERSION = 1
-# `meshes/NNNNNN_LINE.ply`: within the folder, whoever has written the name.
-_MESH_FILE = re.compile(r"meshes/[^/\\]+_[0-9]{1,9}\.(ply|glb)")
+MANIFEST_SCHEMA_VERSION = 2
 RESUME_CURE = "choose another output folder, or start again with --fresh, which removes the results in this one"
 
 
@@ -49,9 +46,6 @@ class FrameEntry(TypedDict, total=False):
     masks_right: int
     ground_source: str
     statuses: dict[str, int]
-    outputs: list[str]
-    mesh_files: list[str]
-    files: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -62,19 +56,25 @@ class RunManifest:
         package_version: of this package.
         config: every setting that bears on the results, nested as in the configuration file.
         sha256: hashes of the files that serve all frames, by their role ("prior", "stereo_bias").
-        inputs: for each frame the hashes of its files, by their role.
-        frames: for each finished frame at least {"state": "done"} or {"state": "failed", "reason": text}.
+        frames: how each frame ended.
     """
 
     package_version: str
     config: Mapping[str, Any]
     sha256: Mapping[str, str | None]
-    inputs: dict[str, dict[str, str]] = field(default_factory=dict)
-    frames: dict[str, dict[str, Any]] = field(default_factory=dict)
+    frames: dict[str, FrameEntry] = field(default_factory=dict)
 
-    def is_done(self, frame_id: str) -> bool:
-        """Whether the frame was refined; failed frames are tried again."""
-        return self.frames.get(frame_id, {}).get("state") == "done"
+    @property
+    def hash(self) -> str:
+        """Of all but the frames; the files of a frame carry it."""
+        made_of = [self.package_version, self.config, self.sha256]
+        return hash_bytes(json.dumps(made_of, sort_keys=True, default=list).encode())
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Why frames could not be refined."""
+        frames = sorted(self.frames.items())
+        return {name: entry.get("reason", "unknown") for name, entry in frames if entry["state"] == "failed"}
 
 
 def hash_bytes(content: bytes) -> str:
@@ -135,46 +135,21 @@ def read_manifest(path: Path | str) -> RunManifest | None:
         )
     manifest = record_of(path, RunManifest, content, RESUME_CURE)
     check_type(path, "config", manifest.config, RunSettings, RESUME_CURE)
-    check_frames(path, manifest.frames)
+    for frame_id in manifest.frames:
+        if not is_frame_id(frame_id):
+            raise DataFormatError(path, f"frames[{shown(frame_id)}]: no name of a frame", cure=RESUME_CURE)
     return manifest
-
-
-def check_frames(path: Path | str, frames: Mapping[str, Any]) -> None:
-    """Raise `DataFormatError` unless these are entries of frames, and lead nowhere out of the output folder."""
-    check_type(path, "frames", frames, dict[str, FrameEntry], RESUME_CURE)
-    for frame_id, entry in frames.items():
-        wrong = [name for name in entry.get("mesh_files", ()) if not _MESH_FILE.fullmatch(name)]
-        if wrong or not is_frame_id(frame_id):
-            raise DataFormatError(
-                path, f"frames[{shown(frame_id)}]: no name of a frame, or {shown(wrong)}", cure=RESUME_CURE
-            )
 
 
 def check_resume(previous: RunManifest, current: RunManifest) -> None:
     """Refuse to mix results of different settings or files in one folder.
 
-    Args:
-        previous: read from the output folder.
-        current: of the run that is about to start; its `inputs` may cover any of the frames.
-
     Raises:
         ResumeError: names the first setting or file that differs, with both values.
     """
     _check_same("package version", previous.package_version, current.package_version)
-    _check_mapping("setting", flatten(previous.config), flatten(current.config))
-    _check_mapping("sha256 of", previous.sha256, current.sha256)
-    for frame_id, hashes in current.inputs.items():
-        check_inputs(previous, frame_id, hashes)
-
-
-def check_inputs(previous: RunManifest, frame_id: str, hashes: Mapping[str, str]) -> None:
-    """Refuse to resume where the files of a refined frame have changed; failed frames may have been mended.
-
-    Raises:
-        ResumeError: names the frame and the file.
-    """
-    if previous.is_done(frame_id):
-        _check_mapping(f"frame {frame_id}: sha256 of", previous.inputs.get(frame_id, {}), hashes)
+    check_mapping("setting", flatten(previous.config), flatten(current.config))
+    check_mapping("sha256 of", previous.sha256, current.sha256)
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -195,7 +170,8 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _check_mapping(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def check_mapping(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise `ResumeError` at the first name whose values differ, with both of them."""
     for name in sorted({*before, *now}):
         _check_same(f"{what} {name!r}", before.get(name, "absent"), now.get(name, "absent"))
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.errors_to_labels import JudgedCar, judge_cars
 from directshape_torch.report.json_numbers import known
-from directshape_torch.report.run_folder import FrameResult
 from directshape_torch.status import Status
 
 

@@ -16,8 +16,8 @@ from directshape_torch.batch.mesh_files import T_GLTF_CAM
 from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
+from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.car_rows import is_refined
-from directshape_torch.report.run_folder import FrameResult
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import Surface

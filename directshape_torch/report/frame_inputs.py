@@ -20,7 +20,8 @@ from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import InstanceMask, MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.run_manifest import RunManifest, hash_file
+from directshape_torch.io.run_folder import FrameResult
+from directshape_torch.io.run_manifest import hash_file
 from directshape_torch.scene import GroundPlane
 
 
@@ -69,87 +70,87 @@ class InputReader:
 
     Attributes:
         sources: where to look.
-        manifest: of the run, with the hashes of its inputs.
+        camera_height_m: of the run's settings.
         problems: what is wrong, and with which frames.
     """
 
     sources: InputSources
-    manifest: RunManifest
+    camera_height_m: float
     problems: defaultdict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
 
-    def detections(self, frame_id: str) -> list[KittiObject] | None:
+    def detections(self, result: FrameResult) -> list[KittiObject] | None:
         """All lines that went in."""
         layout = self.sources.layout
         if layout is None or not self.sources.has_detections:
             return None
-        usable = self._is_unchanged(frame_id, "detections", layout.detection_path(frame_id))
-        return layout.objects(frame_id) if usable else None
+        usable = self._is_unchanged(result, "detections", layout.detection_path(result.frame_id))
+        return layout.objects(result.frame_id) if usable else None
 
     def labels(self, frame_id: str) -> list[KittiObject] | None:
         """The ground truth, which no run reads and so no hash can tell."""
         layout = self.sources.layout
         return None if layout is None else layout.labels(frame_id)
 
-    def read(self, frame_id: str) -> FrameInputs:
+    def read(self, result: FrameResult) -> FrameInputs:
         """Images, camera, ground and masks of a frame."""
-        layout = self.sources.layout
+        layout, frame_id = self.sources.layout, result.frame_id
         if layout is None:
             return FrameInputs(None, None, None, None, (), None)
         roles = ("image_left", "image_right")
-        left, right = (self._image(frame_id, *pair) for pair in zip(roles, layout.images(frame_id), strict=True))
+        left, right = (self._image(result, *pair) for pair in zip(roles, layout.images(frame_id), strict=True))
         if left is not None and right is not None and left.shape != right.shape:
             self.problems["left and right image differ in size"].add(frame_id)
             right = None
-        camera = self._camera(layout, frame_id, left)
-        ground = None if camera is None else self._ground(layout, frame_id, camera, left, right)
-        masks = () if left is None else self._masks(frame_id, (left.shape[0], left.shape[1]))
+        camera = self._camera(layout, result, left)
+        ground = None if camera is None else self._ground(layout, result, camera, left, right)
+        masks = () if left is None else self._masks(result, (left.shape[0], left.shape[1]))
         given = layout.given_masks(frame_id) if self.sources.has_own_masks else None
         return FrameInputs(left, right, camera, ground, masks, given)
 
-    def _is_unchanged(self, frame_id: str, role: str, path: Path) -> bool:
+    def _is_unchanged(self, result: FrameResult, role: str, path: Path) -> bool:
         """Whether the file is the one that the run read."""
+        frame_id, known = result.frame_id, result.record.inputs.get(role)
         if not path.is_file():
             self.problems[f"{_words(role)} not found"].add(frame_id)
             return False
-        known = self.manifest.inputs.get(frame_id, {}).get(role)
         if known is not None and known != hash_file(path):
             self.problems[f"{_words(role)} not used: the file has changed since the run"].add(frame_id)
             return False
         return True
 
-    def _image(self, frame_id: str, role: str, path: Path) -> NDArray[np.uint8] | None:
-        return read_rgb(path) if self._is_unchanged(frame_id, role, path) else None
+    def _image(self, result: FrameResult, role: str, path: Path) -> NDArray[np.uint8] | None:
+        return read_rgb(path) if self._is_unchanged(result, role, path) else None
 
-    def _camera(self, layout: FrameLayout, frame_id: str, left: NDArray[np.uint8] | None) -> StereoCamera | None:
-        if not self._is_unchanged(frame_id, "calibration", layout.calibration_path(frame_id)):
+    def _camera(self, layout: FrameLayout, result: FrameResult, left: NDArray[np.uint8] | None) -> StereoCamera | None:
+        if not self._is_unchanged(result, "calibration", layout.calibration_path(result.frame_id)):
             return None
         fields = () if left is None else self.sources.disparity_fields
         size_wh = (0, 0) if left is None else (left.shape[1], left.shape[0])
-        return camera_of_rig(layout.calibration(frame_id), fields, size_wh, torch.float32)
+        return camera_of_rig(layout.calibration(result.frame_id), fields, size_wh, torch.float32)
 
     def _ground(
         self,
         layout: FrameLayout,
-        frame_id: str,
+        result: FrameResult,
         camera: StereoCamera,
         left: NDArray[np.uint8] | None,
         right: NDArray[np.uint8] | None,
     ) -> GroundPlane | None:
         """The plane of the source that the run used."""
-        source = self.manifest.frames[frame_id].get("ground_source")
+        source, frame_id = result.shapes.ground_source, result.frame_id
         if source == "camera_height":
-            return GroundPlane.from_camera_height(float(self.manifest.config.get("camera_height_m", 1.65)))
+            return GroundPlane.from_camera_height(self.camera_height_m)
         if source == "file":
             path = layout.plane_path(frame_id)
-            if path is None or not self._is_unchanged(frame_id, "ground_plane", path):
+            if path is None or not self._is_unchanged(result, "ground_plane", path):
                 return None
             return _plane_from_ref(layout.plane_ref(frame_id), camera)
         if source == "stereo" and left is not None and right is not None:
             return _plane_from_stereo(left, right, camera)
         return None
 
-    def _masks(self, frame_id: str, size_hw: tuple[int, int]) -> tuple[InstanceMask, ...]:
-        source = self.sources.masks
+    def _masks(self, result: FrameResult, size_hw: tuple[int, int]) -> tuple[InstanceMask, ...]:
+        source, frame_id = self.sources.masks, result.frame_id
         if source is None:
             return ()
         try:
@@ -159,7 +160,7 @@ class InputReader:
             self.problems["masks not found or damaged"].add(frame_id)
             return ()
         for index, path in enumerate(paths):
-            if not self._is_unchanged(frame_id, f"masks_{index}", path):
+            if not self._is_unchanged(result, f"masks_{index}", path):
                 return ()
         return tuple(source.read(frame_id, size_hw))
 

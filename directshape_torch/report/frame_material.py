@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.observation.occlusion import OcclusionOrder
 from directshape_torch.report.drawn_frame import CarState, ObjectMesh
 from directshape_torch.report.frame_inputs import FrameInputs
 from directshape_torch.report.residual_maps import MapSettings
-from directshape_torch.report.run_folder import FrameResult
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import Array
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import TextIOWrapper
@@ -10,11 +11,13 @@ from typing import IO, Any, TypedDict, cast, get_args
 
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver, SilentObserver
-from directshape_torch.batch.run_results import finished_frames, summary_path
+from directshape_torch.batch.run_log import read_log
+from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.files.schema import check_type
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path, summary_path
 from directshape_torch.observation.occlusion import OcclusionOrder
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, as_json, car_rows
 from directshape_torch.report.chosen_frames import choose_frames
@@ -26,7 +29,6 @@ from directshape_torch.report.mesh_data import mesh_data
 from directshape_torch.report.page_assets import data_block, page_frame
 from directshape_torch.report.residual_maps import MapSettings
 from directshape_torch.report.run_facts import problem_notes, run_facts
-from directshape_torch.report.run_folder import FrameResult, RunFolder
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
@@ -92,7 +94,7 @@ def make_report(
         InputError: a frame that the run does not have.
     """
     options = ReportOptions() if options is None else options
-    run = RunFolder.open(out_dir)
+    run = RunFolder(out_dir, options.frames)
     writer = _PageOfRun(run, sources, _right_prior(run, prior), prior is not None)
     return writer.write(page, options, SilentObserver() if observer is None else observer)
 
@@ -108,15 +110,17 @@ class _PageOfRun:
     def __init__(self, run: RunFolder, sources: InputSources, prior: ShapePrior | None, prior_was_given: bool) -> None:
         self._run = run
         # One for all frames and one for those with details: each counts what it could not use.
-        self._reader, self._detail_reader = (InputReader(sources, run.manifest) for _ in range(2))
+        height_m = float(run.setting("camera_height_m"))
+        self._reader, self._detail_reader = (InputReader(sources, height_m) for _ in range(2))
+        self._grounds: Counter[str] = Counter()
         self._prior = prior
         self._prior_was_given = prior_was_given
 
     def write(self, page: Path, options: ReportOptions, observer: RunObserver) -> ReportOutcome:
-        frame_ids = finished_frames(self._run.out_dir, self._run.manifest, options.frames)
+        frame_ids = self._run.frame_ids
         rows = [row for number, name in enumerate(frame_ids) for row in self._rows(number, name)]
         detailed = choose_frames(rows, len(frame_ids), options.most_frames)
-        frame = page_frame(f"{self._run.out_dir.resolve().name}: refined cars")
+        frame = page_frame(f"{self._run.path.resolve().name}: refined cars")
         with replaced_file(page) as content, TextIOWrapper(content, "utf-8", "replace", newline="\n") as file:
             file.write(frame.head)
             self._write_details(file, frame_ids, detailed, observer)
@@ -127,16 +131,15 @@ class _PageOfRun:
 
     def _rows(self, number: int, frame_id: str) -> list[CarRow]:
         material = self._results(frame_id)
+        self._grounds[material.result.shapes.ground_source] += 1
         return car_rows(number, material.result, material.detections, material.labels)
 
     def _results(self, frame_id: str) -> _Results:
         result = self._run.read(frame_id)
-        lines = self._reader.detections(frame_id)
-        detections = None if lines is None else self._run.refined_lines(lines)
+        lines, classes = self._reader.detections(result), self._run.classes
+        detections = None if lines is None else [one for one in lines if one.type in classes and one.has_box_3d]
         if detections is not None and len(detections) != len(result.cars):
-            raise DataFormatError(
-                self._run.out_dir / "shapes", f"frame {frame_id} does not have the cars of its detection file"
-            )
+            raise DataFormatError(shapes_path(self._run.path, frame_id), "does not have the cars of its detection file")
         return _Results(result, lines, detections, self._reader.labels(frame_id))
 
     def _write_details(
@@ -154,7 +157,7 @@ class _PageOfRun:
         for number, name in zip(detailed, names, strict=True):
             known = self._results(name)
             material = FrameMaterial(
-                known.result, self._detail_reader.read(name), known.lines, known.detections, known.labels
+                known.result, self._detail_reader.read(known.result), known.lines, known.detections, known.labels
             )
             details = frame_details(material, settings)
             file.write(data_block(f"thumbnails-{number}", details.thumbnails))
@@ -165,7 +168,7 @@ class _PageOfRun:
     def _detail_settings(self) -> DetailSettings:
         config = self._run.manifest.config
         refiner = config.get("refiner", {})
-        check_type(summary_path(self._run.out_dir), "config['refiner']", refiner, _DrawnSettings)
+        check_type(summary_path(self._run.path), "config['refiner']", refiner, _DrawnSettings)
         mean = None if self._prior is None else decoded_mesh(self._prior, self._prior.initial_code(1)[0].cpu().numpy())
         order = refiner.get("sampling", {}).get("occlusion_order", "depth")
         known = order if order in get_args(OcclusionOrder) else "depth"
@@ -173,8 +176,7 @@ class _PageOfRun:
 
     def _notes(self, num_frames: int, num_detailed: int) -> list[str]:
         sources = self._reader.sources
-        unfinished = self._run.unfinished
-        notes = [] if unfinished is None else [f"the run has not finished ({unfinished}): the page is of what is done"]
+        notes = _unfinished(self._run.path)
         if sources.layout is None:
             notes.append("no pictures and no residual maps: the images were not given (--data)")
         if not sources.has_detections:
@@ -202,7 +204,16 @@ class _PageOfRun:
     ) -> None:
         file.write(data_block("frames", {"ids": list(frame_ids), "detailed": list(detailed)}))
         file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [as_json(row) for row in rows]}))
-        file.write(data_block("run", run_facts(self._run, frame_ids, rows, notes)))
+        file.write(data_block("run", run_facts(self._run, frame_ids, rows, self._grounds, notes)))
+
+
+def _unfinished(out_dir: Path) -> list[str]:
+    """A note on how the run stands where it has not finished."""
+    if read_log(out_dir) is None:
+        return []
+    status = read_status(out_dir)
+    left = f"{status.state}, {status.num_left} frames left"
+    return [] if status.state == "finished" else [f"the run has not finished ({left}): the page is of what is done"]
 
 
 class _Silhouette(TypedDict, total=False):

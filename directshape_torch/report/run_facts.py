@@ -10,38 +10,45 @@ from typing import Any
 
 from directshape_torch.evaluation.comparison_summary import WORSE_BY_BEV_IOU
 from directshape_torch.io.image_files import read_rgb
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_manifest import flatten
 from directshape_torch.report.car_rows import CarRow
 from directshape_torch.report.pictures import data_url
-from directshape_torch.report.run_folder import RunFolder
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
 from directshape_torch.status import Status
 
 
-def run_facts(run: RunFolder, frame_ids: Sequence[str], rows: Sequence[CarRow], notes: Sequence[str]) -> dict[str, Any]:
+def run_facts(
+    run: RunFolder,
+    frame_ids: Sequence[str],
+    rows: Sequence[CarRow],
+    grounds: Mapping[str, int],
+    notes: Sequence[str],
+) -> dict[str, Any]:
     """The facts as JSON.
 
     Args:
         run: the output folder.
         frame_ids: the frames of the page.
         rows: their cars.
+        grounds: number of frames by the source of their ground plane.
         notes: what the reader should know about this page.
     """
     manifest = run.manifest
     return {
-        "name": run.out_dir.resolve().name,
+        "name": run.path.resolve().name,
         "package_version": manifest.package_version,
         "frames_done": len(frame_ids),
-        "failed": run.failed,
+        "failed": {name: why for name, why in manifest.failed.items() if name not in frame_ids},
         "cars": len(rows),
         "refined": sum(row.refined for row in rows),
         "statuses": _statuses(rows),
-        "ground_sources": dict(Counter(str(manifest.frames[name].get("ground_source")) for name in frame_ids)),
+        "ground_sources": dict(grounds),
         "sha256": dict(manifest.sha256),
         "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),
         "notes": list(notes),
-        "rig": _rig(run.out_dir),
+        "rig": _rig(run.path),
     }
 
 

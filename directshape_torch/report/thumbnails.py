@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.car_rows import is_refined
 from directshape_torch.report.drawn_frame import CarState
 from directshape_torch.report.frame_inputs import FrameInputs
 from directshape_torch.report.frame_material import DrawnCars
 from directshape_torch.report.pictures import Window, car_window, data_url
-from directshape_torch.report.run_folder import FrameResult
 from directshape_torch.visualize.drawing import BLUE, GREY, ORANGE, Colour, Picture, View, draw_box, draw_contour
 
 _WIDTH_PX = 260

@@ -21,8 +21,7 @@ from helpers.quick_runs import dataset
 
 from directshape_torch.batch.options import SilentObserver, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.batch.run_file import run_path
-from directshape_torch.batch.run_status import read_status
+from directshape_torch.batch.run_log import log_path, read_log
 from directshape_torch.errors import DirectShapeError
 
 FRAMES = ("000000", "000001", "000002")
@@ -114,7 +113,7 @@ TAKEN: dict[str, Callable[[Path], None]] = {
     "folder deleted": shutil.rmtree,
     "folder a file": _files_in_its_place,
     "data deleted": lambda out: shutil.rmtree(out / "data"),
-    "journal deleted": lambda out: shutil.rmtree(out / "journal"),
+    "log deleted": lambda out: log_path(out).unlink(),
     "data a file": lambda out: _files_in_its_place(out / "data"),
 }
 
@@ -168,8 +167,8 @@ def _judge(
     elif ended == "success" and result_files(out) != expected:
         trouble = "success, with other files than those of an undisturbed run"
     if out.is_dir():
-        if run_path(out).exists():
-            read_status(out)
+        if log_path(out).exists():
+            read_log(out)
         if list(out.rglob("*.tmp")):
             trouble = "a temporary file stays"
     # What stands in the place of a folder is for the user to remove.

@@ -21,8 +21,8 @@ from directshape_torch.config_files import load_config
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.refinement_files import shapes_path
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import shapes_path
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.rig_file import load_fields
 from directshape_torch.shape.shape_prior import ShapePrior

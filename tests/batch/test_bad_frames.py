@@ -17,7 +17,7 @@ from helpers.quick_runs import dataset, refine, refiner
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RefineOptions, SilentObserver
 from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
-from directshape_torch.batch.run_record import RunRecord
+from directshape_torch.batch.resumption import EarlierResults
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.result import RefinementResult
@@ -124,10 +124,10 @@ def test_a_file_that_cannot_be_written_is_reported_and_the_others_go_on(shared_k
 
 def empty_summary(shared_kitti: Path, out: Path) -> str:
     """What a run leaves that was stopped before its first frame."""
-    run = RunRecord(
-        out, run_manifest(dataset(shared_kitti), refiner(shared_kitti), hash_prior(refiner(shared_kitti).prior))
-    )
-    return run.path.read_text()
+    made_of = run_manifest(dataset(shared_kitti), refiner(shared_kitti), hash_prior(refiner(shared_kitti).prior))
+    out.mkdir()
+    EarlierResults(out, made_of, RefineOptions().outputs)
+    return (out / "summary.json").read_text()
 
 
 def test_a_full_disk_stops_the_run_and_the_next_goes_on(

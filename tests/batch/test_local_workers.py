@@ -12,7 +12,7 @@ from helpers.output_folders import result_files
 
 from directshape_torch.batch.options import RefineOptions, SilentObserver, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.batch.run_file import read_run_file
+from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -61,9 +61,9 @@ def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root:
     assert found == expected
     assert sorted(call.frame_ids for call in summary.timings.calls) == [FRAMES[:2], FRAMES[2:4], FRAMES[4:]]
     assert (summary.timings.workers, summary.timings.threads) == (2, 1)
-    run = read_run_file(tmp_path / "two")
+    run = read_log(tmp_path / "two")
     assert run is not None
-    assert (run.state, run.num_done, run.todo) == ("finished", len(FRAMES), [])
+    assert (run.state, run.num_done) == ("finished", len(FRAMES))
 
 
 def test_a_frame_that_kills_its_worker_fails_and_the_others_go_on(root: Path, tmp_path: Path) -> None:

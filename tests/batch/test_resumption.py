@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from helpers.quick_runs import dataset, refine, refiner
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import ResumeError
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -69,8 +69,8 @@ def test_outputs_that_were_removed_are_made_again(shared_kitti: Path, tmp_path: 
 def test_removed_meshes_of_a_format_that_is_not_asked_for_stay_removed(shared_kitti: Path, tmp_path: Path) -> None:
     refine(shared_kitti, tmp_path, meshes="ply")
     refine(shared_kitti, tmp_path, meshes="glb")
-    entry = json.loads((tmp_path / "summary.json").read_text())["frames"]["000000"]
-    assert entry["mesh_files"] == [f"meshes/000000_{line}.{kind}" for line in (1, 3) for kind in ("glb", "ply")]
+    files = RunFolder(tmp_path).read("000000").record.files_of(("meshes_ply", "meshes_glb"))
+    assert sorted(files) == [f"meshes/000000_{line}.{kind}" for line in (1, 3) for kind in ("glb", "ply")]
     (tmp_path / "meshes" / "000000_3.ply").unlink()
     assert refine(shared_kitti, tmp_path).resumed == refine(shared_kitti, tmp_path, meshes="glb").resumed == FRAMES
 

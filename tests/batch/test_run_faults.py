@@ -13,20 +13,21 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.faulty_refiners import QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
 import directshape_torch
-from directshape_torch.batch.journal import FrameRecord, Journal, journal_folder, read_journals
 from directshape_torch.batch.options import RefineOptions, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.batch.run_lock import RunLock
+from directshape_torch.batch.run_log import RunLog, log_path
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import DirectShapeError, RunInProgressError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.run_folder import done_frames
 
 FRAMES = tuple(f"{number:06d}" for number in range(6))
 TESTS = Path(__file__).parent.parent
@@ -60,12 +61,12 @@ def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
     command = [sys.executable, str(TESTS / "helpers" / "slow_run.py"), str(root), str(out)]
     run = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
-        wait_until(lambda: run.poll() is not None or len(read_journals(out).records) > 0)
+        wait_until(lambda: run.poll() is not None or len(done_frames(out)) > 0)
         assert run.poll() is None, "the run ended before it was stopped"
         status = read_status(out)
         assert (status.state, status.num_frames) == ("running", len(FRAMES))
         assert status.num_left == len(FRAMES) - status.num_done > 0
-        workers = [int(path.stem.rpartition("-")[2]) for path in journal_folder(out).iterdir()]
+        workers = children(run.pid)
         if by == signal.SIGINT:  # as a terminal does it
             os.killpg(run.pid, by)
         else:
@@ -75,6 +76,10 @@ def stopped_in_the_middle(root: Path, out: Path, by: signal.Signals) -> None:
     finally:
         with suppress(ProcessLookupError):
             os.killpg(run.pid, signal.SIGKILL)
+
+
+def children(pid: int) -> list[int]:
+    return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 def is_running(pid: int) -> bool:
@@ -96,17 +101,16 @@ def wait_until(condition: object) -> None:
 def test_a_run_that_is_killed_and_damaged_goes_on_where_it_was(root: Path, tmp_path: Path, undisturbed: Path) -> None:
     out = tmp_path / "out"
     stopped_in_the_middle(root, out, signal.SIGKILL)
-    finished = [record.frame_id for record in read_journals(out).records]
+    finished = done_frames(out)
     assert 0 < len(finished) < len(FRAMES)
     assert read_status(out).state == "killed"
     # Everything else that a killed process may leave: a line and a file cut short, a file nobody moved to its name.
-    journal = next(iter(journal_folder(out).iterdir()))
-    journal.write_bytes(journal.read_bytes() + b'0123456789abcdef {"frame_id": "0000')
+    noted = read_status(out).num_done
+    log_path(out).write_bytes(log_path(out).read_bytes() + b'{"frame": "0000')
     (out / "data" / ".000005.txt.k3j4.tmp").write_text("Car 0.00")
     damaged = out / "shapes" / f"{finished[0]}.npz"
     damaged.write_bytes(damaged.read_bytes()[:1000])
-    status = read_status(out)
-    assert (status.num_done, status.num_damaged_lines) == (len(finished), 1)
+    assert read_status(out).num_done == noted
     before = {frame_id: (out / "data" / f"{frame_id}.txt").stat().st_ino for frame_id in finished}
 
     summary = refine(root, out)
@@ -129,7 +133,6 @@ def test_an_interrupted_run_ends_its_frames_and_goes_on(root: Path, tmp_path: Pa
     stopped_in_the_middle(root, out, signal.SIGINT)
     status = read_status(out)
     assert (status.state, status.reason) == ("stopped", "KeyboardInterrupt")
-    assert not journal_folder(out).exists()
     assert len(list((out / "data").glob("*.txt"))) == status.num_done < len(FRAMES)
     assert len(refine(root, out).resumed) == status.num_done
     assert result_files(out) == result_files(undisturbed)
@@ -164,30 +167,43 @@ def test_a_full_disk_stops_a_run_and_room_lets_it_go_on(
         refine(root, out)
     assert not list(out.rglob("*.tmp"))
     (small_disk / "filler").unlink()
-    noted = [record.frame_id for record in read_journals(out).records]
+    finished = done_frames(out)
     summary = refine(root, out)
-    assert set(noted) <= set(summary.resumed)
+    assert list(summary.resumed) == finished
     assert len(summary.timings.calls) == len(FRAMES) - len(summary.resumed)
     assert result_files(out) == result_files(undisturbed)
 
 
 def test_two_runs_at_once(root: Path, tmp_path: Path, undisturbed: Path) -> None:
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
-    with RunLock(out), pytest.raises(RunInProgressError, match="another run is writing here"):
+    with RunLog(out), pytest.raises(RunInProgressError, match="another run is writing here"):
         refine(root, out)
     assert result_files(out) == result_files(undisturbed)
     assert len(refine(root, out).resumed) == len(FRAMES)
 
 
-def test_journals_that_the_summary_has_taken_in_already_change_nothing(
-    root: Path, tmp_path: Path, undisturbed: Path
-) -> None:
-    """A run that was killed after it wrote the summary and before it removed its journals."""
+def test_frames_without_an_entry_in_the_summary_are_finished(root: Path, tmp_path: Path, undisturbed: Path) -> None:
+    """Of a run that was killed before it wrote the summary, and one that asks for other frames."""
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     summary = json.loads((out / "summary.json").read_text())
-    for frame_id in FRAMES:
-        Journal(out, "killed").add(FrameRecord(frame_id, summary["inputs"][frame_id], summary["frames"][frame_id]))
-    assert refine(root, out).resumed == FRAMES
+    (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
+    one = KittiStereoDataset(root, root / "detections", root / "masks", frames=FRAMES[:1])
+    assert refine_dataset(one, QuickRefiner(root), out, workers=WorkerOptions(threads=1)).resumed == FRAMES[:1]
+    assert result_files(out) == result_files(undisturbed)
+
+
+@pytest.mark.parametrize("name", ["data/000002.txt", "shapes/000002.npz"])
+def test_a_file_whose_bytes_have_changed_is_made_again(
+    root: Path, tmp_path: Path, undisturbed: Path, name: str
+) -> None:
+    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
+    if name.endswith("npz"):
+        shapes = dict(np.load(out / name))
+        np.savez(out / name, **{**shapes, "codes": shapes["codes"] + 1})
+    else:
+        (out / name).write_text((out / name).read_text().replace("Car", "Van"))
+    summary = refine(root, out)
+    assert summary.resumed == tuple(frame for frame in FRAMES if frame != "000002")
     assert result_files(out) == result_files(undisturbed)
 
 

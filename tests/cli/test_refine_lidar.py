@@ -14,6 +14,7 @@ from helpers.output_folders import result_files
 from directshape_torch.cli.main import main
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import RunFolder
 
 FRAMES = ("000000", "000001")
 # The scanner stands in camera 0: x forward, y left, z up becomes x right, y down, z forward.
@@ -75,7 +76,7 @@ def test_workers_give_the_same_bytes_and_the_manifest_knows_the_scans(source: Pa
     assert result_files(tmp_path / "a") == result_files(tmp_path / "b")
     assert "lidar" in read_shapes(tmp_path / "a" / "shapes" / "000000.npz").term_names
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
-    assert "lidar" in summary["inputs"]["000001"]
+    assert "lidar" in RunFolder(tmp_path / "a").read("000001").record.inputs
     assert summary["config"]["extra_terms"] == ["LidarPoints(weight=300.0, huber_m=0.1)"]
 
 

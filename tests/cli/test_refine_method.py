@@ -16,6 +16,7 @@ from directshape_torch.cli.main import main
 from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import RunFolder
 
 QUICK = ("--set", "point_cloud.rounds=1", "point_cloud.min_points=50", "stages=[{max_iterations: 2}]")
 
@@ -45,7 +46,7 @@ def test_a_method_with_disparity_maps(source: Path, tmp_path: Path, method: str)
     assert refine(source, tmp_path, "--method", method, "--disparity", str(source / "disparity")) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["config"]["refiner"]["method"] == method
-    assert set(summary["inputs"]["000001"]) >= {"disparity", "image_left"}
+    assert set(RunFolder(tmp_path).read("000001").record.inputs) >= {"disparity", "image_left"}
     for frame_id in ("000000", "000001"):
         shapes = read_shapes(tmp_path / "shapes" / f"{frame_id}.npz")
         assert "point_cloud" in shapes.term_names
@@ -54,7 +55,7 @@ def test_a_method_with_disparity_maps(source: Path, tmp_path: Path, method: str)
 
 def test_without_maps_the_images_are_matched(source: Path, tmp_path: Path) -> None:
     assert refine(source, tmp_path, "--method", "geometric", "--frames", "0") == 0
-    assert "disparity" not in json.loads((tmp_path / "summary.json").read_text())["inputs"]["000000"]
+    assert "disparity" not in RunFolder(tmp_path).read("000000").record.inputs
 
 
 def test_maps_that_nobody_reads_are_an_error(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -63,7 +63,6 @@ def test_summary(out: Path) -> None:
         summary,
         summary["config"],
         summary["sha256"],
-        summary["inputs"]["000000"],
         *summary["frames"].values(),
     ):
         for name in part:

@@ -23,10 +23,10 @@ from directshape_torch.errors import DataFormatError, InputError, MissingDepende
 from directshape_torch.export.export_run import ExportFormat, export_run
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.export.rerun_recording import record_run
-from directshape_torch.export.run_folder import RunFolder
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 

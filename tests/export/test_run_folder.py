@@ -10,7 +10,7 @@ import pytest
 from helpers.finished_run import FRAMES, FinishedRun
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.export.run_folder import COPIED, RunFolder
+from directshape_torch.io.run_folder import COPIED, RunFolder
 from directshape_torch.status import Status
 
 
@@ -53,5 +53,5 @@ def test_files_that_do_not_fit_together_are_named(finished: FinishedRun, tmp_pat
     out = Path(shutil.copytree(finished.out, tmp_path / "out"))
     result = out / "data" / "000000.txt"
     result.write_text("".join(result.read_text().splitlines(keepends=True)[:1]))
-    with pytest.raises(DataFormatError, match=r"data/000000.txt: lacks lines of .*shapes/000000.npz"):
+    with pytest.raises(DataFormatError, match=r"data/000000.txt: has been changed, or does not belong to .*npz"):
         RunFolder(out).read("000000")

@@ -17,10 +17,10 @@ from plyfile import PlyData
 
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
-from directshape_torch.export.run_folder import RunFolder
 from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
+from directshape_torch.io.run_folder import RunFolder
 
 Floats = NDArray[np.float64]
 LINES = (1, 3)

@@ -19,8 +19,6 @@ from helpers.shape_arrays import shape_arrays
 from helpers.synthetic_scene import cached_street
 
 from directshape_torch import load_config
-from directshape_torch.batch.journal import FrameRecord, Journal, journal_folder, read_journals
-from directshape_torch.batch.run_results import read_run_results
 from directshape_torch.batch.run_status import format_status, read_status
 from directshape_torch.diagnosis.trust_model import load_trust_model
 from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, read_tracks, write_tracks
@@ -31,6 +29,7 @@ from directshape_torch.io.kitti_calibration import read_calibration
 from directshape_torch.io.mask_files import CocoFileMasks, InstancePngMasks
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
 from directshape_torch.io.velodyne import read_points, read_scan
@@ -178,10 +177,6 @@ def _frames(root: Path, folder: Path) -> dict[str, Sample]:
 def _runs(root: Path, out: Path) -> dict[str, Sample]:
     """What a run leaves, and whoever goes on from there."""
     refine(root, out, overlays=True)
-    entry = json.loads((out / "summary.json").read_text())["frames"][FRAME]
-    killed = out.parent / "killed"
-    Journal(killed, "killed").add(FrameRecord(FRAME, {}, entry))
-    journal = next(journal_folder(killed).iterdir())
 
     def report() -> object:
         return make_report(out, out.parent / "page.html", InputSources(), load_prior(root / "prior.npz"))
@@ -191,8 +186,8 @@ def _runs(root: Path, out: Path) -> dict[str, Sample]:
 
     return {
         "summary": Sample(out / "summary.json", resumed),
-        "results": Sample(out / "summary.json", lambda: read_run_results(out)),
+        "results": Sample(out / "summary.json", lambda: RunFolder(out)),
         "report": Sample(out / "summary.json", report),
-        "run": Sample(out / "run.json", lambda: format_status(read_status(out))),
-        "journal": Sample(journal, lambda: read_journals(killed), is_exact=False),
+        "run": Sample(out / "run.jsonl", lambda: format_status(read_status(out)), is_exact=False),
+        "results of a frame": Sample(out / "shapes" / f"{FRAME}.npz", lambda: RunFolder(out).read(FRAME)),
     }

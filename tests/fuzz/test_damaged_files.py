@@ -17,7 +17,8 @@ FORMATS = (
     "times", "tracking", "tracks", "shapes", "disparity", "field", "rigs", "split", "points",
     "scan", "network", "prior", "mesh",
     "trust", "settings", "coco", "instances", "image", "calibration", "plane", "labels", "detections", "masks", "rig",
-    "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "run", "journal",
+    "frame", "raw calibration", "sequence calibration", "summary", "results", "report", "run",
+    "results of a frame",
 )  # fmt: skip
 # More of them, and what they cost: scripts/fuzz.py.
 TRIES = 25

@@ -8,8 +8,8 @@ from pathlib import Path
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.cli.main import main
 from directshape_torch.export.frame_source import ExportInputs
-from directshape_torch.export.run_folder import RunFolder
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.kitti_folder import write_data_set
 

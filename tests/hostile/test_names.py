@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.quick_runs import dataset, refine
 
-from directshape_torch.batch.run_lock import RunLock, lock_path
+from directshape_torch.batch.run_log import RunLog, log_path
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.instance_masks import check_count
 from directshape_torch.visualize.drawing import draw_text
@@ -48,8 +48,8 @@ def test_records_that_climb(shared_kitti: Path, tmp_path: Path) -> None:
 def test_the_lock_follows_no_link(tmp_path: Path) -> None:
     foreign = tmp_path / "foreign"
     foreign.write_text("mine")
-    lock_path(tmp_path).symlink_to(foreign)
-    with pytest.raises(DirectShapeError, match=r"\.run\.lock"), RunLock(tmp_path):
+    log_path(tmp_path).symlink_to(foreign)
+    with pytest.raises(DirectShapeError, match=r"run\.jsonl"), RunLog(tmp_path):
         pass
     assert foreign.read_text() == "mine"
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,14 +21,13 @@ from helpers.output_folders import result_files
 from helpers.quick_runs import dataset
 
 import directshape_torch
-from directshape_torch.batch.journal import FrameRecord, Journal, journal_folder
 from directshape_torch.batch.options import SilentObserver, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.batch.run_file import run_path
-from directshape_torch.batch.run_lock import lock_path
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import DataFormatError
+from directshape_torch.io.result_files import read_shapes, write_shapes
+from directshape_torch.io.run_folder import RunFolder, done_frames
 
 THREADS = WorkerOptions(threads=1)
 
@@ -106,58 +106,41 @@ def test_files_that_vanish_during_the_run_are_missed(shared_kitti: Path, tmp_pat
     assert read_status(tmp_path).num_done == 0
 
 
-def test_a_stale_record_with_a_later_clock_fails_nothing(shared_kitti: Path, tmp_path: Path, undisturbed: Path) -> None:
-    out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
-    (out / "data" / f"{FRAMES[1]}.txt").unlink()
-    for frame_id in FRAMES:
-        Journal(out, "stale").add(FrameRecord(frame_id, {}, {"state": "failed", "reason": "old"}, time.time() + 1e6))
-    summary = refine(shared_kitti, out)
-    assert (summary.exit_code, summary.resumed) == (0, (FRAMES[0], FRAMES[2]))
-    assert result_files(out) == result_files(undisturbed)
-
-
 @pytest.mark.parametrize(
     "change",
     [
-        {"frame_id": 7},
-        {"frame_id": "../../foreign"},
+        {"run": "other"},
+        {"run": 7},
         {"inputs": ["a"]},
-        {"entry": {"state": "odd"}},
-        {"entry": {"state": "done", "outputs": 5}},
-        {"entry": {"state": "done", "mesh_files": ["../../foreign"]}},
-        {"finished_at": "now"},
+        {"outputs": 5},
+        {"files": {"../../foreign": "00"}},
+        {"files": {}},
         {"more": 1},
+        None,
     ],
     ids=str,
 )
-def test_journals_that_no_run_has_written(
-    shared_kitti: Path, tmp_path: Path, undisturbed: Path, change: dict[str, object]
+def test_frames_of_records_that_no_run_has_written(
+    shared_kitti: Path, tmp_path: Path, undisturbed: Path, change: dict[str, object] | None
 ) -> None:
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
-    record = FrameRecord(FRAMES[0], {}, {"state": "failed", "reason": "old"})
-    object.__setattr__(record, "__dict__", {**vars(record), **change})
-    Journal(out, "odd").add(record)
-    assert refine(shared_kitti, out).exit_code == 0
+    path = out / "shapes" / f"{FRAMES[0]}.npz"
+    shapes = read_shapes(path)
+    made_of = "{" if change is None else json.dumps({**json.loads(shapes.made_of), **change})
+    write_shapes(path, replace(shapes, made_of=made_of))
+    if change != {"files": {}}:
+        with pytest.raises(DataFormatError, match=path.stem):
+            RunFolder(out).read(FRAMES[0])
+    assert refine(shared_kitti, out).resumed == FRAMES[1:]
     assert result_files(out) == result_files(undisturbed)
 
 
-@pytest.mark.parametrize("name", ["run.json", "summary.json"])
+@pytest.mark.parametrize("name", ["run.jsonl", "summary.json"])
 @pytest.mark.parametrize("content", ["7", "[]", '{"schema_version": 1}', '{"schema_version": [[]]}'])
 def test_records_of_other_programs(shared_kitti: Path, tmp_path: Path, name: str, content: str) -> None:
     (tmp_path / name).write_text(content)
     with pytest.raises((DataFormatError, directshape_torch.ResumeError), match=name):
         refine(shared_kitti, tmp_path)
-
-
-def test_an_owner_of_an_impossible_number_is_not_alive(tmp_path: Path) -> None:
-    import platform
-
-    from directshape_torch.batch.run_lock import read_lock_owner
-
-    lock_path(tmp_path).write_text(json.dumps({"host": platform.node(), "pid": 2**40, "started_at": 0.0}))
-    owner = read_lock_owner(tmp_path)
-    assert owner is not None
-    assert owner.is_alive is False
 
 
 def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
@@ -169,14 +152,12 @@ def test_a_run_that_is_asked_to_end_says_so(tmp_path: Path) -> None:
     package = str(Path(directshape_torch.__file__).parent.parent)
     run = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": package}, stderr=subprocess.PIPE, text=True)
     try:
-        while run.poll() is None and not list(journal_folder(out).glob("*")):
+        while run.poll() is None and not done_frames(out):
             time.sleep(0.02)
         run.send_signal(signal.SIGTERM)
         _, said = run.communicate(timeout=60)
     finally:
         run.kill()
     assert (run.returncode, said.splitlines()[-1]) == (143, "directshape: terminated")
-    status = json.loads(run_path(out).read_text())
-    assert (status["state"], status["reason"]) == ("stopped", "SIGTERM")
-    assert not journal_folder(out).exists()
-    assert not lock_path(out).exists()
+    status = read_status(out)
+    assert (status.state, status.reason) == ("stopped", "SIGTERM")

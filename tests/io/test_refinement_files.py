@@ -17,8 +17,9 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import MatchingSummary
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
-from directshape_torch.io.refinement_files import result_path, shapes_path, write_refinement
+from directshape_torch.io.refinement_files import write_refinement
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane

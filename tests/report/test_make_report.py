@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from helpers.report_runs import FinishedRun, finished_run
 
-from directshape_torch.batch.journal import FrameRecord, Journal
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
@@ -207,17 +206,19 @@ def _refined_again(root: Path, out: Path) -> FinishedRun:
 
 def test_a_run_that_was_cut_off(run: FinishedRun, tmp_path: Path) -> None:
     out = Path(shutil.copytree(run.out, tmp_path / "out"))
-    summary = json.loads((out / "summary.json").read_text())
-    entry, inputs = summary["frames"].pop("000001"), summary["inputs"].pop("000001")
-    (out / "summary.json").write_text(json.dumps(summary))
-    state = json.loads((out / "run.json").read_text())
-    (out / "run.json").write_text(json.dumps({**state, "state": "running", "todo": ["000000", "000001", "000002"]}))
+    log = (out / "run.jsonl").read_text().splitlines(keepends=True)
+    (out / "run.jsonl").write_text("".join(log[:-2]))
+    text = (out / "data" / "000001.txt").read_bytes()
+    (out / "data" / "000001.txt").unlink()
     assert blocks(make_report(out, tmp_path / "a.html", run.sources, run.prior).path)["frames"]["ids"] == ["000000"]
-    Journal(out, state["run_id"]).add(FrameRecord("000001", inputs, entry))
+    (out / "data" / "000001.txt").write_bytes(text)
+    summary = json.loads((out / "summary.json").read_text())
+    (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
     outcome = make_report(out, tmp_path / "b.html", run.sources, run.prior)
     assert blocks(outcome.path)["frames"]["ids"] == ["000000", "000001"]
+    assert blocks(outcome.path)["run"]["ground_sources"] == {"file": 2}
     (note,) = outcome.notes
-    assert re.search(r"not finished \(killed, \d+ frames left\)", note)
+    assert re.search(r"not finished \(running, 1 frames left\)", note)
 
 
 def test_equal_runs_give_equal_pages(run: FinishedRun, tmp_path: Path) -> None:
@@ -246,7 +247,7 @@ def test_results_of_other_lines_are_refused(run: FinishedRun, tmp_path: Path) ->
     out = Path(shutil.copytree(run.out, tmp_path / "out"))
     path = out / "data" / "000000.txt"
     path.write_text("\n".join(path.read_text().splitlines()[1:]) + "\n")
-    with pytest.raises(DataFormatError, match="1 lines of the refined classes"):
+    with pytest.raises(DataFormatError, match="has been changed, or does not belong to"):
         make_report(out, tmp_path / "page.html", InputSources())
 
 

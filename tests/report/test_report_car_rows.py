@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.run_folder import FrameRecord, FrameResult
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, as_json, car_rows
 from directshape_torch.report.chosen_frames import car_gains, choose_frames
-from directshape_torch.report.run_folder import FrameResult
 
 
 def car(x: float, u: float, line: int = 1, occluded: int = 0) -> KittiObject:
@@ -23,7 +23,8 @@ def car(x: float, u: float, line: int = 1, occluded: int = 0) -> KittiObject:
 
 
 def result(*cars: KittiObject, **changes: object) -> FrameResult:
-    return FrameResult("000107", shape_arrays(len(cars), **changes), list(cars), [None] * len(cars))
+    lines = tuple(replace(one, line_number=number) for number, one in enumerate(cars, 1))
+    return FrameResult("000107", lines, shape_arrays(len(cars), **changes), FrameRecord("", {}, [], {}, len(cars), 0))
 
 
 def test_errors_before_and_after() -> None:

@@ -1,0 +1,188 @@
+"""What earlier runs have left in an output folder: which frames need no work, and what must go."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+from directshape_torch.errors import DataFormatError, ResumeError
+from directshape_torch.files.read_files import read_bytes
+from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import (
+    done_frames,
+    frame_entry,
+    overlay_path,
+    read_record,
+    result_path,
+    shapes_path,
+    summary_path,
+)
+from directshape_torch.io.run_manifest import (
+    RESUME_CURE,
+    FrameEntry,
+    RunManifest,
+    check_mapping,
+    check_resume,
+    hash_bytes,
+    hash_files,
+    read_manifest,
+    write_manifest,
+)
+from directshape_torch.io.stereo_dataset import StereoDataset
+
+# Hashing waits for the disk most of the time, and for a network's even longer.
+_READING_THREADS = 8
+_MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
+_OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays")
+
+
+class EarlierResults:
+    """The results of earlier runs, which this one goes on with.
+
+    Args:
+        out_dir: the output folder.
+        manifest: settings and hashes of this run, without frames.
+        outputs: kinds of files that each frame is to have.
+        is_cleared: the results of earlier runs were just removed, and what is left is no result.
+
+    Attributes:
+        manifest: with the frames of earlier runs.
+        remade: frames whose files have been removed or damaged since they were finished, after `finished_frames`.
+
+    Raises:
+        ResumeError: the folder holds results of other settings, or results without a summary.
+    """
+
+    def __init__(self, out_dir: Path, manifest: RunManifest, outputs: Sequence[str], is_cleared: bool = False) -> None:
+        self.out_dir, self.outputs = out_dir, outputs
+        self.remade: list[str] = []
+        previous = read_manifest(summary_path(out_dir))
+        if previous is not None:
+            check_resume(previous, manifest)
+            manifest.frames.update(previous.frames)
+        elif not is_cleared:
+            self._check_empty()
+        self.manifest = manifest
+        self.write()
+
+    def finished_frames(self, dataset: StereoDataset) -> list[str]:
+        """Frames of the data set that need no work: done, with all the outputs whole, from the files as they are now.
+
+        Raises:
+            ResumeError: the files of a finished frame have changed since, or are gone.
+        """
+        frames, done = self.manifest.frames, set(done_frames(self.out_dir))
+        known = [f for f in dataset.frame_ids if f in done or (f in frames and frames[f]["state"] == "done")]
+        with ThreadPoolExecutor(_READING_THREADS) as threads:
+            checked = list(threads.map(partial(self._checked, dataset), known))
+        # Of frames that nobody asks for now the summary tells all the same.
+        self.take_in(done.difference(dataset.frame_ids))
+        found = dict[str, FrameEntry]()
+        for frame_id, (entry, is_damaged) in zip(known, checked, strict=True):
+            if is_damaged:
+                self.remade.append(frame_id)
+                frames.pop(frame_id, None)
+                with suppress(OSError):
+                    result_path(self.out_dir, frame_id).unlink()
+            elif entry is not None:
+                found[frame_id] = entry
+        frames.update(found)
+        return list(found)
+
+    def take_in(self, frame_ids: Iterable[str]) -> None:
+        """Let the summary tell of frames that are done, which nobody has noted."""
+        frames = self.manifest.frames
+        unknown = sorted(f for f in frame_ids if f not in frames or frames[f]["state"] == "failed")
+        with ThreadPoolExecutor(_READING_THREADS) as threads:
+            entries = zip(unknown, threads.map(self.entry, unknown), strict=True)
+            frames.update({frame_id: entry for frame_id, entry in entries if entry is not None})
+
+    def entry(self, frame_id: str) -> FrameEntry | None:
+        """That of a frame which has all outputs of this run, and nobody has removed or changed them since."""
+        with suppress(DataFormatError):
+            path = shapes_path(self.out_dir, frame_id)
+            shapes = read_shapes(path)
+            record = read_record(path, shapes)
+            if record.run == self.manifest.hash and set(self.outputs) <= set(record.outputs):
+                files = record.files_of(self.outputs)
+                is_whole = f"data/{frame_id}.txt" in files
+                if is_whole and all(
+                    hash_bytes(read_bytes(self.out_dir / name)) == sha256 for name, sha256 in files.items()
+                ):
+                    return frame_entry(shapes, record)
+        return None
+
+    def write(self) -> None:
+        """Write `summary.json`."""
+        write_manifest(summary_path(self.out_dir), self.manifest)
+
+    def _checked(self, dataset: StereoDataset, frame_id: str) -> tuple[FrameEntry | None, bool]:
+        """The entry of a frame that is finished, and whether one that is not has lost something."""
+        try:
+            path = shapes_path(self.out_dir, frame_id)
+            record = read_record(path, read_shapes(path))
+        except DataFormatError:
+            return None, True
+        self._check_inputs(dataset, frame_id, record.inputs)
+        entry = self.entry(frame_id)
+        return entry, entry is None and set(self.outputs) <= set(record.outputs)
+
+    def _check_inputs(self, dataset: StereoDataset, frame_id: str, inputs: Mapping[str, str]) -> None:
+        try:
+            hashes = hash_files(dataset.input_files(frame_id))
+        except DataFormatError as error:
+            raise ResumeError(
+                f"cannot resume: frame {frame_id} was refined from a file that is gone: {error}; {RESUME_CURE}"
+            ) from error
+        check_mapping(f"frame {frame_id}: sha256 of", inputs, hashes)
+
+    def _check_empty(self) -> None:
+        for name in ("data", "shapes"):
+            folder = self.out_dir / name
+            if folder.is_dir() and any(folder.iterdir()):
+                raise ResumeError(
+                    f"cannot resume: {folder} holds files, but {summary_path(self.out_dir)} is missing, so what they "
+                    f"were made of is unknown; {RESUME_CURE}"
+                )
+
+
+def remove_unfinished_files(out_dir: Path) -> None:
+    """Remove temporary files of processes that were killed while they wrote; only for who holds the folder."""
+    for folder in (out_dir, *(out_dir / name for name in _OUTPUT_FOLDERS)):
+        for path in folder.glob(".*.tmp"):
+            path.unlink(missing_ok=True)
+
+
+def remove_results(out_dir: Path, others: Iterable[str]) -> bool:
+    """Remove what runs have written into a folder, and nothing else.
+
+    Args:
+        out_dir: the output folder.
+        others: further files of runs, beside the summary.
+
+    Returns:
+        Whether there was a summary; without one nothing is removed.
+
+    Raises:
+        DataFormatError: the folder has a summary that cannot be read, so nobody knows which files are results.
+    """
+    previous = read_manifest(summary_path(out_dir))
+    if previous is None:
+        return False
+    frame_ids = {*previous.frames, *done_frames(out_dir)}
+    for frame_id in frame_ids:
+        for path in (result_path, shapes_path, overlay_path):
+            path(out_dir, frame_id).unlink(missing_ok=True)
+    for mesh in (out_dir / "meshes").glob("*"):
+        if (found := _MESH.fullmatch(mesh.name)) is not None and found[1] in frame_ids:
+            mesh.unlink()
+    for name in (*others, summary_path(out_dir).name):
+        (out_dir / name).unlink(missing_ok=True)
+    for name in _OUTPUT_FOLDERS:
+        with suppress(OSError):  # files of somebody else stay, and their folder with them
+            (out_dir / name).rmdir()
+    return True

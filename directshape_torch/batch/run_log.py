@@ -1,0 +1,348 @@
+"""`run.jsonl`: who runs in an output folder and what has ended so far. The results do not need it.
+
+The run that goes on there holds the file locked, so that there is one at a time, and appends a line of JSON for each
+thing that happens. A line that was cut short (a killed process, a full disk) counts for nothing.
+"""
+
+from __future__ import annotations
+
+import errno
+import importlib.metadata
+import json
+import os
+import platform
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, Any, Literal, Self
+
+from directshape_torch.errors import DataFormatError, DirectShapeError, RunInProgressError, shown
+from directshape_torch.files.read_files import parse_json, read_bytes
+from directshape_torch.files.schema import record_of
+
+try:
+    import fcntl
+except ImportError:  # only Unix has it; elsewhere nothing is locked, but the owner is named
+    fcntl = None  # type: ignore[assignment]
+
+LOG_SCHEMA_VERSION = 1
+RunState = Literal["checking", "running", "finished", "stopped"]
+_BEGINNING = b'{"schema": "directshape run", '
+# Not every system has them.
+_LOCK_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+_PACKAGES = ("directshape_torch", "torch", "numpy", "opencv-python-headless", "scipy")
+# What the last digits of a result depend on.
+_DIGITS = ("threads", "batch_frames", "device")
+
+
+class OutputLostError(DirectShapeError):
+    """The output folder takes nothing more."""
+
+    @classmethod
+    def told_by(cls, error: OSError, out_dir: Path) -> OutputLostError | None:
+        """For an error that says so, else None."""
+        if error.errno not in _DISK_IS_FULL:
+            return None
+        return cls(
+            f"cannot write to {out_dir} any more ({error.strerror or error}): make room there and run the same command "
+            "again; what is finished stays finished"
+        )
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
+
+
+@dataclass(frozen=True)
+class RunBeginning:
+    """The first line.
+
+    Attributes:
+        work: who works: "where" ("this process", "processes" or the address of a Ray cluster), "workers", "threads" of
+            each, "device", "batch_frames", "outputs".
+        num_frames: of the data set.
+        host, pid: the process that was started by the user.
+        started_at: seconds since 1970, like all times.
+        machine: operating system and processor.
+        versions: of Python and of the packages that compute.
+    """
+
+    work: Mapping[str, Any]
+    num_frames: int
+    host: str = field(default_factory=platform.node)
+    pid: int = field(default_factory=os.getpid)
+    started_at: float = field(default_factory=time.time)
+    machine: str = field(default_factory=lambda: f"{platform.system()} {platform.machine()}")
+    versions: Mapping[str, str] = field(default_factory=_versions)
+
+    @property
+    def is_alive(self) -> bool | None:
+        """Whether the process runs; None where it is on another machine."""
+        if self.host != platform.node():
+            return None
+        try:
+            os.kill(self.pid, 0)
+        except (ProcessLookupError, OverflowError):  # no process has such a number
+            return False
+        except PermissionError:  # it runs, but is somebody else's
+            return True
+        return True
+
+    @property
+    def owner(self) -> str:
+        """In words."""
+        since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.started_at))
+        return f"process {self.pid} on {self.host}, since {since}"
+
+
+@dataclass(frozen=True)
+class FrameLine:
+    """A frame has ended, well or for the given reason."""
+
+    frame: str
+    at: float
+    failure: str | None = None
+
+
+@dataclass(frozen=True)
+class _Refining:
+    """What earlier runs left has been checked: so many frames are done."""
+
+    resumed: int
+    at: float
+
+
+@dataclass(frozen=True)
+class _End:
+    """The last line: frames that are done, and why others are not."""
+
+    end: Literal["finished", "stopped"]
+    at: float
+    done: int
+    failed: Mapping[str, str]
+    reason: str | None
+
+
+@dataclass(frozen=True)
+class LogContents:
+    """What a log says of the latest run.
+
+    Attributes:
+        beginning: its first line.
+        state: as the run itself says; one that was killed says nothing.
+        frames: the ends of frames so far, by name.
+        num_resumed: frames that earlier runs had finished.
+        refining_since: when the first frame was begun, or None.
+        ended_at: or None.
+        num_done: frames that are done, those of earlier runs included.
+        failed: the others, with the reason.
+        reason: why the run was stopped, or None.
+    """
+
+    beginning: RunBeginning
+    state: RunState
+    frames: Mapping[str, FrameLine]
+    num_resumed: int
+    refining_since: float | None
+    ended_at: float | None
+    num_done: int
+    failed: Mapping[str, str]
+    reason: str | None
+
+
+class RunLog:
+    """Holds a folder while the body runs; the operating system lets go of it however the process ends.
+
+    Args:
+        out_dir: the output folder; made where it is missing.
+
+    Raises:
+        RunInProgressError: another process holds it.
+        DataFormatError: something else has the log's name.
+    """
+
+    def __init__(self, out_dir: Path) -> None:
+        self.out_dir, self.path = out_dir, log_path(out_dir)
+        self._file: IO[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        while self._file is None:
+            self._file = self._locked()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        file, self._file = self._file, None
+        if file is None:
+            return
+        try:
+            # A run that never began leaves no log. Removed before it is let go of, so that nobody locks a file that is
+            # about to vanish; of a moved folder it may be another run's by now.
+            with suppress(OSError):
+                if not os.fstat(file.fileno()).st_size and self._is_at_its_place(file):
+                    self.path.unlink()
+        finally:
+            file.close()
+
+    def begin(self, beginning: RunBeginning) -> None:
+        """Forget the run before and write the first line."""
+        assert self._file is not None, "the folder is held"
+        self._file.truncate(0)
+        start = json.loads(_BEGINNING.rstrip(b", ") + b"}")
+        self._append({**start, "schema_version": LOG_SCHEMA_VERSION, **asdict(beginning)})
+
+    def refining(self, resumed: int) -> None:
+        """What earlier runs left is checked."""
+        self._append(asdict(_Refining(resumed, time.time())))
+
+    def frame(self, frame_id: str, failure: str | None) -> None:
+        """A frame has ended."""
+        self._append(asdict(FrameLine(frame_id, time.time(), failure)))
+
+    def end(self, done: int, failed: Mapping[str, str], reason: str | None) -> None:
+        """The run has ended; of one that was stopped with the reason."""
+        self._append(asdict(_End("finished" if reason is None else "stopped", time.time(), done, dict(failed), reason)))
+
+    def _append(self, content: Mapping[str, Any]) -> None:
+        """All of a line or, where that fails, nothing."""
+        file = self._file
+        assert file is not None, "the folder is held"
+        length, rest = (
+            os.fstat(file.fileno()).st_size,
+            memoryview(json.dumps(content, allow_nan=False).encode() + b"\n"),
+        )
+        try:
+            while rest:
+                rest = rest[file.write(rest) :]
+        except OSError as error:
+            file.truncate(length)
+            if (lost := OutputLostError.told_by(error, self.out_dir)) is not None:
+                raise lost from error
+            raise
+
+    def _is_at_its_place(self, file: IO[bytes]) -> bool:
+        """Whether the path still leads to the file that is held."""
+        return os.path.samestat(os.fstat(file.fileno()), self.path.stat())
+
+    def _locked(self) -> IO[bytes] | None:
+        """The file, held; None where its last owner removed it in between."""
+        # A link is no lock: it would empty what it leads to.
+        try:
+            file = open(self.path, "a+b", buffering=0, opener=_opened)  # noqa: SIM115
+        except OSError as error:
+            problem = f"cannot be written ({error.strerror})"
+            raise DataFormatError(self.path, problem, cure="remove it, or choose another output folder") from error
+        try:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if self._is_at_its_place(file):
+                read_log(self.out_dir)
+                return file
+        except BlockingIOError as error:
+            file.close()
+            with suppress(DataFormatError):
+                log = read_log(self.out_dir)
+            owner = "its owner is not known" if log is None else log.beginning.owner
+            raise RunInProgressError(
+                f"{self.out_dir}: another run is writing here ({owner}); wait for it, stop it, or choose another "
+                "output folder ('directshape status' shows how far it is)"
+            ) from error
+        except FileNotFoundError:
+            pass
+        except DataFormatError:
+            file.close()
+            raise
+        file.close()
+        return None
+
+
+def _opened(path: str, flags: int) -> int:
+    return os.open(path, flags | _LOCK_FLAGS, 0o666)
+
+
+def log_path(out_dir: Path) -> Path:
+    """The file of an output folder."""
+    return out_dir / "run.jsonl"
+
+
+def read_log(out_dir: Path) -> LogContents | None:
+    """The latest run into a folder, also while it goes on; None where none has begun.
+
+    Raises:
+        DataFormatError: a file of that name is of another version, or not ours.
+    """
+    path = log_path(out_dir)
+    if not path.is_file():
+        return None
+    first, is_whole, rest = read_bytes(path).partition(b"\n")
+    if not is_whole and first[: len(_BEGINNING)] == _BEGINNING[: len(first)]:  # cut short, or not yet written
+        return None
+    beginning, frames = _beginning(path, first), dict[str, FrameLine]()
+    refining: _Refining | None = None
+    end: _End | None = None
+    for line in rest.splitlines():
+        found = _line(path, line)
+        if isinstance(found, FrameLine):
+            frames[found.frame] = found
+        elif isinstance(found, _Refining):
+            refining = found
+        elif found is not None:
+            end = found
+    resumed = 0 if refining is None else refining.resumed
+    failed = {name: line.failure for name, line in frames.items() if line.failure is not None}
+    return LogContents(
+        beginning,
+        end.end if end is not None else "checking" if refining is None else "running",
+        frames,
+        resumed,
+        None if refining is None else refining.at,
+        None if end is None else end.at,
+        resumed + len(frames) - len(failed) if end is None else end.done,
+        failed if end is None else end.failed,
+        None if end is None else end.reason,
+    )
+
+
+def _beginning(path: Path, line: bytes) -> RunBeginning:
+    cure = "remove it; results do not need it"
+    content = parse_json(path, line, cure)
+    if not isinstance(content, dict) or content.pop("schema", None) != "directshape run":
+        raise DataFormatError(path, "describes no run", cure=cure)
+    version = content.pop("schema_version", None)
+    if version != LOG_SCHEMA_VERSION:
+        raise DataFormatError(path, f"schema version is {shown(version)}, known is {LOG_SCHEMA_VERSION}", cure=cure)
+    return record_of(path, RunBeginning, content, cure)
+
+
+def _line(path: Path, line: bytes) -> FrameLine | _Refining | _End | None:
+    """None for one that was cut short."""
+    with suppress(DataFormatError):
+        content = parse_json(path, line)
+        kind = next((kind for name, kind in (("frame", FrameLine), ("resumed", _Refining)) if name in content), _End)
+        return record_of(path, kind, content)  # type: ignore[return-value]
+    return None
+
+
+def digit_warnings(before: RunBeginning | None, now: RunBeginning) -> tuple[str, ...]:
+    """What differs from the previous run so that the last digits of further results may differ too.
+
+    Examples:
+        >>> digit_warnings(RunBeginning({"threads": 1}, 5), RunBeginning({"threads": 2}, 5))
+        ('threads: 1 in the previous run, 2 now; the last digits of results may differ',)
+    """
+    if before is None:
+        return ()
+    was = {**before.versions, **{name: before.work.get(name) for name in _DIGITS}}
+    is_now = {**now.versions, **{name: now.work.get(name) for name in _DIGITS}}
+    return tuple(
+        f"{name}: {was.get(name)} in the previous run, {is_now[name]} now; the last digits of results may differ"
+        for name in is_now
+        if was.get(name) != is_now[name]
+    )

@@ -1,0 +1,302 @@
+"""The output folder of `directshape refine`, read frame by frame: the one reader of results.
+
+A frame is done when `data/NNNNNN.txt` and `shapes/NNNNNN.npz` exist and the latter says that the folder's manifest and
+the former's bytes belong to it. Both are written whole or not at all, so nothing else need be asked.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.names import is_frame_id
+from directshape_torch.files.read_files import parse_json, read_bytes
+from directshape_torch.files.schema import record_of
+from directshape_torch.geometry.box3d import rotation_about_y
+from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.result_files import ShapeArrays, read_shapes
+from directshape_torch.io.run_manifest import FrameEntry, hash_bytes, read_manifest
+from directshape_torch.status import Status
+
+COPIED = "copied"
+"""The status of lines of other classes, which a refinement leaves as they are."""
+
+_AGAIN = "refine the frame again"
+# Within the folder, whoever has written the name.
+_FILE = re.compile(r"(data|shapes|meshes|overlays)/[^/\\]+")
+
+
+def summary_path(out_dir: Path | str) -> Path:
+    """What the results of a folder were made of."""
+    return Path(out_dir) / "summary.json"
+
+
+def result_path(out_dir: Path | str, frame_id: str) -> Path:
+    """The KITTI result file of a frame."""
+    return Path(out_dir) / "data" / f"{frame_id}.txt"
+
+
+def shapes_path(out_dir: Path | str, frame_id: str) -> Path:
+    """The file of states and shapes of a frame."""
+    return Path(out_dir) / "shapes" / f"{frame_id}.npz"
+
+
+def overlay_path(out_dir: Path | str, frame_id: str) -> Path:
+    """The picture of a frame."""
+    return Path(out_dir) / "overlays" / f"{frame_id}.png"
+
+
+def mesh_path(out_dir: Path | str, frame_id: str, line_number: int, mesh_format: str) -> Path:
+    """The mesh file of one car; lines are counted from 1."""
+    return Path(out_dir) / "meshes" / f"{frame_id}_{line_number}.{mesh_format}"
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What the files of a frame were made of; `shapes/NNNNNN.npz` carries it.
+
+    Attributes:
+        run: hash of the manifest.
+        inputs: sha256 of the files of the data set, by their role.
+        outputs: kinds of files that the frame has: "data", "shapes", "meshes_ply", "meshes_glb", "overlays".
+        files: sha256 of each of them but the one that this stands in, by its path in the output folder.
+        lines: of the detection file.
+        masks_right: cars with a mask in the right image.
+    """
+
+    run: str
+    inputs: Mapping[str, str]
+    outputs: Sequence[str]
+    files: Mapping[str, str]
+    lines: int
+    masks_right: int
+
+    def files_of(self, outputs: Iterable[str]) -> dict[str, str]:
+        """Those of `files` that belong to some kinds of outputs."""
+        kinds = set(outputs)
+        return {name: sha256 for name, sha256 in self.files.items() if _kind(name) in kinds}
+
+    def text(self) -> str:
+        """For `ShapeArrays.made_of`."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+
+def _kind(name: str) -> str:
+    folder, _, file = name.partition("/")
+    return f"meshes_{file[-3:]}" if folder == "meshes" else folder
+
+
+def read_record(path: Path, shapes: ShapeArrays) -> FrameRecord:
+    """The record in the shapes of a frame.
+
+    Args:
+        path: the file of `shapes`, for messages.
+
+    Raises:
+        DataFormatError: there is none, or it names files outside of the output folder.
+    """
+    record = record_of(path, FrameRecord, parse_json(path, shapes.made_of, _AGAIN, "was not written by a run"), _AGAIN)
+    if wrong := [name for name in record.files if not _FILE.fullmatch(name)]:
+        raise DataFormatError(path, f"names a file {wrong[0][:80]!r}", cure=_AGAIN)
+    return record
+
+
+def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
+    """What `summary.json` says of a frame that is done."""
+    return {
+        "state": "done",
+        "lines": record.lines,
+        "cars": len(shapes.input_lines),
+        "masks_left": int(shapes.has_mask_left.sum()),
+        "masks_right": record.masks_right,
+        "ground_source": shapes.ground_source,
+        "statuses": dict(Counter(shapes.statuses)),
+    }
+
+
+@dataclass(frozen=True)
+class ResultObject:
+    """One result line with a 3D box, refined or not.
+
+    Attributes:
+        line: type, 2D box, score and whatever else the detector said.
+        status: name of the `Status` of a car, or "copied".
+        car: row in the frame's `ShapeArrays`, -1 for lines that are not in it.
+        R_ref_obj: (3, 3) axes of the object (forward, down, left) in `ref`; of a refined car with its tilt.
+        bottom_ref: (3,) bottom centre of the box in `ref`, metres.
+        hwl: (3,) height, width, length, metres.
+    """
+
+    line: KittiObject
+    status: str
+    car: int
+    R_ref_obj: NDArray[np.float64]
+    bottom_ref: NDArray[np.float64]
+    hwl: NDArray[np.float64]
+
+    @property
+    def is_refined(self) -> bool:
+        """Whether box and shape come from a refinement."""
+        return self.status != COPIED and Status[self.status].is_refined
+
+    @property
+    def centre_ref(self) -> NDArray[np.float64]:
+        """The centre (3,) of the box in `ref`, metres: half its height above the bottom centre."""
+        return np.asarray(self.bottom_ref - 0.5 * self.hwl[0] * self.R_ref_obj[:, 1])
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What a run left of one frame.
+
+    Attributes:
+        frame_id: the frame.
+        lines: every line of the result file.
+        shapes: states and shapes of its cars.
+        record: what it was made of.
+        mesh_files: the saved mesh of each car, or None.
+    """
+
+    frame_id: str
+    lines: tuple[KittiObject, ...]
+    shapes: ShapeArrays
+    record: FrameRecord
+    mesh_files: tuple[Path | None, ...] = ()
+
+    @property
+    def cars(self) -> list[KittiObject]:
+        """The result line of each car."""
+        by_number = {line.line_number: line for line in self.lines}
+        return [by_number[number] for number in self.shapes.input_lines.tolist()]
+
+    @property
+    def objects(self) -> tuple[ResultObject, ...]:
+        """The lines that have a 3D box, in their order."""
+        car_of_line = {number: car for car, number in enumerate(self.shapes.input_lines.tolist())}
+        boxes = [line for line in self.lines if line.has_box_3d]
+        return tuple(_object(line, car_of_line.get(line.line_number, -1), self.shapes) for line in boxes)
+
+    @property
+    def refined_cars(self) -> tuple[ResultObject, ...]:
+        """The objects that have a refined shape."""
+        return tuple(one for one in self.objects if one.is_refined)
+
+
+class RunFolder:
+    """An output folder of `directshape refine`, while the run goes on and after it was cut off too.
+
+    Args:
+        path: holds `summary.json`, `data` and `shapes`.
+        frames: ids to read, "000107" or as a number with zeros or without; default all that are done.
+
+    Attributes:
+        manifest: what its results were made of.
+        frame_ids: the chosen frames that are done, in order.
+
+    Raises:
+        DataFormatError: it is no such folder.
+        InputError: a frame that is asked for is not done.
+    """
+
+    def __init__(self, path: Path | str, frames: Iterable[str | int] | None = None) -> None:
+        self.path = Path(path)
+        manifest = read_manifest(summary_path(self.path))
+        if manifest is None:
+            cure = "give the folder of --out of 'directshape refine'"
+            raise DataFormatError(summary_path(self.path), "is missing", cure=cure)
+        self.manifest = manifest
+        self.frame_ids = tuple(_chosen(self.path, done_frames(self.path), frames))
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The types of objects that were refined."""
+        return tuple(self.setting("classes"))
+
+    def setting(self, name: str) -> Any:
+        """A setting of the run, by its name at the top of `config`.
+
+        Raises:
+            DataFormatError: the summary does not have it.
+        """
+        if name not in self.manifest.config:
+            raise DataFormatError(summary_path(self.path), f"has no setting {name!r}")
+        return self.manifest.config[name]
+
+    def read(self, frame_id: str) -> FrameResult:
+        """The results of a frame that is done.
+
+        Raises:
+            DataFormatError: a file is missing or damaged, or does not belong to the other, or to this run.
+        """
+        path = shapes_path(self.path, frame_id)
+        shapes = read_shapes(path)
+        record, text = read_record(path, shapes), result_path(self.path, frame_id)
+        if record.run != self.manifest.hash:
+            raise DataFormatError(path, f"was made with other settings than {summary_path(self.path)}", cure=_AGAIN)
+        if record.files.get(f"data/{text.name}") != hash_bytes(read_bytes(text)):
+            raise DataFormatError(text, f"has been changed, or does not belong to {path}", cure=_AGAIN)
+        lines = tuple(read_objects(text))
+        if not set(shapes.input_lines.tolist()) <= {line.line_number for line in lines}:
+            raise DataFormatError(text, f"lacks lines of {path}", cure=_AGAIN)
+        names = record.files_of(("meshes_ply", "meshes_glb"))
+        # "meshes/NNNNNN_LINE.ply"; a frame's name may hold an underscore too.
+        saved = {Path(name).stem.rpartition("_")[2]: self.path / name for name in names}
+        meshes = (saved.get(str(line)) for line in shapes.input_lines.tolist())
+        whole = tuple(mesh if mesh is not None and mesh.is_file() else None for mesh in meshes)
+        return FrameResult(frame_id, lines, shapes, record, whole)
+
+
+def done_frames(out_dir: Path) -> list[str]:
+    """Frames that have both of their files, in order."""
+    texts = {path.stem for path in (out_dir / "data").glob("*.txt")}
+    stems = (path.stem for path in (out_dir / "shapes").glob("*.npz"))
+    return sorted(stem for stem in stems if stem in texts and is_frame_id(stem))
+
+
+def _chosen(out_dir: Path, done: Sequence[str], wanted: Iterable[str | int] | None) -> list[str]:
+    """Of the frames that are done those that are meant by ids, or by numbers with leading zeros or without."""
+    if wanted is None:
+        return list(done)
+    # The ids after the numbers, so that they win.
+    known = {_number(name): name for name in done} | {name: name for name in done}
+    words = [str(one) for one in wanted]
+    missing = [word for word in words if word not in known and _number(word) not in known]
+    if missing:
+        raise InputError("frames", f"finished frames of {out_dir}", ", ".join(missing[:5]))
+    return sorted({known[word] if word in known else known[_number(word)] for word in words})
+
+
+def _number(word: str) -> str:
+    """A number without leading zeros; other names as they are."""
+    return word.lstrip("0") or "0" if word.isdecimal() else word
+
+
+def _object(line: KittiObject, car: int, shapes: ShapeArrays) -> ResultObject:
+    if car < 0:
+        R_ref_obj = rotation_about_y(torch.tensor(line.rotation_y, dtype=torch.float64)).numpy()
+        return ResultObject(line, COPIED, car, R_ref_obj, np.array(line.location_ref), np.array(line.hwl))
+    return ResultObject(
+        line=line,
+        status=shapes.statuses[car],
+        car=car,
+        R_ref_obj=_nearest_rotation(shapes.T_ref_obj[car, :3, :3]),
+        bottom_ref=shapes.boxes_location_ref[car].astype(np.float64),
+        hwl=shapes.boxes_hwl[car].astype(np.float64),
+    )
+
+
+def _nearest_rotation(R: NDArray[Any]) -> NDArray[np.float64]:
+    """A rotation kept in float32 is one to seven digits; other programs check more of them."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(R.astype(np.float64)).as_matrix())

@@ -1,0 +1,163 @@
+"""One run at a time in a folder, whoever was killed there before, and what its log says, wherever it is cut."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from directshape_torch.batch.run_log import OutputLostError, RunBeginning, RunLog, log_path, read_log
+from directshape_torch.errors import DataFormatError, RunInProgressError
+
+# Does not end by itself: holds the folder until it is killed.
+HOLDER = """
+import sys, time
+from pathlib import Path
+from directshape_torch.batch.run_log import RunBeginning, RunLog
+with RunLog(Path(sys.argv[1])) as log:
+    log.begin(RunBeginning({}, 3))
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_second_run_is_told_who_is_there_and_a_killed_one_holds_nothing(tmp_path: Path) -> None:
+    holder = subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(RunInProgressError, match=f"another run is writing here \\(process {holder.pid} on "):
+            RunLog(tmp_path).__enter__()
+        log = read_log(tmp_path)
+        assert log is not None
+        assert log.beginning.is_alive
+    finally:
+        holder.kill()
+        holder.communicate()
+    assert log.beginning.is_alive is False
+    with RunLog(tmp_path) as mine:
+        mine.begin(RunBeginning({}, 3))
+        now = read_log(tmp_path)
+        assert now is not None
+        assert (now.beginning.pid, now.beginning.host) == (os.getpid(), platform.node())
+
+
+def test_within_one_process_too(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "new"), pytest.raises(RunInProgressError, match="its owner is not known"):
+        RunLog(tmp_path / "new").__enter__()
+    assert not log_path(tmp_path / "new").exists()
+    with RunLog(tmp_path / "new"):
+        pass
+
+
+def test_processes_of_other_machines_are_not_judged() -> None:
+    assert RunBeginning({}, 1, host="elsewhere", pid=1).is_alive is None
+    assert RunBeginning({}, 1, pid=2**40).is_alive is False
+
+
+def written(out: Path) -> bytes:
+    """A log of three frames, one of which fails."""
+    with RunLog(out) as log:
+        log.begin(RunBeginning({"threads": 1}, 5))
+        log.refining(2)
+        for frame_id, failure in (("000000", None), ("000001", "cut short"), ("000002", None)):
+            log.frame(frame_id, failure)
+        log.end(4, {"000001": "cut short"}, None)
+    return log_path(out).read_bytes()
+
+
+def test_a_log_cut_anywhere_says_what_its_whole_lines_say(tmp_path: Path) -> None:
+    content = written(tmp_path)
+    states: list[tuple[str | None, int | None]] = []
+    for end in range(len(content) + 1):
+        log_path(tmp_path).write_bytes(content[:end])
+        log = read_log(tmp_path)
+        states.append((None, None) if log is None else (log.state, log.num_done))
+    in_order = list(dict.fromkeys(states))
+    assert in_order == [
+        (None, None),
+        ("checking", 0),
+        ("running", 2),
+        ("running", 3),
+        ("running", 4),
+        ("finished", 4),
+    ]
+    log = read_log(tmp_path)
+    assert log is not None
+    assert log.failed == {"000001": "cut short"}
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        ("7", "describes no run"),
+        ("[]\n", "describes no run"),
+        ('{"schema": "directshape run", "schema_version": 7}\n', "schema version is 7"),
+        ('{"schema": "directshape run", "schema_version": 1}\n', "is missing"),
+    ],
+)
+def test_files_of_other_programs_stay(tmp_path: Path, content: str, problem: str) -> None:
+    log_path(tmp_path).write_text(content)
+    with pytest.raises(DataFormatError, match=problem):
+        RunLog(tmp_path).__enter__()
+    assert log_path(tmp_path).read_text() == content
+
+
+def test_a_folder_whose_place_a_file_takes_holds_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with RunLog(out):
+        log_path(out).unlink()
+        out.rmdir()
+        out.write_text("a file")
+    out.unlink()
+    with RunLog(out):
+        assert log_path(out).exists()
+
+
+def test_what_a_full_disk_took_of_a_line_is_taken_back(tmp_path: Path) -> None:
+    class Disk:
+        """Takes ten bytes and no more."""
+
+        def __init__(self, file: object) -> None:
+            self.file, self.left = file, 10
+
+        def write(self, content: memoryview) -> int:
+            if not self.left:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            taken, self.left = self.left, 0
+            return int(self.file.write(content[:taken]))  # type: ignore[attr-defined]
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self.file, name)
+
+    with RunLog(tmp_path) as log:
+        log.begin(RunBeginning({}, 5))
+        whole, file = log_path(tmp_path).read_bytes(), log._file
+        log._file = Disk(file)  # type: ignore[assignment]
+        with pytest.raises(OutputLostError, match=r"No space left.*run the same command again"):
+            log.refining(2)
+        assert log_path(tmp_path).read_bytes() == whole
+        log._file = file
+        log.refining(2)
+    found = read_log(tmp_path)
+    assert found is not None
+    assert (found.state, found.num_resumed) == ("running", 2)
+
+
+def test_a_beginning_comes_back(tmp_path: Path) -> None:
+    assert read_log(tmp_path) is None
+    beginning = RunBeginning({"threads": 1, "outputs": ["data"]}, 5)
+    with RunLog(tmp_path) as log:
+        log.begin(beginning)
+        log.begin(replace(beginning, num_frames=6))
+    found = read_log(tmp_path)
+    assert found is not None
+    assert found.beginning == replace(beginning, num_frames=6)
+    assert len([json.loads(line) for line in log_path(tmp_path).read_text().splitlines()]) == 1
