@@ -48,7 +48,7 @@ class ConfigError(DirectShapeError, ValueError):
 
 
 class MeshError(DirectShapeError, ValueError):
-    """A mesh cannot be read or cannot be made solid."""
+    """A mesh cannot be made solid, or a field has no surface."""
 
 
 class ResumeError(DirectShapeError):

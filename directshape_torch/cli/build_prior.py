@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.errors import DirectShapeError, InputError, MeshError
+from directshape_torch.errors import DataFormatError, DirectShapeError, InputError, MeshError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -52,7 +52,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "prior, a report (.json) and a picture of the components (.png) beside it.",
     )
     parser.add_argument(
-        "--meshes", type=Path, required=True, help="folder of obj, ply, glb or off files, searched deep"
+        "--meshes", type=Path, required=True, help="folder of obj, ply, glb, off or stl files, searched deep"
     )
     parser.add_argument("--out", type=Path, required=True, help="npz file to write")
     parser.add_argument("--pattern", default="**/*", help="which files below the folder (default: %(default)s)")
@@ -130,7 +130,7 @@ def find_meshes(folder: Path, pattern: str) -> list[Path]:
     Raises:
         InputError: no such folder, or nothing that matches.
     """
-    from directshape_torch.shape.mesh_to_sdf import MESH_SUFFIXES
+    from directshape_torch.files.mesh_files import MESH_SUFFIXES
 
     if not folder.is_dir():
         raise InputError("--meshes", "a folder", str(folder))
@@ -155,7 +155,7 @@ def _read_meshes(
         name = str(file.relative_to(folder))
         try:
             grids[name] = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file, options), grid, options, name))
-        except MeshError as problem:
+        except (DataFormatError, MeshError) as problem:
             skipped[name] = str(problem)
     return grids, skipped
 

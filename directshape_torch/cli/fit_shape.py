@@ -57,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.io.velodyne import read_points
     from directshape_torch.shape.load_prior import load_prior
 
-    points, boxes = (torch.from_numpy(read(path)) for read, path in ((read_points, args.points), (_boxes, args.boxes)))
+    points, boxes = (
+        torch.from_numpy(read(path)) for read, path in ((read_points, args.points), (read_boxes, args.boxes))
+    )
     fit = fit_shape(points, boxes, args.convention, load_prior(args.prior))
     cars = fit.cars
     fitted = cars.to_boxes(args.convention, T_cam_boxes=torch.eye(4, dtype=boxes.dtype))
@@ -81,7 +83,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _boxes(path: Path) -> NDArray[np.float64]:
+def read_boxes(path: Path) -> NDArray[np.float64]:
+    """Boxes (B, 7) of a text file, seven numbers a line.
+
+    Raises:
+        DataFormatError: the file cannot be read, or a line holds something else.
+    """
     import numpy as np
 
     from directshape_torch.errors import DataFormatError

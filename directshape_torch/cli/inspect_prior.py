@@ -10,7 +10,7 @@ import torch
 from tqdm import tqdm
 
 from directshape_torch.cli.build_prior import find_meshes
-from directshape_torch.errors import InputError, MeshError
+from directshape_torch.errors import DataFormatError, InputError, MeshError
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.parametric_cars import BODY_TYPES, car_sdf, sample_car
@@ -66,7 +66,7 @@ def _real_cars(prior: ShapePrior, folder: Path, options: MeshOptions) -> list[Fi
         name = str(file.relative_to(folder).with_suffix(""))
         try:
             truth = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file, options), grid, options, name))
-        except MeshError as problem:
+        except (DataFormatError, MeshError) as problem:
             print(f"skipped: {problem}", file=sys.stderr)
             continue
         fitted.append(fit_car(prior, truth, name))

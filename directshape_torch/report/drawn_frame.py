@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.batch.mesh_files import T_GLTF_CAM
-from directshape_torch.errors import DataFormatError
+from directshape_torch.files.mesh_files import read_mesh
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
 from directshape_torch.io.run_folder import FrameResult
@@ -120,18 +120,10 @@ def saved_mesh(path: Path, T_cam_obj: Array) -> ObjectMesh:
     Raises:
         DataFormatError: no readable mesh.
     """
-    import trimesh
-
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
-    except (ValueError, KeyError, IndexError, OSError) as error:
-        raise DataFormatError(path, f"is no readable mesh ({error})", cure="refine the frame again") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise DataFormatError(path, "is no mesh", cure="refine the frame again")
-    vertices_cam = np.asarray(mesh.vertices, dtype=np.float64)
+    vertices_cam, faces = read_mesh(path, cure="refine the frame again")
     if path.suffix == ".glb":
         vertices_cam = vertices_cam @ T_GLTF_CAM[:3, :3]
-    return ObjectMesh((vertices_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3], np.asarray(mesh.faces))
+    return ObjectMesh((vertices_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3], faces)
 
 
 def frame_t_cam_ref(result: FrameResult) -> Tensor:

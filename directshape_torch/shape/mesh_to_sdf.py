@@ -6,6 +6,8 @@ that solid is sampled at the nodes of a coarser grid.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError, MeshError
+from directshape_torch.files.mesh_files import read_mesh
 from directshape_torch.numerics.checks import check_positive
 
 if TYPE_CHECKING:
@@ -22,10 +25,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Voxels = NDArray[np.bool_]
 
-MESH_SUFFIXES = (".obj", ".ply", ".glb", ".off")
 _AXES = {sign + axis: k for k, axis in enumerate("xyz") for sign in "+-"}
 # A solid car fills 60 to 85 percent of its convex hull; a shell that the flood entered fills a few percent.
 _LEAST_SHARE_OF_HULL = 0.4
+# Distance transforms need some twenty bytes for each.
+_MOST_VOXELS = 2**27
+_POINTS_AT_ONCE = 2**21
 
 
 @dataclass(frozen=True)
@@ -91,18 +96,11 @@ def load_mesh_obj(path: Path | str, options: MeshOptions | None = None) -> trime
     """Read a mesh file and place it in the object frame: x forward, y down, centred in x and z, lowest point at y = 0.
 
     Raises:
-        MeshError: the file cannot be read or holds no triangles.
+        DataFormatError: the file cannot be read or holds no triangles.
     """
     import trimesh
 
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as problem:  # the loaders of the formats raise whatever their parsers raise
-        raise MeshError(f"{path}: cannot be read as a mesh ({type(problem).__name__}: {problem})") from problem
-    has_faces = isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0 and mesh.vertices.shape[1] == 3
-    if not has_faces or not np.isfinite(mesh.vertices).all():
-        raise MeshError(f"{path}: holds no triangles with finite vertices")
-    return place_mesh(mesh, options or MeshOptions())
+    return place_mesh(trimesh.Trimesh(*read_mesh(path), process=False), options or MeshOptions())
 
 
 def place_mesh(mesh: trimesh.Trimesh, options: MeshOptions) -> trimesh.Trimesh:
@@ -113,7 +111,7 @@ def place_mesh(mesh: trimesh.Trimesh, options: MeshOptions) -> trimesh.Trimesh:
     R_obj_file = np.stack([forward, -up, np.cross(forward, -up)])
     vertices = options.scale * np.asarray(mesh.vertices, dtype=np.float64) @ R_obj_file.T
     if options.length_m is not None:
-        vertices *= options.length_m / np.ptp(vertices[:, 0])
+        vertices *= options.length_m / max(np.ptp(vertices[:, 0]), 1e-9)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices -= [0.5 * (low[0] + high[0]), high[1], 0.5 * (low[2] + high[2])]
     return trimesh.Trimesh(vertices, mesh.faces, process=False)
@@ -174,7 +172,8 @@ def mesh_to_sdf(
 def _check_fits(mesh_obj: trimesh.Trimesh, grid: GridSpec, name: str) -> None:
     low = np.array(grid.origin)
     high = low + grid.spacing_m * (np.array(grid.shape) - 1)
-    if (mesh_obj.bounds[0] < low).any() or (mesh_obj.bounds[1] > high).any():
+    # Also where sizes have become infinite.
+    if not ((mesh_obj.bounds[0] >= low).all() and (mesh_obj.bounds[1] <= high).all()):
         raise MeshError(
             f"{name}: extents {np.round(mesh_obj.bounds, 2).tolist()} m leave the grid {low.round(2).tolist()} to "
             f"{high.round(2).tolist()} m; check axes and scale, or normalise the length"
@@ -189,7 +188,10 @@ def _voxelise(mesh_obj: trimesh.Trimesh, grid: GridSpec, options: MeshOptions) -
     # Symmetric about the middle plane and covering the grid, so that both halves are sampled alike.
     high[2] = max(high[2], -grid.origin[2] + room)
     low = np.minimum(np.array(grid.origin) - room, [np.inf, np.inf, -high[2]])
-    shape = np.ceil((high - low) / options.voxel_m).astype(int) + 1
+    shape = [math.ceil(size) + 1 for size in (high - low) / options.voxel_m]
+    if math.prod(shape) > _MOST_VOXELS:
+        got = f"{math.prod(shape)} by {options.voxel_m:g} m"
+        raise InputError("voxel_m", f"at most {_MOST_VOXELS} voxels", got, "raise it, or lower closing_m")
     voxels = np.zeros(shape, dtype=bool)
     for points in _surface_points(mesh_obj, half_cell):
         index = np.floor((points - low) / options.voxel_m + 0.5).astype(int)
@@ -197,18 +199,19 @@ def _voxelise(mesh_obj: trimesh.Trimesh, grid: GridSpec, options: MeshOptions) -
     return voxels, low
 
 
-def _surface_points(mesh_obj: trimesh.Trimesh, step_m: float) -> list[Array]:
-    """Points on all triangles, on barycentric lattices at most `step_m` apart."""
+def _surface_points(mesh_obj: trimesh.Trimesh, step_m: float) -> Iterator[Array]:
+    """Points on all triangles, on barycentric lattices at most `step_m` apart, some million at a time."""
     triangles = np.asarray(mesh_obj.triangles, dtype=np.float64)
     longest = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
     divisions = np.maximum(np.ceil(longest / step_m).astype(int), 1)
-    parts = []
     for count in np.unique(divisions):
         i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
         keep = i + j <= count
         weights = np.stack([i[keep], j[keep], count - i[keep] - j[keep]], axis=1) / count
-        parts.append(np.einsum("wk,tkc->twc", weights, triangles[divisions == count]).reshape(-1, 3))
-    return parts
+        chosen = triangles[divisions == count]
+        at_once = max(_POINTS_AT_ONCE // len(weights), 1)
+        for first in range(0, len(chosen), at_once):
+            yield np.einsum("wk,tkc->twc", weights, chosen[first : first + at_once]).reshape(-1, 3)
 
 
 def _solid(surface: Voxels, mesh_obj: trimesh.Trimesh, options: MeshOptions, name: str) -> Voxels:

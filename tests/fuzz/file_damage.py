@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import random
+import struct
 import zipfile
 from typing import Any
 
@@ -32,7 +33,9 @@ def damaged(content: bytes, name: str, chance: random.Random) -> bytes:
         return _archive(content, chance)
     if name.endswith(".png"):
         return _image(content, chance)
-    if name.endswith((".txt", ".yaml", ".obj", ".jsonl")):
+    if name.endswith(".glb"):
+        return _scene(content, chance)
+    if name.endswith((".txt", ".yaml", ".obj", ".off", ".jsonl")):
         return _text(content.decode(), chance)
     return _bytes(content, chance)
 
@@ -100,6 +103,15 @@ def _archive(content: bytes, chance: random.Random) -> bytes:
         with zipfile.ZipFile(file, "a") as archive:
             archive.writestr("extra", b"x")
     return file.getvalue()
+
+
+def _scene(content: bytes, chance: random.Random) -> bytes:
+    """Its description changed, its numbers as they are."""
+    (length,) = struct.unpack_from("<I", content, 12)
+    text = json.dumps(_node(json.loads(content[20 : 20 + length]), chance)).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    return content[:8] + struct.pack("<II", 20 + len(text) + len(rest), len(text)) + content[16:20] + text + rest
 
 
 def _image(content: bytes, chance: random.Random) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+import trimesh
 from helpers.kitti_folder import FRAMES
 from helpers.layouts import SEQUENCE, write_folder, write_raw, write_sequence
 from helpers.quick_runs import dataset, refine
@@ -20,8 +22,11 @@ from helpers.synthetic_scene import cached_street
 
 from directshape_torch import load_config
 from directshape_torch.batch.run_status import format_status, read_status
+from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.diagnosis.trust_model import load_trust_model
+from directshape_torch.errors import MeshError
 from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, read_tracks, write_tracks
+from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.disparity_files import read_disparity, write_disparity
 from directshape_torch.io.instance_masks import MaskSource
@@ -38,7 +43,7 @@ from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
-from directshape_torch.shape.mesh_to_sdf import load_mesh_obj
+from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 
 ASSETS = Path(load_prior.__code__.co_filename).parents[1] / "assets"
 FRAME = FRAMES[0]
@@ -92,9 +97,18 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         shutil.copyfile(ASSETS / name, folder / Path(name).name)
     corners = "v 0 0 0\nv 4 0 0\nv 0 2 0\nv 0 0 2\n"
     (folder / "mesh.obj").write_text(f"{corners}f 1 2 3\nf 1 4 2\nf 2 4 3\nf 1 3 4\n")
+    for suffix in ("ply", "glb", "off", "stl"):
+        trimesh.Trimesh(*read_mesh(folder / "mesh.obj"), process=False).export(folder / f"mesh.{suffix}")
+    (folder / "boxes.txt").write_text("10 2 -1 3.9 1.6 1.5 0.3\n" * 3)
 
     def scan(path: Path) -> object:
         return read_scan(path, read_calibration(calibration), street.frames.camera)
+
+    def solid(path: Path) -> object:
+        grid, options = GridSpec.for_cars(0.5), MeshOptions(voxel_m=0.1)
+        with suppress(MeshError):
+            return mesh_to_sdf(load_mesh_obj(path, options), grid, options)
+        return None
 
     return {
         "times": (folder / "times.txt", read_timestamps),
@@ -109,7 +123,8 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "points": (folder / "points.npy", read_points),
         "network": (folder / "neural_prior.safetensors", load_prior),
         "prior": (root / "prior.npz", load_prior),
-        "mesh": (folder / "mesh.obj", load_mesh_obj),
+        "boxes": (folder / "boxes.txt", read_boxes),
+        **{f"mesh {suffix[1:]}": (folder / f"mesh{suffix}", solid) for suffix in MESH_SUFFIXES},
         "trust": (folder / "trust_model.json", load_trust_model),
         "settings": (folder / "fast.yaml", load_config),
     }

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from directshape_torch.errors import InputError, MeshError
+from directshape_torch.errors import DataFormatError, InputError, MeshError
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 
 GRID = GridSpec.for_cars(0.2)
@@ -75,7 +75,7 @@ def test_too_large_mesh_names_its_extents():
         mesh_to_sdf(box_on_the_ground().apply_scale(2.0), GRID)
 
 
-@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "off"])
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "off", "stl"])
 def test_axes_units_and_length(tmp_path, suffix):
     # In the file: front towards -y, up towards +x, centimetres, moved away from the origin; a mark shows the front.
     file_box = trimesh.creation.box((150.0, 400.0, 180.0))
@@ -93,9 +93,9 @@ def test_axes_units_and_length(tmp_path, suffix):
 def test_unreadable_files_and_options(tmp_path):
     broken = tmp_path / "broken.ply"
     broken.write_text("not a mesh")
-    with pytest.raises(MeshError, match=r"broken\.ply"):
+    with pytest.raises(DataFormatError, match=r"broken\.ply"):
         load_mesh_obj(broken)
-    with pytest.raises(MeshError, match=r"missing\.obj"):
+    with pytest.raises(DataFormatError, match=r"missing\.obj"):
         load_mesh_obj(tmp_path / "missing.obj")
     with pytest.raises(InputError, match="up_axis: expected another axis"):
         MeshOptions(forward_axis="+x", up_axis="-x")
