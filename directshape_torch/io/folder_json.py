@@ -19,7 +19,7 @@ _RIG_KEYS = frozenset(
 )
 _FRAME_KEYS = frozenset({"schema_version", "objects", "labels", "ground_plane", "times_s", "comment"})
 _BOX_KEYS = ("dimensions_hwl_m", "bottom_center_m", "rotation_y_rad")
-_OBJECT_KEYS = frozenset({"class", "score", "box_2d", "mask_left", "mask_right", *_BOX_KEYS})
+_OBJECT_KEYS = frozenset({"class", "score", "box_2d", "mask_left", "mask_right", "track_id", *_BOX_KEYS})
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ class FolderObject:
         bottom_center_cam: of the box, metres; None without a 3D box.
         rotation_y: heading as in KITTI, radians; None without a 3D box.
         masks: for "left" and "right" the path of a PNG, a COCO segmentation, or None.
+        track_id: number of the car over the frames, -1 where there is none.
     """
 
     object_class: str
@@ -61,6 +62,7 @@ class FolderObject:
     bottom_center_cam: tuple[float, float, float] | None
     rotation_y: float | None
     masks: Mapping[str, Any]
+    track_id: int
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,16 @@ def _object(path: Path, where: str, entry: Mapping[str, Any]) -> FolderObject:
         None if center is None else (center[0], center[1], center[2]),
         _number(path, f"{where}: rotation_y_rad", entry["rotation_y_rad"]) if present else None,
         {side: entry.get(f"mask_{side}") for side in ("left", "right")},
+        _track(path, where, entry.get("track_id", -1)),
     )
+
+
+def _track(path: Path, where: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= 2**31:
+        raise DataFormatError(
+            path, f"{where}: 'track_id' is {shown(value)}, expected a whole number", cure="-1 for none"
+        )
+    return value
 
 
 def _read_object(path: Path, keys: frozenset[str]) -> Mapping[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -136,6 +136,10 @@ class FolderLayout:
         """The calibration of the frame; its format does not place a scanner, so a scan is refused by name."""
         return self.calibration(frame_id)
 
+    def sequence_of(self, frame_id: str) -> str:
+        """All frames are of one drive."""
+        return ""
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """Those of the frame's file, where it has them."""
         return self._frame(frame_id).times_s
@@ -155,7 +159,7 @@ class FolderLayout:
     def _kitti_object(self, path: Path, number: int, entry: FolderObject, with_score: bool) -> KittiObject:
         line = f"{entry.object_class} -1 -1 {self._columns(path, entry)}"
         text = f"{line} {entry.score!r}" if with_score else line
-        return parse_object(path, Line(number, text, text))
+        return replace(parse_object(path, Line(number, text, text)), track_id=entry.track_id)
 
     def _columns(self, path: Path, entry: FolderObject) -> str:
         """Observation angle, 2D box and 3D box of a line."""

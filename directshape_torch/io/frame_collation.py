@@ -41,7 +41,7 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
         disparity=_disparities([item.frame.disparity for item in loaded], size_hw),
         points_cam=_points([item.frame.points_cam for item in loaded]),
     )
-    return frame, _detections([item.detections for item in loaded], size_hw)
+    return frame, _detections([item.detections for item in loaded], size_hw, _tracks(loaded))
 
 
 def _largest_size(loaded: Sequence[LoadedFrame]) -> tuple[int, int]:
@@ -121,7 +121,19 @@ def _grounds(grounds: Sequence[GroundPlane]) -> GroundPlane:
     )
 
 
-def _detections(parts: Sequence[Detections], size_hw: tuple[int, int]) -> Detections:
+def _tracks(loaded: Sequence[LoadedFrame]) -> Tensor | None:
+    """(B,) those of one sequence as they are; of several sequences so that none is that of another."""
+    tracks = _known_rows(
+        [(d.track_id, torch.full_like(d.frame_index, -1)) for d in (item.detections for item in loaded)]
+    )
+    places = {sequence: place for place, sequence in enumerate(dict.fromkeys(item.sequence for item in loaded))}
+    if tracks is None or len(places) == 1:
+        return tracks
+    place = torch.cat([torch.full_like(item.detections.frame_index, places[item.sequence]) for item in loaded])
+    return torch.where(tracks < 0, tracks, tracks * len(places) + place)
+
+
+def _detections(parts: Sequence[Detections], size_hw: tuple[int, int], track_id: Tensor | None) -> Detections:
     rows = {
         name: torch.cat([getattr(part, name) for part in parts])
         for name in ("T_cam_obj", "dimensions_hwl", "box_2d", "score", "has_mask_left", "has_mask_right")
@@ -134,7 +146,7 @@ def _detections(parts: Sequence[Detections], size_hw: tuple[int, int]) -> Detect
         occluders=_occluders(occluders, size_hw),
         pose_sigma=_known_rows([(p.pose_sigma, p.T_cam_obj.new_full((len(p), 4), torch.inf)) for p in parts]),
         offset_sigma_px=_known_rows([(p.offset_sigma_px, torch.zeros_like(p.T_cam_obj[:, 0, 0])) for p in parts]),
-        track_id=_known_rows([(p.track_id, torch.full_like(p.frame_index, -1)) for p in parts]),
+        track_id=track_id,
         **rows,
     )
 

@@ -29,12 +29,14 @@ class MatchingSummary:
     Attributes:
         instance_left, instance_right: (B,) instance ids of the file, -1 for none.
         overlap_left, overlap_right: (B,) overlap of the boxes that decided, 0 for none.
+        track_left: (B,) track of the left mask, -1 for none.
     """
 
     instance_left: tuple[int, ...]
     instance_right: tuple[int, ...]
     overlap_left: tuple[float, ...]
     overlap_right: tuple[float, ...]
+    track_left: tuple[int, ...] = ()
 
 
 def build_detections(
@@ -201,4 +203,5 @@ def _summary(by_side: dict[Side, list[InstanceMask]], matches: dict[Side, MaskMa
     def overlaps(side: Side) -> tuple[float, ...]:
         return tuple(float(value) for value in matches[side].overlap)
 
-    return MatchingSummary(ids("left"), ids("right"), overlaps("left"), overlaps("right"))
+    tracks = tuple(by_side["left"][k].track_id if k >= 0 else -1 for k in matches["left"].mask_of_detection)
+    return MatchingSummary(ids("left"), ids("right"), overlaps("left"), overlaps("right"), tracks)

@@ -84,6 +84,10 @@ class FrameLayout(Protocol):
         """The calibration that places the scanner in the camera, where its format can."""
         ...
 
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence of frames that follow each other, "" where there is but one; None: a frame by itself."""
+        ...
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """When the left and the right image were taken, seconds from any start, or None where no file says so."""
         ...

@@ -36,6 +36,7 @@ class InstanceMask:
         mask_box: the smallest box around the mask, whole pixels, both ends belonging to it.
         probability: (H, W), bool or float32 foreground probability in [0, 1].
         score: the segmentation's, 1 where there is none.
+        track_id: number of the car over the frames of its sequence, -1 where `instance_id` is of one frame alone.
     """
 
     side: Side
@@ -46,6 +47,7 @@ class InstanceMask:
     mask_box: tuple[float, float, float, float]
     probability: NDArray[np.bool_] | NDArray[np.float32]
     score: float
+    track_id: int = -1
 
 
 class MaskSource(Protocol):

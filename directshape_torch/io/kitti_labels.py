@@ -34,6 +34,7 @@ class KittiObject:
         score: the detector's, or None in a label.
         raw_line: the line as it is in the file, without its newline.
         line_number: from 1.
+        track_id: number of the car over the frames of its sequence, -1 where the file has none.
     """
 
     type: str
@@ -47,6 +48,7 @@ class KittiObject:
     score: float | None
     raw_line: str
     line_number: int
+    track_id: int = -1
 
     @property
     def has_box_3d(self) -> bool:

@@ -55,6 +55,10 @@ class KittiTextLayout(ABC):
         """The calibration of the frame, which places the scanner too."""
         return self.calibration(frame_id)
 
+    def sequence_of(self, frame_id: str) -> str | None:
+        """None: frames of many streets."""
+        return None
+
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """None: no file of this layout says so."""
         return None

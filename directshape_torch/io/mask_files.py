@@ -31,6 +31,7 @@ COCO_CAR_IDS = frozenset({3})
 PNG_CAR_IDS = frozenset({1, 26})
 _MOTS_IGNORE_CLASS = 10
 _IDS_PER_CLASS = 1000
+_TRACKING_FOLDERS = ("instance_02", "instance_03")
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ class InstancePngMasks:
     Attributes:
         directory: the folder that holds both, or the left one alone.
         car_ids: classes that are cars.
-        folders: names of the two; `instance_02` and `instance_03` in the layout of tracking sequences.
+        folders: names of the two; `instance_02` and `instance_03` in the layout of tracking sequences, whose instances
+            are tracks.
     """
 
     directory: Path
@@ -107,7 +109,8 @@ class InstancePngMasks:
             mask = ids == value
             box = tight_box(mask)
             if box is not None:
-                yield InstanceMask(side, value, category, category in self.car_ids, box, box, mask, 1.0)
+                track = value % _IDS_PER_CLASS if self.folders == _TRACKING_FOLDERS else -1
+                yield InstanceMask(side, value, category, category in self.car_ids, box, box, mask, 1.0, track)
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,7 @@ def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> 
     directory = Path(directory)
     if not directory.is_dir():
         raise DataFormatError(directory, "is not a folder of masks", cure="give the folder of NNNNNN.json files")
-    for folders in (("instance_2", "instance_3"), ("instance_02", "instance_03")):
+    for folders in (("instance_2", "instance_3"), _TRACKING_FOLDERS):
         if (directory / folders[0]).is_dir():
             return InstancePngMasks(directory, PNG_CAR_IDS if car_ids is None else frozenset(car_ids), folders)
     return FrameJsonMasks(directory, COCO_CAR_IDS if car_ids is None else frozenset(car_ids))

@@ -148,6 +148,10 @@ class SequenceLayout(KittiTextLayout):
             return None
         return self._tracked(sequence.labels, stem)
 
+    def sequence_of(self, frame_id: str) -> str:
+        """The prefix of the frame, where there are several sequences."""
+        return "" if self._single else self._split(frame_id)[0].name
+
     def disparity_path(self, folder: Path, frame_id: str) -> Path:
         """`folder/NNNNNN.png`, and of several sequences `folder/SEQUENCE/NNNNNN.png`."""
         sequence, stem = self._split(frame_id)

@@ -25,6 +25,7 @@ class LoadedFrame:
         refined_rows: for each input line the index of its detection, or -1 for lines to copy as they are.
         labels: the ground truth, or None where there is no label file.
         matching: which masks were found for the detections, for reports.
+        sequence: whose frames the tracks of the detections go through; see `StereoDataset.sequence_of`.
     """
 
     frame: FrameBatch
@@ -33,6 +34,7 @@ class LoadedFrame:
     refined_rows: tuple[int, ...]
     labels: list[KittiObject] | None
     matching: MatchingSummary
+    sequence: str | None = None
 
     @property
     def frame_id(self) -> str:
@@ -98,6 +100,10 @@ class StereoDataset(Protocol):
         Raises:
             DataFormatError: their file is missing or damaged.
         """
+        ...
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence through which the tracks of a frame go, "" where there is but one; None: it has no tracks."""
         ...
 
     def detection_path(self, frame_id: str) -> Path:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Self, TypedDict, get_args
 
@@ -12,20 +14,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.files.names import check_frame_id
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.disparity_files import read_disparity
-from directshape_torch.io.frame_detections import build_detections
+from directshape_torch.io.frame_detections import MatchingSummary, build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
+from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene import FrameBatch, GroundPlane
 
@@ -43,6 +46,7 @@ class DatasetOptions(TypedDict, total=False):
     disparity_field: DisparityField | Sequence[DisparityField] | None
     disparity_dir: Path | str | None
     lidar_dir: Path | str | None
+    tracks: bool
     dtype: torch.dtype
 
 
@@ -63,11 +67,14 @@ class FileStereoDataset:
             methods that fit a point cloud; None: they match the images themselves.
         lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, which the calibration of the frames places; None: frames
             come without points.
+        tracks: number the cars over the frames of a sequence (`Detections.track_id`): by the detection files, else by
+            the masks of KITTI MOTS, else by `associate`.
         dtype: of the tensors.
 
     Raises:
         DataFormatError: a folder or the split file is missing.
-        InputError: no frames, frames without a detection file, or an unknown `ground`.
+        InputError: no frames, frames without a detection file, an unknown `ground`, or tracks in a layout without
+            sequences.
     """
 
     def __init__(
@@ -83,6 +90,7 @@ class FileStereoDataset:
         disparity_field: DisparityField | Sequence[DisparityField] | None = None,
         disparity_dir: Path | str | None = None,
         lidar_dir: Path | str | None = None,
+        tracks: bool = False,
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if ground not in get_args(GroundSource):
@@ -104,6 +112,10 @@ class FileStereoDataset:
         self.lidar_dir = None if lidar_dir is None else existing_folder(Path(lidar_dir), "is no folder of LiDAR scans")
         self.dtype = dtype
         self.frame_ids = self._choose_frames(split, frames)
+        self.tracks = tracks
+        if tracks and self.layout.sequence_of(self.frame_ids[0]) is None:
+            raise InputError("tracks", "a layout of sequences: tracking, raw or folder", "frames by themselves")
+        self._tracks: dict[str | None, dict[str, list[int]]] = {}
 
     def __len__(self) -> int:
         return len(self.frame_ids)
@@ -138,7 +150,10 @@ class FileStereoDataset:
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
         given = self.layout.given_masks(frame_id) if self._own_masks else None
         detections, rows, matching = build_detections(objects, masks, camera, (height, width), self.classes, given)
-        return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), matching)
+        if self.tracks:
+            detections = replace(detections, track_id=self._track_id(frame_id, rows, matching))
+        sequence = self.sequence_of(frame_id)
+        return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), matching, sequence)
 
     def changed(
         self, *, ground: GroundSource, disparity_field: DisparityField | Sequence[DisparityField] | None
@@ -151,6 +166,10 @@ class FileStereoDataset:
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The detections of a frame alone, without its images."""
         return self.layout.objects(frame_id)
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence of the frame, where tracks are wanted."""
+        return self.layout.sequence_of(frame_id) if self.tracks else None
 
     def detection_path(self, frame_id: str) -> Path:
         """The file that holds the detections of a frame."""
@@ -175,6 +194,29 @@ class FileStereoDataset:
         if self.masks is not None:
             files |= {f"masks_{index}": path for index, path in enumerate(self.masks.files(frame_id))}
         return files
+
+    def _track_id(self, frame_id: str, rows: tuple[int, ...], matching: MatchingSummary) -> Tensor:
+        """(B,) of the detections: by the masks, else by the detections themselves."""
+        if any(track >= 0 for track in matching.track_left):
+            return torch.tensor(matching.track_left)
+        sequence = self.sequence_of(frame_id)
+        if sequence not in self._tracks:
+            self._tracks[sequence] = self._tracks_of(sequence)
+        ids = self._tracks[sequence][frame_id]
+        return torch.tensor([track for track, row in zip(ids, rows, strict=True) if row >= 0], dtype=torch.int64)
+
+    def _tracks_of(self, sequence: str | None) -> dict[str, list[int]]:
+        """Of all frames of a sequence, whichever of them are used: those of its files, or associated."""
+        objects: dict[str, list[KittiObject]] = {}
+        for frame_id in self.layout.frame_ids():
+            if self.layout.sequence_of(frame_id) == sequence:
+                # A file that cannot be read is reported when its turn comes.
+                with contextlib.suppress(DirectShapeError, OSError):
+                    objects[frame_id] = self.objects(frame_id)
+        given = {frame_id: [found.track_id for found in frame] for frame_id, frame in objects.items()}
+        if any(track >= 0 for ids in given.values() for track in ids):
+            return given
+        return dict(zip(objects, associate(list(objects.values())), strict=True))
 
     def _choose_frames(self, split: Path | str | None, frames: Iterable[str | int] | None) -> tuple[str, ...]:
         if split is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError
@@ -14,7 +15,7 @@ _MOST_DIGITS = 9
 
 
 def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
-    """The objects of every frame number that occurs; their `raw_line` leaves frame and track out.
+    """The objects of every frame number that occurs, with their tracks; their `raw_line` leaves frame and track out.
 
     Args:
         path: of a label file (17 columns) or a result file (18 columns, the score last).
@@ -25,14 +26,19 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
     frames: dict[int, list[KittiObject]] = {}
     for line in read_lines(path):
         words = line.text.split()
-        if len(words) not in (17, 18) or not words[0].isdecimal() or len(words[0]) > _MOST_DIGITS:
+        if len(words) not in (17, 18) or not _is_number(words[0]) or not _is_number(words[1].removeprefix("-")):
             raise DataFormatError(
                 path,
-                f"expected 17 or 18 columns beginning with the frame's number, got {len(words)}",
+                f"expected 17 or 18 columns beginning with the numbers of frame and track, got {len(words)}",
                 line_number=line.number,
                 line=line.text,
                 cure=f"write one object a line: {_COLUMNS}",
             )
         text = " ".join(words[_LEADING:])
-        frames.setdefault(int(words[0]), []).append(parse_object(path, Line(line.number, text, text)))
+        found = replace(parse_object(path, Line(line.number, text, text)), track_id=int(words[1]))
+        frames.setdefault(int(words[0]), []).append(found)
     return frames
+
+
+def _is_number(word: str) -> bool:
+    return word.isdecimal() and len(word) <= _MOST_DIGITS
