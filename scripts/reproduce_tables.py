@@ -1,12 +1,10 @@
-"""The paper's experiments, one command each: pose, shape, ablation, detectors.
+"""The paper's experiments, one command each: pose, ablation.
 
     export DIRECTSHAPE_DATA=...                      # or --data ROOT, a full KITTI with detections and masks
     python scripts/reproduce_tables.py pose          # AP before and after: ours, the geometric baseline, both together
-    python scripts/reproduce_tables.py shape         # completeness, accuracy, F1 and RMSE over tau
     python scripts/reproduce_tables.py ablation      # scripts/paper_tables/ablation_rows.py, row by row
-    python scripts/reproduce_tables.py detectors     # every detector
 
-Which folders a data set has: scripts/paper_tables/data_sets.py. Written to --out: NAME.md, NAME_*.csv, plots,
+Which folders a data set has: scripts/paper_tables/data_sets.py. Written to --out: NAME.md, NAME_*.csv,
 NAME_manifest.json (options, seeds, versions, hashes of the runs), and under runs/ every refinement, as `directshape
 refine` writes it. Refinements are kept: a second call makes tables only, and one that was stopped goes on. They are
 told apart by settings, prior, stereo field and masks, not by the program's code: after a change of that, choose another
@@ -25,35 +23,26 @@ from command_line import run_command
 from paper_tables.ablation_rows import ROWS
 from paper_tables.ablation_table import make_ablation_table
 from paper_tables.data_sets import DataSet, find_data_sets
-from paper_tables.detector_table import make_detector_table
 from paper_tables.disparity_fields import field_file
 from paper_tables.experiment import Experiment
 from paper_tables.pose_table import make_pose_table
 from paper_tables.refinements import Refinery
 from paper_tables.report import Report
-from paper_tables.shape_table import make_shape_table
 
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.comparison_summary import BootstrapSettings
 
 TABLES: dict[str, Callable[[Experiment], None]] = {
     "pose": make_pose_table,
-    "shape": make_shape_table,
     "ablation": make_ablation_table,
-    "detectors": make_detector_table,
 }
 
 
-def stereo_field(data_set: DataSet, choice: str, table: str, out: Path) -> Path | None:
-    """The residual disparity field that a table uses for a data set.
-
-    "auto" fits it: from disparity maps, but for shapes, which are judged by these, from LiDAR.
-    """
+def stereo_field(data_set: DataSet, choice: str, out: Path) -> Path | None:
+    """The residual disparity field of a data set; "auto" fits it from disparity maps."""
     if choice == "none":
         return None
-    if choice != "auto":
-        return Path(choice)
-    return field_file(data_set.root, "lidar" if table == "shape" else "disparity", out)
+    return field_file(data_set.root, "disparity", out) if choice == "auto" else Path(choice)
 
 
 def chosen_data_sets(args: argparse.Namespace) -> tuple[DataSet, ...]:
@@ -78,7 +67,7 @@ def run(args: argparse.Namespace) -> None:
     """Make one experiment's tables."""
     torch.set_num_threads(args.threads)
     data_sets = chosen_data_sets(args)
-    fields = {d.name: stereo_field(d, args.stereo_bias, args.table, args.out / "fields") for d in data_sets}
+    fields = {d.name: stereo_field(d, args.stereo_bias, args.out / "fields") for d in data_sets}
     options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
     for name in ("data", "out", "masks"):
         # Results do not depend on where the files lie.

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.errors import DataFormatError, DirectShapeError, InputError, MeshError
+from directshape_torch.errors import DataFormatError, InputError, MeshError
+from directshape_torch.files import atomic_files
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -49,7 +48,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "build-prior",
         help="make a shape prior from a folder of car meshes",
         description="Make meshes solid, sample their signed distance and keep the principal components. Writes the "
-        "prior, a report (.json) and a picture of the components (.png) beside it.",
+        "prior and a report (.json) beside it; 'inspect --prior FILE' draws its shapes.",
     )
     parser.add_argument(
         "--meshes", type=Path, required=True, help="folder of obj, ply, glb, off or stl files, searched deep"
@@ -105,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     prior.save(args.out)
     report = _make_report(prior, samples, tuple(grids), skipped)
-    _write_beside(args.out, prior, report)
+    atomic_files.write_json(args.out.with_suffix(".json"), asdict(report))
     print(_report_text(args.out, report))
     return 3 if skipped else 0
 
@@ -179,24 +178,11 @@ def _make_report(prior: PCAShapePrior, samples: Tensor, names: tuple[str, ...], 
     )
 
 
-def _write_beside(out: Path, prior: PCAShapePrior, report: PriorReport) -> None:
-    import cv2
-
-    from directshape_torch.visualize.prior_pictures import prior_picture
-
-    temporary = out.with_name(f".{out.stem}.{os.getpid()}.json")
-    temporary.write_text(json.dumps(asdict(report), indent=2) + "\n", encoding="utf-8")
-    os.replace(temporary, out.with_suffix(".json"))
-    picture = out.with_suffix(".png")
-    if not cv2.imwrite(str(picture), prior_picture(prior)):
-        raise DirectShapeError(f"{picture}: the picture could not be written")
-
-
 def _report_text(out: Path, report: PriorReport) -> str:
     shares = " ".join(f"{100 * share:.1f}" for share in report.explained_variance_ratio)
     sizes = zip(report.mean_height_width_length_m, report.std_height_width_length_m, strict=True)
     lines = [
-        f"{out}: {report.num_codes} components of {report.num_meshes} meshes (report .json and picture .png beside it)",
+        f"{out}: {report.num_codes} components of {report.num_meshes} meshes (report .json beside it)",
         f"explained variance, %: {shares} (sum {100 * sum(report.explained_variance_ratio):.1f})",
         f"leave-one-out error within 7 cm of the surface: {report.leave_one_out_error_cm:.2f} cm "
         f"(mean over {report.leave_one_out_num_cars} cars)",

@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.options import RefineOptions
     from directshape_torch.batch.refine_dataset import refine_dataset
     from directshape_torch.batch.run_summary import format_summary
-    from directshape_torch.cli.demo_report import error_table, write_observation_sheets, write_scene
+    from directshape_torch.cli.demo_report import error_table, write_scene
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.cli.refine import make_refiner
     from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -53,10 +53,8 @@ def run(args: argparse.Namespace) -> int:
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
         write_scene(args.out / "scene.glb", loaded, args.out, refiner.prior)
-        write_observation_sheets(args.out / "observation", loaded, refiner.config.sampling)
         print(error_table(loaded, args.out))
     print(format_summary(summary))
     print(f"picture  {args.out / 'overlays' / f'{dataset.frame_ids[0]}.png'}")
-    print(f"pixels   {args.out / 'observation'}, what was sampled of each car, and what hides it")
     print(f"scene    {args.out / 'scene.glb'}")
     return summary.exit_code

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 
 from directshape_torch.batch.mesh_files import scene_bytes
-from directshape_torch.config import SamplingConfig
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
-from directshape_torch.files.atomic_files import write_bytes, write_png
+from directshape_torch.evaluation.text_table import align
+from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
@@ -38,16 +38,16 @@ def error_table(loaded: LoadedFrame, out_dir: Path) -> str:
     statuses = read_shapes(shapes_path(out_dir, loaded.frame_id)).statuses
     labels = loaded.labels or []
     partners = match_to_labels(before, labels)
-    rows = [("car", "depth", "centre [m]", "yaw [deg]", "BEV IoU", "status")]
+    rows = [["car", "depth", "centre [m]", "yaw [deg]", "BEV IoU", "status"]]
     pairs = [car for car, partner in enumerate(partners) if partner >= 0]
     true = [labels[partners[car]] for car in pairs]
     errors = [_errors([objects[car] for car in pairs], true) for objects in (before, after)]
     for row, car in enumerate(pairs):
         depth = f"{true[row].location_ref[2]:.1f} m"
-        rows.append((str(before[car].line_number), depth, *_columns(errors, [row]), statuses[car]))
+        rows.append([str(before[car].line_number), depth, *_columns(errors, [row]), statuses[car]])
     if pairs:
-        rows.append(("mean", "", *_columns(errors, range(len(pairs))), ""))
-    return _aligned(rows)
+        rows.append(["mean", "", *_columns(errors, range(len(pairs))), ""])
+    return align(rows)
 
 
 def write_scene(path: Path, loaded: LoadedFrame, out_dir: Path, prior: ShapePrior) -> None:
@@ -84,20 +84,3 @@ def _columns(errors: Sequence[PoseErrors], rows: Sequence[int]) -> tuple[str, st
         return " -> ".join(f"{value:{decimals + 3}.{decimals}f}" for value in values)
 
     return change("centre_m", 2), change("yaw_deg", 1), change("bev_iou", 2)
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    return "\n".join("  ".join(f"{word:<{w}}" for word, w in zip(row, widths, strict=True)).rstrip() for row in rows)
-
-
-def write_observation_sheets(folder: Path, loaded: LoadedFrame, config: SamplingConfig) -> None:
-    """One picture `NNNNNN_LINE.png` a car with a left mask: its sampled pixels and what hides it."""
-    from directshape_torch.visualize.observation_sheet import observation_sheet
-
-    folder.mkdir(parents=True, exist_ok=True)
-    for car, row in enumerate(loaded.row_of_detection):
-        if bool(loaded.detections.has_mask_left[car]):
-            line = loaded.input_objects[row].line_number
-            sheet = observation_sheet(loaded.frame, loaded.detections, car, config)
-            write_png(folder / f"{loaded.frame_id}_{line}.png", sheet)

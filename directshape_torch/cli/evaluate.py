@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         write_scores_json(args.json, scores)
     if args.plots is not None:
-        from directshape_torch.cli.evaluate_plots import write_plots
+        from directshape_torch.cli.evaluate_plots import write_recall_plots
 
-        write_plots(args.plots, scores)
+        write_recall_plots(args.plots, scores)
     return 0

@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     if args.csv is not None:
         write_shape_scores_csv(args.csv, scores.cars)
     if args.plots is not None:
-        from directshape_torch.cli.evaluate_shape_plots import write_plots
+        from directshape_torch.cli.evaluate_plots import write_tau_plots
 
-        write_plots(args.plots, scores)
+        write_tau_plots(args.plots, scores)
     return 0

@@ -23,7 +23,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.visualize.inspection.car_figures import write_car_figures
 from directshape_torch.visualize.inspection.car_view import CarView
-from directshape_torch.visualize.inspection.point_figure import stereo_points
+from directshape_torch.visualize.inspection.point_figures import stereo_points
 from directshape_torch.visualize.overlay import overlay_of_frame
 
 

@@ -17,7 +17,7 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.status import Status
-from directshape_torch.visualize.inspection.residual_values import (
+from directshape_torch.visualize.inspection.residual_figure import (
     CarResiduals,
     PixelResiduals,
     car_residuals,

@@ -70,6 +70,11 @@ def figure_png(figure: Any) -> bytes:
     return content.getvalue()
 
 
+def write_figure(path: Path | str, figure: Any) -> None:
+    """Write a figure of `new_figure` as PNG."""
+    atomic_files.write_bytes(path, figure_png(figure))
+
+
 def figure_picture(figure: Any) -> NDArray[np.uint8]:
     """A figure of `new_figure` as pixels (h, w, 3), RGB, for animations.
 

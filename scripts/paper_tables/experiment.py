@@ -42,10 +42,6 @@ class Experiment:
     quick: bool
     only_groups: tuple[str, ...] = ()
 
-    @property
-    def plots(self) -> Path:
-        return self.report.folder / "plots"
-
     def detectors_of(self, data_set: DataSet) -> dict[str, Path]:
         """Folders of detections by name, those that the user chose."""
         chosen = data_set.detections if self.detectors is None else self.detectors

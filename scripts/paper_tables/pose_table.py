@@ -1,4 +1,4 @@
-"""The paper's table of average precisions and its figure of precision over recall, for every detector and method."""
+"""The paper's table of average precisions, for every detector and method."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 from directshape_torch.evaluation.comparison import Comparison
 from directshape_torch.evaluation.kitti_ap import KittiScores
 from directshape_torch.evaluation.kitti_curve import NUM_RECALL_POINTS
-from directshape_torch.visualize.precision_recall import RecallCurve, RecallPanel, write_recall_plot
 from paper_tables.average_precision import Average, ap_scores, long_rows, paper_columns, paper_row
 from paper_tables.data_sets import DataSet
 from paper_tables.experiment import Experiment
@@ -22,7 +21,7 @@ _AVERAGES: dict[Average, str] = {
 
 
 def make_pose_table(experiment: Experiment) -> None:
-    """Refine with every method, score, compare, plot."""
+    """Refine with every method, score, compare."""
     rows: list[dict[str, Any]] = []
     for data_set in experiment.data_sets:
         # Labels given as results have no error to take away; the table of detectors has them.
@@ -46,8 +45,6 @@ def _one_detector(experiment: Experiment, data_set: DataSet, name: str, detectio
     for average, meaning in _AVERAGES.items():
         experiment.report.add(_ap_table(f"{heading}: {meaning}", scores, average))
     experiment.report.add(_box_table(f"{heading}: boxes of counted cars with a mask", comparisons))
-    for iou in (0.5, 0.7):
-        _plot(experiment.plots / f"pose_{data_set.name}_{name}_3d_{iou}.png", f"{data_set.name}, {name}", scores, iou)
     return [
         row for method, s in scores.items() for row in long_rows(s, set=data_set.name, detections=name, after=method)
     ]
@@ -94,19 +91,3 @@ def _cell(key: str, estimate: Any) -> str:
         return f"{100 * estimate.value:.1f} %"
     unit = {"centre_m_median": " m", "yaw_deg_median": " deg"}.get(key, "")
     return f"{estimate.value:.2f}{unit}" if key == "yaw_deg_median" else f"{estimate.value:.3f}{unit}"
-
-
-def _plot(path: Path, name: str, scores: dict[str, KittiScores], iou: float) -> None:
-    """As the paper's figure: a panel for each difficulty, a line for each method."""
-    panels = [
-        RecallPanel(
-            f"{difficulty}, 3D IoU > {iou}",
-            "precision",
-            tuple(
-                RecallCurve(method.replace("`", ""), s.score("3d", iou, difficulty).curve.precision)
-                for method, s in scores.items()
-            ),
-        )
-        for difficulty in ("easy", "moderate", "hard")
-    ]
-    write_recall_plot(path, panels, name)

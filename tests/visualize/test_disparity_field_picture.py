@@ -7,7 +7,7 @@ import torch
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.visualize.disparity_field_picture import draw_disparity_field
+from directshape_torch.visualize.rig_picture import draw_disparity_field
 
 SIZE = (200, 80)
 TITLE_PX = 34

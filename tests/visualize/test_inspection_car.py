@@ -21,12 +21,14 @@ from directshape_torch.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.drawing import Surface, View, silhouette_mask
 from directshape_torch.visualize.inspection.car_view import CarView, KnownPoints
-from directshape_torch.visualize.inspection.cost_figure import costs_of_car
-from directshape_torch.visualize.inspection.drift_figure import distance_course
-from directshape_torch.visualize.inspection.iteration_animation import animation_frames
-from directshape_torch.visualize.inspection.known_point_figure import write_known_point_figure
-from directshape_torch.visualize.inspection.point_figure import point_sets, shape_points_cam, stereo_points
-from directshape_torch.visualize.inspection.residual_values import car_residuals
+from directshape_torch.visualize.inspection.course_figures import animation_frames, costs_of_car, distance_course
+from directshape_torch.visualize.inspection.point_figures import (
+    point_sets,
+    shape_points_cam,
+    stereo_points,
+    write_known_point_figure,
+)
+from directshape_torch.visualize.inspection.residual_figure import car_residuals
 from directshape_torch.visualize.inspection.sampling_figure import sampled_pixels
 
 _CAR = 1

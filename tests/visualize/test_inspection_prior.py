@@ -5,21 +5,25 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.parametric_cars import car_sdf, sample_car
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.prior_quality import fit_code
-from directshape_torch.visualize.inspection.field_views import (
+from directshape_torch.visualize.inspection.prior_figures import code_frames, code_path
+from directshape_torch.visualize.inspection.prior_fit import fit_car, grid_of
+from directshape_torch.visualize.inspection.shape_figure import (
     FRONT_VIEW,
     coloured_surface,
     distance_at,
     section,
+    shaded_view,
     surface_colours,
 )
-from directshape_torch.visualize.inspection.prior_animation import code_frames, code_path
-from directshape_torch.visualize.inspection.prior_fit import fit_car, grid_of
+
+PAINT = np.array([60.0, 130.0, 205.0])
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +106,21 @@ def test_animation_has_a_frame_a_code_and_moves(prior: PCAShapePrior) -> None:
     assert still.shape == moved.shape
     assert (still != moved).any(axis=2).mean() > 0.02
     assert np.array_equal(still, still_again)
+
+
+def test_silhouette_of_a_box_has_its_size() -> None:
+    # 3 x 1 m at 52 pixels per metre: 156 x 52 pixels, give or take the border.
+    box = trimesh.creation.box((3.0, 1.0, 1.5)).apply_translation((0.0, -0.5, 0.0))
+    image = shaded_view(np.asarray(box.vertices), np.asarray(box.faces), 0.0, 0.0, PAINT)
+    rows, columns = np.nonzero((image < 255).any(axis=2))
+    assert np.ptp(columns) == pytest.approx(156, abs=2)
+    assert np.ptp(rows) == pytest.approx(52, abs=2)
+
+
+def test_the_front_is_to_the_right_and_a_shape_has_faces() -> None:
+    box = trimesh.creation.box((1.0, 0.5, 0.5)).apply_translation((1.0, -0.7, 0.0))
+    image = shaded_view(np.asarray(box.vertices), np.asarray(box.faces), 0.0, 0.0, PAINT)
+    columns = np.nonzero((image < 255).any(axis=(0, 2)))[0]
+    assert columns.min() > image.shape[1] / 2
+    with pytest.raises(InputError, match="faces"):
+        shaded_view(np.zeros((3, 3)), np.zeros((0, 3), dtype=int), 0.0, 0.0, PAINT)

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from directshape_torch.visualize.inspection.car_view import CarView
-from directshape_torch.visualize.inspection.contour_figure import write_contour_figure
-from directshape_torch.visualize.inspection.cost_figure import write_cost_figure
-from directshape_torch.visualize.inspection.drift_figure import write_drift_figure
-from directshape_torch.visualize.inspection.iteration_animation import write_iteration_animation
-from directshape_torch.visualize.inspection.known_point_figure import write_known_point_figure
-from directshape_torch.visualize.inspection.point_figure import write_point_figure
+from directshape_torch.visualize.inspection.course_figures import (
+    write_contour_figure,
+    write_cost_figure,
+    write_drift_figure,
+    write_iteration_animation,
+)
+from directshape_torch.visualize.inspection.point_figures import write_known_point_figure, write_point_figure
 from directshape_torch.visualize.inspection.residual_figure import write_residual_figure
 from directshape_torch.visualize.inspection.sampling_figure import write_occlusion_picture, write_sampling_figure
 from directshape_torch.visualize.inspection.shape_figure import write_shape_figure

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.files import atomic_files
-from directshape_torch.io.figure_files import figure_png
 from directshape_torch.visualize.drawing import Picture
-from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
-from directshape_torch.visualize.inspection.shape_in_image import Window
+from directshape_torch.visualize.inspection.car_view import CarView, Window, footprint_of_corners
 
 Array = NDArray[np.float64]
 Ink = Any  # whatever matplotlib takes for a colour
@@ -22,11 +18,6 @@ DETECTOR_INK, TRUTH_INK, MASK_INK, BEFORE_INK, AFTER_INK = "darkorange", "limegr
 _BIRDS_EYE_MARGIN_M = 0.7
 # Points of the road would cover the cars.
 _LEAST_HEIGHT_M = 0.2
-
-
-def write_figure(path: Path | str, figure: Any) -> None:
-    """Write a figure of `new_figure` as PNG."""
-    atomic_files.write_bytes(path, figure_png(figure))
 
 
 def iteration_inks(count: int) -> list[Ink]:

@@ -1,4 +1,4 @@
-"""Pictures of sampling and occlusion: their size, their colours where the scene is known, and clear errors."""
+"""Pictures of occlusion: their size, their colours where the scene is known, and clear errors."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ import torch
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.observation.sampling import PixelSelection
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane
-from directshape_torch.visualize.sampling_picture import (
-    GREEN,
+from directshape_torch.visualize.inspection.sampling_figure import (
     OCCLUDER_COLOURS,
     PANEL_GAP_PX,
-    RED,
     occlusion_picture,
-    sampling_picture,
 )
 
 REGIONS = torch.tensor([[0, 0, 20, 20], [10, 10, 40, 30], [0, 0, 0, 0]])
@@ -42,22 +38,6 @@ def two_cars() -> tuple[FrameBatch, Detections]:
         torch.zeros(3, dtype=torch.long), poses, torch.ones(3, 3), boxes, torch.ones(3), masks, masks, present, present
     )
     return frames, detections
-
-
-def test_sampling_picture_colours_and_leaves_hidden_pixels_out() -> None:
-    frames, detections = two_cars()
-    selection = PixelSelection(
-        torch.tensor([0, 1, 1, 1]),
-        torch.tensor([[3, 3], [30, 12], [25, 25], [12, 12]]),
-        torch.tensor([True, True, False, True]),
-    )
-    picture = sampling_picture(frames, detections, REGIONS, selection, 1, scale=8)
-    assert picture.shape == (160, 240, 3)
-    assert picture.dtype == np.uint8
-    assert picture[20, 164].tolist() == list(GREEN)  # (30, 12): (12 - 10 + 0.5) * 8 = 20, (30 - 10 + 0.5) * 8 = 164
-    assert picture[124, 124].tolist() == list(RED)  # (25, 25)
-    assert picture[20, 20].tolist() == [128, 128, 128]  # (12, 12) is hidden by the near car
-    assert (picture.reshape(-1, 3) == np.array(GREEN)).all(axis=1).sum() < 64
 
 
 def test_occlusion_picture_shows_three_panels() -> None:

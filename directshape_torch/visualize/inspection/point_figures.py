@@ -1,4 +1,4 @@
-"""Points on a car: from dense stereo, from the refined shape, and true ones (paper, figure of the point clouds)."""
+"""Points on a car: by dense stereo, of the refined shape, true ones (paper, point clouds); a scan over the image."""
 
 from __future__ import annotations
 
@@ -10,14 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.config import PointCloudConfig
+from directshape_torch.errors import InputError
 from directshape_torch.geometry.camera import rays_from_pixels
-from directshape_torch.io.figure_files import new_figure
+from directshape_torch.io.figure_files import new_figure, write_figure
 from directshape_torch.observation.car_points import car_points
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.visualize.inspection.car_view import CarView
-from directshape_torch.visualize.inspection.field_views import COLOURS, distance_at, distance_scale
-from directshape_torch.visualize.inspection.panels import AFTER_INK, write_figure
+from directshape_torch.visualize.inspection.panels import (
+    AFTER_INK,
+    BEFORE_INK,
+    draw_footprint,
+    draw_lines,
+    show_birds_eye,
+    show_crop,
+)
+from directshape_torch.visualize.inspection.shape_figure import COLOURS, distance_at, distance_scale
 
 Array = NDArray[np.float64]
 
@@ -129,3 +137,37 @@ def _frame(axes: Any, places: list[Array], vertical: int, is_first: bool) -> Non
         axes.set_ylabel("y, down [m]" if vertical == 1 else "z, left [m]")
     axes.set_facecolor("0.93")
     axes.grid(alpha=0.4)
+
+
+_SCAN_INCHES = (12.0, 4.6)
+# Depth about the car that the colours tell apart.
+_DEPTH_RANGE_M = 6.0
+
+
+def write_known_point_figure(path: Path | str, view: CarView) -> None:
+    """Write the figure as PNG: points coloured by depth over the image, and all of them from above.
+
+    Raises:
+        InputError: the view has no known points.
+        MissingDependencyError: matplotlib is not installed.
+    """
+    points = view.known_points
+    if points is None:
+        raise InputError("view", "a car of a frame with a scan or another source of true points", "none")
+    figure = new_figure(*_SCAN_INCHES, "drawing scan points")
+    figure.suptitle(f"{view.title}; {points.name}, {int(points.of_car.sum())} points on the car")
+    image, above = figure.subplots(1, 2, width_ratios=[3, 2])
+    u0, v0, u1, v1 = window = view.window("left")
+    show_crop(image, view.image("left"), window, dimmed=True)
+    inside = ((points.uv >= (u0, v0)) & (points.uv < (u1, v1))).all(axis=1)
+    depth = float(view.centre_cam(len(view.trace) - 1)[1])
+    limits = {"vmin": depth - _DEPTH_RANGE_M / 2, "vmax": depth + _DEPTH_RANGE_M / 2}
+    dots = image.scatter(*points.uv[inside].T, c=points.points_cam[inside, 2], s=6, cmap="turbo", **limits)
+    figure.colorbar(dots, ax=image, label="depth [m]", extend="both", shrink=0.8)
+    show_birds_eye(above, view)
+    for number, name, ink in ((0, "before", BEFORE_INK), (len(view.trace) - 1, "after", AFTER_INK)):
+        draw_lines(image, view.contours("left", number), ink, name, linewidth=1.5)
+        draw_footprint(above, view.footprint(number), ink, name, linewidth=1.5)
+    image.legend(loc="lower left", fontsize=8)
+    above.legend(loc="upper left", fontsize=8)
+    write_figure(path, figure)

@@ -1,0 +1,269 @@
+"""The course of a refinement: contours and boxes of every state, costs, an animation, the drift without photometry."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.io.figure_files import figure_picture, new_figure, write_animation, write_figure
+from directshape_torch.io.instance_masks import SIDES
+from directshape_torch.visualize.drawing import Picture
+from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
+from directshape_torch.visualize.inspection.panels import (
+    DETECTOR_INK,
+    MASK_INK,
+    draw_footprint,
+    draw_lines,
+    iteration_inks,
+    show_birds_eye,
+    show_crop,
+)
+
+_CONTOUR_INCHES = (11.5, 4.6)
+
+
+def write_contour_figure(path: Path | str, view: CarView) -> None:
+    """Write the figure as PNG: the instance mask is the dotted line, the colour tells the iteration.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure(*_CONTOUR_INCHES, "drawing iterations")
+    figure.suptitle(view.title)
+    image, above = figure.subplots(1, 2, width_ratios=[3, 2])
+    inks = iteration_inks(len(view.steps))
+    show_crop(image, view.image("left"), view.window("left"), f"projected contour of {len(view.steps)} states")
+    draw_lines(image, view.mask_lines("left"), MASK_INK, "mask", linewidth=1.3, linestyle=":")
+    show_birds_eye(above, view, [view.footprint(k) for k in view.steps])
+    detector = footprint_of_corners(view.detector_corners_cam)
+    draw_footprint(above, detector, DETECTOR_INK, "detection", linewidth=1.2, linestyle="--")
+    for place, number in enumerate(view.steps):
+        width = 1.8 if place in (0, len(view.steps) - 1) else 0.8
+        draw_lines(image, view.contours("left", number), inks[place], linewidth=width)
+        draw_footprint(above, view.footprint(number), inks[place], linewidth=width)
+    _add_iteration_bar(figure, above, view.steps)
+    image.legend(loc="lower left", fontsize=8, facecolor="0.3", labelcolor="white")
+    above.legend(loc="upper left", fontsize=8)
+    write_figure(path, figure)
+
+
+def _add_iteration_bar(figure: Any, axes: Any, steps: list[int]) -> None:
+    """A bar of the colours that the states have, with the iterations that they come from."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    edges = [k - 0.5 for k in range(len(steps) + 1)]
+    colours = ScalarMappable(BoundaryNorm(edges, len(steps)), ListedColormap(iteration_inks(len(steps))))
+    bar = figure.colorbar(colours, ax=axes, label="iteration", ticks=range(len(steps)))
+    bar.set_ticklabels([str(k) for k in steps], fontsize=7)
+
+
+_COST_INCHES = (8.5, 4.4)
+# Of the largest total: terms below are not worth their decades of the axis.
+_LEAST_SHARE = 1e-4
+
+
+def costs_of_car(view: CarView) -> dict[str, NDArray[np.float64]]:
+    """Cost (N + 1,) of each term by its name, at the final stage's settings, and their "sum"."""
+    costs = view.trace.costs[:, view.car].cpu().numpy()
+    named = dict(zip(view.trace.result.term_names, costs.T, strict=True))
+    return {**named, "sum": costs.sum(axis=1)}
+
+
+def stage_beginnings(stage: Sequence[int]) -> list[float]:
+    """Places between the states where a later stage than the first begins.
+
+    Examples:
+        >>> stage_beginnings([-1, 0, 0, 1, 1])
+        [2.5]
+    """
+    return [k - 0.5 for k in range(1, len(stage)) if stage[k] != stage[k - 1] and stage[k] > 0]
+
+
+def write_cost_figure(path: Path | str, view: CarView) -> None:
+    """Write the figure as PNG: all costs are those of the final stage, so a step of an earlier stage may raise them.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure(*_COST_INCHES, "drawing costs")
+    axes = figure.subplots()
+    costs, iterations = costs_of_car(view), np.arange(len(view.trace))
+    for name, values in costs.items():
+        style = {"color": "black", "linewidth": 2.2} if name == "sum" else {"linewidth": 1.4}
+        axes.plot(iterations, values, label=name, **style)
+    accepted = view.trace.accepted[:, view.car].cpu().numpy()
+    refused = ~accepted
+    refused[0] = False
+    axes.plot(
+        iterations[refused], costs["sum"][refused], "x", color="0.5", markersize=5, label="step refused, or car done"
+    )
+    for number, place in enumerate(stage_beginnings(view.trace.stage)):
+        axes.axvline(place, color="0.6", linestyle=":", label=None if number else "next stage")
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=_LEAST_SHARE * costs["sum"].max())
+    axes.set(xlabel="iteration", ylabel="cost at the final stage's settings", title=view.title)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8)
+    write_figure(path, figure)
+
+
+_ANIMATION_INCHES = (13.5, 3.3)
+_SECONDS_A_STEP, _SECONDS_AT_END = 0.35, 2.5
+
+
+def write_iteration_animation(path: Path | str, view: CarView) -> None:
+    """Write the GIF: contour in both images, box from above, and costs, for every state that the car moved to.
+
+    Raises:
+        MissingDependencyError: matplotlib or Pillow is not installed.
+    """
+    frames = animation_frames(view)
+    seconds = [_SECONDS_A_STEP] * (len(frames) - 1) + [_SECONDS_AT_END]
+    write_animation(path, frames, seconds)
+
+
+def animation_frames(view: CarView) -> list[Picture]:
+    """One picture (h, w, 3) for each of `view.steps`."""
+    figure = new_figure(*_ANIMATION_INCHES, "drawing an animation")
+    panels = figure.subplots(1, 4, width_ratios=[2.7, 2.7, 1.9, 1.7])
+    *images, above, costs = panels
+    for axes, side in zip(images, SIDES, strict=True):
+        show_crop(axes, view.image(side), view.window(side), side)
+        draw_lines(axes, view.mask_lines(side), MASK_INK, linewidth=1.2, linestyle=":")
+    figure.suptitle(view.title, fontsize=9)
+    show_birds_eye(above, view, [view.footprint(k) for k in view.steps])
+    _draw_cost_curves(costs, view)
+    # The parts find their places once: they would dance if every picture were laid out anew.
+    figure_picture(figure)
+    figure.set_layout_engine("none")
+    return [_frame(figure, panels, view, place) for place in range(len(view.steps))]
+
+
+def _frame(figure: Any, panels: Sequence[Any], view: CarView, place: int) -> Picture:
+    inks, number = iteration_inks(len(view.steps)), view.steps[place]
+    known = [(axes, len(axes.lines)) for axes in panels]
+    *images, above, costs = panels
+    figure.suptitle(f"{view.title}, iteration {number}", fontsize=9)
+    for axes, side in zip(images, SIDES, strict=True):
+        draw_lines(axes, view.contours(side, number), inks[place], linewidth=2.0)
+    for earlier in range(place):
+        draw_footprint(above, view.footprint(view.steps[earlier]), inks[earlier], linewidth=0.5)
+    draw_footprint(above, view.footprint(number), inks[place], linewidth=2.0)
+    costs.axvline(number, color="crimson", linewidth=1.0)
+    picture = figure_picture(figure)
+    for axes, count in known:
+        for line in list(axes.lines)[count:]:
+            line.remove()
+    return picture
+
+
+def _draw_cost_curves(axes: Any, view: CarView) -> None:
+    for name, values in costs_of_car(view).items():
+        if name in ("sum", "photometric") or name.startswith("silhouette"):
+            axes.plot(values, color="black" if name == "sum" else None, label=name, linewidth=1.2)
+    axes.set_ylim(bottom=0)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.set(xlabel="iteration", title="cost")
+    axes.grid(alpha=0.3)
+    # Costs may stay high or fall to nothing, but hardly stay half-way.
+    axes.legend(fontsize=7, loc="center right")
+
+
+_DRIFT_INCHES = (14.5, 5.6)
+_INKS = {"silhouettes alone": "crimson", "all terms": "royalblue"}
+
+
+def distance_course(view: CarView) -> NDArray[np.float64]:
+    """How far the middle of the car's footprint lies from the true one after each iteration, metres.
+
+    From the input's own, where there is no truth.
+    """
+    reference = view.centre_cam(0)
+    if view.truth_corners_cam is not None:
+        reference = footprint_of_corners(view.truth_corners_cam).mean(axis=0)
+    return np.array([np.linalg.norm(view.centre_cam(k) - reference) for k in range(len(view.trace))])
+
+
+def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) -> None:
+    """Write the figure as PNG: a row each, seen from above, then the contours of three states, then the distances.
+
+    Args:
+        path: of the picture.
+        full: a car refined with all terms.
+        silhouettes: the same car refined without photometry.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+    """
+    figure = new_figure(*_DRIFT_INCHES, "drawing the drift")
+    figure.suptitle(full.title)
+    left, right = figure.subfigures(1, 2, width_ratios=[4, 1.1])
+    axes = left.subplots(2, 4, width_ratios=[1.1, 1, 1, 1])
+    views = dict(zip(_INKS, (silhouettes, full), strict=True))
+    all_footprints = [v.footprint(k) for v in views.values() for k in v.steps]
+    for row, (name, view) in zip(axes, views.items(), strict=True):
+        _draw_from_above(row[0], name, view, all_footprints)
+        _draw_contours(row[1:], view)
+    _draw_legend(left, [*axes[0], *axes[1]])
+    _draw_distances(right.subplots(), views)
+    write_figure(path, figure)
+
+
+def _draw_from_above(axes: Any, name: str, view: CarView, others: list[Any]) -> None:
+    show_birds_eye(axes, view, others)
+    names = {view.steps[0]: "input", view.steps[-1]: "last iteration"}
+    for number, ink in zip(view.steps, iteration_inks(len(view.steps)), strict=True):
+        draw_footprint(axes, view.footprint(number), ink, names.get(number), linewidth=1.1)
+    axes.set_title(name, fontsize=10, color=_INKS[name])
+
+
+def _draw_contours(row: Any, view: CarView) -> None:
+    inks = iteration_inks(len(view.steps))
+    for axes, place in zip(row, three_places(len(view.steps)), strict=True):
+        title = f"iteration {view.steps[place]}"
+        show_crop(axes, view.image("left"), view.window("left"), title)
+        draw_lines(axes, view.mask_lines("left"), MASK_INK, "mask", linewidth=1.3, linestyle=":")
+        draw_lines(axes, view.contours("left", view.steps[place]), inks[place], linewidth=1.8)
+
+
+def three_places(count: int) -> tuple[int, int, int]:
+    """The first, an early and the last of so many states; most is done in the first few steps.
+
+    Examples:
+        >>> three_places(12), three_places(2)
+        ((0, 3, 11), (0, 1, 1))
+    """
+    return 0, min(max(count // 4, 1), count - 1), count - 1
+
+
+def _draw_legend(figure: Any, all_axes: list[Any]) -> None:
+    """One for all panels below them: colours mean the same in each."""
+    labelled = [pair for axes in all_axes for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in reversed(labelled)}
+    names = [name for name in ("input", "last iteration", "ground truth", "mask") if name in handles]
+    figure.legend(
+        [handles[name] for name in names],
+        names,
+        loc="outside lower center",
+        ncols=len(names),
+        fontsize=9,
+        facecolor="0.3",
+        labelcolor="white",
+    )
+
+
+def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:
+    for name, view in views.items():
+        axes.plot(distance_course(view), color=_INKS[name], label=name)
+    is_truth = next(iter(views.values())).truth_corners_cam is not None
+    axes.set(xlabel="iteration", ylabel=f"distance to the {'true' if is_truth else 'input'} centre [m]")
+    axes.set_ylim(bottom=0)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
