@@ -30,7 +30,7 @@ from paper_tables.refinements import Refinery
 from paper_tables.report import Report
 
 from directshape_torch.errors import InputError
-from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
 
 TABLES: dict[str, Callable[[Experiment], None]] = {
     "pose": make_pose_table,

@@ -19,7 +19,7 @@ from command_line import run_command
 from torch import Tensor
 
 from directshape_torch import DirectShapeRefiner, load_config
-from directshape_torch.evaluation.text_table import align
+from directshape_torch.evaluation.tables import align
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from torch import Tensor
 
 from directshape_torch.batch.mesh_files import scene_bytes
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
-from directshape_torch.evaluation.text_table import align
+from directshape_torch.evaluation.tables import align
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import read_shapes
@@ -72,11 +73,11 @@ def _paint(mesh: trimesh.Trimesh, rgb: tuple[int, int, int]) -> None:
     mesh.visual = ColorVisuals(mesh, vertex_colors=[[*rgb, 255]] * len(mesh.vertices))
 
 
-def _errors(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> PoseErrors:
+def _errors(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> PoseErrors[Tensor]:
     return pose_errors(boxes_of(objects), boxes_of(true))
 
 
-def _columns(errors: Sequence[PoseErrors], rows: Sequence[int]) -> tuple[str, str, str]:
+def _columns(errors: Sequence[PoseErrors[Tensor]], rows: Sequence[int]) -> tuple[str, str, str]:
     """Before and after of centre, yaw and overlap, averaged over the rows."""
 
     def change(name: str, decimals: int) -> str:

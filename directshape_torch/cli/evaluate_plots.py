@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores
-from directshape_torch.evaluation.shape_error_report import TITLES
-from directshape_torch.evaluation.shape_error_scores import ShapeScores
-from directshape_torch.evaluation.shape_error_summary import ShapeCurve
+from directshape_torch.evaluation.shape_report import TITLES
+from directshape_torch.evaluation.shape_scores import ShapeCurve, ShapeScores
 from directshape_torch.visualize.curve_panels import Curve, CurvePanel, write_curve_panels
 
 

@@ -58,8 +58,8 @@ def run(args: argparse.Namespace) -> int:
         DirectShapeError: for the main program to show.
     """
     from directshape_torch.batch.content_hashes import hash_prior
-    from directshape_torch.evaluation.shape_error_cars import evaluate_shapes
-    from directshape_torch.evaluation.shape_error_report import (
+    from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
+    from directshape_torch.evaluation.shape_report import (
         format_shape_scores,
         write_shape_scores_csv,
         write_shape_scores_json,

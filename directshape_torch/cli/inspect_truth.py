@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.evaluation.shape_error_surface import SurfaceSource
+from directshape_torch.evaluation.shape_truth import SurfaceSource
 from directshape_torch.geometry.camera import project, rays_from_pixels
 from directshape_torch.io.frame_layout import FrameLayout, first_disparity
 from directshape_torch.io.stereo_dataset import LoadedFrame

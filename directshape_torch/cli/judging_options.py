@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from directshape_torch.cli.data_options import frame_id_of
 
 if TYPE_CHECKING:
-    from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+    from directshape_torch.evaluation.bootstrap import BootstrapSettings
 
 
 def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
@@ -28,6 +28,6 @@ def add_interval_options(parser: argparse.ArgumentParser) -> None:
 
 def bootstrap_settings(args: argparse.Namespace) -> BootstrapSettings:
     """What `--seed` and `--draws` ask for."""
-    from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+    from directshape_torch.evaluation.bootstrap import BootstrapSettings
 
     return BootstrapSettings(num_draws=args.draws, seed=args.seed)

@@ -13,6 +13,27 @@ from directshape_torch.errors import InputError
 # Draws are handled this many matrix elements at a time, to bound the memory for thousands of cars.
 _CHUNK_ELEMENTS = 4_000_000
 
+
+@dataclass(frozen=True)
+class BootstrapSettings:
+    """How confidence intervals are drawn.
+
+    Attributes:
+        num_draws: number of draws.
+        confidence: share that an interval holds.
+        seed: of the random draws.
+    """
+
+    num_draws: int = 2000
+    confidence: float = 0.95
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.num_draws < 1 or not 0 < self.confidence < 1:
+            got = f"{self.num_draws}, {self.confidence}"
+            raise InputError("num_draws, confidence", "at least 1, within (0, 1)", got)
+
+
 Statistic = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -23,6 +44,15 @@ class Estimate:
     value: float
     low: float | None
     high: float | None
+
+
+@dataclass(frozen=True)
+class MetricSummary:
+    """One figure before, after, and the change with an interval of its own (same cars in every draw)."""
+
+    before: Estimate
+    after: Estimate
+    change: Estimate
 
 
 def weighted_mean(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -58,15 +88,13 @@ class CarBootstrap:
     Args:
         car_index: (N,) the car of each row, 0 .. number of cars - 1.
         base_weights: (N,) weight of each row, default one each (1 / rows of the car makes every car count the same).
-        num_draws: number of draws.
-        confidence: share that the interval holds.
-        seed: of the random draws.
+        settings: of the intervals.
 
     Raises:
-        InputError: no rows, shapes that differ, or a setting out of range.
+        InputError: no rows, or shapes that differ.
 
     Examples:
-        >>> boot = CarBootstrap(np.array([0, 0, 1, 2]), seed=0)
+        >>> boot = CarBootstrap(np.array([0, 0, 1, 2]))
         >>> boot.estimate(np.array([1.0, 1.0, 1.0, 1.0]), weighted_mean)
         Estimate(value=1.0, low=1.0, high=1.0)
     """
@@ -75,22 +103,18 @@ class CarBootstrap:
         self,
         car_index: NDArray[np.int64],
         base_weights: NDArray[np.float64] | None = None,
-        *,
-        num_draws: int = 2000,
-        confidence: float = 0.95,
-        seed: int = 0,
+        settings: BootstrapSettings | None = None,
     ) -> None:
         if car_index.ndim != 1 or not len(car_index):
             raise InputError("car_index", "shape (N,) with at least one row", str(car_index.shape))
-        if num_draws < 1 or not 0 < confidence < 1:
-            raise InputError("num_draws, confidence", "at least 1, within (0, 1)", f"{num_draws}, {confidence}")
         base = np.ones(len(car_index)) if base_weights is None else np.asarray(base_weights, dtype=np.float64)
         if base.shape != car_index.shape:
             raise InputError("base_weights", f"shape {car_index.shape}", str(base.shape))
         self.car_index, self.base_weights = car_index, base
         self.num_cars = int(car_index.max()) + 1
-        self.tail = 50 * (1 - confidence)
-        draws = np.random.default_rng(seed).integers(self.num_cars, size=(num_draws, self.num_cars))
+        settings = BootstrapSettings() if settings is None else settings
+        self.tail = 50 * (1 - settings.confidence)
+        draws = np.random.default_rng(settings.seed).integers(self.num_cars, size=(settings.num_draws, self.num_cars))
         self._copies = np.stack([np.bincount(draw, minlength=self.num_cars) for draw in draws]).astype(np.uint16)
 
     def estimate(self, values: NDArray[np.float64], statistic: Statistic) -> Estimate:
@@ -101,6 +125,11 @@ class CarBootstrap:
         """Statistic of `after` (N,) minus that of `before` (N,), both of the same cars in every draw."""
         value = self._value(after, statistic) - self._value(before, statistic)
         return self._interval(value, self._drawn(after, statistic) - self._drawn(before, statistic))
+
+    def summary(self, before: NDArray[np.float64], after: NDArray[np.float64], statistic: Statistic) -> MetricSummary:
+        """Both, and the change."""
+        both = self.estimate(before, statistic), self.estimate(after, statistic)
+        return MetricSummary(*both, self.change(before, after, statistic))
 
     def _value(self, values: NDArray[np.float64], statistic: Statistic) -> float:
         return float(statistic(values, self.base_weights[None])[0])

@@ -1,29 +1,139 @@
-"""Result files before and after a refinement, judged against labels."""
+"""Result files before and after a refinement, judged against labels, with confidence intervals over physical cars."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.car_identity import CarTracks, read_tracks
-from directshape_torch.evaluation.comparison_summary import (
+from directshape_torch.evaluation.bootstrap import (
     BootstrapSettings,
-    CarErrors,
-    ComparedCar,
-    GroupSummary,
-    summarise,
+    CarBootstrap,
+    Estimate,
+    MetricSummary,
+    Statistic,
+    weighted_mean,
+    weighted_median,
 )
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
-from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
-from directshape_torch.files.text_files import read_lines
+from directshape_torch.evaluation.car_identity import CarTracks, read_tracks
+from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
+from directshape_torch.evaluation.pose_error import CarErrors, boxes_of, car_errors, pose_errors
 from directshape_torch.io.instance_masks import file_of_frame
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import read_shapes
+
+GOOD_BEV_IOU = 0.7
+WORSE_BY_BEV_IOU = 0.05
+
+
+@dataclass(frozen=True)
+class ComparedCar:
+    """One detection with its label, before and after.
+
+    Attributes:
+        frame_id: the frame.
+        detection_line: line of both result files, from 1.
+        label_line: line of the label file, from 1.
+        car: name of the physical car, or of the label where the car is not known.
+        drive: name of the drive, or None.
+        depth_m: of the label's box along the optical axis, metres.
+        height_px: of the label's 2D box.
+        score: the detector's, or None.
+        before, after: errors of the two boxes.
+    """
+
+    frame_id: str
+    detection_line: int
+    label_line: int
+    car: str
+    drive: str | None
+    depth_m: float
+    height_px: float
+    score: float | None
+    before: CarErrors
+    after: CarErrors
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How one figure is made: a value for each car, and the statistic over cars."""
+
+    key: str
+    label: str
+    unit: str
+    value: Callable[[CarErrors], float]
+    statistic: Statistic
+
+
+METRICS = (
+    Metric("bev_iou_mean", "BEV IoU, mean", "", lambda e: e.bev_iou, weighted_mean),
+    Metric("iou_3d_mean", "3D IoU, mean", "", lambda e: e.iou_3d, weighted_mean),
+    Metric(
+        "bev_iou_good_share", f"BEV IoU > {GOOD_BEV_IOU}", "%", lambda e: float(e.bev_iou > GOOD_BEV_IOU), weighted_mean
+    ),
+    Metric("centre_m_median", "centre error, median", "m", lambda e: e.centre_m, weighted_median),
+    Metric("centre_bev_m_median", "centre error BEV, median", "m", lambda e: e.centre_bev_m, weighted_median),
+    Metric("yaw_deg_median", "yaw error mod 360, median", "deg", lambda e: e.yaw_deg, weighted_median),
+    Metric("yaw_axis_deg_median", "yaw error mod 180, median", "deg", lambda e: e.yaw_axis_deg, weighted_median),
+)
+
+
+@dataclass(frozen=True)
+class GroupSummary:
+    """Figures of a group of detections.
+
+    Attributes:
+        name: of the group.
+        num_detections: n, detections compared.
+        num_cars: physical cars among them (labels, where cars are not known).
+        metrics: by `Metric.key`; empty for an empty group.
+        worse_share: share of detections whose BEV IoU fell by more than 0.05; None for an empty group.
+    """
+
+    name: str
+    num_detections: int
+    num_cars: int
+    metrics: dict[str, MetricSummary]
+    worse_share: Estimate | None
+
+
+def summarise(
+    name: str, cars: Sequence[ComparedCar], settings: BootstrapSettings, *, cars_weigh_equally: bool = False
+) -> GroupSummary:
+    """Figures of a group of detections.
+
+    Args:
+        name: of the group.
+        cars: its detections.
+        settings: of the confidence intervals.
+        cars_weigh_equally: one vote for each physical car, instead of one for each detection.
+
+    Examples:
+        >>> summarise("nothing", [], BootstrapSettings()).num_detections
+        0
+    """
+    if not cars:
+        return GroupSummary(name, 0, 0, {}, None)
+    _, index = np.unique([car.car for car in cars], return_inverse=True)
+    weights = 1.0 / np.bincount(index)[index] if cars_weigh_equally else None
+    bootstrap = CarBootstrap(index, weights, settings)
+    metrics = {}
+    for metric in METRICS:
+        before = _values([metric.value(car.before) for car in cars])
+        after = _values([metric.value(car.after) for car in cars])
+        metrics[metric.key] = bootstrap.summary(before, after, metric.statistic)
+    worse = _values([car.after.bev_iou < car.before.bev_iou - WORSE_BY_BEV_IOU for car in cars])
+    return GroupSummary(name, len(cars), bootstrap.num_cars, metrics, bootstrap.estimate(worse, weighted_mean))
+
+
+def _values(values: Sequence[float]) -> NDArray[np.float64]:
+    return np.array(values, dtype=np.float64)
+
 
 # Depth of the label along the optical axis, metres; the last bin is open.
 DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))
@@ -93,7 +203,10 @@ def compare_results(
     counted = CountedLabels() if counted is None else counted
     known = read_tracks(tracks) if isinstance(tracks, (str, Path)) else tracks
     folders = Path(labels_dir), Path(before_dir), Path(after_dir)
-    frame_ids = _choose_frames(folders[1], split, frames)
+    named = named_frames(frames, split)
+    frame_ids = _frames_of(folders[1]) if named is None else named
+    if not frame_ids:
+        raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
     pairs: list[_Pair] = []
     num_counted = 0
     for frame_id in frame_ids:
@@ -131,19 +244,9 @@ class _Pair:
     after: KittiObject
 
 
-def _choose_frames(before_dir: Path, split: Path | str | None, frames: Iterable[str | int] | None) -> tuple[str, ...]:
-    if frames is not None and split is not None:
-        raise InputError("frames", "frames or split", "both", "give one of them")
-    if frames is not None:
-        chosen = [f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames]
-    elif split is not None:
-        chosen = [line.text for line in read_lines(split)]
-    else:
-        nested = before_dir / "data"
-        chosen = sorted(path.stem for path in (nested if nested.is_dir() else before_dir).glob("*.txt"))
-    if not chosen:
-        raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
-    return tuple(dict.fromkeys(chosen))
+def _frames_of(results: Path) -> tuple[str, ...]:
+    nested = results / "data"
+    return tuple(sorted(path.stem for path in (nested if nested.is_dir() else results).glob("*.txt")))
 
 
 def _pairs_of_frame(folders: tuple[Path, Path, Path], frame_id: str, counted: CountedLabels) -> tuple[list[_Pair], int]:
@@ -179,8 +282,8 @@ def _check_same_lines(
 
 def _compared_cars(pairs: Sequence[_Pair], tracks: CarTracks) -> tuple[ComparedCar, ...]:
     true_boxes = boxes_of([p.label for p in pairs])
-    before = _rows(pose_errors(boxes_of([p.before for p in pairs]), true_boxes))
-    after = _rows(pose_errors(boxes_of([p.after for p in pairs]), true_boxes))
+    before = car_errors(pose_errors(boxes_of([p.before for p in pairs]), true_boxes))
+    after = car_errors(pose_errors(boxes_of([p.after for p in pairs]), true_boxes))
     cars = []
     for pair, errors_before, errors_after in zip(pairs, before, after, strict=True):
         identity = tracks.identity(pair.frame_id, pair.label.line_number)
@@ -199,12 +302,6 @@ def _compared_cars(pairs: Sequence[_Pair], tracks: CarTracks) -> tuple[ComparedC
             )
         )
     return tuple(cars)
-
-
-def _rows(errors: PoseErrors) -> list[CarErrors]:
-    columns = asdict(errors)
-    table = torch.stack(list(columns.values()), dim=-1).tolist()
-    return [CarErrors(**dict(zip(columns, row, strict=True))) for row in table]
 
 
 def _group(

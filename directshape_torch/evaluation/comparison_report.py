@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.evaluation.comparison import Comparison
-from directshape_torch.evaluation.comparison_summary import (
+from directshape_torch.evaluation.comparison import (
     METRICS,
     WORSE_BY_BEV_IOU,
-    CarErrors,
     ComparedCar,
+    Comparison,
     GroupSummary,
     Metric,
 )
-from directshape_torch.evaluation.text_table import align, number, with_interval
+from directshape_torch.evaluation.pose_error import PoseErrors
+from directshape_torch.evaluation.tables import align, number, plain, with_interval, write_csv
 from directshape_torch.files import atomic_files
 
 COMPARISON_SCHEMA_VERSION = 1
@@ -35,31 +33,19 @@ def format_comparison(comparison: Comparison) -> str:
 
 def write_comparison_json(path: Path | str, comparison: Comparison) -> None:
     """Write every group, without the single detections, as JSON: estimates as value, low, high."""
-    content = {f.name: getattr(comparison, f.name) for f in fields(comparison) if f.name != "cars"}
-    atomic_files.write_json(
-        path, {"schema_version": COMPARISON_SCHEMA_VERSION} | {k: _plain(v) for k, v in content.items()}
-    )
+    content = plain(replace(comparison, cars=()))
+    del content["cars"]
+    atomic_files.write_json(path, {"schema_version": COMPARISON_SCHEMA_VERSION} | content)
 
 
 def write_comparison_csv(path: Path | str, cars: Sequence[ComparedCar]) -> None:
     """Write one line for each detection; columns are the fields of `ComparedCar`, errors as `<error>_before/_after`."""
-    errors = [f.name for f in fields(CarErrors)]
-    plain = [f.name for f in fields(ComparedCar) if f.name not in ("before", "after")]
-    columns = plain + [f"{name}_{when}" for name in errors for when in ("before", "after")]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
+    own = [f.name for f in fields(ComparedCar) if f.name not in ("before", "after")]
+    rows: list[list[Any]] = [own + [f"{name}_{when}" for name in PoseErrors._fields for when in ("before", "after")]]
     for car in cars:
-        values = [getattr(car, name) for name in plain]
-        values += [getattr(side, name) for name in errors for side in (car.before, car.after)]
-        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
-    atomic_files.write_text(path, text.getvalue())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, GroupSummary):
-        return asdict(value)
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+        errors = [error for pair in zip(car.before, car.after, strict=True) for error in pair]
+        rows.append([*(getattr(car, name) for name in own), *errors])
+    write_csv(path, rows)
 
 
 def _heading(comparison: Comparison) -> str:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from directshape_torch.evaluation.kitti_ap import ApScore, KittiScores
+from directshape_torch.evaluation.kitti_boxes import DIFFICULTIES
 from directshape_torch.evaluation.kitti_curve import NUM_RECALL_POINTS
-from directshape_torch.evaluation.kitti_difficulty import DIFFICULTIES
-from directshape_torch.evaluation.text_table import align
+from directshape_torch.evaluation.tables import align, plain
 from directshape_torch.files import atomic_files
 
 KITTI_SCORES_SCHEMA_VERSION = 1
@@ -26,43 +25,10 @@ def format_scores(scores: KittiScores) -> str:
 
 def write_scores_json(path: Path | str, scores: KittiScores) -> None:
     """Write every score and curve as JSON; an open end of a distance bin is null."""
-    content = {
-        "schema_version": KITTI_SCORES_SCHEMA_VERSION,
-        "object_type": scores.object_type,
-        "num_frames": scores.num_frames,
-        "num_frames_without_results": scores.num_frames_without_results,
-        "num_result_frames_unused": scores.num_result_frames_unused,
-        "num_detections": scores.num_detections,
-        "scores": [_plain(score) for score in scores.scores],
-        "by_distance": [
-            {
-                "low_m": part.low_m,
-                "high_m": part.high_m if math.isfinite(part.high_m) else None,
-                "scores": [_plain(score) for score in part.scores],
-            }
-            for part in scores.by_distance
-        ],
-    }
-    atomic_files.write_json(path, content)
-
-
-def _plain(score: ApScore) -> dict[str, Any]:
-    curve = score.curve
-    return {
-        "metric": score.metric,
-        "minimum_iou": score.minimum_iou,
-        "difficulty": score.difficulty,
-        "num_labels": score.num_labels,
-        "ap_r11": score.ap_r11,
-        "ap_r40": score.ap_r40,
-        "ap_area": score.ap_area,
-        "aos_r11": score.aos_r11,
-        "aos_r40": score.aos_r40,
-        "thresholds": curve.thresholds.tolist(),
-        "recall": curve.recall.tolist(),
-        "precision": curve.precision.tolist(),
-        "orientation": None if curve.orientation is None else curve.orientation.tolist(),
-    }
+    content = plain(scores)
+    for score in (*content["scores"], *(score for part in content["by_distance"] for score in part["scores"])):
+        score |= score.pop("curve")
+    atomic_files.write_json(path, {"schema_version": KITTI_SCORES_SCHEMA_VERSION} | content)
 
 
 def _heading(scores: KittiScores) -> str:

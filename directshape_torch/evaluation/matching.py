@@ -1,14 +1,16 @@
-"""Which detection belongs to which label, and which labels count."""
+"""Which frames are judged, which detection belongs to which label, and which labels count."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.numerics.checks import check_shape
 
@@ -34,12 +36,13 @@ class CountedLabels:
     def counts(self, label: KittiObject) -> bool:
         """Whether a label counts.
 
-        Examples:
-            >>> from directshape_torch.io.kitti_labels import parse_object
-            >>> from directshape_torch.files.text_files import Line
-            >>> line = Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.6 20 0", "")
-            >>> CountedLabels().counts(parse_object("labels", line))
-            True
+                Examples:
+                    >>> from directshape_torch.files.text_files import read_lines
+        from directshape_torch.io.kitti_labels import parse_object
+                    >>> from directshape_torch.files.text_files import Line
+                    >>> line = Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.6 20 0", "")
+                    >>> CountedLabels().counts(parse_object("labels", line))
+                    True
         """
         height_px = label.box_2d[3] - label.box_2d[1]
         return (
@@ -117,6 +120,26 @@ def match_to_labels(
     known = [index for index, label in enumerate(labels) if label.has_box_3d]
     boxes = _image_boxes(detections), _image_boxes([labels[index] for index in known])
     return [known[column] if column >= 0 else -1 for column in match_by_iou(box_iou_2d(*boxes), minimum_iou_2d)]
+
+
+def named_frames(frames: Iterable[str | int] | None, split: Path | str | None) -> tuple[str, ...] | None:
+    """Ids of the frames that a caller names: by id or number, or in a file with one a line; None where by neither.
+
+    Raises:
+        InputError: both are given.
+        DataFormatError: the file cannot be read.
+
+    Examples:
+        >>> named_frames([7, "000012", 7], None)
+        ('000007', '000012')
+    """
+    if frames is not None and split is not None:
+        raise InputError("frames", "frames or split", "both", "give one of them")
+    if split is not None:
+        frames = [line.text for line in read_lines(split)]
+    if frames is None:
+        return None
+    return tuple(dict.fromkeys(f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames))
 
 
 def _image_boxes(objects: Sequence[KittiObject]) -> Tensor:

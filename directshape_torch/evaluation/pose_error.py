@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,10 +14,11 @@ from directshape_torch.geometry.box3d import wrap_angle
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.numerics.checks import check_shape
 
+Number = TypeVar("Number", Tensor, float)
 
-@dataclass(frozen=True)
-class PoseErrors:
-    """Errors of N boxes against the true ones, each (N,).
+
+class PoseErrors(NamedTuple, Generic[Number]):
+    """Errors of N boxes against the true ones, each (N,); or of one box, each a number.
 
     Attributes:
         centre_m: distance of the centres of the boxes (not of their bottom faces), metres.
@@ -31,15 +32,23 @@ class PoseErrors:
         length_m: above 0 where a box is too long.
     """
 
-    centre_m: Tensor
-    centre_bev_m: Tensor
-    yaw_deg: Tensor
-    yaw_axis_deg: Tensor
-    bev_iou: Tensor
-    iou_3d: Tensor
-    along_m: Tensor
-    across_m: Tensor
-    length_m: Tensor
+    centre_m: Number
+    centre_bev_m: Number
+    yaw_deg: Number
+    yaw_axis_deg: Number
+    bev_iou: Number
+    iou_3d: Number
+    along_m: Number
+    across_m: Number
+    length_m: Number
+
+
+CarErrors = PoseErrors[float]
+
+
+def car_errors(errors: PoseErrors[Tensor]) -> list[CarErrors]:
+    """Those of each box."""
+    return [PoseErrors(*row) for row in torch.stack(list(errors), dim=-1).tolist()]
 
 
 def boxes_of(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64) -> Tensor:
@@ -56,7 +65,7 @@ def boxes_of(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64)
 def pose_errors(
     boxes: Tensor,  # (N, 7)
     true_boxes: Tensor,  # (N, 7)
-) -> PoseErrors:
+) -> PoseErrors[Tensor]:
     """Errors of boxes, paired row by row with the true ones; columns as in `boxes_of`.
 
     Raises:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
+from directshape_torch.evaluation.shape_truth import EstimatedCar
 from directshape_torch.export.visible_surface import FrameView, Points
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame

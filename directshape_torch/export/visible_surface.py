@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
+from directshape_torch.evaluation.shape_truth import EstimatedCar
 
 Points = NDArray[np.float64]
 

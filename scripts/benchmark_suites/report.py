@@ -11,7 +11,7 @@ from typing import Any
 from benchmark_suites.figures import Row, SuiteResult
 from benchmark_suites.machine import Machine
 from directshape_torch.config_files import config_to_mapping, load_config
-from directshape_torch.evaluation.text_table import align
+from directshape_torch.evaluation.tables import align
 from directshape_torch.files.atomic_files import write_json
 
 

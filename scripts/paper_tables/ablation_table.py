@@ -12,8 +12,7 @@ import numpy as np
 
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.bootstrap import CarBootstrap, Estimate, weighted_mean
-from directshape_torch.evaluation.comparison import Comparison, LineFilter
-from directshape_torch.evaluation.comparison_summary import ComparedCar
+from directshape_torch.evaluation.comparison import ComparedCar, Comparison, LineFilter
 from directshape_torch.io.kitti_labels import read_objects
 from paper_tables.ablation_rows import REFERENCE, ROWS, Row
 from paper_tables.data_sets import DataSet
@@ -134,8 +133,7 @@ def _difference(
         return None
     _, index = np.unique([after[0][key].car for key in common], return_inverse=True)
     default, row = (np.array([cars[key].after.bev_iou for key in common]) for cars in after)
-    settings = experiment.bootstrap
-    return CarBootstrap(index, num_draws=settings.num_draws, seed=settings.seed).change(default, row, weighted_mean)
+    return CarBootstrap(index, settings=experiment.bootstrap).change(default, row, weighted_mean)
 
 
 def _after(entry: Judged) -> Estimate:

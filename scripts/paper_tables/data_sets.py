@@ -20,7 +20,7 @@ from pathlib import Path
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks
-from directshape_torch.evaluation.shape_error_scores import TruthKind
+from directshape_torch.evaluation.shape_scores import TruthKind
 from paper_tables.physical_cars import link_drive
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.comparison import Comparison, LineFilter, compare_results, lines_with_left_mask
-from directshape_torch.evaluation.comparison_summary import BootstrapSettings
 from paper_tables.data_sets import DataSet
 from paper_tables.refinements import Refinery, Run
 from paper_tables.report import Report

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.evaluation.comparison_summary import BootstrapSettings, CarErrors, ComparedCar, summarise
-from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
+from directshape_torch.evaluation.comparison import ComparedCar, summarise
+from directshape_torch.evaluation.pose_error import CarErrors, boxes_of, pose_errors
 from directshape_torch.refiner import DirectShapeRefiner
 from refiner_training.box_loss import refined_boxes
 from refiner_training.car_frames import CarBatch, CarFrame, CountedCar, joined

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from directshape_torch.config import BackwardConfig
 from directshape_torch.config_files import load_config
-from directshape_torch.evaluation.comparison_summary import ComparedCar
+from directshape_torch.evaluation.comparison import ComparedCar
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from refiner_training.car_frames import CarFrame, prepare_frame

@@ -7,7 +7,7 @@ import io
 import math
 from collections.abc import Sequence
 
-from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.io.figure_files import figure_png, new_figure
 from refiner_training.evaluation import Variant, table_row
 from refiner_training.jobs import Kind, Options, Outcome, folds_of

@@ -4,12 +4,18 @@ import numpy as np
 import pytest
 
 from directshape_torch.errors import InputError
-from directshape_torch.evaluation.bootstrap import CarBootstrap, Estimate, weighted_mean, weighted_median
+from directshape_torch.evaluation.bootstrap import (
+    BootstrapSettings,
+    CarBootstrap,
+    Estimate,
+    weighted_mean,
+    weighted_median,
+)
 
 
 def test_interval_of_a_mean_is_that_of_the_normal_law():
     values = np.random.default_rng(3).normal(size=400)
-    estimate = CarBootstrap(np.arange(400), num_draws=4000).estimate(values, weighted_mean)
+    estimate = CarBootstrap(np.arange(400), settings=BootstrapSettings(4000)).estimate(values, weighted_mean)
     half_width = 1.96 * values.std() / np.sqrt(400)
     assert estimate.value == pytest.approx(values.mean(), abs=1e-12)
     assert estimate.low == pytest.approx(values.mean() - half_width, abs=0.1 * half_width)
@@ -50,12 +56,13 @@ def test_one_car_has_no_interval():
 
 def test_seed_decides_the_interval_and_chunks_do_not(monkeypatch: pytest.MonkeyPatch):
     values = np.random.default_rng(6).normal(size=30)
-    whole = CarBootstrap(np.arange(30), seed=1).estimate(values, weighted_median)
-    assert whole == CarBootstrap(np.arange(30), seed=1).estimate(values, weighted_median)
-    means = [CarBootstrap(np.arange(30), seed=seed).estimate(values, weighted_mean) for seed in (1, 1, 2)]
+    draws = [CarBootstrap(np.arange(30), settings=BootstrapSettings(seed=seed)) for seed in (1, 1, 2)]
+    whole = draws[0].estimate(values, weighted_median)
+    assert whole == draws[1].estimate(values, weighted_median)
+    means = [one.estimate(values, weighted_mean) for one in draws]
     assert means[0] == means[1] != means[2]
     monkeypatch.setattr("directshape_torch.evaluation.bootstrap._CHUNK_ELEMENTS", 100)
-    assert whole == CarBootstrap(np.arange(30), seed=1).estimate(values, weighted_median)
+    assert whole == draws[0].estimate(values, weighted_median)
 
 
 def test_wrong_input_is_named():
@@ -64,4 +71,4 @@ def test_wrong_input_is_named():
     with pytest.raises(InputError, match="base_weights: expected shape"):
         CarBootstrap(np.arange(3), np.ones(2))
     with pytest.raises(InputError, match="num_draws, confidence"):
-        CarBootstrap(np.arange(3), confidence=1.0)
+        BootstrapSettings(confidence=1.0)

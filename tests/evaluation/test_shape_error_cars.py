@@ -20,10 +20,10 @@ from helpers.synthetic_scene import TWO_CARS, stereo_camera
 
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.comparison_summary import BootstrapSettings
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
+from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
 from directshape_torch.evaluation.matching import CountedLabels
-from directshape_torch.evaluation.shape_error_cars import evaluate_shapes
-from directshape_torch.evaluation.shape_error_scores import ShapeScores
+from directshape_torch.evaluation.shape_scores import ShapeScores
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.camera import disparity_of_depth, rays_from_pixels

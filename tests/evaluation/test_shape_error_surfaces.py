@@ -11,9 +11,14 @@ from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
 from helpers.synthetic_scene import stereo_camera
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
-from directshape_torch.evaluation.shape_error_segment import read_disparity, segment_truth
-from directshape_torch.evaluation.shape_error_surface import SceneDepth, SurfaceTruth, read_surface_points
+from directshape_torch.evaluation.shape_truth import (
+    EstimatedCar,
+    SceneDepth,
+    SurfaceTruth,
+    read_disparity,
+    read_surface_points,
+    segment_truth,
+)
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
 

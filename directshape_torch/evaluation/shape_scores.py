@@ -1,15 +1,15 @@
-"""Shape errors before and after a refinement over a group of cars, with confidence intervals over physical cars."""
+"""What an evaluation of shapes finds: errors car by car, and figures of each surface with intervals over cars."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.evaluation.bootstrap import CarBootstrap, weighted_mean
-from directshape_torch.evaluation.comparison_summary import BootstrapSettings, MetricSummary
+from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, MetricSummary, weighted_mean
 from directshape_torch.evaluation.shape_error import ShapeError
 
 METRICS = ("completeness", "accuracy", "f1", "rmse_m")
@@ -121,10 +121,61 @@ def _summarise(
     if not known.any():
         return 0, None
     _, index = np.unique(cars[known], return_inverse=True)
-    boot = CarBootstrap(index, num_draws=settings.num_draws, confidence=settings.confidence, seed=settings.seed)
-    before, after = before[known], after[known]
-    return int(known.sum()), MetricSummary(
-        before=boot.estimate(before, weighted_mean),
-        after=boot.estimate(after, weighted_mean),
-        change=boot.change(before, after, weighted_mean),
-    )
+    boot = CarBootstrap(index, settings=settings)
+    return int(known.sum()), boot.summary(before[known], after[known], weighted_mean)
+
+
+TruthKind = Literal["disparity", "points"]
+
+
+@dataclass(frozen=True)
+class EvaluatedCar:
+    """One label with a detection and a true surface.
+
+    Attributes:
+        frame_id: the frame.
+        detection_line, label_line: lines of their files, from 1.
+        car: name of the physical car, or of the label where it is not known.
+        status: how the refinement of the car ended.
+        depth_m: of the label's box along the optical axis, metres.
+        segment: which pixels of the left image are the car's.
+        before: errors of the mean shape at the pose of the detection, by the name of the surface.
+        after: errors of the refined shape.
+        sampling_limit: what points alone would leave to a perfect estimate.
+    """
+
+    frame_id: str
+    detection_line: int
+    label_line: int
+    car: str
+    status: str
+    depth_m: float
+    segment: str
+    before: dict[str, ShapeError]
+    after: dict[str, ShapeError]
+    sampling_limit: dict[str, ShapeError]
+
+
+@dataclass(frozen=True)
+class ShapeScores:
+    """Everything `evaluate_shapes` finds.
+
+    Attributes:
+        truth: kind of ground truth.
+        cars: in the order of frames and detection lines.
+        surfaces: figures for each kind of surface.
+        num_frames: frames evaluated.
+        num_labels_counted: labels that count in these frames.
+        num_without_truth: of these, labels without a true surface: no mask, no disparity in it, or no points.
+        num_without_detection: of the others, labels that no detection was refined for.
+        tracks_known: whether physical cars are known; else every label is taken for a car of its own.
+    """
+
+    truth: TruthKind
+    cars: tuple[EvaluatedCar, ...]
+    surfaces: tuple[SurfaceSummary, ...]
+    num_frames: int
+    num_labels_counted: int
+    num_without_truth: int
+    num_without_detection: int
+    tracks_known: bool

@@ -1,11 +1,19 @@
-"""Tables of figures as text: aligned columns, units, and intervals behind their figures."""
+"""Figures as text tables (aligned columns, units, intervals), as CSV and as JSON."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from directshape_torch.evaluation.bootstrap import Estimate
+from directshape_torch.files import atomic_files
 
 
 def align(rows: Sequence[Sequence[str]]) -> str:
@@ -56,3 +64,34 @@ def with_interval(unit: str, estimate: Estimate, sign: bool = False) -> str:
         return value
     low, high = (number(unit, bound, sign).split(" ")[0] for bound in (estimate.low, estimate.high))
     return f"{value} [{low}, {high}]"
+
+
+def write_csv(path: Path | str, rows: Iterable[Sequence[Any]]) -> None:
+    """Write rows, the first of which names the columns: six digits a number, nothing for one that is not finite."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([_cell(value) for value in row] for row in rows)
+    atomic_files.write_text(path, text.getvalue())
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, float):
+        return f"{value:.6g}" if math.isfinite(value) else ""
+    return value
+
+
+def plain(value: Any) -> Any:
+    """Nested dataclasses, tuples and arrays as JSON has them: objects, lists, and null for what is not finite.
+
+    Examples:
+        >>> plain((Estimate(0.5, None, math.inf), np.arange(2)))
+        [{'value': 0.5, 'low': None, 'high': None}, [0, 1]]
+    """
+    if is_dataclass(value):
+        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, dict):
+        return {name: plain(part) for name, part in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (tuple, list)):
+        return [plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

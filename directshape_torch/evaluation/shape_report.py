@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from directshape_torch.evaluation.shape_error import TAUS_M
-from directshape_torch.evaluation.shape_error_scores import EvaluatedCar, ShapeScores
-from directshape_torch.evaluation.shape_error_summary import METRICS, ShapeCurve, SurfaceSummary
-from directshape_torch.evaluation.text_table import align, number, with_interval
+from directshape_torch.evaluation.shape_scores import METRICS, EvaluatedCar, ShapeCurve, ShapeScores, SurfaceSummary
+from directshape_torch.evaluation.tables import align, number, plain, with_interval, write_csv
 from directshape_torch.files import atomic_files
 
 SHAPE_SCORES_SCHEMA_VERSION = 1
@@ -39,63 +36,23 @@ def format_shape_scores(scores: ShapeScores) -> str:
 
 def write_shape_scores_json(path: Path | str, scores: ShapeScores) -> None:
     """Write the figures of every surface at every tau; what is undefined is null."""
-    content = {
-        "schema_version": SHAPE_SCORES_SCHEMA_VERSION,
-        "truth": scores.truth,
-        "num_frames": scores.num_frames,
-        "num_labels_counted": scores.num_labels_counted,
-        "num_without_truth": scores.num_without_truth,
-        "num_without_detection": scores.num_without_detection,
-        "tracks_known": scores.tracks_known,
-        "surfaces": [
-            {
-                "surface": surface.surface,
-                "num_rows": surface.num_rows,
-                "num_cars": surface.num_cars,
-                "mean_num_true": surface.mean_num_true,
-                "curves": [_plain_curve(curve) for curve in surface.curves],
-            }
-            for surface in scores.surfaces
-        ],
-    }
-    atomic_files.write_json(path, content)
+    content = plain(replace(scores, cars=()))
+    del content["cars"]
+    atomic_files.write_json(path, {"schema_version": SHAPE_SCORES_SCHEMA_VERSION} | content)
 
 
 def write_shape_scores_csv(path: Path | str, cars: Sequence[EvaluatedCar]) -> None:
     """Write one line for each label, surface and tau: counts of points and the four metrics, before and after."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    figures = ("num_estimated", *METRICS)
-    pairs = [f"{name}_{when}" for name in figures for when in ("before", "after")]
-    writer.writerow([*_PLAIN, "surface", "tau_m", "num_true", *pairs])
+    pairs = [f"{name}_{when}" for name in ("num_estimated", *METRICS) for when in ("before", "after")]
+    rows: list[list[Any]] = [[*_PLAIN, "surface", "tau_m", "num_true", *pairs]]
     for car in cars:
         for surface, after in car.after.items():
             sides = (car.before[surface], after)
-            values = {name: [getattr(side, name) for side in sides] for name in METRICS}
+            figures = [getattr(side, name).tolist() for name in METRICS for side in sides]
             for k, tau in enumerate(after.taus_m.tolist()):
                 row = [getattr(car, name) for name in _PLAIN] + [surface, tau, after.num_true]
-                row += [side.num_estimated for side in sides]
-                row += [float(value[k]) for name in METRICS for value in values[name]]
-                writer.writerow([_cell(value) for value in row])
-    atomic_files.write_text(path, text.getvalue())
-
-
-def _cell(value: Any) -> Any:
-    """An undefined RMSE is an empty cell."""
-    if isinstance(value, float):
-        return f"{value:.6g}" if math.isfinite(value) else ""
-    return value
-
-
-def _plain_curve(curve: ShapeCurve) -> dict[str, Any]:
-    limits = curve.sampling_limit
-    return {
-        "metric": curve.metric,
-        "taus_m": list(curve.taus_m),
-        "num_rows": list(curve.num_rows),
-        "summaries": [None if summary is None else asdict(summary) for summary in curve.summaries],
-        "sampling_limit": None if limits is None else [x if math.isfinite(x) else None for x in limits],
-    }
+                rows.append([*row, *(side.num_estimated for side in sides), *(values[k] for values in figures)])
+    write_csv(path, rows)
 
 
 def _heading(scores: ShapeScores) -> str:

@@ -10,16 +10,18 @@ from typing import Protocol, get_args
 import torch
 
 from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.car_identity import CarTracks, read_tracks
-from directshape_torch.evaluation.comparison_summary import BootstrapSettings
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
 from directshape_torch.evaluation.shape_error import ShapeError
-from directshape_torch.evaluation.shape_error_estimate import EstimatedCar
-from directshape_torch.evaluation.shape_error_scores import EvaluatedCar, ShapeScores, TruthKind
-from directshape_torch.evaluation.shape_error_segment import FOLDER, SegmentSource
-from directshape_torch.evaluation.shape_error_summary import SurfaceSummary, summarise_surface
-from directshape_torch.evaluation.shape_error_surface import SurfaceSource
-from directshape_torch.files.text_files import read_lines
+from directshape_torch.evaluation.shape_scores import (
+    EvaluatedCar,
+    ShapeScores,
+    SurfaceSummary,
+    TruthKind,
+    summarise_surface,
+)
+from directshape_torch.evaluation.shape_truth import FOLDER, EstimatedCar, SegmentSource, SurfaceSource
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
@@ -110,7 +112,7 @@ def evaluate_shapes(
         counted=CountedLabels() if counted is None else counted,
         tracks=CarTracks({}) if known is None else known,
     )
-    frame_ids = _choose_frames(inputs, frames, split)
+    frame_ids = _choose_frames(inputs, named_frames(frames, split))
     parts = [_evaluate_frame(inputs, frame_id) for frame_id in frame_ids]
     cars = tuple(car for part in parts for car in part.cars)
     if not cars:
@@ -171,23 +173,18 @@ def _source(training: Path, truth: TruthKind, masks: Path | str | MaskSource | N
     return SegmentSource(folder, mask_source(masks) if isinstance(masks, (str, Path)) else masks)
 
 
-def _choose_frames(inputs: _Inputs, frames: Iterable[str | int] | None, split: Path | str | None) -> tuple[str, ...]:
-    if frames is not None and split is not None:
-        raise InputError("frames", "frames or split", "both", "give one of them")
-    if split is not None:
-        frames = [line.text for line in read_lines(split)]
+def _choose_frames(inputs: _Inputs, named: tuple[str, ...] | None) -> tuple[str, ...]:
     known = inputs.source.frame_ids()
-    if frames is None:
-        chosen = [frame_id for frame_id in known if shapes_path(inputs.refined_dir, frame_id).is_file()]
-    else:
-        chosen = list(dict.fromkeys(f"{frame:06d}" if isinstance(frame, int) else frame for frame in frames))
-    missing = sorted(set(chosen) - set(known))
-    if missing:
-        raise InputError("frames", "frames with ground truth", ", ".join(missing[:5]))
+    if named is not None:
+        missing = sorted(set(named) - set(known))
+        if missing:
+            raise InputError("frames", "frames with ground truth", ", ".join(missing[:5]))
+    refined = [frame_id for frame_id in known if shapes_path(inputs.refined_dir, frame_id).is_file()]
+    chosen = tuple(refined) if named is None else named
     if not chosen:
         where = f"{inputs.refined_dir} has no shapes/NNNNNN.npz of any of the {len(known)} frames with ground truth"
         raise InputError("frames", "refined frames with ground truth", f"none: {where}")
-    return tuple(chosen)
+    return chosen
 
 
 def _evaluate_frame(inputs: _Inputs, frame_id: str) -> _FrameCars:
