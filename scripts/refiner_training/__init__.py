@@ -1,1 +1,0 @@
-"""Parts of `train_through_refiner.py`: frames, networks, loss, training, evaluation, report."""
