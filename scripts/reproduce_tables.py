@@ -2,13 +2,12 @@
 
     export DIRECTSHAPE_DATA=...                      # or --data ROOT, a full KITTI with detections and masks
     python scripts/reproduce_tables.py pose          # AP before and after: ours, the geometric baseline, both together
-    python scripts/reproduce_tables.py ablation      # scripts/paper_tables/ablation_rows.py, row by row
+    python scripts/reproduce_tables.py ablation      # scripts/paper_tables/rows.py, row by row
 
-Which folders a data set has: scripts/paper_tables/data_sets.py. Written to --out: NAME.md, NAME_*.csv,
-NAME_manifest.json (options, seeds, versions, hashes of the runs), and under runs/ every refinement, as `directshape
-refine` writes it. Refinements are kept: a second call makes tables only, and one that was stopped goes on. They are
-told apart by settings, prior, stereo field and masks, not by the program's code: after a change of that, choose another
---out. Try everything in a minute or two with --quick (two frames, one row of each group).
+Which folders a data set has: scripts/paper_tables/data_sets.py. Written to --out: NAME.md, NAME_*.csv, and under runs/
+every refinement, as `directshape refine` writes it. Refinements are kept: a second call makes tables only, and one that
+was stopped goes on. They are told apart by settings, prior, stereo field and masks, not by the program's code: after a
+change of that, choose another --out. --quick tries everything in a minute or two (two frames, one row of each group).
 """
 
 from __future__ import annotations
@@ -20,14 +19,10 @@ from pathlib import Path
 
 import torch
 from command_line import run_command
-from paper_tables.ablation_rows import ROWS
-from paper_tables.ablation_table import make_ablation_table
-from paper_tables.data_sets import DataSet, find_data_sets
-from paper_tables.disparity_fields import field_file
-from paper_tables.experiment import Experiment
-from paper_tables.pose_table import make_pose_table
-from paper_tables.refinements import Refinery
-from paper_tables.report import Report
+from paper_tables.data_sets import DataSet, field_file, find_data_sets
+from paper_tables.rows import ROWS
+from paper_tables.runs import Experiment
+from paper_tables.tables import make_ablation_table, make_pose_table
 
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.bootstrap import BootstrapSettings
@@ -36,13 +31,6 @@ TABLES: dict[str, Callable[[Experiment], None]] = {
     "pose": make_pose_table,
     "ablation": make_ablation_table,
 }
-
-
-def stereo_field(data_set: DataSet, choice: str, out: Path) -> Path | None:
-    """The residual disparity field of a data set; "auto" fits it from disparity maps."""
-    if choice == "none":
-        return None
-    return field_file(data_set.root, "disparity", out) if choice == "auto" else Path(choice)
 
 
 def chosen_data_sets(args: argparse.Namespace) -> tuple[DataSet, ...]:
@@ -67,27 +55,21 @@ def run(args: argparse.Namespace) -> None:
     """Make one experiment's tables."""
     torch.set_num_threads(args.threads)
     data_sets = chosen_data_sets(args)
-    fields = {d.name: stereo_field(d, args.stereo_bias, args.out / "fields") for d in data_sets}
-    options = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
-    for name in ("data", "out", "masks"):
-        # Results do not depend on where the files lie.
-        options.pop(name)
-    refinery = Refinery(args.out, fields, args.device)
+    given = None if args.stereo_bias in ("none", "auto") else Path(args.stereo_bias)
     experiment = Experiment(
+        out=args.out,
         data_sets=data_sets,
-        refinery=refinery,
-        report=Report(args.table, args.out, options),
+        fields={
+            d.name: field_file(d.root, args.out / "fields") if args.stereo_bias == "auto" else given for d in data_sets
+        },
+        device=args.device,
         frames=None if args.frames is None else tuple(frame.zfill(6) for frame in args.frames),
         detectors=None if args.detections is None else tuple(args.detections),
         bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
-        seed=args.seed,
         quick=args.quick,
-        only_groups=tuple(args.groups),
+        groups=tuple(args.groups),
     )
-    try:
-        TABLES[args.table](experiment)
-    finally:
-        experiment.report.write_record(refinery.used)
+    TABLES[args.table](experiment)
     print(f"{args.out / args.table}.md")
 
 

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
-from paper_tables.physical_cars import link_drive
+from paper_tables.data_sets import link_drive
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.car_identity import CarIdentity
