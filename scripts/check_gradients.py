@@ -68,7 +68,6 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
         pixels_per_car=args.pixels,
         second=args.second,
-        steps=args.steps,
     )
     scene = load_scene(args.data, args.frame, args.detections, args.masks)
     prior = (PCAShapePrior.load_bundled() if args.prior is None else PCAShapePrior.load(args.prior)).double()
@@ -89,7 +88,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; 0: all bounds hold, 1: one is broken, 2: wrong use."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--states", type=int, default=6, metavar="N", help="states in each regime (default 6)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="for CSV files, plots and summary.md")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for jacobians.csv and summary.md")
     parser.add_argument(
         "--term", nargs="+", metavar="NAME", help="terms and factors, default all; module:factory for one of your own"
     )
@@ -102,10 +101,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--pixels", type=int, default=64, metavar="N", help="pixels per car and side (default 64)")
     parser.add_argument("--second", action=argparse.BooleanOptionalAction, default=True, help="second derivatives too")
-    parser.add_argument(
-        "--steps", action=argparse.BooleanOptionalAction, default=True,
-        help="measure what float32 and the paper's depth derivative do to a step too",
-    )  # fmt: skip
     torch.set_num_threads(1)  # the operations are small, and threads would spin
     return run_command(parser, run, arguments)
 

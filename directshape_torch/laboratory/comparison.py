@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from directshape_torch.laboratory.differences import KINK, STEPS, DifferenceSweep, choose, sweep
+from directshape_torch.laboratory.differences import KINK, DifferenceSweep, choose, sweep
 from directshape_torch.laboratory.experiments import Experiment, Subject
 
 PAIRS = ("analytic-autograd", "analytic-numeric", "autograd-numeric")
@@ -36,17 +36,6 @@ class PairError:
 
 
 @dataclass(frozen=True)
-class StepCurve:
-    """Error of numeric differences against autograd over the step: the V-shape. Relative to the row's norm."""
-
-    steps: tuple[float, ...]
-    central_median: tuple[float, ...]
-    central_999: tuple[float, ...]
-    extrapolated_steps: tuple[float, ...]
-    extrapolated_median: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class Comparison:
     """One subject in one regime.
 
@@ -60,7 +49,6 @@ class Comparison:
         flat_rows: further rows so short that they are compared with `FLAT_SHARE` of the longest.
         errors: for each pair.
         value_error: see `Subject`.
-        curve: of the numeric differences; None where there is nothing to draw.
     """
 
     name: str
@@ -72,7 +60,6 @@ class Comparison:
     flat_rows: int
     errors: Mapping[str, PairError]
     value_error: float = 0.0
-    curve: StepCurve | None = field(repr=False, default=None)
 
     @property
     def excluded_share(self) -> float:
@@ -137,7 +124,6 @@ def _compare(subject: Subject, found: DifferenceSweep, regime: str) -> Compariso
         flat_rows=int((moving & (norm < scale)).sum()),
         errors={pair: _pair_error(e) for pair, e in pairs.items()},
         value_error=subject.value_error,
-        curve=_curve(subject, found, moving, scale[:, None]),
     )
 
 
@@ -175,17 +161,3 @@ def quantile(values: Tensor, share: float) -> float:
         return float("nan")
     rank = min(len(values) - 1, round(share * (len(values) - 1)))
     return float(values.sort().values[rank])
-
-
-def _curve(subject: Subject, found: DifferenceSweep, moving: Tensor, scale: Tensor) -> StepCurve | None:
-    if not bool(moving.any()):
-        return None
-    central = [((c - subject.autograd).abs() / scale)[moving].flatten() for c in found.central]
-    extrapolated = [((e - subject.autograd).abs() / scale)[moving].flatten() for e in found.extrapolated]
-    return StepCurve(
-        STEPS,
-        tuple(quantile(e, 0.5) for e in central),
-        tuple(quantile(e, 0.999) for e in central),
-        STEPS[2:],
-        tuple(quantile(e, 0.5) for e in extrapolated),
-    )

@@ -40,16 +40,14 @@ Evaluate = Callable[[Tensor], Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class DifferenceSweep:
-    """Derivatives of one function of D unknowns with values (R,), from S steps and S - 2 stencils.
+    """Derivatives of one function of D unknowns with values (R,), from S steps, which make S - 2 stencils.
 
     Attributes:
-        central: (S, R, D) plain central differences.
         extrapolated: (S - 2, R, D) Richardson's.
         error: (S - 2, R, D) estimated error of those: truncation, kinks and rounding.
         rounding: (S - 2, R, D) the rounding part alone.
     """
 
-    central: Tensor
     extrapolated: Tensor
     error: Tensor
     rounding: Tensor
@@ -101,7 +99,7 @@ def _extrapolate(centre: Tensor, plus: Tensor, minus: Tensor, noise: Tensor, uni
     _, extrapolated_jump = _two_orders(jump, (1, 3))
     rounding = 2 * noise[:, None] / step[2:]
     kink = (extrapolated_jump.abs() - _JUMP_ROUNDING * noise[:, None] / step[2:]).clamp_min(0)
-    return DifferenceSweep(central, second, (second - first[1:]).abs() + kink + rounding, rounding)
+    return DifferenceSweep(second, (second - first[1:]).abs() + kink + rounding, rounding)
 
 
 def _two_orders(values: Tensor, orders: tuple[int, int]) -> tuple[Tensor, Tensor]:

