@@ -14,13 +14,13 @@ from directshape_torch.errors import DataFormatError, InputError, MeshError
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.parametric_cars import BODY_TYPES, car_sdf, sample_car
+from directshape_torch.shape.prior_quality import FittedCar, fit_car, grid_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.inspection.prior_figures import (
     write_code_animation,
     write_code_figure,
     write_fit_figure,
 )
-from directshape_torch.visualize.inspection.prior_fit import FittedCar, fit_car, grid_of
 
 # The bundled prior is made of the generator's cars with seeds from 0 to 599.
 _UNSEEN_SEED = 100_000

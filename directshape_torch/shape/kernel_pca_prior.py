@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +21,9 @@ from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, P
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 from directshape_torch.shape.tensor_file import read_tensors, write_tensors
+
+_CURE = "make one with: python scripts/build_kernel_prior.py"
+_GRIDS = ("subspace.mean", "subspace.basis")
 
 
 class KernelPCAShapePrior(nn.Module):
@@ -49,6 +53,8 @@ class KernelPCAShapePrior(nn.Module):
         >>> at.J_value_code.shape
         torch.Size([1, 1])
     """
+
+    SCHEMA: ClassVar = "directshape_torch.kernel_pca_shape_prior/1"
 
     anchors: Tensor
     weights: Tensor
@@ -178,9 +184,10 @@ class KernelPCAShapePrior(nn.Module):
 
     def save(self, path: Path | str) -> None:
         """Write a safetensors file, atomically; the grids in float16, which rounds by less than 1 mm near surfaces."""
-        from directshape_torch.shape.kernel_pca_prior import write_kernel_prior
-
-        write_kernel_prior(self, Path(path))
+        tensors = dict(self.named_buffers())
+        tensors |= {name: tensors[name].to(torch.float16) for name in _GRIDS}
+        description = {"schema": self.SCHEMA, "spacing_m": self.spacing_m, "provenance": asdict(self.provenance)}
+        write_tensors(Path(path), tensors, description)
 
     @classmethod
     def load(cls, path: Path | str) -> KernelPCAShapePrior:
@@ -189,9 +196,15 @@ class KernelPCAShapePrior(nn.Module):
         Raises:
             DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
         """
-        from directshape_torch.shape.kernel_pca_prior import read_kernel_prior
-
-        return read_kernel_prior(Path(path))
+        path = Path(path)
+        tensors, description = read_tensors(path, cls.SCHEMA, _CURE)
+        of_subspace = {name.removeprefix("subspace."): tensors.pop(name) for name in list(tensors) if "." in name}
+        try:
+            made = PriorProvenance(**description["provenance"])
+            subspace = PCAShapePrior(spacing_m=float(description["spacing_m"]), provenance=made, **of_subspace)
+            return cls(subspace, **tensors)
+        except (InputError, KeyError, TypeError, ValueError) as problem:
+            raise DataFormatError(path, f"not a valid kernel PCA prior: {problem!r}", cure=_CURE) from problem
 
 
 class CurvedGridShape:
@@ -242,43 +255,3 @@ def _ridge_regression(
     penalised = kernel + ridge * torch.eye(len(anchors), dtype=kernel.dtype, device=kernel.device)
     weights = torch.linalg.solve(penalised, targets - design @ solution)
     return solution[0], solution[1:].T, weights
-
-
-SCHEMA = "directshape_torch.kernel_pca_shape_prior/1"
-CURE = "make one with: python scripts/build_kernel_prior.py"
-
-_GRIDS = ("subspace.mean", "subspace.basis")
-
-
-def write_kernel_prior(prior: KernelPCAShapePrior, path: Path) -> None:
-    """Write a prior; a reader never sees a half-written file."""
-    tensors = dict(prior.named_buffers())
-    tensors |= {name: tensors[name].to(torch.float16) for name in _GRIDS}
-    description = {
-        "schema": SCHEMA,
-        "spacing_m": prior.spacing_m,
-        "provenance": asdict(prior.provenance),
-    }
-    write_tensors(path, tensors, description)
-
-
-def read_kernel_prior(path: Path) -> KernelPCAShapePrior:
-    """Read a prior, float32 on the CPU.
-
-    Raises:
-        DataFormatError: missing, truncated, of another schema, or with tensors that do not fit together.
-    """
-    tensors, description = read_tensors(path, SCHEMA, CURE)
-    try:
-        provenance = PriorProvenance(**description["provenance"])
-        subspace = PCAShapePrior(
-            spacing_m=float(description["spacing_m"]), provenance=provenance, **_below(tensors, "subspace.")
-        )
-        own = {name: tensor for name, tensor in tensors.items() if "." not in name}
-        return KernelPCAShapePrior(subspace, **own)
-    except (InputError, KeyError, TypeError, ValueError) as problem:
-        raise DataFormatError(path, f"not a valid kernel PCA prior: {problem!r}", cure=CURE) from problem
-
-
-def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}

@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, shown
-from directshape_torch.shape import kernel_pca_prior as kernel_pca_prior_file
-from directshape_torch.shape import neural_prior as neural_prior_file
+from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -20,8 +19,8 @@ BUNDLED_PRIORS: Mapping[str, Callable[[], ShapePrior]] = {
 """The priors that come with the package, by the name that `load_prior` knows them by."""
 
 _READERS: Mapping[str, Callable[[Path], ShapePrior]] = {
-    neural_prior_file.SCHEMA: neural_prior_file.read_neural_prior,
-    kernel_pca_prior_file.SCHEMA: kernel_pca_prior_file.read_kernel_prior,
+    NeuralShapePrior.SCHEMA: NeuralShapePrior.load,
+    KernelPCAShapePrior.SCHEMA: KernelPCAShapePrior.load,
 }
 
 

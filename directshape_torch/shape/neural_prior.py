@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +27,8 @@ from directshape_torch.shape.tensor_file import read_tensors, write_tensors
 MIRROR_ROUNDING_M = 0.2
 # Typical frequency of the first layer before training: details of cars are a few decimetres large.
 FIRST_RADIANS_PER_M = 3.0
+_MOST_NODES = 2**24
+_CURE = "make one with: python scripts/train_neural_prior.py"
 # Points that are computed together: their units stay in a core's cache, which is twice as fast.
 _CHUNK_POINTS = 4096
 
@@ -68,6 +71,8 @@ class NeuralShapePrior(nn.Module):
         >>> bool(at.value < 0), at.gradient.shape, at.J_value_code.shape[1] == prior.num_codes
         (True, torch.Size([1, 3]), True)
     """
+
+    SCHEMA: ClassVar = "directshape_torch.neural_shape_prior/1"
 
     origin: Tensor
     dimensions_mean_hwl: Tensor
@@ -147,9 +152,15 @@ class NeuralShapePrior(nn.Module):
 
     def save(self, path: Path | str) -> None:
         """Write a safetensors file, atomically."""
-        from directshape_torch.shape.neural_prior import write_neural_prior
-
-        write_neural_prior(self, Path(path))
+        description = {
+            "schema": self.SCHEMA,
+            "layer_widths": self.layer_widths,
+            "num_codes": self.num_codes,
+            "grid_shape": self.grid_shape,
+            "spacing_m": self.spacing_m,
+            "provenance": asdict(self.provenance),
+        }
+        write_tensors(Path(path), {**dict(self.named_parameters()), **dict(self.named_buffers())}, description)
 
     @classmethod
     def load(cls, path: Path | str) -> NeuralShapePrior:
@@ -158,9 +169,21 @@ class NeuralShapePrior(nn.Module):
         Raises:
             DataFormatError: not such a file, truncated, another schema, or tensors that do not fit together.
         """
-        from directshape_torch.shape.neural_prior import read_neural_prior
-
-        return read_neural_prior(Path(path))
+        path = Path(path)
+        tensors, description = read_tensors(path, cls.SCHEMA, _CURE)
+        try:
+            settings = {name: description[name] for name in ("layer_widths", "num_codes", "spacing_m")}
+            nx, ny, nz = description["grid_shape"]
+            if len(settings["layer_widths"]) > len(tensors) or math.prod((nx, ny, nz)) > _MOST_NODES:
+                raise ValueError(f"more layers than tensors, or more than {_MOST_NODES} nodes")
+            made = PriorProvenance(**description["provenance"])
+            # Without memory and random numbers until it is filled: the sizes are those that somebody has written down.
+            with torch.device("meta"):
+                prior = cls(origin=torch.zeros(3), grid_shape=(nx, ny, nz), provenance=made, **settings)
+            prior.load_state_dict(tensors, assign=True)
+        except (InputError, KeyError, TypeError, ValueError, RuntimeError) as problem:
+            raise DataFormatError(path, f"it describes no neural prior: {problem}", cure=_CURE) from problem
+        return prior
 
     @classmethod
     def load_bundled(cls) -> NeuralShapePrior:
@@ -264,44 +287,3 @@ def _safe_norm(vector: Tensor) -> Tensor:
     squared = (vector * vector).sum(-1)
     positive = squared > 0
     return torch.where(positive, torch.where(positive, squared, torch.ones_like(squared)).sqrt(), squared)
-
-
-_MOST_NODES = 2**24
-SCHEMA = "directshape_torch.neural_shape_prior/1"
-CURE = "make one with: python scripts/train_neural_prior.py"
-
-
-def write_neural_prior(prior: NeuralShapePrior, path: Path) -> None:
-    """Write a prior, its weights as they are; a reader never sees a half-written file."""
-    tensors = {**dict(prior.named_parameters()), **dict(prior.named_buffers())}
-    description = {
-        "schema": SCHEMA,
-        "layer_widths": prior.layer_widths,
-        "num_codes": prior.num_codes,
-        "grid_shape": prior.grid_shape,
-        "spacing_m": prior.spacing_m,
-        "provenance": asdict(prior.provenance),
-    }
-    write_tensors(path, tensors, description)
-
-
-def read_neural_prior(path: Path) -> NeuralShapePrior:
-    """Read a prior, float32 on the CPU.
-
-    Raises:
-        DataFormatError: missing, truncated, of another schema, or with tensors that do not fit together.
-    """
-    tensors, description = read_tensors(path, SCHEMA, CURE)
-    try:
-        settings = {name: description[name] for name in ("layer_widths", "num_codes", "spacing_m")}
-        nx, ny, nz = description["grid_shape"]
-        if len(settings["layer_widths"]) > len(tensors) or math.prod((nx, ny, nz)) > _MOST_NODES:
-            raise ValueError(f"more layers than tensors, or more than {_MOST_NODES} nodes")
-        provenance = PriorProvenance(**description["provenance"])
-        # Without memory and random numbers until it is filled: the sizes are those that somebody has written down.
-        with torch.device("meta"):
-            prior = NeuralShapePrior(origin=torch.zeros(3), grid_shape=(nx, ny, nz), provenance=provenance, **settings)
-        prior.load_state_dict(tensors, assign=True)
-    except (InputError, KeyError, TypeError, ValueError, RuntimeError) as problem:
-        raise DataFormatError(path, f"it describes no neural prior: {problem}", cure=CURE) from problem
-    return prior

@@ -3,7 +3,7 @@ import pytest
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape import parametric_cars as cars
-from directshape_torch.shape.parametric_cars_solid import polygon_distance
+from directshape_torch.shape.parametric_cars import polygon_distance
 
 
 @pytest.mark.parametrize("body_type", cars.BODY_TYPES)

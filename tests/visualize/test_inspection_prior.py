@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.load_prior import load_prior
-from directshape_torch.shape.parametric_cars import car_sdf, sample_car
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.prior_quality import fit_code
+from directshape_torch.shape.prior_quality import grid_of
 from directshape_torch.visualize.inspection.prior_figures import code_frames, code_path
-from directshape_torch.visualize.inspection.prior_fit import fit_car, grid_of
 from directshape_torch.visualize.inspection.shape_figure import (
     FRONT_VIEW,
     coloured_surface,
@@ -29,45 +25,6 @@ PAINT = np.array([60.0, 130.0, 205.0])
 @pytest.fixture(scope="module")
 def prior() -> PCAShapePrior:
     return PCAShapePrior.load_bundled()
-
-
-def _car(prior: PCAShapePrior) -> torch.Tensor:
-    nodes = grid_of(prior).nodes()
-    distance = car_sdf(sample_car(123_456, "saloon"), nodes.reshape(-1, 3)).reshape(nodes.shape[:-1])
-    return torch.from_numpy(distance.astype(np.float32))
-
-
-@pytest.mark.parametrize("name", ["pca", "neural"])
-def test_fit_finds_a_shape_of_the_prior_again(name: str) -> None:
-    prior = load_prior(name)
-    code = prior.initial_code(1)
-    code[0, 0], code[0, 1] = 1.2, -0.8
-    with torch.no_grad():
-        truth = prior.values(code)[0]
-    fitted = fit_car(prior, truth, "itself")
-    assert fitted.error_cm < 0.1
-    np.testing.assert_allclose(fitted.code[:2], [1.2, -0.8], atol=0.05)
-
-
-def test_fit_of_an_unseen_car_is_the_least_squares_one(prior: PCAShapePrior) -> None:
-    truth = _car(prior)
-    fitted, expected = fit_car(prior, truth, "saloon"), fit_code(prior, truth)
-    assert expected.code.abs().max() < 3
-    np.testing.assert_allclose(fitted.code, expected.code, atol=0.02)
-    assert fitted.error_cm == pytest.approx(expected.mean_error_cm, rel=0.01)
-
-
-def test_codes_stay_within_three_deviations(prior: PCAShapePrior) -> None:
-    code = prior.initial_code(1)
-    code[0, 0] = 6.0
-    assert fit_car(prior, prior.values(code)[0], "giant").code.abs().max() <= 3
-
-
-def test_fit_refuses_another_grid_and_a_field_without_surface(prior: PCAShapePrior) -> None:
-    with pytest.raises(InputError, match="truth"):
-        fit_car(prior, torch.zeros(3, 3, 3), "small")
-    with pytest.raises(InputError, match="near the surface"):
-        fit_car(prior, torch.full_like(prior.mean, 5.0), "nothing")
 
 
 def test_colours_tell_outside_from_inside_and_zero_is_pale() -> None:

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from directshape_torch.io.figure_files import figure_picture, new_figure, write_animation, write_figure
+from directshape_torch.shape.prior_quality import FittedCar
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import Picture
 from directshape_torch.visualize.inspection.panels import TRUTH_INK
-from directshape_torch.visualize.inspection.prior_fit import FittedCar
 from directshape_torch.visualize.inspection.shape_figure import (
     FIELD_LIMIT_M,
     FRONT_VIEW,
