@@ -119,9 +119,8 @@ def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
     from directshape_torch.cli.progress import Bar
     from directshape_torch.errors import InputError
     from directshape_torch.rig.estimate import rig_among
-    from directshape_torch.rig.observe_motion import observe_motion
     from directshape_torch.rig.self_calibration import self_calibrate
-    from directshape_torch.rig.stereo_sequence import open_sequence
+    from directshape_torch.rig.stereo_sequence import observe_motion, open_sequence
 
     if not 0 <= args.camera_height < 10:
         raise InputError("--camera-height", "metres between 0 (not known) and 10", str(args.camera_height))

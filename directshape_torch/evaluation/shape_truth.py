@@ -18,6 +18,7 @@ from directshape_torch.files.npz_files import read_npz
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import points_from_disparity, rays_from_pixels
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
@@ -140,7 +141,7 @@ class SegmentSource:
         Raises:
             DataFormatError: the disparity map or the masks are missing or damaged.
         """
-        disparity = read_disparity(self.folder / f"{frame_id}.png")
+        disparity = read_disparity(self.folder / f"{frame_id}.png").astype(np.float64)
         masks = [mask for mask in self.masks.read(frame_id, disparity.shape) if mask.side == "left"]
         boxes = np.array([label.box_2d for label in labels], dtype=np.float64).reshape(-1, 4)
         found: dict[int, SegmentTruth] = {}
@@ -153,21 +154,9 @@ class SegmentSource:
         return found
 
 
-def read_disparity(path: Path) -> NDArray[np.float64]:
-    """A disparity map (H, W), pixels, 0 where unknown, from a 16-bit PNG of disparity times 256.
-
-    Raises:
-        DataFormatError: it is missing, damaged or has not 16 bits.
-    """
-    stored = read_single_channel(path)
-    if stored.dtype != np.uint16:
-        raise DataFormatError(path, f"expected 16 bits (disparity times 256), got {stored.dtype}")
-    return stored.astype(np.float64) / 256
-
-
 def segment_truth(
     name: str,
-    disparity: NDArray[np.float64],  # (H, W)
+    disparity: NDArray[np.float64],  # (H, W) pixels, NaN where unknown
     inside: NDArray[np.bool_],  # (H, W)
     camera: StereoCamera,  # of one frame
 ) -> SegmentTruth:

@@ -104,6 +104,19 @@ def observe_disparity(
     return DisparityObservations(uv[keep], bias[keep], vertical[keep], known.depth_m[chosen][keep])
 
 
+def matched_pixels(
+    image_left: NDArray[np.uint8],  # (H, W, 3) RGB
+    image_right: NDArray[np.uint8],  # (H, W, 3)
+    uv_left: Tensor,  # (P, 2) whole pixels, float64
+    matched: Tensor,  # (H, W) start, pixels
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Those of the pixels whose patches could be aligned: (Q, 2), their disparity (Q,) and row shift (Q,)."""
+    left, right = (_grey(image) for image in (image_left, image_right))
+    start = matched[uv_left[:, 1].long(), uv_left[:, 0].long()]
+    disparity, row_shift, reliable = refine_disparity(left, right, uv_left, start, torch.zeros_like(start))
+    return uv_left[reliable], disparity[reliable], row_shift[reliable]
+
+
 def cell_index(
     uv: Tensor,  # (P, 2)
     size_wh: tuple[int, int],

@@ -9,6 +9,7 @@ from typing import Protocol, Self
 import torch
 from torch import Tensor
 
+from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS
 from directshape_torch.rig.disparity_observations import DisparityObservations
 
@@ -90,3 +91,25 @@ def scale_of(distances: Tensor, degrees_of_freedom: int) -> float:
         return 1.0
     expected = 0.6745 if degrees_of_freedom == 1 else math.sqrt(2 * math.log(2))
     return float(distances.median()) / expected
+
+
+def disparity_slope(
+    uv_left: Tensor,  # (P, 2) pixels
+    inverse_depth: Tensor,  # (P,) 1/m
+    K_left: Tensor,  # (3, 3)
+    K_right: Tensor,  # (3, 3)
+    T_right_cam: Tensor,  # (4, 4)
+) -> Tensor:  # (P,)
+    """Derivative of the true disparity by the inverse depth, pixels x metres.
+
+    Examples:
+        >>> K, T = torch.tensor([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), torch.eye(4)
+        >>> T[0, 3] = -0.5
+        >>> disparity_slope(torch.tensor([[600.0, 180.0]]), torch.tensor([0.1]), K, K, T)
+        tensor([350.])
+    """
+    a = rays_from_pixels(uv_left, K_left) @ (K_right @ T_right_cam[:3, :3]).T
+    b = K_right @ T_right_cam[:3, 3]
+    homogeneous = a + inverse_depth[:, None] * b
+    u_right = homogeneous[:, 0] / homogeneous[:, 2]
+    return -(b[0] - u_right * b[2]) / homogeneous[:, 2]

@@ -15,8 +15,8 @@ from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.geometry.camera import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.rig.detections import near_side_depth
 from directshape_torch.rig.disparity_observations import KnownDepth
-from directshape_torch.rig.near_side import near_side_depth
 
 CLASSES = ("Car", "Van")
 _NEAREST_M = 15.0

@@ -1,8 +1,9 @@
-"""Consecutive stereo frames of one rig, from a folder in the layout of KITTI's tracking sequences."""
+"""Consecutive stereo frames of one rig, in the layout of KITTI's tracking sequences, and all constraints they offer."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -15,7 +16,11 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
+from directshape_torch.rig.field_constraint import FieldConstraint
 from directshape_torch.rig.frames_with_truth import chosen_frames
+from directshape_torch.rig.motion import STEPS, MotionConstraint, StereoFeatures, find_features, track_features
+from directshape_torch.rig.road import RoadConstraint, find_road_pixels
+from directshape_torch.stereo_matching.disparity import match_disparity
 
 _ENDINGS = (".png", ".jpg", ".jpeg")
 
@@ -101,3 +106,63 @@ def _images(root: Path, name: str) -> set[str]:
 def _in_time(frame_id: str) -> tuple[int, str]:
     """Numbers in their order, with and without leading zeros."""
     return len(frame_id), frame_id
+
+
+def observe_motion(
+    sequence: StereoSequence,
+    height_m: float | None,
+    frame_ids: Iterable[str] | None = None,
+) -> tuple[list[FieldConstraint], tuple[int, int]]:
+    """Read the frames one after the other and collect what they show.
+
+    Args:
+        sequence: of one rig.
+        height_m: of the camera above the road; None leaves the road out.
+        frame_ids: the sequence's own, as an iterator that shows progress, say.
+
+    Returns:
+        constraints, and (width, height) of the images.
+
+    Raises:
+        DataFormatError: an image is missing or damaged, or not as large as those before it.
+    """
+    constraints: list[FieldConstraint] = []
+    size_wh: tuple[int, int] | None = None
+    waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)
+    for frame_id in sequence.frame_ids if frame_ids is None else frame_ids:
+        left, right = sequence.read(frame_id)
+        size_wh = _one_size(size_wh, (left.shape[1], left.shape[0]), sequence.root / "image_02" / frame_id)
+        matched = torch.from_numpy(match_disparity(left, right)).double()
+        if height_m is not None:
+            road = find_road_pixels(left, right, sequence.camera, matched)
+            if road is not None:
+                constraints.append(RoadConstraint.of(road, sequence.camera, size_wh, height_m))
+        waiting.append(find_features(left, right, sequence.camera, matched))
+        if len(waiting) == waiting.maxlen:
+            constraints += _tracked(waiting, sequence, size_wh)
+            waiting.popleft()
+    if size_wh is None:
+        raise InputError("frame_ids", "at least one frame", "none")
+    # The last frames have fewer that follow them.
+    while len(waiting) > 1:
+        constraints += _tracked(waiting, sequence, size_wh)
+        waiting.popleft()
+    return constraints, size_wh
+
+
+def _one_size(before: tuple[int, int] | None, size_wh: tuple[int, int], path: Path) -> tuple[int, int]:
+    if before is not None and before != size_wh:
+        raise DataFormatError(
+            path,
+            f"is {size_wh[0]} x {size_wh[1]}, the frames before it {before[0]} x {before[1]}",
+            cure="give frames of one rig",
+        )
+    return size_wh
+
+
+def _tracked(
+    waiting: deque[StereoFeatures], sequence: StereoSequence, size_wh: tuple[int, int]
+) -> list[MotionConstraint]:
+    first, *later = waiting
+    tracked = track_features(first, [features.grey_left for features in later], sequence.camera)
+    return [MotionConstraint.of(tracks, sequence.camera, size_wh) for tracks in tracked]

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from directshape_torch.cli import calibrate_rig
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.rig.motion_constraint import MotionConstraint
-from directshape_torch.rig.observe_motion import observe_motion
+from directshape_torch.rig.motion import MotionConstraint
 from directshape_torch.rig.rig_file import load_fields
-from directshape_torch.rig.stereo_sequence import open_sequence
+from directshape_torch.rig.stereo_sequence import observe_motion, open_sequence
 
 SIZE = (320, 160)
 FOCAL_PX, BASELINE_M, BIAS_PX = 300.0, 0.5, -0.4

@@ -16,10 +16,8 @@ from directshape_torch.geometry.se3 import exp
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.field_constraint import FieldConstraint, Linearisation
-from directshape_torch.rig.motion_constraint import MotionConstraint
-from directshape_torch.rig.motion_tracks import TrackedFeatures
-from directshape_torch.rig.road_constraint import RoadConstraint
-from directshape_torch.rig.road_pixels import RoadPixels
+from directshape_torch.rig.motion import MotionConstraint, TrackedFeatures
+from directshape_torch.rig.road import RoadConstraint, RoadPixels
 from directshape_torch.rig.self_calibration import SelfCalibration, self_calibrate
 
 SIZE = (1242, 375)
