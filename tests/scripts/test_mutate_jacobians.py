@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import json
 from pathlib import Path
 
 import mutate_jacobians
 import pytest
-from jacobian_mutants.equivalents import EQUIVALENTS, reason_for
-from jacobian_mutants.forked_tests import function_of
 from jacobian_mutants.mutants import Mutant, mutants_of
-from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError
-from jacobian_mutants.targets import TARGETS, Target
+from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError, function_of
+from jacobian_mutants.targets import EQUIVALENTS, TARGETS, Target, reason_for
 
 _ROOT = Path(__file__).resolve().parents[2]
 
@@ -140,16 +137,13 @@ def test_tests_that_fail_without_a_mutation_are_an_error(small_tree: tuple[Path,
 
 
 def test_a_survivor_ends_the_command_with_1(
-    small_tree: tuple[Path, Target], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    small_tree: tuple[Path, Target], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root, target = small_tree
     monkeypatch.setattr(mutate_jacobians, "ROOT", root)
     monkeypatch.setattr(mutate_jacobians, "TARGETS", {"t": target})
-    report = tmp_path / "report.json"
-    assert mutate_jacobians.main(["--processes", "1", "--json", str(report)]) == 1
-    assert "SURVIVED" in capsys.readouterr().out
-    verdicts = [outcome["verdict"] for outcome in json.loads(report.read_text())["outcomes"]]
-    assert verdicts.count("survived") == 4
+    assert mutate_jacobians.main(["--processes", "1"]) == 1
+    assert capsys.readouterr().out.count("SURVIVED") == 4
 
 
 def test_a_sample_of_the_real_mutants_is_caught(capsys: pytest.CaptureFixture[str]) -> None:
