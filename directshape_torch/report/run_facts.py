@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.evaluation.comparison_summary import WORSE_BY_BEV_IOU
+from directshape_torch.evaluation.comparison import WORSE_BY_BEV_IOU
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_manifest import flatten
