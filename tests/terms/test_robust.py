@@ -16,6 +16,7 @@ def _check_weights(norm: RobustValue, residual: Tensor) -> None:
     (slope,) = torch.autograd.grad(norm.rho.sum(), residual)
     torch.testing.assert_close(norm.gradient_weight, slope)
     torch.testing.assert_close(norm.hessian_weight * residual, slope)
+    assert torch.equal(norm.information_weight, norm.hessian_weight)
 
 
 def test_weights_are_derivatives_of_the_value() -> None:
@@ -49,4 +50,5 @@ def test_identity_is_the_papers_reweighting_with_a_floor() -> None:
     norm = identity(residual, 0.01)
     assert (norm.rho == residual).all()
     assert (norm.gradient_weight == 1).all()
+    assert (norm.information_weight == 1).all()
     torch.testing.assert_close(norm.hessian_weight, torch.tensor([1 / 4.6, 2.0, 100.0, 100.0], dtype=torch.float64))
