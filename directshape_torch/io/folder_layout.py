@@ -16,7 +16,7 @@ from directshape_torch.files.text_files import Line
 from directshape_torch.io.coco_segmentation import decode_segmentation
 from directshape_torch.io.folder_json import FolderFrame, FolderObject, FolderRig, read_frame, read_rig
 from directshape_torch.io.frame_detections import GivenMasks
-from directshape_torch.io.frame_layout import existing_folder, first_disparity
+from directshape_torch.io.frame_layout import FrameLayout, existing_folder
 from directshape_torch.io.ground_plane_files import upright_plane
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import (
@@ -30,7 +30,7 @@ from directshape_torch.io.instance_masks import (
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
-from directshape_torch.io.mask_files import COCO_CAR_IDS, mask_source
+from directshape_torch.io.mask_files import COCO_CAR_IDS
 from directshape_torch.scene_check.image_boxes import project_boxes
 
 _CAR = "Car"
@@ -39,7 +39,7 @@ _OTHER_CATEGORY = 0
 _NO_BOX_3D = "-1 -1 -1 -1000 -1000 -1000 -10"
 
 
-class FolderLayout:
+class FolderLayout(FrameLayout):
     """`root/left`, `root/right`, `root/rig.json` and `root/frames/ID.json`; labels, planes and masks are in the latter.
 
     The frame of boxes and planes is the left camera's: `ref` is `cam`.
@@ -121,21 +121,6 @@ class FolderLayout:
             return None
         return [self._kitti_object(frame.path, number, entry, False) for number, entry in enumerate(frame.labels, 1)]
 
-    def disparity_path(self, folder: Path, frame_id: str) -> Path:
-        """`folder/ID.png`."""
-        return first_disparity(folder, frame_id)
-
-    def scan(self, frame_id: str) -> None:
-        """None: this layout has no scans."""
-
-    def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
-        """`folder/ID.bin`."""
-        return {"lidar": folder / f"{frame_id}.bin"}
-
-    def lidar_calibration(self, frame_id: str) -> KittiCalibration:
-        """The calibration of the frame; its format does not place a scanner, so a scan is refused by name."""
-        return self.calibration(frame_id)
-
     def sequence_of(self, frame_id: str) -> str:
         """All frames are of one drive."""
         return ""
@@ -146,7 +131,7 @@ class FolderLayout:
 
     def masks(self, directory: Path | None) -> MaskSource | None:
         """Those of the frames' files, unless a folder of others is given."""
-        return FolderMasks(self.root, self.detections_dir) if directory is None else mask_source(directory)
+        return FolderMasks(self.root, self.detections_dir) if directory is None else super().masks(directory)
 
     def given_masks(self, frame_id: str) -> GivenMasks | None:
         """Each object carries its masks."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,90 +15,92 @@ from directshape_torch.io.image_files import IMAGE_ENDINGS
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.mask_files import mask_source
 
 
-class FrameLayout(Protocol):
-    """Finds and reads the files of a frame, all but images and masks, whose readers the layouts share."""
+class FrameLayout(ABC):
+    """Finds and reads the files of a frame, all but images and masks, whose readers the layouts share.
 
-    @property
-    def detections_dir(self) -> Path:
-        """The folder that detections are read from."""
-        ...
+    Attributes:
+        detections_dir: the folder that detections are read from.
+        detection_file_name: what detection files are called, for messages.
+    """
 
-    @property
-    def detection_file_name(self) -> str:
-        """What detection files are called, for messages."""
-        ...
+    detections_dir: Path
+    detection_file_name: str
 
+    @abstractmethod
     def frame_ids(self) -> list[str]:
         """All frames that have detections, sorted."""
-        ...
 
+    @abstractmethod
     def frame_id(self, number: int) -> str:
         """The name of the frame of that number."""
-        ...
 
+    @abstractmethod
     def images(self, frame_id: str) -> tuple[Path, Path]:
         """Left and right image."""
-        ...
 
+    @abstractmethod
     def calibration_path(self, frame_id: str) -> Path: ...
 
+    @abstractmethod
     def calibration(self, frame_id: str) -> KittiCalibration: ...
 
+    @abstractmethod
     def plane_path(self, frame_id: str) -> Path | None:
         """The file with the ground plane of a frame, or None where it has none."""
-        ...
 
+    @abstractmethod
     def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
         """The plane (a, b, c, d) of that file, see `read_plane`.
 
         Raises:
             DataFormatError: there is none, or it is damaged.
         """
-        ...
 
+    @abstractmethod
     def detection_path(self, frame_id: str) -> Path: ...
 
+    @abstractmethod
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The detections of a frame."""
-        ...
 
+    @abstractmethod
     def labels(self, frame_id: str) -> list[KittiObject] | None:
         """The ground truth of a frame, or None."""
-        ...
 
     def disparity_path(self, folder: Path, frame_id: str) -> Path:
         """The disparity map of a frame in a folder of such maps."""
-        ...
+        return first_disparity(folder, frame_id)
 
     def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
         """The LiDAR scan of a frame and a calibration that places it in the camera, or None where there is no scan."""
-        ...
+        return None
 
     def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
         """By role: the scan of a frame in a folder of scans ("lidar"), and a file of the scanner's place."""
-        ...
+        return {"lidar": folder / f"{frame_id}.bin"}
 
     def lidar_calibration(self, frame_id: str) -> KittiCalibration:
         """The calibration that places the scanner in the camera, where its format can."""
-        ...
+        return self.calibration(frame_id)
 
     def sequence_of(self, frame_id: str) -> str | None:
         """The sequence of frames that follow each other, "" where there is but one; None: a frame by itself."""
-        ...
+        return None
 
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """When the left and the right image were taken, seconds from any start, or None where no file says so."""
-        ...
+        return None
 
     def masks(self, directory: Path | None) -> MaskSource | None:
         """The reader of a folder of masks; None: of those that come with the layout itself, if there are any."""
-        ...
+        return None if directory is None else mask_source(directory)
 
     def given_masks(self, frame_id: str) -> GivenMasks | None:
         """Which instance belongs to which detection where the layout's own masks say so; None: matched by overlap."""
-        ...
+        return None
 
 
 def existing_folder(path: Path, problem: str, cure: str = "check the path") -> Path:
@@ -110,12 +112,6 @@ def existing_folder(path: Path, problem: str, cure: str = "check the path") -> P
     if not path.is_dir():
         raise DataFormatError(path, problem, cure=cure)
     return path
-
-
-def detection_stems(folder: Path) -> list[str]:
-    """Names without ending of the result files in a folder, or in its folder `data` where there is one, sorted."""
-    nested = folder / "data"
-    return sorted(path.stem for path in (nested if nested.is_dir() else folder).glob("*.txt"))
 
 
 def first_existing(paths: Sequence[Path]) -> Path:

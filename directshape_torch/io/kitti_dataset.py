@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Unpack
 
 from directshape_torch.io.instance_masks import MaskSource
-from directshape_torch.io.kitti_layout import KittiObjectLayout
+from directshape_torch.io.kitti_layout import object_layout
 from directshape_torch.io.stereo_files import DatasetOptions, FileStereoDataset
 
 
@@ -32,4 +32,4 @@ class KittiStereoDataset(FileStereoDataset):
         masks: Path | str | MaskSource | None = None,
         **options: Unpack[DatasetOptions],
     ) -> None:
-        super().__init__(KittiObjectLayout(root, detections_dir), masks, **options)
+        super().__init__(object_layout(root, detections_dir), masks, **options)

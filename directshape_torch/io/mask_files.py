@@ -17,7 +17,6 @@ from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
     SIDES,
     InstanceMask,
-    MaskSource,
     Side,
     check_count,
     check_size,
@@ -50,7 +49,7 @@ class FrameJsonMasks:
     car_ids: frozenset[int] = COCO_CAR_IDS
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
-        path = self._path(frame_id)
+        path = self.path(frame_id)
         masks, entries = [], read_coco_list(path)
         check_count(path, len(entries), size_hw)
         for index, entry in enumerate(entries):
@@ -61,12 +60,13 @@ class FrameJsonMasks:
         return [mask for mask in masks if mask is not None]
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
-        path = self._path(frame_id)
+        path = self.path(frame_id)
         entries = read_coco_list(path)
         soft = [path.parent / str(entry["soft_probability"]) for entry in entries if entry.get("soft_probability")]
         return (path, *soft)
 
-    def _path(self, frame_id: str) -> Path:
+    def path(self, frame_id: str) -> Path:
+        """The file without which there are no masks of a frame."""
         return file_of_frame(self.directory, f"{frame_id}.json")
 
 
@@ -98,6 +98,10 @@ class InstancePngMasks:
     def files(self, frame_id: str) -> tuple[Path, ...]:
         left, right = (self.directory / folder for folder in self.folders)
         return tuple(find_image(folder, frame_id) for folder in (left, right) if folder == left or right.is_dir())
+
+    def path(self, frame_id: str) -> Path:
+        """The file without which there are no masks of a frame."""
+        return self.files(frame_id)[0]
 
     def _instances(self, path: Path, side: Side, ids: NDArray[Any]) -> Iterable[InstanceMask]:
         values = np.unique(ids).tolist()
@@ -163,7 +167,7 @@ class CocoFileMasks:
         return self._by_frame[side]
 
 
-def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> MaskSource:
+def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> FrameJsonMasks | InstancePngMasks:
     """The reader that fits a folder of masks: instance PNG if it holds `instance_2` (or `instance_02`), else one json
     a frame.
 

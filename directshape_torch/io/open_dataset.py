@@ -7,11 +7,9 @@ from typing import Literal, Unpack, get_args
 
 from directshape_torch.errors import InputError
 from directshape_torch.io.folder_layout import FolderLayout
-from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.sequence_layout import raw_layout, tracking_layout
-from directshape_torch.io.stereo2015_layout import Stereo2015Layout
+from directshape_torch.io.kitti_layout import raw_layout, stereo2015_layout, tracking_layout
 from directshape_torch.io.stereo_files import DatasetOptions, FileStereoDataset
 
 LayoutName = Literal["kitti", "raw", "tracking", "stereo2015", "folder"]
@@ -44,12 +42,7 @@ def open_dataset(
         raise InputError("detections", f"a folder of detections for the layout {layout!r}", "none", "--detections DIR")
     if layout == "kitti":
         return KittiStereoDataset(root, str(detections_dir), masks, **options)
-    return FileStereoDataset(_find_layout(layout, root, detections_dir), masks, **options)
-
-
-def _find_layout(layout: LayoutName, root: Path | str, detections_dir: Path | str | None) -> FrameLayout:
     if layout == "folder":
-        return FolderLayout(root, detections_dir)
-    if layout == "stereo2015":
-        return Stereo2015Layout(root, str(detections_dir))
-    return (raw_layout if layout == "raw" else tracking_layout)(root, str(detections_dir))
+        return FileStereoDataset(FolderLayout(root, detections_dir), masks, **options)
+    find = {"raw": raw_layout, "tracking": tracking_layout, "stereo2015": stereo2015_layout}[layout]
+    return FileStereoDataset(find(root, str(detections_dir)), masks, **options)

@@ -9,7 +9,7 @@ from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.config_files import load_config
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.kitti_layout import KittiObjectLayout
+from directshape_torch.io.kitti_layout import object_layout
 from directshape_torch.io.mask_files import mask_source
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.report.frame_inputs import InputSources
@@ -36,7 +36,7 @@ class FinishedRun:
 
     @property
     def sources(self) -> InputSources:
-        layout = KittiObjectLayout(self.root, self.root / "detections")
+        layout = object_layout(self.root, self.root / "detections")
         return InputSources(layout, True, mask_source(self.root / "masks"))
 
 

@@ -14,7 +14,7 @@ import torch
 from demo_scene import camera, car_surfaces, frame_files, labels, layout, motion, sensor, surfaces
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.sequence_layout import tracking_layout
+from directshape_torch.io.kitti_layout import tracking_layout
 
 # pycocotools' decode predates numpy 2's protocol.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
