@@ -35,7 +35,6 @@ def write_recording(path: Path, out_dir: Path, dataset: StereoDataset, refiner: 
     Raises:
         DirectShapeError: a file is missing or damaged.
     """
-    from directshape_torch.batch.content_hashes import hash_prior
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.export.frame_source import ExportInputs
     from directshape_torch.export.rerun_recording import record_run
@@ -45,8 +44,7 @@ def write_recording(path: Path, out_dir: Path, dataset: StereoDataset, refiner: 
     if not done:
         print("warning: no recording, for no frame was refined", file=sys.stderr)
         return
-    priors = {hash_prior(refiner.prior): refiner.prior}
     with ProgressBar("record") as progress:
-        inputs = ExportInputs(priors, dataset, has_detections=True, refiner=refiner)
+        inputs = ExportInputs(refiner.prior, dataset, has_detections=True, refiner=refiner)
         record_run(path, RunFolder(out_dir, done), inputs, progress)
     print(f"viewer   rerun {path}")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
+from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import InputError
 from directshape_torch.export import exporters
@@ -49,6 +50,8 @@ def export_run(
     """
     if not run.frame_ids:
         raise InputError("frames", f"finished frames of {run.path}", "none")
+    if inputs.prior is not None and hash_prior(inputs.prior) != run.manifest.sha256["prior"]:
+        raise InputError("prior", "that of the run", "another one", "name that of the run with --prior")
     feed([_make(one, Path(folder), run, inputs) for one in dict.fromkeys(formats)], run, inputs, observer)
 
 

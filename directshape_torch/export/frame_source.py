@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.export.painted_cars import PaintedFrame
-from directshape_torch.io.run_folder import FrameResult, RunFolder, shapes_path
+from directshape_torch.io.run_folder import FrameResult, RunFolder
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -20,7 +19,7 @@ class ExportInputs:
     """What an export may use beside the run itself.
 
     Attributes:
-        priors: shape priors by the hash that a run notes of them.
+        prior: the shapes of the run; None: exports without surfaces.
         dataset: images, calibrations, masks and detections of the run's frames; None: exports without colours, and
             none that need an image.
         data_root: folder that names of images begin in, where a file lists them.
@@ -30,7 +29,7 @@ class ExportInputs:
         points_per_car: points spread over a surface.
     """
 
-    priors: Mapping[str, ShapePrior]
+    prior: ShapePrior | None = None
     dataset: StereoDataset | None = None
     data_root: Path | None = None
     has_detections: bool = False
@@ -89,12 +88,8 @@ class FrameSource:
         """The shapes that the codes of the run belong to.
 
         Raises:
-            DataFormatError: it was another prior.
+            InputError: it was not given.
         """
-        sha256 = self.refined.shapes.prior_sha256
-        if sha256 not in self.inputs.priors:
-            path = shapes_path(self.run.path, self.frame_id)
-            raise DataFormatError(
-                path, f"was made with another shape prior ({sha256[:12]})", cure="name that of the run with --prior"
-            )
-        return self.inputs.priors[sha256]
+        if self.inputs.prior is None:
+            raise InputError("--prior", "the shape prior of the run", "nothing")
+        return self.inputs.prior

@@ -1,4 +1,4 @@
-"""The table of cars: one row of numbers and words each, without pictures."""
+"""The table of cars: one row of numbers and words each, and which frames of them get pictures."""
 
 from __future__ import annotations
 
@@ -6,11 +6,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
+from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
+from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
-from directshape_torch.report.errors_to_labels import JudgedCar, judge_cars
-from directshape_torch.report.json_numbers import known
+from directshape_torch.report.page_data import known
 from directshape_torch.status import Status
+
+
+@dataclass(frozen=True)
+class BoxErrors:
+    """Errors of one box: centre distance in metres, heading in degrees, overlap of the footprints."""
+
+    centre_m: float
+    yaw_deg: float
+    bev_iou: float
+
+
+@dataclass(frozen=True)
+class JudgedCar:
+    """A car whose label is known.
+
+    Attributes:
+        counts: whether `directshape compare` would count the label.
+        before: None where the detections are not at hand.
+        after: of the result.
+    """
+
+    counts: bool
+    before: BoxErrors | None
+    after: BoxErrors
 
 
 @dataclass(frozen=True)
@@ -127,3 +152,65 @@ def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) ->
 def is_refined(status: str) -> bool:
     """Whether a status is one of a refined state; one of a later version is taken for none."""
     return status in Status.__members__ and Status[status].is_refined
+
+
+def judge_cars(
+    before: Sequence[KittiObject] | None, after: Sequence[KittiObject], labels: Sequence[KittiObject]
+) -> dict[int, JudgedCar]:
+    """The errors of each car that has a label, by its place in `after`.
+
+    Args:
+        before: the same cars as the detector gave them, or None.
+        after: result lines of the refined classes; matched by their 2D boxes, which a refinement leaves alone.
+        labels: of the frame, all classes.
+    """
+    partners = match_to_labels(after, labels)
+    cars = [car for car, partner in enumerate(partners) if partner >= 0]
+    if not cars:
+        return {}
+    true = [labels[partners[car]] for car in cars]
+    counted = CountedLabels(tuple({o.type for o in after}))
+    errors_after = _errors([after[car] for car in cars], true)
+    errors_before = [None] * len(cars) if before is None else _errors([before[car] for car in cars], true)
+    return {
+        car: JudgedCar(counted.counts(label), e_before, e_after)
+        for car, label, e_before, e_after in zip(cars, true, errors_before, errors_after, strict=True)
+    }
+
+
+def _errors(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> list[BoxErrors]:
+    errors = pose_errors(boxes_of(objects), boxes_of(true))
+    columns = (errors.centre_m.tolist(), errors.yaw_deg.tolist(), errors.bev_iou.tolist())
+    return [BoxErrors(*row) for row in zip(*columns, strict=True)]
+
+
+def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
+    """How much better each car became, and the number of its frame, worst first.
+
+    By the overlap with the label where the run has labels, else by the probability to be better; the two cannot be
+    compared. Cars that were not refined have none. The page's `highlights.js` ranks by the same rule.
+    """
+    refined = [row for row in rows if row.refined]
+    judged = [(row.iou_before, row.iou_after, row.frame) for row in refined]
+    by_labels = [(after - before, f) for before, after, f in judged if before is not None and after is not None]
+    if any(row.iou_before is not None for row in rows):
+        return sorted(by_labels)
+    return sorted((row.probability_better, row.frame) for row in refined if row.probability_better is not None)
+
+
+def choose_frames(rows: Sequence[CarRow], num_frames: int, most: int) -> list[int]:
+    """Numbers of the frames to show, ascending: those of the worst and best cars first, then evenly over the run.
+
+    Examples:
+        >>> choose_frames([], 10, 3)
+        [0, 3, 6]
+    """
+    if num_frames <= most:
+        return list(range(num_frames))
+    gains = car_gains(rows)
+    ranked = [frame for pair in zip(gains, reversed(gains), strict=True) for _, frame in pair]
+    # At most half of the frames for the extremes: a page of nothing else would mislead.
+    chosen = list(dict.fromkeys(ranked))[: most // 2]
+    evenly = [number * num_frames // most for number in range(most)]
+    rest = [frame for frame in (*evenly, *range(num_frames)) if frame not in set(chosen)]
+    return sorted([*chosen, *list(dict.fromkeys(rest))[: most - len(chosen)]])

@@ -1,4 +1,4 @@
-"""What a refinement looks at, pixel by pixel: photometric and silhouette residuals of one car, in the left image.
+"""What a refinement looks at, pixel by pixel: photometric and silhouette residuals of one car, as coloured pictures.
 
 A map is made anew from the state: all pixels of the car's window, not only the sampled ones, and without the rules by
 which the energy leaves pixels out, but for other instances that lie in front.
@@ -20,17 +20,27 @@ from directshape_torch.geometry.camera import rays_from_pixels, warp_to_right
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.report.pictures import Window
+from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.silhouette import ZETA_BOUNDS, closest_approach_residual
+from directshape_torch.visualize.drawing import Picture
 
 Floats = npt.NDArray[np.floating[Any]]
+Window = tuple[int, int, int, int]
 
 # A near car needs no ray for each of its pixels.
 _MOST_COLUMNS = 240
 # Two exposures differ by a few percent (as in the energy); more is a wrong place.
 _GAIN_BOUNDS = (0.8, 1.25)
+
+FULL_COLOUR_GREY_LEVELS = 40.0
+# Of a sure pixel: -log(0.01).
+FULL_COLOUR_SILHOUETTE = 4.6
+
+_RED, _BLUE, _WHITE = (np.array(c, dtype=np.float64) for c in ((214, 47, 39), (49, 87, 200), (245, 245, 245)))
+_SPILLED, _UNFILLED = (np.array(c, dtype=np.float64) for c in ((255, 140, 0), (186, 60, 220)))
+_DIM = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,14 +62,12 @@ class ViewedPair:
     """
 
     left: Tensor
-    right: Tensor | None
+    right: Tensor
     camera: StereoCamera
 
     @classmethod
-    def of_images(
-        cls, left: npt.NDArray[np.uint8], right: npt.NDArray[np.uint8] | None, camera: StereoCamera
-    ) -> ViewedPair:
-        return cls(_grey(left), None if right is None else _grey(right), camera)
+    def of_frame(cls, frame: FrameBatch) -> ViewedPair:
+        return cls(grey_levels(frame.images_left), grey_levels(frame.images_right), frame.camera)
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,7 @@ class ResidualMaps:
             a mask.
     """
 
-    photometric: Floats | None
+    photometric: Floats
     silhouette: Floats | None
 
 
@@ -104,10 +112,8 @@ def residual_maps(
     ray_cam = rays_from_pixels(uv, pair.camera.K_left[0])
     seen = cast(prior, CarState.of(se3.inverse(T), code_of_car), torch.zeros_like(ray_cam[0]), ray_cam)
     out = torch.from_numpy(hidden)[uv[:, 1].long(), uv[:, 0].long()]
-    photometric = None
-    if pair.right is not None:
-        hit = seen.depth.isfinite()
-        photometric = _photometric(pair, uv, ray_cam, seen.depth.where(hit, 1.0), hit & ~out, settings)
+    hit = seen.depth.isfinite()
+    photometric = _photometric(pair, uv, ray_cam, seen.depth.where(hit, 1.0), hit & ~out, settings)
     silhouette = None
     if foreground is not None:
         p_fg = torch.from_numpy(foreground)[uv[:, 1].long(), uv[:, 0].long()].to(uv)
@@ -115,7 +121,7 @@ def residual_maps(
         silhouette = torch.where(out, torch.zeros_like(p_fg), _silhouette(seen.closest_sdf, p_fg, zeta, settings))
     size = grid.shape[:2]
     return ResidualMaps(
-        None if photometric is None else photometric.reshape(size).numpy(),
+        photometric.reshape(size).numpy(),
         None if silhouette is None else silhouette.reshape(size).numpy(),
     )
 
@@ -125,7 +131,6 @@ def _photometric(
 ) -> Tensor:
     """Right minus left, grey levels, NaN where not seen."""
     camera = pair.camera
-    assert pair.right is not None, "asked for only where there is a right image"
     rig = camera.disparity_field
     bias, vertical = (None, None) if rig is None else rig.offsets(uv)
     warped = warp_to_right(ray_cam, depth, camera.K_right[0], camera.T_right_cam[0], bias, vertical)
@@ -151,5 +156,35 @@ def _zeta(camera: StereoCamera, depth_m: float, settings: MapSettings) -> float:
     return min(max(zeta, ZETA_BOUNDS[0]), ZETA_BOUNDS[1])
 
 
-def _grey(image: npt.NDArray[np.uint8]) -> Tensor:
-    return grey_levels(torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255)
+def photometric_picture(image: Picture, window: Window, residual: Floats) -> Picture:
+    """White where left and right agree, red where the right image is brighter, blue where it is darker.
+
+    Args:
+        image: (H, W, 3) left.
+        window: of the car.
+        residual: (h, w) grey levels, NaN where there is none.
+    """
+    known = np.isfinite(residual)
+    share = np.clip(np.nan_to_num(residual) / FULL_COLOUR_GREY_LEVELS, -1, 1)[..., None]
+    tint = np.where(share > 0, _RED, _BLUE)
+    colour = _WHITE + np.abs(share) * (tint - _WHITE)
+    return _uint8(np.where(known[..., None], colour, dimmed(image, window)))
+
+
+def silhouette_picture(image: Picture, window: Window, residual: Floats) -> Picture:
+    """Orange where the shape spills out of its mask, violet where it does not fill it, over the dimmed image."""
+    strength = np.clip(np.abs(residual) / FULL_COLOUR_SILHOUETTE, 0, 1)[..., None] ** 0.7
+    tint = np.where(residual[..., None] > 0, _SPILLED, _UNFILLED)
+    base = dimmed(image, window)
+    return _uint8(base + strength * (tint - base))
+
+
+def dimmed(image: Picture, window: Window) -> Floats:
+    """The image at the pixels of a map, darker and grey, (h, w, 3)."""
+    grid = pixel_grid(window).long().numpy()
+    grey = image[grid[..., 1], grid[..., 0]].mean(axis=-1, keepdims=True)
+    return np.asarray(np.repeat(_DIM * grey, 3, axis=-1))
+
+
+def _uint8(colours: Floats) -> Picture:
+    return np.ascontiguousarray(np.round(np.clip(colours, 0, 255)).astype(np.uint8))

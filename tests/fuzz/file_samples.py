@@ -38,7 +38,6 @@ from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
 from directshape_torch.io.velodyne import read_points, read_scan
-from directshape_torch.report.frame_inputs import InputSources
 from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
@@ -194,7 +193,7 @@ def _runs(root: Path, out: Path) -> dict[str, Sample]:
     refine(root, out, overlays=True)
 
     def report() -> object:
-        return make_report(out, out.parent / "page.html", InputSources(), load_prior(root / "prior.npz"))
+        return make_report(RunFolder(out), out.parent / "page.html", prior=load_prior(root / "prior.npz"))
 
     def resumed() -> object:
         return refine(root, out, overlays=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.cli.main import main
 from directshape_torch.export.frame_source import ExportInputs
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -27,8 +26,7 @@ class FinishedRun:
     def inputs(self, with_images: bool = True, **options: object) -> ExportInputs:
         """What an export may use."""
         dataset = KittiStereoDataset(self.root, self.root / "detections", self.root / "masks") if with_images else None
-        priors = {hash_prior(prior): prior for prior in (PCAShapePrior.load(self.root / "prior.npz"),)}
-        return ExportInputs(priors, dataset, self.root, **options)  # type: ignore[arg-type]
+        return ExportInputs(PCAShapePrior.load(self.root / "prior.npz"), dataset, self.root, **options)  # type: ignore[arg-type]
 
     @property
     def folder(self) -> RunFolder:

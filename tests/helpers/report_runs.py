@@ -9,10 +9,8 @@ from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.config_files import load_config
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.kitti_layout import object_layout
-from directshape_torch.io.mask_files import mask_source
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.report.frame_inputs import InputSources
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.kitti_folder import write_data_set
 
@@ -35,9 +33,12 @@ class FinishedRun:
         return PCAShapePrior.load(self.root / "prior.npz")
 
     @property
-    def sources(self) -> InputSources:
-        layout = object_layout(self.root, self.root / "detections")
-        return InputSources(layout, True, mask_source(self.root / "masks"))
+    def dataset(self) -> KittiStereoDataset:
+        classes = self.folder().classes
+        return KittiStereoDataset(self.root, self.root / "detections", self.root / "masks", classes=classes)
+
+    def folder(self, *frames: str) -> RunFolder:
+        return RunFolder(self.out, frames or None)
 
 
 def finished_run(

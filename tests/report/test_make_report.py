@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,13 @@ import numpy as np
 import pytest
 from helpers.report_runs import FinishedRun, finished_run
 
+from directshape_torch.config_files import load_config
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
-from directshape_torch.report.frame_inputs import InputSources
-from directshape_torch.report.make_report import ReportOptions, make_report, map_settings
-from directshape_torch.report.mesh_data import unpacked
+from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.report.make_report import make_report, map_settings
+from directshape_torch.report.page_data import unpacked
 from directshape_torch.report.residual_maps import MapSettings
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -35,7 +35,7 @@ def blocks(page: Path) -> dict[str, Any]:
 
 
 def test_page_carries_every_part(run: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(run.out, tmp_path / "page.html", run.sources, run.prior)
+    outcome = make_report(run.folder(), tmp_path / "page.html", run.dataset, run.prior)
     data = blocks(outcome.path)
     assert outcome.notes == ()
     assert data["run"]["notes"] == []
@@ -56,7 +56,7 @@ def test_page_carries_every_part(run: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_table_says_what_the_files_say(run: FinishedRun, tmp_path: Path) -> None:
-    data = blocks(make_report(run.out, tmp_path / "page.html", run.sources, run.prior).path)
+    data = blocks(make_report(run.folder(), tmp_path / "page.html", run.dataset, run.prior).path)
     rows = [dict(zip(data["cars"]["columns"], row, strict=True)) for row in data["cars"]["rows"]]
     shapes = read_shapes(run.out / "shapes" / "000001.npz")
     last = [row for row in rows if row["frame"] == 1]
@@ -85,7 +85,7 @@ def test_table_says_what_the_files_say(run: FinishedRun, tmp_path: Path) -> None
 
 
 def test_meshes_stand_on_the_page_where_their_boxes_are(run: FinishedRun, tmp_path: Path) -> None:
-    scene = blocks(make_report(run.out, tmp_path / "page.html", run.sources, run.prior).path)["scene-0"]
+    scene = blocks(make_report(run.folder(), tmp_path / "page.html", run.dataset, run.prior).path)["scene-0"]
     for car in scene["cars"]:
         vertices = unpacked(car["mesh"]["vertices"]).reshape(3, -1).T / 1000
         T = np.array(car["T_cam_obj"]).reshape(4, 4)
@@ -98,8 +98,8 @@ def test_meshes_stand_on_the_page_where_their_boxes_are(run: FinishedRun, tmp_pa
 
 
 def test_saved_meshes_stand_in_for_the_prior(run: FinishedRun, tmp_path: Path) -> None:
-    with_prior = blocks(make_report(run.out, tmp_path / "a.html", InputSources(), run.prior).path)["scene-0"]
-    outcome = make_report(run.out, tmp_path / "b.html", InputSources())
+    with_prior = blocks(make_report(run.folder(), tmp_path / "a.html", prior=run.prior).path)["scene-0"]
+    outcome = make_report(run.folder(), tmp_path / "b.html")
     saved = blocks(outcome.path)["scene-0"]
     assert any("no residual maps" in note for note in outcome.notes)
     for decoded_car, saved_car in zip(with_prior["cars"], saved["cars"], strict=True):
@@ -109,7 +109,7 @@ def test_saved_meshes_stand_in_for_the_prior(run: FinishedRun, tmp_path: Path) -
 
 
 def test_without_inputs_the_page_says_so(run: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(run.out, tmp_path / "page.html", InputSources(), run.prior)
+    outcome = make_report(run.folder(), tmp_path / "page.html", prior=run.prior)
     data = blocks(outcome.path)
     assert data["run"]["notes"] == list(outcome.notes)
     assert any("--data" in note for note in outcome.notes)
@@ -125,7 +125,7 @@ def test_a_changed_image_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
     shutil.copy(root / "training/image_3/000000.png", root / "training/image_2/000000.png")
     (root / "training/image_2/000001.png").unlink()
     (root / "masks/000001.json").unlink()
-    outcome = make_report(run.out, tmp_path / "page.html", FinishedRun(root, run.out).sources, run.prior)
+    outcome = make_report(run.folder(), tmp_path / "page.html", FinishedRun(root, run.out).dataset, run.prior)
     data = blocks(outcome.path)
     assert data["scene-0"]["image"] is None
     assert "left image not used: the file has changed since the run (1 of 2 frames)" in outcome.notes
@@ -137,8 +137,8 @@ def test_changed_detections_are_named_for_frames_without_pictures_too(run: Finis
     for name in ("000000.txt", "000001.txt"):
         path = root / "detections" / "data" / name
         path.write_text(path.read_text() + "\n")
-    sources = FinishedRun(root, run.out).sources
-    outcome = make_report(run.out, tmp_path / "page.html", sources, run.prior, ReportOptions(most_frames=1))
+    dataset = FinishedRun(root, run.out).dataset
+    outcome = make_report(run.folder(), tmp_path / "page.html", dataset, run.prior, most_frames=1)
     assert "detections not used: the file has changed since the run (2 of 2 frames)" in outcome.notes
 
 
@@ -146,19 +146,19 @@ def test_images_are_looked_for_where_there_are_pictures(run: FinishedRun, tmp_pa
     root = Path(shutil.copytree(run.root, tmp_path / "kitti"))
     for name in ("000000.png", "000001.png"):
         (root / "training" / "image_2" / name).unlink()
-    sources = FinishedRun(root, run.out).sources
-    outcome = make_report(run.out, tmp_path / "page.html", sources, run.prior, ReportOptions(most_frames=1))
+    dataset = FinishedRun(root, run.out).dataset
+    outcome = make_report(run.folder(), tmp_path / "page.html", dataset, run.prior, most_frames=1)
     assert "left image not found (1 of 1 frames)" in outcome.notes
 
 
 def test_another_prior_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(run.out, tmp_path / "page.html", run.sources, PCAShapePrior.load_bundled())
+    outcome = make_report(run.folder(), tmp_path / "page.html", run.dataset, PCAShapePrior.load_bundled())
     assert any("the prior is not that of the run" in note for note in outcome.notes)
     assert "mean-mesh" not in blocks(outcome.path)
 
 
 def test_few_frames_have_details(run: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(run.out, tmp_path / "page.html", run.sources, run.prior, ReportOptions(most_frames=1))
+    outcome = make_report(run.folder(), tmp_path / "page.html", run.dataset, run.prior, most_frames=1)
     data = blocks(outcome.path)
     assert len(data["frames"]["detailed"]) == 1
     assert len(data["cars"]["rows"]) == 4
@@ -167,12 +167,12 @@ def test_few_frames_have_details(run: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_chosen_frames_alone(run: FinishedRun, tmp_path: Path) -> None:
-    options = ReportOptions(frames=("1", "000001"))
-    data = blocks(make_report(run.out, tmp_path / "page.html", run.sources, run.prior, options).path)
+    page = make_report(run.folder("1", "000001"), tmp_path / "page.html", run.dataset, run.prior).path
+    data = blocks(page)
     assert data["frames"]["ids"] == ["000001"]
     assert data["run"]["frames_done"] == 1
     with pytest.raises(InputError, match="000009"):
-        make_report(run.out, tmp_path / "page.html", run.sources, run.prior, ReportOptions(frames=("000009",)))
+        run.folder("000009")
 
 
 def test_failed_frames_and_frames_without_cars(run: FinishedRun, tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_failed_frames_and_frames_without_cars(run: FinishedRun, tmp_path: Path)
     (data_set / "training/image_3/000000.png").write_bytes(b"no image")
     (data_set / "detections/data/000001.txt").write_text("")
     again = _refined_again(data_set, folder / "out")
-    data = blocks(make_report(again.out, tmp_path / "page.html", again.sources, again.prior).path)
+    data = blocks(make_report(again.folder(), tmp_path / "page.html", again.dataset, again.prior).path)
     assert list(data["run"]["failed"]) == ["000000"]
     assert data["frames"]["ids"] == ["000001"]
     assert data["cars"]["rows"] == []
@@ -210,11 +210,13 @@ def test_a_run_that_was_cut_off(run: FinishedRun, tmp_path: Path) -> None:
     (out / "run.jsonl").write_text("".join(log[:-2]))
     text = (out / "data" / "000001.txt").read_bytes()
     (out / "data" / "000001.txt").unlink()
-    assert blocks(make_report(out, tmp_path / "a.html", run.sources, run.prior).path)["frames"]["ids"] == ["000000"]
+    assert blocks(make_report(RunFolder(out), tmp_path / "a.html", run.dataset, run.prior).path)["frames"]["ids"] == [
+        "000000"
+    ]
     (out / "data" / "000001.txt").write_bytes(text)
     summary = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
-    outcome = make_report(out, tmp_path / "b.html", run.sources, run.prior)
+    outcome = make_report(RunFolder(out), tmp_path / "b.html", run.dataset, run.prior)
     assert blocks(outcome.path)["frames"]["ids"] == ["000000", "000001"]
     assert blocks(outcome.path)["run"]["ground_sources"] == {"file": 2}
     (note,) = outcome.notes
@@ -222,13 +224,15 @@ def test_a_run_that_was_cut_off(run: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_equal_runs_give_equal_pages(run: FinishedRun, tmp_path: Path) -> None:
-    pages = [make_report(run.out, tmp_path / f"{n}.html", run.sources, run.prior).path.read_bytes() for n in range(2)]
+    pages = [
+        make_report(run.folder(), tmp_path / f"{n}.html", run.dataset, run.prior).path.read_bytes() for n in range(2)
+    ]
     assert pages[0] == pages[1]
 
 
 def test_no_run_no_page(tmp_path: Path) -> None:
     with pytest.raises(DataFormatError, match=r"summary\.json.*directshape refine"):
-        make_report(tmp_path, tmp_path / "page.html", InputSources())
+        make_report(RunFolder(tmp_path), tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
 
 
@@ -238,7 +242,7 @@ def test_a_damaged_frame_leaves_the_old_page(run: FinishedRun, tmp_path: Path) -
     page.write_text("old")
     (out / "shapes" / "000001.npz").write_bytes(b"PK")
     with pytest.raises(DataFormatError, match="000001"):
-        make_report(out, page, run.sources, run.prior)
+        make_report(RunFolder(out), page, run.dataset, run.prior)
     assert page.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir() if path.name.endswith(".tmp")] == []
 
@@ -248,17 +252,12 @@ def test_results_of_other_lines_are_refused(run: FinishedRun, tmp_path: Path) ->
     path = out / "data" / "000000.txt"
     path.write_text("\n".join(path.read_text().splitlines()[1:]) + "\n")
     with pytest.raises(DataFormatError, match="has been changed, or does not belong to"):
-        make_report(out, tmp_path / "page.html", InputSources())
+        make_report(RunFolder(out), tmp_path / "page.html")
 
 
-def test_settings_of_maps_are_those_of_the_run() -> None:
-    refiner = {
-        "stages": [{"contour_width_px": 2.0}, {"contour_width_px": 0.7}],
-        "silhouette": {"probability_floor": 0.02, "weight": 12.0},
-        "photometric": {"brightness": "none"},
-    }
-    expected = replace(MapSettings(), contour_width_px=0.7, probability_floor=0.02, matches_brightness=False)
-    assert map_settings(refiner) == expected
-    assert map_settings({}) == MapSettings()
+def test_settings_of_maps_are_those_of_the_run(run: FinishedRun, tmp_path: Path) -> None:
+    words = ["stages=[{contour_width_px: 2.0}, {contour_width_px: 0.7}]", "photometric.brightness=none"]
+    config = load_config(None, [*words, "silhouette.probability_floor=0.02"])
+    assert map_settings(config) == MapSettings(0.7, 0.02, matches_brightness=False)
     with pytest.raises(InputError, match="most_frames"):
-        ReportOptions(most_frames=-1)
+        make_report(run.folder(), tmp_path / "page.html", most_frames=-1)

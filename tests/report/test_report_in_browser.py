@@ -28,7 +28,7 @@ PATIENCE_S = 40.0
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = finished_run(tmp_path_factory.mktemp("browser"), FRAMES, out_name=OUT_NAME, car_type=CAR_TYPE)
-    return make_report(run.out, run.out.parent / "a page#1.html", run.sources, run.prior).path
+    return make_report(run.folder(), run.out.parent / "a page#1.html", run.dataset, run.prior).path
 
 
 @pytest.fixture(scope="module")

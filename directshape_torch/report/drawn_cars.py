@@ -18,9 +18,10 @@ from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.car_rows import is_refined
+from directshape_torch.report.residual_maps import Window
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.visualize.drawing import Surface
+from directshape_torch.visualize.drawing import NEAR_PLANE_M, Picture, Surface, View
 
 Array = npt.NDArray[np.floating[Any]]
 
@@ -56,6 +57,26 @@ class CarState:
     @property
     def surface(self) -> Surface | None:
         return None if self.mesh is None else self.mesh.in_camera(self.T_cam_obj)
+
+
+@dataclass(frozen=True)
+class DrawnCars:
+    """The cars of a frame, in the left camera frame.
+
+    Attributes:
+        before: as they were detected, or None where nobody knows.
+        after: as they are now.
+        truth: (8, 3) corners of each labelled box, metres.
+    """
+
+    before: list[CarState] | None
+    after: list[CarState]
+    truth: list[Array]
+
+    def states(self, car: int) -> dict[str, CarState]:
+        """A car "before", where that is known, and "after"."""
+        after = {"after": self.after[car]}
+        return after if self.before is None else {"before": self.before[car], **after}
 
 
 def states_before(
@@ -133,3 +154,39 @@ def frame_t_cam_ref(result: FrameResult) -> Tensor:
         return torch.zeros(3, dtype=torch.float64)
     offset = np.asarray(shapes.T_cam_obj, np.float64)[:, :3, 3] - np.asarray(shapes.T_ref_obj, np.float64)[:, :3, 3]
     return torch.from_numpy(np.median(offset, axis=0))
+
+
+def window_of_states(image: Picture, K: npt.NDArray[np.float64], states: Sequence[CarState]) -> Window | None:
+    """The part of the image that shows a car in all of its states, or None where it shows none."""
+    return car_window(image, K, np.concatenate([state.corners_cam for state in states]))
+
+
+def car_window(
+    image: Picture,
+    K: Array,  # (3, 3)
+    points_cam: Array,  # (N, 3) metres
+    least_aspect: float = 1.2,
+) -> Window | None:
+    """The part (u_min, v_min, u_max, v_max), half open, of the image around some points, within the image.
+
+    Returns:
+        None where the image does not show them.
+
+    Examples:
+        >>> K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+        >>> car_window(np.zeros((100, 100, 3), np.uint8), K, np.array([[-1.0, -1, 10], [1, 1, 10]]))
+        (35, 38, 65, 62)
+    """
+    visible = points_cam[points_cam[:, 2] > NEAR_PLANE_M]
+    height, width = image.shape[:2]
+    if not len(visible):
+        return None
+    pixels = np.clip(View(image, K).project(visible), 0, [width - 1, height - 1])
+    (u0, v0), (u1, v1) = pixels.min(axis=0), pixels.max(axis=0)
+    if u1 - u0 < 1 or v1 - v0 < 1:
+        return None
+    tall = 1.2 * (v1 - v0) + 1
+    wide = max(1.2 * (u1 - u0) + 4, least_aspect * tall)
+    u, v = (u0 + u1) / 2, (v0 + v1) / 2
+    corners = (round(u - wide / 2), round(v - tall / 2), round(u + wide / 2), round(v + tall / 2))
+    return max(corners[0], 0), max(corners[1], 0), min(corners[2], width), min(corners[3], height)
