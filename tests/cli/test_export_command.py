@@ -73,7 +73,7 @@ def test_masks_and_grey_change_the_colours(finished: FinishedRun, tmp_path: Path
         ),
         (("--format", "ply", "--frames", "7"), "frames: expected finished frames of"),
         (("--format", "points", "--points", "0"), "points_per_car: expected at least 1, got 0"),
-        (("--format", "ply", "--prior", "pca"), "was made with another shape prior"),
+        (("--format", "ply", "--prior", "pca"), "--prior: expected the prior of the run"),
     ],
 )
 def test_wrong_use_is_named(
