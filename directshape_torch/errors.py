@@ -63,6 +63,10 @@ class SceneWarning(UserWarning):
     """What a refiner found wrong with images, calibration, masks or boxes (setting `check`)."""
 
 
+class NoGradientWarning(UserWarning):
+    """Gradients of a refiner's inputs are wanted, and its settings give none (setting `backward.mode`)."""
+
+
 class CompilationError(DirectShapeError, RuntimeError):
     """Compiled functions were asked for (`compile: on`) where they cannot be had."""
 

@@ -16,7 +16,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.diagnosis.box_alignment import align_boxes
 from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.diagnosis.outcome import Outcome, judged, outcome_of, outcome_of_boxes
-from directshape_torch.errors import InputError, SceneWarning
+from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
@@ -86,7 +86,7 @@ class DirectShapeRefiner(nn.Module):
         self.config = RefinerConfig() if config is None else config
         self.extra_terms = tuple(extra_terms)
         self.rig = rig
-        self._has_checked = False
+        self._has_checked = self._has_warned = False
         if self.extra_terms and self.config.method == "box_alignment":
             raise InputError("extra_terms", "none with method box_alignment", f"{len(extra_terms)}", "choose direct")
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
@@ -129,6 +129,7 @@ class DirectShapeRefiner(nn.Module):
         of_prior = dict((*self.prior.named_buffers(), *self.prior.named_parameters()))
         check_no_tangents(frames, detections, term_weights, of_prior)
         self._warn_of(frames, detections)
+        self._warn_without_gradient(frames, detections)
         differentiate = self.config.backward.mode != "none" and torch.is_grad_enabled()
         with (
             torch.set_grad_enabled(differentiate),
@@ -149,7 +150,18 @@ class DirectShapeRefiner(nn.Module):
         self._has_checked = True
         for finding in check_scene(frames, detections, match_images=False).findings:
             if finding.severity != "note":
-                warnings.warn(str(finding), SceneWarning, stacklevel=5)
+                warnings.warn(str(finding), SceneWarning, stacklevel=6)
+
+    def _warn_without_gradient(self, frames: FrameBatch, detections: Detections) -> None:
+        """Once: a loss behind the result would train nothing before it, without a word."""
+        if self._has_warned or self.config.backward.mode != "none" or not torch.is_grad_enabled():
+            return
+        inputs = (*frames.tensors("frames"), *detections.tensors("detections"))
+        wanted = [each.name for each in inputs if each.value.requires_grad]
+        if wanted:
+            self._has_warned = True
+            cure = "to train through the refiner set backward.mode=unroll, else call it under torch.no_grad()"
+            warnings.warn(f"{', '.join(wanted)} get no gradient: {cure}", NoGradientWarning, stacklevel=6)
 
     def _refine(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None

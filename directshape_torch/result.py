@@ -140,8 +140,10 @@ class RefinementResult(CarRecord):
         sources = tuple(self.ground_source[row] for row in index.tolist())
         return replace(super().rows(index), ground_source=sources)
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+    def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """On another device, poses, codes and shapes of another dtype; a prior that moves is a copy."""
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
         moved = super().to(device)
         if dtype is not None:
             like_input = ("T_cam_obj", "code", "input_dimensions_hwl", "t_cam_ref")
@@ -284,13 +286,13 @@ class RefinementResult(CarRecord):
         Raises:
             InputError: no such car.
         """
-        if not (isinstance(index, Integral) and 0 <= index < len(self)):
+        if not (isinstance(index, Integral) and -len(self) <= index < len(self)):
             raise InputError(
                 "index", f"a car of 0..{len(self) - 1}" if len(self) else "no car", f"{shown(index)}: {len(self)} cars"
             )
         from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 
-        values = self.prior.values(self.code[index : index + 1])[0]
+        values = self.prior.values(self.code[index][None])[0]
         return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, T_cam_obj=self.T_cam_obj[index])
 
     def meshes(self, kind: Literal["trimesh", "pytorch3d"] = "trimesh") -> Any:

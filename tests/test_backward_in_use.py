@@ -17,7 +17,7 @@ from torch import Tensor
 
 from directshape_torch import refiner as refiner_module
 from directshape_torch.config import StageConfig
-from directshape_torch.errors import InputError
+from directshape_torch.errors import InputError, NoGradientWarning
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -44,7 +44,8 @@ def test_the_result_is_that_without_gradients_to_the_bit(inputs: StreetInputs, m
 
 def test_no_graph_without_a_mode_and_under_no_grad(inputs: StreetInputs) -> None:
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)
-    assert not inputs.refine(SETTLED, "masks", by).T_cam_obj.requires_grad
+    with pytest.warns(NoGradientWarning, match=r"detections.mask_left.* get no gradient: .* backward.mode=unroll"):
+        assert not inputs.refine(SETTLED, "masks", by).T_cam_obj.requires_grad
     with torch.no_grad():
         assert not inputs.refine(with_mode("implicit"), "masks", by).T_cam_obj.requires_grad
     with torch.inference_mode():

@@ -13,7 +13,10 @@ from torch import Tensor
 from directshape_torch import InputError, PCAShapePrior, ShapeFit, Status, fit_shape
 from directshape_torch.cli.main import main
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box_formats import boxes_to_poses
+from directshape_torch.geometry.box_formats import boxes_to_poses, poses_to_boxes
+from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.scan_fits import fit_scan
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 
@@ -113,3 +116,57 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "points.npy").write_bytes(b"nothing")
     assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
     assert "points.npy: is no readable npy file" in capsys.readouterr().err
+
+
+def scanned_dataset(root: Path) -> tuple[Path, Path]:
+    """A data set of one frame with a scan of two cars and a file of their boxes; nothing else, no image."""
+    points, _ = cars(False)  # in the frame of a LiDAR
+    T_cam_velo = torch.tensor([[0.0, -1, 0, 0.1], [0, 0, -1, -0.1], [1, 0, 0, 12.0], [0, 0, 0, 1]]).double()
+    training, boxes = root / "training", root / "boxes"
+    for folder in (training / "calib", root / "velodyne", boxes):
+        folder.mkdir(parents=True)
+    matrices = {"P2": "700 0 300 40 0 700 100 0 0 0 1 0", "P3": "700 0 300 -300 0 700 100 0 0 0 1 0"}
+    matrices["R0_rect"] = "1 0 0 0 1 0 0 0 1"
+    matrices["Tr_velo_to_cam"] = " ".join(str(x) for x in T_cam_velo[:3].flatten().tolist())
+    (training / "calib" / "000003.txt").write_text("".join(f"{name}: {row}\n" for name, row in matrices.items()))
+    scan = np.hstack([points.numpy(), np.zeros((len(points), 1))])
+    (root / "velodyne" / "000003.bin").write_bytes(scan.astype("<f4").tobytes())
+    T, hwl = boxes_to_poses(TRUE_BOXES + ERRORS, "mmdet3d_lidar", T_cam_velo)
+    lines = ["Pedestrian 0 0 0 10 10 20 40 1.7 0.6 0.6 3 1.6 9 0"]
+    for x, y, z, h, w, length, yaw in poses_to_boxes(T, hwl, "kitti").tolist():
+        lines.append(f"Car 0 0 0 10 10 90 90 {h} {w} {length} {x} {y} {z} {yaw}")
+    for name in ("000003", "000004"):
+        (boxes / f"{name}.txt").write_text("".join(f"{line}\n" for line in lines))
+    return root, boxes
+
+
+def test_scans_of_a_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, boxes = scanned_dataset(tmp_path)
+    words = ["fit-shape", "--data", str(root), "--lidar", str(root / "velodyne"), "--boxes", str(boxes)]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "000003  2 of 2 cars fitted" in said
+    assert "no scan of 1 frames" in said
+    before, after = (read_objects(folder / "000003.txt") for folder in (boxes, tmp_path / "out" / "data"))
+    assert after[0].raw_line == before[0].raw_line
+    # The same cars, in the frame of the labels: as far from the given boxes as the disturbance was.
+    T_ref_velo = torch.tensor([[0.0, -1, 0, 0.1], [0, 0, -1, -0.1], [1, 0, 0, 12.0], [0, 0, 0, 1]]).double()
+    true, _ = boxes_to_poses(TRUE_BOXES, "mmdet3d_lidar", T_ref_velo)
+    for car, line in enumerate(after[1:]):
+        assert line.location_ref[0] == pytest.approx(float(true[car, 0, 3]), abs=0.15)
+        assert line.location_ref[2] == pytest.approx(float(true[car, 2, 3]), abs=0.15)
+    assert {path.name for path in (tmp_path / "out" / "meshes").iterdir()} == {"000003_2.ply", "000003_3.ply"}
+    with np.load(tmp_path / "out" / "shapes" / "000003.npz") as arrays:
+        assert (arrays["distances_after_m"] < 0.5 * arrays["distances_before_m"]).all()
+        assert arrays["input_lines"].tolist() == [2, 3]
+
+
+def test_scans_need_their_data_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, boxes = scanned_dataset(tmp_path)
+    words = ["fit-shape", "--lidar", str(boxes), "--boxes", str(boxes), "--out", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert "--data: expected the folder of the data set" in capsys.readouterr().err
+    assert main([*words, "--data", str(root)]) == 2
+    assert "--lidar: expected a scan of frame 000003" in capsys.readouterr().err
+    with pytest.raises(InputError, match="lidar_dir"):
+        fit_scan(open_dataset("kitti", root, boxes), "000003")

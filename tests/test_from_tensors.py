@@ -50,6 +50,18 @@ def test_tensors_alone_give_what_the_records_give() -> None:
     torch.testing.assert_close(a.T_cam_obj, b.T_cam_obj, atol=1e-6, rtol=0)
 
 
+def test_masks_that_are_no_tensors_are_refused_with_the_cure() -> None:
+    with pytest.raises(InputError, match=r"mask_left: expected tensors, got ndarray; torch.as_tensor"):
+        from_boxes(mask_left=STREET.detections.mask_left.numpy())
+
+
+def test_a_result_moves_and_counts_from_the_end_like_a_tensor() -> None:
+    result = refined()
+    assert result.to(torch.float64).T_cam_obj.dtype == result.to(dtype=torch.float64).code.dtype == torch.float64
+    assert result.to("cpu").T_cam_obj.dtype == result.T_cam_obj.dtype
+    assert (result.mesh(-1).vertices == result.mesh(len(result) - 1).vertices).all()
+
+
 def test_intrinsics_of_one_and_of_many_frames() -> None:
     K = STREET.frames.camera.K_left[0]
     assert StereoCamera.from_intrinsics(K, 0.5).baseline.tolist() == [0.5]

@@ -19,21 +19,12 @@ _EITHER = "either a folder (--masks DIR) or COCO files (--masks-left FILE, --mas
 
 def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = True, required: bool = True) -> None:
     """`--data`, `--layout`, `--detections`, masks, choice of frames and classes, ground, the rig's correction."""
-    group.add_argument("--data", type=Path, required=required, metavar="ROOT", help="folder of the data set")
-    group.add_argument(
-        "--layout",
-        choices=LAYOUTS,
-        default="kitti",
-        help="of the files below ROOT (docs/inputs.md): KITTI's object benchmark (default), a raw drive or day of "
-        "drives, a tracking sequence or all of them, Stereo 2015, or a plain folder with JSON",
-    )
+    add_layout_options(group, required)
     group.add_argument(
         "--detections", type=Path, metavar="DIR", help="NNNNNN.txt in DIR or DIR/data (folder: default ROOT/frames)"
     )
     add_mask_options(group)
     group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
-    group.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
-    group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
     add_rig_option(group, "correct the stereo rig by a file of 'directshape calibrate-rig' or of a run (default: none)")
     if with_disparity:
         group.add_argument(
@@ -50,6 +41,20 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
         "stereo, else file, else camera height)",
     )
     group.add_argument("--camera-height", type=float, default=1.65, metavar="M", help="above ground (default: 1.65)")
+
+
+def add_layout_options(group: argparse._ActionsContainer, required: bool = False) -> None:
+    """`--data`, `--layout`, and which frames and classes of it."""
+    group.add_argument("--data", type=Path, required=required, metavar="ROOT", help="folder of the data set")
+    group.add_argument(
+        "--layout",
+        choices=LAYOUTS,
+        default="kitti",
+        help="of the files below ROOT (docs/inputs.md): KITTI's object benchmark (default), a raw drive or day of "
+        "drives, a tracking sequence or all of them, Stereo 2015, or a plain folder with JSON",
+    )
+    group.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
+    group.add_argument("--classes", nargs="+", default=["Car"], metavar="NAME", help="types to refine (default: Car)")
 
 
 def add_rig_option(group: argparse._ActionsContainer, words: str) -> None:

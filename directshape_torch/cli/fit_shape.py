@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
+
+from directshape_torch.cli.data_options import add_layout_options
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from directshape_torch.fit_shape import ShapeFit
+
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
 _DESCRIPTION = """
-Fit a pose and a shape to the points in each box. Writes, in the frame of the points, OUT/boxes.txt (seven numbers a
-line in the convention of the input), OUT/shapes.npz (poses, codes, statuses, distances of the points) and
-OUT/meshes/NNN.ply.
+Fit a pose and a shape to the points in each box, without images. Of one cloud (--points, --boxes FILE), in its own
+frame: OUT/boxes.txt (seven numbers a line in the convention of the input), OUT/shapes.npz (poses, codes, statuses,
+distances of the points) and OUT/meshes/NNN.ply. Of a data set (--data, --lidar, --boxes DIR): OUT/data/ID.txt
+(KITTI result lines, for 'directshape compare'), OUT/shapes/ID.npz and OUT/meshes/ID_LINE.ply in the left camera frame.
 Exit code: 0, or 2 for wrong usage or input.
 """
 
@@ -25,17 +31,24 @@ def add_parser(subparsers: Subparsers) -> None:
     from directshape_torch.geometry.box_formats import BoxFormat
 
     parser = subparsers.add_parser("fit-shape", help="fit shapes to LiDAR points in boxes", description=_DESCRIPTION)
-    parser.add_argument(
-        "--points", type=Path, required=True, metavar="FILE", help="points.npy (P, 3 or more), or KITTI's velodyne .bin"
+    where = parser.add_mutually_exclusive_group(required=True)
+    where.add_argument(
+        "--points", type=Path, metavar="FILE", help="points.npy (P, 3 or more), or KITTI's velodyne .bin"
     )
+    where.add_argument("--lidar", type=Path, metavar="DIR", help="scans of a data set, NNNNNN.bin; needs --data")
     parser.add_argument(
-        "--boxes", type=Path, required=True, metavar="FILE", help="seven numbers a line, in the frame of the points"
+        "--boxes",
+        type=Path,
+        required=True,
+        metavar="FILE|DIR",
+        help="of --points: seven numbers a line, in its frame; of --lidar: a folder of detections or labels",
     )
+    add_layout_options(parser)
     parser.add_argument(
         "--convention",
         choices=get_args(BoxFormat),
         default="mmdet3d_lidar",
-        help="of the boxes: order, centre and heading (default: %(default)s)",
+        help="of the boxes of --points: order, centre and heading (default: %(default)s)",
     )
     parser.add_argument("--prior", metavar="FILE|NAME", default="pca", help="shapes (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
@@ -48,6 +61,48 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         DirectShapeError: input that cannot be used; for the main program to show.
     """
+    return _fit_cloud(args) if args.lidar is None else _fit_scans(args)
+
+
+def _fit_scans(args: argparse.Namespace) -> int:
+    from directshape_torch.errors import InputError
+    from directshape_torch.io.open_dataset import open_dataset
+    from directshape_torch.io.scan_fits import fit_scan, write_scan_fit
+    from directshape_torch.shape.load_prior import load_prior
+
+    if args.data is None:
+        raise InputError("--data", "the folder of the data set that the scans belong to", "none", "--data ROOT")
+    options = {"frames": args.frames, "classes": args.classes, "lidar_dir": args.lidar}
+    dataset, prior = open_dataset(args.layout, args.data, args.boxes, **options), load_prior(args.prior)
+    scanned = [each for each in dataset.frame_ids if dataset.layout.lidar_files(args.lidar, each)["lidar"].is_file()]
+    if not scanned:
+        raise InputError("--lidar", f"a scan of frame {dataset.frame_ids[0]} or another", f"none in {args.lidar}")
+    fits = []
+    for frame_id in scanned:
+        scan = fit_scan(dataset, frame_id, prior)
+        write_scan_fit(args.out, scan)
+        fits.append(scan.fit)
+        print(f"{frame_id}  {_summary([scan.fit])}", flush=True)
+    if len(scanned) < len(dataset.frame_ids):
+        print(f"no scan of {len(dataset.frame_ids) - len(scanned)} frames in {args.lidar}")
+    print(f"all     {_summary(fits)}\nresults {args.out}")
+    return 0
+
+
+def _summary(fits: Sequence[ShapeFit]) -> str:
+    """How many cars were fitted, and how far their points are from the surfaces in the mean."""
+    import torch
+
+    refined = torch.cat([fit.cars.refined for fit in fits])
+    before, after = (
+        float(torch.cat([getattr(fit, f"distance_{when}_m") for fit in fits])[refined].mean())
+        for when in ("before", "after")
+    )
+    means = f", points {before:.3f} -> {after:.3f} m from the surface" if refined.any() else ""
+    return f"{int(refined.sum())} of {len(refined)} cars fitted{means}"
+
+
+def _fit_cloud(args: argparse.Namespace) -> int:
     import numpy as np
     import torch
     from trimesh.exchange.ply import export_ply

@@ -1,0 +1,100 @@
+"""Shapes fitted to the LiDAR scans of a data set, in boxes of any origin; no image is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from directshape_torch.errors import InputError
+from directshape_torch.files import atomic_files
+from directshape_torch.fit_shape import ShapeFit, fit_shape
+from directshape_torch.geometry.box_formats import poses_to_boxes
+from directshape_torch.io.kitti_calibration import to_stereo_camera
+from directshape_torch.io.kitti_labels import KittiObject, poses_cam
+from directshape_torch.io.result_files import RefinedBox, write_result_text
+from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.velodyne import read_scan
+from directshape_torch.result import RefinementResult
+from directshape_torch.shape.shape_prior import ShapePrior
+
+
+@dataclass(frozen=True)
+class ScanFit:
+    """The cars of a frame, fitted to its scan.
+
+    Attributes:
+        frame_id: the frame.
+        objects: all lines of its file of boxes.
+        rows: N numbers, which of them were fitted.
+        fit: of these, in the left camera frame.
+    """
+
+    frame_id: str
+    objects: list[KittiObject]
+    rows: list[int]
+    fit: ShapeFit
+
+
+def fit_scan(dataset: FileStereoDataset, frame_id: str, prior: ShapePrior | None = None) -> ScanFit:
+    """Fit a pose and a shape to the points in each box of a frame.
+
+    Args:
+        dataset: opened with `lidar_dir` (`io.open_dataset`); its detections are the boxes, labels among them.
+        frame_id: one of `dataset.frame_ids`.
+        prior: the shapes; default the bundled ones.
+
+    Raises:
+        InputError: a data set without scans.
+        DataFormatError: a file is missing or damaged.
+    """
+    if dataset.lidar_dir is None:
+        raise InputError("dataset", "one with LiDAR scans", "none", "open it with lidar_dir=..")
+    calibration = dataset.layout.lidar_calibration(frame_id)
+    camera = to_stereo_camera([calibration], dtype=torch.float64)
+    points = read_scan(dataset.layout.lidar_files(dataset.lidar_dir, frame_id)["lidar"], calibration, camera)
+    objects = dataset.objects(frame_id)
+    rows = [row for row, each in enumerate(objects) if each.type in dataset.classes and each.has_box_3d]
+    chosen = [objects[row] for row in rows]
+    hwl = torch.tensor([each.hwl for each in chosen], dtype=torch.float64).reshape(-1, 3)
+    boxes = poses_to_boxes(poses_cam(chosen, camera.t_cam_ref[0]), hwl, "kitti")
+    fit = fit_shape(points, boxes, "kitti", prior)
+    cars = replace(fit.cars, t_cam_ref=camera.t_cam_ref.expand(len(rows), 3))
+    return ScanFit(frame_id, objects, rows, replace(fit, cars=cars))
+
+
+def write_scan_fit(out_dir: Path, scan: ScanFit) -> None:
+    """Write `data/ID.txt` (result lines), `shapes/ID.npz` and `meshes/ID_LINE.ply`, the latter in the camera frame."""
+    from trimesh.exchange.ply import export_ply
+
+    cars, refined = scan.fit.cars, scan.fit.cars.refined.tolist()
+    for folder in ("data", "shapes", "meshes"):
+        (out_dir / folder).mkdir(parents=True, exist_ok=True)
+    boxes = {row: box for row, box, fitted in zip(scan.rows, _boxes(cars), refined, strict=True) if fitted}
+    write_result_text(out_dir / "data" / f"{scan.frame_id}.txt", scan.objects, boxes)
+    arrays = {
+        "T_cam_obj": cars.T_cam_obj,
+        "codes": cars.code,
+        "num_points": scan.fit.num_points,
+        "distances_before_m": scan.fit.distance_before_m,
+        "distances_after_m": scan.fit.distance_after_m,
+        "input_lines": torch.tensor([scan.objects[row].line_number for row in scan.rows], dtype=torch.int64),
+    }
+    statuses = np.array([status.name for status in cars.status], dtype=np.str_)
+    content = {**{name: each.numpy() for name, each in arrays.items()}, "statuses": statuses}
+    atomic_files.write_npz(out_dir / "shapes" / f"{scan.frame_id}.npz", content)
+    for car, row in enumerate(scan.rows):
+        if refined[car]:
+            name = f"{scan.frame_id}_{scan.objects[row].line_number}.ply"
+            atomic_files.write_bytes(out_dir / "meshes" / name, export_ply(cars.mesh(car)))
+
+
+def _boxes(cars: RefinementResult) -> list[RefinedBox]:
+    boxes = cars.boxes()
+    columns = (boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y, boxes.alpha)
+    return [
+        RefinedBox((hwl[0], hwl[1], hwl[2]), (at[0], at[1], at[2]), rotation_y, alpha)
+        for hwl, at, rotation_y, alpha in zip(*(column.tolist() for column in columns), strict=True)
+    ]
