@@ -49,21 +49,15 @@ def write_car_meshes(
 
 def mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
     """A mesh in the left camera frame as the content of a file."""
-    if mesh_format == "glb":
-        return scene_bytes({"car": mesh})
-    from trimesh.exchange.ply import export_ply
+    if mesh_format == "ply":
+        from trimesh.exchange.ply import export_ply
 
-    content: bytes = export_ply(mesh)
-    return content
-
-
-def scene_bytes(meshes_cam: dict[str, trimesh.Trimesh]) -> bytes:
-    """Named meshes in the left camera frame as one binary glTF scene, y up."""
+        content: bytes = export_ply(mesh)
+        return content
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
     scene = trimesh.Scene()
-    for name, mesh in meshes_cam.items():
-        scene.add_geometry(mesh, node_name=name, geom_name=name, transform=T_GLTF_CAM)
+    scene.add_geometry(mesh, node_name="car", geom_name="car", transform=T_GLTF_CAM)
     export: Callable[..., bytes] = export_glb
     return export(scene, include_normals=True)

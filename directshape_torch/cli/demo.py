@@ -39,20 +39,26 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.options import RefineOptions
     from directshape_torch.batch.refine_dataset import refine_dataset
     from directshape_torch.batch.run_summary import format_summary
-    from directshape_torch.cli.demo_report import error_table, write_scene
+    from directshape_torch.cli.demo_report import error_table
     from directshape_torch.cli.progress import ProgressBar
     from directshape_torch.cli.refine import make_refiner
+    from directshape_torch.export.gltf_scene import frame_glb
+    from directshape_torch.export.painted_cars import PaintedFrame
+    from directshape_torch.files.atomic_files import write_bytes
     from directshape_torch.io.kitti_dataset import KittiStereoDataset
+    from directshape_torch.io.run_folder import RunFolder
+    from directshape_torch.shape.load_prior import load_prior
 
     dataset = KittiStereoDataset(
         DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training/masks"
     )
-    refiner = make_refiner(args.config, [], None, args.device)
+    refiner = make_refiner(args.config, [], "pca", args.device)
     with ProgressBar() as progress:
         summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress)
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
-        write_scene(args.out / "scene.glb", loaded, args.out, refiner.prior)
+        painted = PaintedFrame(RunFolder(args.out).read(frame_id), load_prior("pca"), loaded)
+        write_bytes(args.out / "scene.glb", frame_glb(painted, loaded))
         print(error_table(loaded, args.out))
     print(format_summary(summary))
     print(f"picture  {args.out / 'overlays' / f'{dataset.frame_ids[0]}.png'}")

@@ -1,33 +1,19 @@
-"""What `directshape demo` shows: a table of errors before and after, and the refined cars as one 3D scene."""
+"""What `directshape demo` prints: a table of errors before and after."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
-from directshape_torch.batch.mesh_files import scene_bytes
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
 from directshape_torch.evaluation.tables import align
-from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
-from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.status import Status
-from directshape_torch.visualize.ground_grid import ground_grid
-
-if TYPE_CHECKING:
-    import trimesh
-
-# Paints that are easy to tell apart.
-_PAINTS_RGB = ((66, 135, 245), (235, 120, 50), (80, 190, 110), (205, 80, 160), (230, 195, 60), (120, 110, 220))
 
 
 def error_table(loaded: LoadedFrame, out_dir: Path) -> str:
@@ -49,28 +35,6 @@ def error_table(loaded: LoadedFrame, out_dir: Path) -> str:
     if pairs:
         rows.append(["mean", "", *_columns(errors, range(len(pairs))), ""])
     return align(rows)
-
-
-def write_scene(path: Path, loaded: LoadedFrame, out_dir: Path, prior: ShapePrior) -> None:
-    """All refined cars of a frame, painted, on a grid of 5 m, as binary glTF."""
-    shapes = read_shapes(shapes_path(out_dir, loaded.frame_id))
-    meshes: dict[str, trimesh.Trimesh] = {}
-    for car, status in enumerate(shapes.statuses):
-        if Status[status].is_refined:
-            code = torch.from_numpy(shapes.codes[car : car + 1]).to(prior.origin)
-            T_cam_obj = torch.from_numpy(shapes.T_cam_obj[car])
-            mesh = sdf_to_mesh(prior.values(code)[0], prior.origin, prior.spacing_m, T_cam_obj)
-            _paint(mesh, _PAINTS_RGB[car % len(_PAINTS_RGB)])
-            meshes[f"car_{shapes.input_lines[car]}"] = mesh
-    meshes["ground"] = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
-    _paint(meshes["ground"], (120, 120, 120))
-    write_bytes(path, scene_bytes(meshes))
-
-
-def _paint(mesh: trimesh.Trimesh, rgb: tuple[int, int, int]) -> None:
-    from trimesh.visual import ColorVisuals
-
-    mesh.visual = ColorVisuals(mesh, vertex_colors=[[*rgb, 255]] * len(mesh.vertices))
 
 
 def _errors(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> PoseErrors[Tensor]:

@@ -7,20 +7,11 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
-from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
+from directshape_torch.evaluation.pose_error import CarErrors, boxes_of, car_errors, pose_errors
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.page_data import known
 from directshape_torch.status import Status
-
-
-@dataclass(frozen=True)
-class BoxErrors:
-    """Errors of one box: centre distance in metres, heading in degrees, overlap of the footprints."""
-
-    centre_m: float
-    yaw_deg: float
-    bev_iou: float
 
 
 @dataclass(frozen=True)
@@ -34,8 +25,8 @@ class JudgedCar:
     """
 
     counts: bool
-    before: BoxErrors | None
-    after: BoxErrors
+    before: CarErrors | None
+    after: CarErrors
 
 
 @dataclass(frozen=True)
@@ -178,10 +169,8 @@ def judge_cars(
     }
 
 
-def _errors(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> list[BoxErrors]:
-    errors = pose_errors(boxes_of(objects), boxes_of(true))
-    columns = (errors.centre_m.tolist(), errors.yaw_deg.tolist(), errors.bev_iou.tolist())
-    return [BoxErrors(*row) for row in zip(*columns, strict=True)]
+def _errors(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> list[CarErrors]:
+    return car_errors(pose_errors(boxes_of(objects), boxes_of(true)))
 
 
 def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:
