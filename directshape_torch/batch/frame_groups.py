@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 
 @dataclass(frozen=True)
@@ -12,7 +13,7 @@ class FrameGroup:
 
     Attributes:
         frame_ids: all of them; the last digits of a result depend on its company.
-        wanted: those whose files are to be written; the others are finished already.
+        wanted: those whose files are to be written; the others are finished already, or another call writes them.
     """
 
     frame_ids: tuple[str, ...]
@@ -42,3 +43,27 @@ def frame_groups(frame_ids: Sequence[str], size: int, finished: Collection[str])
     finished = frozenset(finished)
     groups = (tuple(frame_ids[first : first + size]) for first in range(0, len(frame_ids), size))
     return [FrameGroup(ids, frozenset(ids) - finished) for ids in groups if not finished.issuperset(ids)]
+
+
+def track_windows(
+    frame_ids: Sequence[str], sequence_of: Callable[[str], str | None], size: int, finished: Collection[str]
+) -> list[FrameGroup]:
+    """The calls of a run with tracks: each sequence whole, or in windows that overlap by half.
+
+    A frame is written by the window in whose middle it is most. What is finished changes nothing in the others.
+
+    Examples:
+        >>> windows = track_windows("abcdef", lambda _: "", 4, finished={"e"})
+        >>> [(window.frame_ids, sorted(window.wanted)) for window in windows]
+        [(('a', 'b', 'c', 'd'), ['a', 'b', 'c']), (('c', 'd', 'e', 'f'), ['d', 'f'])]
+    """
+    windows = []
+    for _, members in groupby(sorted(frame_ids, key=lambda frame: (sequence_of(frame) or "", frame)), sequence_of):
+        ids = tuple(members)
+        last = max(len(ids) - size, 0)
+        starts = [*range(0, last, max(size // 2, 1)), last]
+        nearest = [min(starts, key=lambda first: abs(2 * (k - first) + 1 - size)) for k in range(len(ids))]
+        for first in starts:
+            wanted = frozenset(name for name, start in zip(ids, nearest, strict=True) if start == first)
+            windows.append(FrameGroup(ids[first : first + size], wanted.difference(finished)))
+    return [window for window in windows if window.wanted]

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from directshape_torch.batch.content_hashes import hash_fields, hash_prior
-from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
+from directshape_torch.batch.frame_groups import FrameGroup, frame_groups, track_windows
 from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import FrameEnd, GroupRefiner, GroupReport, RunJob, limited_threads
 from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver, WorkerOptions
@@ -26,6 +26,7 @@ from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import RunManifest
 from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.io.track_files import write_tracks
 from directshape_torch.problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 
@@ -70,7 +71,7 @@ def refine_dataset(
     with RunLog(out_dir) as log, limited_threads(workers.threads if workers.in_this_process else None):
         remove_unfinished_files(out_dir)
         is_cleared = fresh and remove_results(out_dir, (_TIMINGS,))
-        manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior))
+        manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior), options.batch_frames)
         earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
         return _Run(dataset, refiner, earlier, log, options, observer or SilentObserver(), workers).execute()
 
@@ -107,7 +108,7 @@ class _Run:
         resumed: list[str] = []
         try:
             resumed += self.earlier.finished_frames(self.dataset)
-            groups = frame_groups(self.dataset.frame_ids, self.options.batch_frames, resumed)
+            groups = self._groups(resumed)
             self.log.refining(len(resumed))
             self.observer.started([name for group in groups for name in group.frame_ids if name in group.wanted])
             self._refine(groups)
@@ -117,6 +118,12 @@ class _Run:
                 self._end(resumed, str(error) or type(error).__name__)
             raise
         return self._end(resumed, None)
+
+    def _groups(self, finished: Collection[str]) -> list[FrameGroup]:
+        dataset, size = self.dataset, self.options.batch_frames
+        if has_tracks(dataset):
+            return track_windows(dataset.frame_ids, dataset.sequence_of, size, finished)
+        return frame_groups(dataset.frame_ids, size, finished)
 
     def _refine(self, groups: Sequence[FrameGroup]) -> None:
         if not groups:
@@ -179,6 +186,8 @@ class _Run:
         """Write what is known at the end of the run, whatever end that is."""
         if reason is None:
             self._look_for_files()
+            if has_tracks(self.dataset):
+                write_tracks(self.out_dir, sorted(set(self.dataset.frame_ids).difference(self.failed)))
         else:
             # Workers have ended the frames that they had, and nobody heard of it.
             self.earlier.take_in(set(done_frames(self.out_dir)).intersection(self.dataset.frame_ids))
@@ -244,10 +253,17 @@ def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
     return round(count * len(frame_ids) / max(1, len(looked_at)))
 
 
-def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha256: str) -> RunManifest:
+def has_tracks(dataset: StereoDataset) -> bool:
+    """Whether its cars are numbered over the frames of sequences."""
+    return dataset.sequence_of(dataset.frame_ids[0]) is not None
+
+
+def run_manifest(
+    dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha256: str, batch_frames: int = 1
+) -> RunManifest:
     """What the results of a run depend on, besides the files of each frame.
 
-    Device, batch size and kinds of outputs are left out: they do not change what is computed.
+    Device, kinds of outputs and, without tracks, batch size are left out: they do not change what is computed.
     """
     settings: dict[str, Any] = {
         "refiner": config_to_mapping(refiner.config),
@@ -256,6 +272,8 @@ def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha2
         "camera_height_m": dataset.camera_height_m,
         "dtype": str(refiner.prior.origin.dtype).removeprefix("torch."),
     }
+    if has_tracks(dataset):
+        settings["track_frames"] = batch_frames
     if refiner.extra_terms:
         settings["extra_terms"] = [_described(make) for make in refiner.extra_terms]
     hashes = {"prior": prior_sha256, "stereo_bias": hash_fields(dataset.disparity_fields)}

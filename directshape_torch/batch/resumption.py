@@ -37,7 +37,8 @@ from directshape_torch.io.stereo_dataset import StereoDataset
 # Hashing waits for the disk most of the time, and for a network's even longer.
 _READING_THREADS = 8
 _MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
-_OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays")
+_TRACK = re.compile(r"(.+_)?[0-9]{6,}\.npz")
+_OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks")
 
 
 class EarlierResults:
@@ -180,6 +181,9 @@ def remove_results(out_dir: Path, others: Iterable[str]) -> bool:
     for mesh in (out_dir / "meshes").glob("*"):
         if (found := _MESH.fullmatch(mesh.name)) is not None and found[1] in frame_ids:
             mesh.unlink()
+    for track in (out_dir / "tracks").glob("*.npz"):
+        if _TRACK.fullmatch(track.name) is not None:
+            track.unlink()
     for name in (*others, summary_path(out_dir).name):
         (out_dir / name).unlink(missing_ok=True)
     for name in _OUTPUT_FOLDERS:

@@ -95,6 +95,7 @@ def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
         disparity_field=() if args.rig in ("auto", "none") else load_fields(args.rig),
         disparity_dir=getattr(args, "disparity", None),
         lidar_dir=getattr(args, "lidar", None),
+        tracks=getattr(args, "tracks", False),
     )
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 # Enough to tell a mistake from the noise of a detector.
 _CHECKED_FRAMES = 3
+# Beyond, the views of a car add little; longer sequences go through windows of so many.
+_TRACK_FRAMES = 16
 _DESCRIPTION = """
 Refine the rough 3D boxes of a detector: poses, boxes and shapes of all cars of all frames. A second run with the same
 settings continues where the first stopped, however it stopped; 'directshape status' tells how far it is. Exit code: 0
@@ -36,6 +38,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     inputs.set_defaults(rig="auto")
     inputs.add_argument(
         "--lidar", type=Path, metavar="DIR", help="LiDAR scans NNNNNN.bin (KITTI's velodyne) as further evidence"
+    )
+    inputs.add_argument(
+        "--tracks",
+        action="store_true",
+        help="the same car in several frames of a sequence gets one shape and a pose in each (docs/tracks.md)",
     )
     _add_outputs(parser.add_argument_group("output"))
     _add_settings(parser.add_argument_group("settings"))
@@ -83,7 +90,9 @@ def _add_settings(group: argparse._ArgumentGroup) -> None:
         "--prior", metavar="FILE|NAME", help="shape prior of any kind, or the bundled pca (default) or neural"
     )
     group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
-    group.add_argument("--batch-frames", type=int, default=1, metavar="N", help="frames in one call (default: 1)")
+    group.add_argument(
+        "--batch-frames", type=int, metavar="N", help=f"frames in one call (default: 1, of tracks {_TRACK_FRAMES})"
+    )
 
 
 def _add_workers(group: argparse._ArgumentGroup) -> None:
@@ -129,7 +138,9 @@ def run(args: argparse.Namespace) -> int:
 
     check_rerun(args.rerun)
     workers = WorkerOptions(args.workers, args.threads, args.ray, args.retries)
-    options = RefineOptions(args.meshes, args.overlays, args.batch_frames)
+    default_frames = _TRACK_FRAMES if args.tracks else 1
+    batch_frames = default_frames if args.batch_frames is None else args.batch_frames
+    options = RefineOptions(args.meshes, args.overlays, batch_frames)
     chosen = [] if args.method is None else [f"method={args.method}"]
     extra = [] if args.lidar is None else [LidarPoints()]
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)

@@ -17,6 +17,7 @@ from directshape_torch.geometry.box3d import alpha_from_kitti
 from directshape_torch.io.result_files import RefinedBox, ShapeArrays, write_result_text, write_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.track_files import track_name
 from directshape_torch.result import RefinementResult
 
 
@@ -82,6 +83,7 @@ def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: st
         prior_sha256=prior_sha256,
         ground_source=loaded.frame.ground.source[0],
         input_lines=np.array(lines, dtype=np.int64),
+        tracks=_tracks(loaded),
         T_cam_obj=_numpy(result.T_cam_obj[rows]),
         T_ref_obj=_numpy(result.T_ref_obj[rows]),
         boxes_hwl=_numpy(boxes.dimensions_hwl[rows]),
@@ -111,6 +113,13 @@ def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: st
         profile_costs_before=_numpy(result.profile.cost_before[rows]),
         profile_costs_after=_numpy(result.profile.cost_after[rows]),
     )
+
+
+def _tracks(loaded: LoadedFrame) -> tuple[str, ...]:
+    ids = loaded.detections.track_id
+    if ids is None:
+        return ("",) * len(loaded.detections)
+    return tuple(track_name(loaded.sequence or "", number) for number in ids.tolist())
 
 
 def _numpy(tensor: Tensor) -> NDArray[Any]:

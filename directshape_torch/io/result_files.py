@@ -1,4 +1,4 @@
-"""What a refinement leaves behind for each frame: a KITTI result file, and states with shapes as npz (schema 2)."""
+"""What a refinement leaves behind for each frame: a KITTI result file, and states with shapes as npz (schema 3)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,11 @@ from directshape_torch.files.npz_files import read_npz
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.status import Status
 
-SHAPES_SCHEMA_VERSION = 2
+SHAPES_SCHEMA_VERSION = 3
 _AGAIN = "refine the frame again"
 
 Floats = NDArray[np.floating[Any]]
+_Arrays = TypeVar("_Arrays")
 # Of arrays in a file, by the type of the field.
 _KINDS = {"str": "U", "tuple[str, ...]": "U", "Floats": "f", "NDArray[np.int64]": "i", "NDArray[np.bool_]": "b"}
 
@@ -85,8 +86,8 @@ def write_result_text(
     atomic_files.write_text(path, "".join(f"{line}\n" for line in lines))
 
 
-def _shape(*sizes: str | int) -> dict[str, tuple[str | int, ...]]:
-    """What a field of `ShapeArrays` must look like; letters as in its description."""
+def shaped(*sizes: str | int) -> dict[str, tuple[str | int, ...]]:
+    """For the metadata of a field that `check_shapes` looks at: its sizes, letters as in the class's description."""
     return {"shape": sizes}
 
 
@@ -99,6 +100,7 @@ class ShapeArrays:
         prior_sha256: of the shape prior whose codes these are.
         ground_source: "file", "stereo" or "camera_height".
         input_lines: (B,) line numbers in the detection file, from 1.
+        tracks: (B,) text, the name of the track of which each car is a view, "" for none.
         T_cam_obj, T_ref_obj: (B, 4, 4) object to left camera, and to the frame of the labels.
         boxes_hwl: (B, 3) metres.
         boxes_location_ref: (B, 3) bottom centres, metres.
@@ -127,53 +129,71 @@ class ShapeArrays:
     frame_id: str
     prior_sha256: str
     ground_source: str
-    input_lines: NDArray[np.int64] = field(metadata=_shape("B"))
-    T_cam_obj: Floats = field(metadata=_shape("B", 4, 4))
-    T_ref_obj: Floats = field(metadata=_shape("B", 4, 4))
-    boxes_hwl: Floats = field(metadata=_shape("B", 3))
-    boxes_location_ref: Floats = field(metadata=_shape("B", 3))
-    boxes_rotation_y: Floats = field(metadata=_shape("B"))
-    codes: Floats = field(metadata=_shape("B", "K"))
-    covariances: Floats = field(metadata=_shape("B", "D", "D"))
-    covariances_ref: Floats = field(metadata=_shape("B", 4, 4))
-    statuses: tuple[str, ...] = field(metadata=_shape("B"))
-    messages: tuple[str, ...] = field(metadata=_shape("B"))
+    input_lines: NDArray[np.int64] = field(metadata=shaped("B"))
+    tracks: tuple[str, ...] = field(metadata=shaped("B"))
+    T_cam_obj: Floats = field(metadata=shaped("B", 4, 4))
+    T_ref_obj: Floats = field(metadata=shaped("B", 4, 4))
+    boxes_hwl: Floats = field(metadata=shaped("B", 3))
+    boxes_location_ref: Floats = field(metadata=shaped("B", 3))
+    boxes_rotation_y: Floats = field(metadata=shaped("B"))
+    codes: Floats = field(metadata=shaped("B", "K"))
+    covariances: Floats = field(metadata=shaped("B", "D", "D"))
+    covariances_ref: Floats = field(metadata=shaped("B", 4, 4))
+    statuses: tuple[str, ...] = field(metadata=shaped("B"))
+    messages: tuple[str, ...] = field(metadata=shaped("B"))
     term_names: tuple[str, ...]
-    costs_before: Floats = field(metadata=_shape("B", "T"))
-    costs_after: Floats = field(metadata=_shape("B", "T"))
-    iterations: NDArray[np.int64] = field(metadata=_shape("B"))
-    has_mask_left: NDArray[np.bool_] = field(metadata=_shape("B"))
-    mask_iou_left: Floats = field(metadata=_shape("B"))
-    mask_iou_right: Floats = field(metadata=_shape("B"))
-    photometric_errors_grey: Floats = field(metadata=_shape("B"))
-    matched_shares: Floats = field(metadata=_shape("B"))
-    probabilities_better: Floats = field(metadata=_shape("B"))
-    probabilities_not_worse: Floats = field(metadata=_shape("B"))
-    sigmas_ref: Floats = field(metadata=_shape("B", 4))
-    unseen: tuple[str, ...] = field(metadata=_shape("B"))
-    unseen_sigmas_m: Floats = field(metadata=_shape("B", 7))
-    unseen_directions: Floats = field(metadata=_shape("B", 7, 7))
-    profile_offsets_px: Floats = field(metadata=_shape("P"))
-    profile_costs_before: Floats = field(metadata=_shape("B", "P"))
-    profile_costs_after: Floats = field(metadata=_shape("B", "P"))
+    costs_before: Floats = field(metadata=shaped("B", "T"))
+    costs_after: Floats = field(metadata=shaped("B", "T"))
+    iterations: NDArray[np.int64] = field(metadata=shaped("B"))
+    has_mask_left: NDArray[np.bool_] = field(metadata=shaped("B"))
+    mask_iou_left: Floats = field(metadata=shaped("B"))
+    mask_iou_right: Floats = field(metadata=shaped("B"))
+    photometric_errors_grey: Floats = field(metadata=shaped("B"))
+    matched_shares: Floats = field(metadata=shaped("B"))
+    probabilities_better: Floats = field(metadata=shaped("B"))
+    probabilities_not_worse: Floats = field(metadata=shaped("B"))
+    sigmas_ref: Floats = field(metadata=shaped("B", 4))
+    unseen: tuple[str, ...] = field(metadata=shaped("B"))
+    unseen_sigmas_m: Floats = field(metadata=shaped("B", 7))
+    unseen_directions: Floats = field(metadata=shaped("B", 7, 7))
+    profile_offsets_px: Floats = field(metadata=shaped("P"))
+    profile_costs_before: Floats = field(metadata=shaped("B", "P"))
+    profile_costs_after: Floats = field(metadata=shaped("B", "P"))
     made_of: str = ""
 
     def __post_init__(self) -> None:
         last = {"B": self.input_lines.shape, "K": self.codes.shape, "P": self.profile_offsets_px.shape}
-        sizes: dict[str | int, int] = {letter: shape[-1] if shape else 0 for letter, shape in last.items()}
-        sizes |= {"D": 6 + sizes["K"], "T": len(self.term_names)}
-        for entry in fields(self):
-            shape = tuple(sizes.get(size, size) for size in entry.metadata.get("shape", ()))
-            got = np.shape(getattr(self, entry.name))
-            if shape and got != shape:
-                raise InputError(entry.name, f"shape {shape}", f"{got}")
+        sizes = {letter: shape[-1] if shape else 0 for letter, shape in last.items()}
+        check_shapes(self, {**sizes, "D": 6 + sizes["K"], "T": len(self.term_names)})
+
+
+def check_shapes(arrays: Any, sizes: Mapping[str, int]) -> None:
+    """Whether the fields of a dataclass have the shapes that they declare by `shaped`.
+
+    Args:
+        arrays: the dataclass.
+        sizes: by the letters of the declarations.
+
+    Raises:
+        InputError: one has not.
+    """
+    for entry in fields(arrays):
+        shape = tuple(sizes.get(str(size), size) for size in entry.metadata.get("shape", ()))
+        got = np.shape(getattr(arrays, entry.name))
+        if shape and got != shape:
+            raise InputError(entry.name, f"shape {shape}", f"{got}")
 
 
 def write_shapes(path: Path | str, shapes: ShapeArrays) -> None:
     """Write the states and shapes of a frame, and a checksum; equal content gives equal bytes, no pickle inside."""
-    arrays: dict[str, NDArray[Any]] = {"schema_version": np.array(SHAPES_SCHEMA_VERSION)}
-    for entry in fields(shapes):
-        value = getattr(shapes, entry.name)
+    write_arrays(path, shapes, SHAPES_SCHEMA_VERSION)
+
+
+def write_arrays(path: Path | str, content: Any, version: int) -> None:
+    """Write the fields of a dataclass (arrays and text), and a checksum, for `read_arrays`."""
+    arrays: dict[str, NDArray[Any]] = {"schema_version": np.array(version)}
+    for entry in fields(content):
+        value = getattr(content, entry.name)
         arrays[entry.name] = np.array(value, dtype=np.str_) if isinstance(value, (str, tuple)) else np.asarray(value)
     atomic_files.write_npz(path, {**arrays, "sha256": np.array(_hash_arrays(arrays))})
 
@@ -184,30 +204,38 @@ def read_shapes(path: Path | str) -> ShapeArrays:
     Raises:
         DataFormatError: it is no such file, of another schema version, or changed since it was written.
     """
+    return read_arrays(path, ShapeArrays, SHAPES_SCHEMA_VERSION)
+
+
+def read_arrays(path: Path | str, kind: type[_Arrays], version_read: int) -> _Arrays:
+    """Read a file of `write_arrays` as the dataclass `kind`, whose `statuses` are names of `Status`.
+
+    Raises:
+        DataFormatError: it is no such file, of another schema version, or changed since it was written.
+    """
     arrays = read_npz(path, cure=_AGAIN)
     sha256 = arrays.pop("sha256", None)
     is_whole = sha256 is not None and sha256.tolist() == _hash_arrays(arrays)
     version = arrays.pop("schema_version", None)
-    if version is None or version.tolist() != SHAPES_SCHEMA_VERSION:
+    if version is None or version.tolist() != version_read:
         found = None if version is None else version.tolist()
-        raise DataFormatError(
-            path, f"has shape schema {shown(found)}, this version reads {SHAPES_SCHEMA_VERSION}", cure=_AGAIN
-        )
+        raise DataFormatError(path, f"has shape schema {shown(found)}, this version reads {version_read}", cure=_AGAIN)
     if not is_whole:
         raise DataFormatError(path, "has been changed since it was written", cure=_AGAIN)
-    kinds = {entry.name: _KINDS[str(entry.type)] for entry in fields(ShapeArrays)}
+    kinds = {entry.name: _KINDS[str(entry.type)] for entry in fields(cast(Any, kind))}
     if set(arrays) != set(kinds):
         raise DataFormatError(path, f"has the fields {sorted(arrays)}, expected {sorted(kinds)}", cure=_AGAIN)
-    for name, kind in kinds.items():
-        if arrays[name].dtype.kind != kind:
-            raise DataFormatError(path, f"{name} holds {arrays[name].dtype}, expected kind {kind!r}", cure=_AGAIN)
+    for name, letter in kinds.items():
+        if arrays[name].dtype.kind != letter:
+            raise DataFormatError(path, f"{name} holds {arrays[name].dtype}, expected kind {letter!r}", cure=_AGAIN)
+    statuses = set(arrays["statuses"].reshape(-1).tolist())
     try:
-        shapes = ShapeArrays(**{name: _from_text(array) for name, array in arrays.items()})
+        content = kind(**{name: _from_text(array) for name, array in arrays.items()})
     except InputError as error:
         raise DataFormatError(path, str(error), cure=_AGAIN) from error
-    if unknown := set(shapes.statuses) - set(Status.__members__):
+    if unknown := statuses - set(Status.__members__):
         raise DataFormatError(path, f"statuses hold {shown(min(unknown))}", cure=_AGAIN)
-    return shapes
+    return content
 
 
 def _hash_arrays(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -19,6 +19,7 @@ def shape_arrays(num_cars: int, **changes: Any) -> ShapeArrays:
         prior_sha256="ab" * 32,
         ground_source="file",
         input_lines=np.arange(B, dtype=np.int64) + 1,
+        tracks=("000031", "", "000007")[:B],
         T_cam_obj=random.random((B, 4, 4)),
         T_ref_obj=random.random((B, 4, 4)),
         boxes_hwl=random.random((B, 3)),

@@ -94,7 +94,7 @@ def test_shapes_round_trip_and_equal_bytes(tmp_path: Path, num_cars: int) -> Non
         else:
             assert before == after
     with np.load(tmp_path / "a.npz", allow_pickle=False) as archive:
-        assert int(archive["schema_version"]) == 2
+        assert int(archive["schema_version"]) == 3
 
 
 def test_shapes_of_wrong_size() -> None:
@@ -116,12 +116,12 @@ def test_files_that_are_no_shapes(tmp_path: Path) -> None:
     with pytest.raises(DataFormatError, match="is no readable npz file"):
         read_shapes(path)
     write_npz(path, {"codes": np.zeros(3)})
-    with pytest.raises(DataFormatError, match="has shape schema None, this version reads 2"):
+    with pytest.raises(DataFormatError, match="has shape schema None, this version reads 3"):
         read_shapes(path)
     write_npz(path, {"schema_version": np.array(1)})
-    with pytest.raises(DataFormatError, match="has shape schema 1, this version reads 2"):
+    with pytest.raises(DataFormatError, match="has shape schema 1, this version reads 3"):
         read_shapes(path)
-    write_npz(path, {"schema_version": np.array(2), "codes": np.zeros(3)})
+    write_npz(path, {"schema_version": np.array(3), "codes": np.zeros(3)})
     with pytest.raises(DataFormatError, match="has been changed since it was written"):
         read_shapes(path)
 

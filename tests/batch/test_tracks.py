@@ -1,0 +1,87 @@
+"""`refine --tracks`: the frames of a track in one call, its file at the end, resumption that keeps to its windows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.kitti_folder import FRAMES
+from helpers.layouts import write, write_sequence
+from helpers.output_folders import result_files
+from helpers.quick_runs import refiner
+
+from directshape_torch.batch.frame_groups import track_windows
+from directshape_torch.batch.options import RefineOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.run_summary import RunSummary
+from directshape_torch.errors import ResumeError
+from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.track_files import read_track, track_path
+
+
+@pytest.fixture(scope="module")
+def sequence(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The frames of the shared data set as a sequence, every car with the track of its line."""
+    root = tmp_path_factory.mktemp("sequence")
+    write_sequence(shared_kitti, root, FRAMES, single=True)
+    lines = [
+        f"{number} {track} {line}\n"
+        for number, frame_id in enumerate(FRAMES)
+        for track, line in enumerate(
+            (shared_kitti / "detections" / "data" / f"{frame_id}.txt").read_text().splitlines()
+        )
+    ]
+    write(root / "results" / f"{root.name}.txt", "".join(lines))
+    return root
+
+
+def refine(kitti: Path, sequence: Path, out: Path, batch_frames: int = 16, fresh: bool = False) -> RunSummary:
+    dataset = open_dataset("tracking", sequence, sequence / "results", kitti / "masks", tracks=True)
+    return refine_dataset(dataset, refiner(kitti), out, RefineOptions(batch_frames=batch_frames), fresh=fresh)
+
+
+def test_views_of_a_track_share_a_shape_and_get_a_file(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, sequence, tmp_path)
+    frames = [read_shapes(tmp_path / "shapes" / f"{number:06d}.npz") for number in range(len(FRAMES))]
+    assert frames[0].tracks[0] == "000000"
+    track = read_track(track_path(tmp_path, "000000"))
+    assert track.frame_ids == tuple(frame.frame_id for frame in frames)
+    assert track.statuses == tuple(frame.statuses[0] for frame in frames)
+    np.testing.assert_array_equal(track.T_cam_obj, np.stack([frame.T_cam_obj[0] for frame in frames]))
+    np.testing.assert_array_equal(track.codes, np.broadcast_to(track.code, track.codes.shape))
+    np.testing.assert_array_equal(track.dimensions_hwl, track.boxes_hwl[0])
+    assert np.isfinite(track.code_covariance).all()
+
+
+def test_an_interrupted_run_keeps_to_its_windows(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, sequence, tmp_path)
+    before = result_files(tmp_path)
+    (tmp_path / "shapes" / "000000.npz").unlink()
+    assert refine(shared_kitti, sequence, tmp_path).resumed == ("000001", "000002")
+    assert result_files(tmp_path) == before
+    with pytest.raises(ResumeError, match="setting 'track_frames' was 16, now is 1"):
+        refine(shared_kitti, sequence, tmp_path, batch_frames=1)
+
+
+def test_a_fresh_start_removes_tracks(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, sequence, tmp_path)
+    track_path(tmp_path, "000000").rename(track_path(tmp_path, "000099"))
+    refine(shared_kitti, sequence, tmp_path, batch_frames=1, fresh=True)
+    assert not track_path(tmp_path, "000099").exists()
+    assert track_path(tmp_path, "000000").is_file()
+
+
+def test_windows_cover_every_frame_once() -> None:
+    names = [f"{sequence}_{number:03d}" for sequence in "ab" for number in range(37)]
+    windows = track_windows(names, lambda name: name[0], 16, finished=())
+    assert sorted(name for window in windows for name in window.wanted) == names
+    for window in windows:
+        assert len(window.frame_ids) == 16
+        assert len({name[0] for name in window.frame_ids}) == 1
+        for name in window.wanted:
+            # In the window's middle half, but at the ends of the sequence.
+            place = window.frame_ids.index(name)
+            assert 4 <= place <= 11 or "000" in window.frame_ids[0] or "036" in window.frame_ids[-1]
+    assert track_windows(names, lambda name: name[0], 16, finished=names) == []
