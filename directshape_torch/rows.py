@@ -170,10 +170,9 @@ class ObjectRays(NamedTuple):
         """Where the rays are inside bounds (2, 3), in front of their camera."""
         direction = self.direction_obj
         inverse = 1 / torch.where(direction.abs() < _LEAST_DIRECTION, _LEAST_DIRECTION, direction)
-        to_lower, to_upper = ((corner.view(3, 1, 1) - self.centre_obj) * inverse for corner in bounds_obj)
+        to_lower, to_upper = (bounds_obj[..., None, None] - self.centre_obj) * inverse
         enters, leaves = torch.minimum(to_lower, to_upper), torch.maximum(to_lower, to_upper)
-        near = torch.maximum(torch.maximum(enters[0], enters[1]), enters[2]).clamp_min(0)
-        far = torch.minimum(torch.minimum(leaves[0], leaves[1]), leaves[2])
+        near, far = enters.amax(0).clamp_min(0), leaves.amin(0)
         hit = far > near
         near = torch.where(hit, near, 1.0)
         return Interval(near, torch.where(hit, far, near + 1), hit, enters, leaves)

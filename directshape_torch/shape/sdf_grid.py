@@ -1,11 +1,10 @@
 """Stacked signed distance grids: a shape of them, where points lie in them, and what they find there.
 
 Lookups take points (3, ...): coordinates apart, so that each arithmetic step runs over memory without a jump, and of
-any shape behind that, so that several depths of the same rays are one lookup. Outside the grid the field continues as
-the value at the nearest point of the grid plus the distance to it: continuous, growing, with a defined gradient. (It
-overestimates the true distance, so ray marching never steps by it.)
-
-A difference that serves the value and a derivative is made once: compiling takes the longer the more steps there are.
+any shape behind that, so that several depths of the same rays are one lookup. The corners of a cell are the axis before
+(8, ...), of which each interpolation takes the two halves: few and large operations, whose number is what a call of few
+cars costs. Outside the grid the field continues as the value at the nearest point of the grid plus the distance to it:
+continuous, growing, with a defined gradient. (It overestimates the true distance, so ray marching never steps by it.)
 """
 
 from __future__ import annotations
@@ -22,6 +21,9 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.shape_prior import SdfDerivatives
+
+
+_TINY = 1e-30
 
 
 class GridShape:
@@ -86,26 +88,49 @@ class GridField(NamedTuple):
     spacing_m: float  # between nodes
 
     @property
-    def last_node(self) -> tuple[int, ...]:
-        """Number of the last node along each axis."""
-        return tuple(count - 1 for count in self.basis.shape[:3])
-
-    @property
     def num_nodes(self) -> int:
         """Of one grid."""
         return math.prod(self.basis.shape[:3])
 
-    def node_at(self, cell: Sequence[Tensor]) -> Tensor:
-        """Flat index (...), within one grid, of nodes, three whole numbers in floating point."""
+    @property
+    def _strides(self) -> tuple[int, int, int]:
         ny, nz = self.basis.shape[1:3]
-        x, y, z = cell
-        return (x * (ny * nz) + (y * nz + z)).long()
+        return ny * nz, nz, 1
+
+    def along_axes(self, values: Sequence[float], like: Tensor) -> Tensor:
+        """One number for each axis, as it goes with points (3, ...)."""
+        return constant_like(tuple(values), like).view(3, *[1] * (like.ndim - 1))
+
+    def positions(self, points_obj: Tensor) -> Tensor:
+        """Points (3, ...) in cells from node (0, 0, 0)."""
+        return (points_obj - self.origin.view(3, *[1] * (points_obj.ndim - 1))) * (1 / self.spacing_m)
+
+    def last_nodes(self, like: Tensor) -> Tensor:
+        """Number of the last node along each axis, as it goes with points (3, ...)."""
+        return self.along_axes([count - 1 for count in self.basis.shape[:3]], like)
+
+    def steps(self, cells: Tensor) -> Tensor:
+        """What moves (3, ...) by whole cells, in floating point, add to the flat index (...) of a node."""
+        return (cells * self.along_axes(self._strides, cells)).sum(0).int()
+
+    def lower_nodes(self, cells: Tensor) -> Tensor:
+        """Flat index (...), within one grid, of the lower corners of cells (3, ...); a valid one of a NaN cell too."""
+        return self.steps(cells).clamp(0, self.num_nodes - 1 - self.steps_to_last_corner)
 
     @property
-    def corners(self) -> tuple[int, ...]:
-        """Offsets of the 8 corners of a cell, x outermost: 000, 001, 010, 011, 100, 101, 110, 111."""
-        ny, nz = self.basis.shape[1:3]
-        return tuple(i * ny * nz + j * nz + k for i in (0, 1) for j in (0, 1) for k in (0, 1))
+    def steps_to_last_corner(self) -> int:
+        """From the flat index of the lower corner of a cell to that of its upper one."""
+        return sum(self._strides)
+
+    def nodes_of(self, node: Tensor, object_index: Tensor) -> Tensor:
+        """Flat index (...) among the nodes of all grids, from that within the grid of an object; 32 bits, for speed."""
+        return node + (object_index * self.num_nodes).int()
+
+    def at_corners(self, node: Tensor) -> Tensor:
+        """Flat indices (8, ...) of the corners of cells, z outermost: 000, 100, 010, 110, 001, 101, 011, 111."""
+        x, y, z = self._strides
+        offsets = tuple(i * x + j * y + k * z for k in (0, 1) for j in (0, 1) for i in (0, 1))
+        return node + constant_like(offsets, node).view(8, *[1] * node.ndim)
 
 
 class Lookup(NamedTuple):
@@ -120,15 +145,15 @@ class Cells(NamedTuple):
     """The grid cells that hold points (3, ...)."""
 
     lower_node: Tensor  # (...) flat index, within one grid, of the cell's lower corner
-    fraction: Sequence[Tensor]  # three of (...), position inside the cell, 0..1
-    outward: Sequence[Tensor]  # three of (...), from the nearest point of the grid to the point, in cells; zero inside
+    fraction: Tensor  # (3, ...) position inside the cell, 0..1
+    outward: Tensor  # (3, ...) from the nearest point of the grid to the point, in cells; zero inside
 
     def distance(self, constant: bool) -> Tensor:
         """From the grid (...), in cells; zero inside. `constant`: not to be differentiated."""
-        x, y, z = self.outward
-        squared = torch.addcmul(torch.addcmul(x * x, y, y), z, z)
+        squared = (self.outward * self.outward).sum(0)
         if constant:
-            return squared.sqrt()
+            # On a processor the root of zero takes five times as long as any other.
+            return (squared + _TINY).sqrt()
         # The gradient at zero is zero instead of NaN.
         positive = squared > 0
         return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), squared)
@@ -136,39 +161,26 @@ class Cells(NamedTuple):
 
 def cells_at(field: GridField, points_obj: Tensor) -> Cells:
     """The cells at points (3, ...). A NaN point gets a valid cell, at a distance of NaN: it cannot disturb others."""
-    lower, fraction, outward = [], [], []
-    for coordinate, origin, last in zip(points_obj, field.origin, field.last_node, strict=True):
-        position = (coordinate - origin) * (1 / field.spacing_m)
-        # A comparison with NaN is false.
-        clamped = torch.where(position >= 0, position, 0.0).clamp_max(last)
-        lower.append(clamped.detach().floor().clamp_max(last - 1))
-        fraction.append(clamped - lower[-1])
-        outward.append(position - clamped)
-    return Cells(field.node_at(lower), fraction, outward)
+    position = field.positions(points_obj)
+    last = field.last_nodes(position)
+    clamped = position.clamp_min(0).minimum(last)
+    lower = clamped.detach().floor().minimum(last - 1)
+    return Cells(field.lower_nodes(lower), clamped - lower, position - clamped)
 
 
-def corner_values(field: GridField, node: Tensor) -> list[Tensor]:
-    """Signed distances (...) at the 8 corners of cells with lower node (...) among those of all grids, x outermost."""
+def corner_values(field: GridField, node: Tensor) -> Tensor:
+    """Signed distances (8, ...) at the corners of cells with lower node (...) among those of all grids."""
+    corners = field.at_corners(node)
     if torch.compiler.is_compiling():
         # Whose indices are known not to be negative.
-        return [row[..., 0] for row in corner_rows(field, field.values[:, None], node)]
-    flat = node.reshape(-1)
-    return [field.values[corner:].index_select(0, flat).view(node.shape) for corner in field.corners]
+        return embedding(corners, field.values[:, None])[..., 0]
+    return field.values.index_select(0, corners.view(-1)).view(corners.shape)
 
 
-def corner_rows(field: GridField, table: Tensor, node: Tensor) -> list[Tensor]:
-    """Rows (..., C) of a table of nodes at the 8 corners of cells with lower node (...), x outermost."""
-    return [embedding(node + corner if corner else node, table) for corner in field.corners]
-
-
-def differences(ends: Sequence[Tensor]) -> list[Tensor]:
-    """Between the upper and the lower ends along the innermost axis that is left."""
-    return [high - low for low, high in zip(ends[0::2], ends[1::2], strict=True)]
-
-
-def moved(lower: Sequence[Tensor], fraction: Tensor, differences: Sequence[Tensor]) -> list[Tensor]:
-    """From the lower ends on by fractions of the differences."""
-    return [torch.addcmul(low, fraction, difference) for low, difference in zip(lower, differences, strict=True)]
+def halves(ends: Tensor) -> tuple[Tensor, Tensor]:
+    """The lower ends (n, ...) along the outermost axis that is left, and what the upper ones (n, ...) are above them."""
+    lower, upper = ends.tensor_split(2)
+    return lower, upper - lower
 
 
 def value_at(field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False) -> Tensor:
@@ -177,9 +189,8 @@ def value_at(field: GridField, points_obj: Tensor, object_index: Tensor, constan
     With `constant` nothing will be differentiated, which takes fewer steps.
     """
     cells = cells_at(field, points_obj)
-    node = cells.lower_node + object_index * field.num_nodes
-    inside = _interpolated(corner_values(field, node), cells.fraction)
-    return inside + field.spacing_m * cells.distance(constant)
+    inside = _interpolated(corner_values(field, field.nodes_of(cells.lower_node, object_index)), cells.fraction)
+    return torch.add(inside, cells.distance(constant), alpha=field.spacing_m)
 
 
 def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False) -> Lookup:
@@ -190,11 +201,10 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     """
     cells = cells_at(field, points_obj)
     value, gradient = _value_and_gradient(field, cells, object_index, constant)
-    table = field.basis.flatten(0, 2)
+    table, corners = field.basis.flatten(0, 2), field.at_corners(cells.lower_node)
     if constant and not torch.compiler.is_compiling():
-        return Lookup(value, gradient, _summed(field, table, cells))
-    basis = _interpolated(corner_rows(field, table, cells.lower_node), [x[..., None] for x in cells.fraction])
-    return Lookup(value, gradient, basis)
+        return Lookup(value, gradient, _summed(table, corners, cells.fraction))
+    return Lookup(value, gradient, _interpolated(embedding(corners, table), cells.fraction[..., None]))
 
 
 def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
@@ -204,44 +214,37 @@ def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> T
 
 def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor, constant: bool) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
-    corners = corner_values(field, cells.lower_node + object_index * field.num_nodes)
-    along_z = differences(corners)
-    (d_z,) = _along(fx, _along(fy, along_z))
-    lower = moved(corners[0::2], fz, along_z)
-    along_y = differences(lower)
-    (d_y,) = _along(fx, along_y)
-    lowest, upper = moved(lower[0::2], fy, along_y)
-    d_x = upper - lowest
-    value = torch.addcmul(lowest, fx, d_x)
+    lower, along_z = halves(corner_values(field, field.nodes_of(cells.lower_node, object_index)))
+    lower, along_y = halves(torch.addcmul(lower, fz, along_z))
+    lowest, along_x = halves(torch.addcmul(lower, fy, along_y))
+    inside = torch.addcmul(lowest, fx, along_x)[0]
+    along_z = _moved(halves(along_z), fy)
+    slope = torch.cat([along_x, *(_moved(halves(x), fx) for x in (along_y, along_z))])
     distance = cells.distance(constant)
-    per_distance = 1 / torch.where(distance > 0, distance, 1.0)
-    gradient = [
-        torch.where(out == 0, slope * (1 / field.spacing_m), out * per_distance)
-        for slope, out in zip((d_x, d_y, d_z), cells.outward, strict=True)
-    ]
-    return value + field.spacing_m * distance, torch.stack(gradient)
+    beyond = cells.outward * (1 / torch.where(distance > 0, distance, 1.0))
+    gradient = torch.where(cells.outward == 0, slope * (1 / field.spacing_m), beyond)
+    return torch.add(inside, distance, alpha=field.spacing_m), gradient
 
 
-def _interpolated(corners: Sequence[Tensor], fraction: Sequence[Tensor]) -> Tensor:
-    """Of 8 corners, x outermost, at fractions along three axes."""
-    fx, fy, fz = fraction
-    (result,) = _along(fx, _along(fy, _along(fz, corners)))
-    return result
+def _moved(ends: tuple[Tensor, Tensor], fraction: Tensor) -> Tensor:
+    """From lower ends on by a fraction of the differences."""
+    return torch.addcmul(ends[0], fraction, ends[1])
 
 
-def _along(fraction: Tensor, ends: Sequence[Tensor]) -> list[Tensor]:
-    return moved(ends[0::2], fraction, differences(ends))
+def _interpolated(corners: Tensor, fraction: Tensor) -> Tensor:
+    """Of the corners (8, ...) of cells, at fractions (3, ...) along the axes."""
+    for along in reversed(fraction.unbind(0)):
+        corners = _moved(halves(corners), along)
+    return corners[0]
 
 
-def _summed(field: GridField, table: Tensor, cells: Cells) -> Tensor:
+def _summed(table: Tensor, corners: Tensor, fraction: Tensor) -> Tensor:
     """`_interpolated` as one weighted sum of table rows: one pass instead of three."""
-    x1, y1, z1 = cells.fraction
-    x0, y0, z0 = 1 - x1, 1 - y1, 1 - z1
-    xy = (x0 * y0, x0 * y1, x1 * y0, x1 * y1)
-    weight = torch.stack([w * z for w in xy for z in (z0, z1)], dim=-1).view(-1, 8)
-    node = (cells.lower_node[..., None] + constant_like(field.corners, cells.lower_node)).view(-1, 8)
-    rows = torch.nn.functional.embedding_bag(node, table, mode="sum", per_sample_weights=weight)
-    return rows.view(*cells.lower_node.shape, rows.shape[-1])
+    x, y, z = torch.stack([1 - fraction, fraction], dim=1)
+    weight = z[:, None, None] * (y[:, None] * x)
+    node, share = (per_corner.reshape(8, -1).mT.contiguous() for per_corner in (corners, weight))
+    rows = torch.nn.functional.embedding_bag(node, table, mode="sum", per_sample_weights=share)
+    return rows.view(*fraction.shape[1:], rows.shape[-1])
 
 
 def zero_level_extents(
