@@ -34,7 +34,7 @@ from directshape_torch.terms.check_term import check_term
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.point_cloud import PointCloud
-from directshape_torch.terms.priors import prior_terms
+from directshape_torch.terms.priors import PriorTerm, joined, prior_terms
 from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import (
     Evaluation,
@@ -266,15 +266,24 @@ class CarStage:
         # What is differentiated afterwards is the marched energy, so its minimum must be found: under `no_grad`
         # too, for evaluation gives the results of training.
         if problem.config.solver.rays == "marched" or problem.config.backward.mode != "none":
-            terms, rest = self.terms, None
+            terms, rest = self._with_joined_priors(), None
             wheres = tuple(term.where(sight) for term in terms)
         else:
-            moving = [term.moving(sight, self.after_wider) for term in self.terms]
+            moving = [term.moving(sight, self.after_wider) for term in self._with_joined_priors()]
             terms, wheres, costs = (tuple(x) for x in zip(*moving, strict=True))
             by_column = torch.cat(costs, dim=1)
             rest = (by_column if problem.factors is None else by_column * problem.factors).sum(dim=1)
         iterations = CarIterations.of(self, terms, rest, problem.factors, problem.masks, problem.sharing)
         return iterations, iterations.evaluated(sight.field, sight.state, wheres)
+
+    def _with_joined_priors(self) -> tuple[Term, ...]:
+        """The terms with our priors as one, where cars have no factors of their own; a user's stay by themselves."""
+        own = self.terms[: len(self.terms) - self.problem.num_extra]
+        priors = [term for term in own if isinstance(term, PriorTerm) and term.is_prior]
+        if not priors or self.problem.factors is not None:
+            return self.terms
+        others = [term for term in own if not (isinstance(term, PriorTerm) and term.is_prior)]
+        return (*others, joined(priors), *self.terms[len(own) :])
 
     def linearise_differentiably(self, state: CarState) -> Evaluation:
         """The hand-derived linearisation with an autograd graph to state, images, masks, prior and weights."""

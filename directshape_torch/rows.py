@@ -140,12 +140,12 @@ class Rays(NamedTuple):
 
     def in_objects(self, T_obj_cam: Tensor) -> ObjectRays:
         """The rays in the frames of their cars, by the poses (B, 4, 4) of the cars."""
-        T = T_obj_cam[self.owner, :3]
-        centre = (T[:, :, :3] * self.centre_cam[:, None]).sum(-1) + T[:, :, 3]
-        x_axis, y_axis, z_axis = T[:, :, :3].permute(2, 1, 0)[..., None]  # columns of R, (3, M, 1) each
-        x, y, z = self.ray_cam
+        # Columns of R and the translation, (3, M, 1) each.
+        x_axis, y_axis, z_axis, moved = T_obj_cam[self.owner, :3].permute(2, 1, 0)[..., None].unbind(0)
+        (cx, cy, cz), (x, y, z) = self.centre_cam.mT[..., None].unbind(0), self.ray_cam.unbind(0)
+        centre = torch.addcmul(torch.addcmul(torch.addcmul(moved, x_axis, cx), y_axis, cy), z_axis, cz)
         direction = torch.addcmul(torch.addcmul(x_axis * x, y_axis, y), z_axis, z)
-        return ObjectRays(centre.mT[..., None], direction)
+        return ObjectRays(centre, direction)
 
 
 class ObjectRays(NamedTuple):

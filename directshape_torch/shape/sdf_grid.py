@@ -179,7 +179,7 @@ def corner_values(field: GridField, node: Tensor) -> Tensor:
 
 def halves(ends: Tensor) -> tuple[Tensor, Tensor]:
     """The lower ends (n, ...) along the outermost axis that is left, and what the upper ones (n, ...) are above them."""
-    lower, upper = ends.tensor_split(2)
+    lower, upper = ends.chunk(2)
     return lower, upper - lower
 
 

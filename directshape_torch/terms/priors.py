@@ -129,6 +129,16 @@ def prior_terms(config: PriorConfig, prior: ShapePrior, cars: CarBatch) -> list[
     return [term for term in all_terms if term.weight > 0]
 
 
+def joined(terms: Sequence[PriorTerm]) -> PriorTerm:
+    """One term that costs what some terms of the same cars do together: an iteration asks for the sum alone."""
+
+    def residual_of(cars: CarBatch, state: CarState) -> PriorResidual:
+        scaled = [[math.sqrt(term.weight) * x for x in term.residual_of(cars, state)] for term in terms]
+        return PriorResidual(*(torch.cat(parts, dim=1) for parts in zip(*scaled, strict=True)))
+
+    return PriorTerm("priors", 1.0, terms[0].cars, residual_of, sum(term.num_rows for term in terms))
+
+
 def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
     """Standard deviations (B, 4) of the input poses, see `Detections.pose_sigma`; infinite where nobody knows them."""
     if cars.detector_pose_sigma is not None:
@@ -160,12 +170,11 @@ def height_prior(cars: CarBatch, state: CarState) -> PriorResidual:
 
     `r = (n . t + d) / n_y` with t the object origin in the camera frame, which moves by `-R_cam_obj v`.
     """
-    R_cam_obj = state.T_obj_cam[:, :3, :3].transpose(1, 2)
-    origin_cam = -(R_cam_obj @ state.T_obj_cam[:, :3, 3:])[..., 0]
-    n_over_ny = cars.ground_normal_cam / cars.ground_normal_cam[:, 1:2]
-    residual = (n_over_ny * origin_cam).sum(-1) + cars.ground_offset / cars.ground_normal_cam[:, 1]
-    J_v = -(n_over_ny[:, None] @ R_cam_obj)
-    return PriorResidual(residual[:, None], torch.nn.functional.pad(J_v, (0, 3 + state.code.shape[1])))
+    # With `t = -R_cam_obj p`, p the translation of T_obj_cam, `n . t = -n_obj . p`.
+    n_obj, n_y = _ground_normal_obj(cars, state), cars.ground_normal_cam[:, 1]
+    residual = (cars.ground_offset - (n_obj * state.T_obj_cam[:, :3, 3]).sum(-1)) / n_y
+    J_v = -n_obj / n_y[:, None]
+    return PriorResidual(residual[:, None], torch.nn.functional.pad(J_v, (0, 3 + state.code.shape[1]))[:, None])
 
 
 def tilt_prior_normal(cars: CarBatch, state: CarState) -> PriorResidual:
@@ -173,7 +182,7 @@ def tilt_prior_normal(cars: CarBatch, state: CarState) -> PriorResidual:
 
     `n_obj = R_obj_cam n`, `r = (n_obj.x, n_obj.z)`; unlike the paper's form its Jacobian does not vanish at zero.
     """
-    x, y, z = _ground_normal_obj(cars, state)
+    x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     zero = torch.zeros_like(x)
     J_x, J_z = torch.stack([zero, z, -y], dim=-1), torch.stack([y, -x, zero], dim=-1)
     return PriorResidual(torch.stack([x, z], dim=-1), _by_rotation(torch.stack([J_x, J_z], dim=1), state))
@@ -181,13 +190,13 @@ def tilt_prior_normal(cars: CarBatch, state: CarState) -> PriorResidual:
 
 def tilt_prior_cosine(cars: CarBatch, state: CarState) -> PriorResidual:
     """The paper's `r_rot = 1 - (R_cam_obj [0, -1, 0]) . n = 1 + n_obj.y`; its Jacobian vanishes where r does."""
-    x, y, z = _ground_normal_obj(cars, state)
+    x, y, z = _ground_normal_obj(cars, state).unbind(-1)
     J_omega = torch.stack([-z, torch.zeros_like(x), x], dim=-1)[:, None]
     return PriorResidual((1 + y)[:, None], _by_rotation(J_omega, state))
 
 
-def _ground_normal_obj(cars: CarBatch, state: CarState) -> tuple[Tensor, ...]:
-    return (state.T_obj_cam[:, :3, :3] @ cars.ground_normal_cam[..., None])[..., 0].unbind(-1)
+def _ground_normal_obj(cars: CarBatch, state: CarState) -> Tensor:
+    return (state.T_obj_cam[:, :3, :3] * cars.ground_normal_cam[:, None]).sum(-1)
 
 
 def _by_rotation(J_omega: Tensor, state: CarState) -> Tensor:
