@@ -77,7 +77,7 @@ def _agreement(stage: CarStage, course: Course) -> Agreement:
 
 def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
     """Overlap (2, B) of shape and mask over the pixels of the left and the right image."""
-    distance = seen.field.value(seen.closest.points_obj, masks.rays.owner, constant=True)
+    distance = seen.field.value(seen.closest.points_obj, masks.rays.owner)
     counts = masks.filled.to(torch.float64)
     covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > 0.5
     both, either = ((x * counts).sum(dim=1) for x in (covered & masked, covered | masked))

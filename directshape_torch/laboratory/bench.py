@@ -184,7 +184,7 @@ def _chosen(
         closest = closest_of_march(field, owner, rays, bounds, marched)
         hits = first_hits(field, owner, rays, marched, closest)
         if regime.pixels == "contour":
-            sdf = field.value(closest.points_obj, owner, constant=True)
+            sdf = field.value(closest.points_obj, owner)
             wanted = (zeta[owner][:, None] * sdf).abs() < _CONTOUR
         elif regime.pixels == "grazing":
             slope = (hits.normal_obj * rays.direction_obj).sum(0).abs()

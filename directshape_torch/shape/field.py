@@ -21,8 +21,8 @@ from directshape_torch.shape.shape_prior import BoundShape
 class Field(Protocol):
     """Signed distances of B cars; points are (3, ..., M, R) and belong to the cars (M,) of their blocks."""
 
-    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
-        """Signed distance (..., M, R), metres; `constant`: not to be differentiated."""
+    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+        """Signed distance (..., M, R), metres."""
         ...
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
@@ -56,8 +56,8 @@ class Grids(NamedTuple):
 
     grids: GridField
 
-    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
-        return value_at(self.grids, points_obj, owner[:, None], constant)
+    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+        return value_at(self.grids, points_obj, owner[:, None])
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
         return gradient_at(self.grids, points_obj, owner[:, None])
@@ -86,7 +86,7 @@ class PackedField(NamedTuple):
 
     shape: BoundShape
 
-    def value(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
         return self.shape.value(*_packed(points_obj, owner)).view(points_obj.shape[1:])
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
@@ -118,7 +118,7 @@ class PackedField(NamedTuple):
 
     def _along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor) -> Callable[[Tensor], Tensor]:
         """Signed distances (n, M, R) at depths (n, M, R) of rays."""
-        return lambda depths: self.value(centre_obj[:, None] + depths * direction_obj[:, None], owner, constant=True)
+        return lambda depths: self.value(centre_obj[:, None] + depths * direction_obj[:, None], owner)
 
 
 def field_of(shape: BoundShape) -> Field:

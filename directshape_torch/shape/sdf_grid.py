@@ -22,8 +22,8 @@ from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.shape_prior import SdfDerivatives
 
-
-_TINY = 1e-30
+# Beside any distance nothing, and a normal number in single precision.
+_TINY = 2e-38
 
 
 class GridShape:
@@ -64,7 +64,7 @@ class GridShape:
 
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
-        return value_at(self.field, points_obj.mT.contiguous(), object_index, nothing_is_differentiated())
+        return value_at(self.field, points_obj.mT.contiguous(), object_index)
 
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
@@ -148,15 +148,11 @@ class Cells(NamedTuple):
     fraction: Tensor  # (3, ...) position inside the cell, 0..1
     outward: Tensor  # (3, ...) from the nearest point of the grid to the point, in cells; zero inside
 
-    def distance(self, constant: bool) -> Tensor:
-        """From the grid (...), in cells; zero inside. `constant`: not to be differentiated."""
-        squared = (self.outward * self.outward).sum(0)
-        if constant:
-            # On a processor the root of zero takes five times as long as any other.
-            return (squared + _TINY).sqrt()
-        # The gradient at zero is zero instead of NaN.
-        positive = squared > 0
-        return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), squared)
+    @property
+    def distance(self) -> Tensor:
+        """From the grid (...), in cells; next to nothing inside."""
+        # The root of zero has no derivative, and takes a processor five times as long as any other.
+        return ((self.outward * self.outward).sum(0) + _TINY).sqrt()
 
 
 def cells_at(field: GridField, points_obj: Tensor) -> Cells:
@@ -178,29 +174,25 @@ def corner_values(field: GridField, node: Tensor) -> Tensor:
 
 
 def halves(ends: Tensor) -> tuple[Tensor, Tensor]:
-    """The lower ends (n, ...) along the outermost axis that is left, and what the upper ones (n, ...) are above them."""
+    """The lower ends (n, ...) along the outermost axis that is left, and by how much the upper ones are above them."""
     lower, upper = ends.chunk(2)
     return lower, upper - lower
 
 
-def value_at(field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False) -> Tensor:
-    """Signed distance (...) at points (3, ...) of the objects with index broadcastable to (...).
-
-    With `constant` nothing will be differentiated, which takes fewer steps.
-    """
+def value_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
+    """Signed distance (...) at points (3, ...) of the objects with index broadcastable to (...)."""
     cells = cells_at(field, points_obj)
     inside = _interpolated(corner_values(field, field.nodes_of(cells.lower_node, object_index)), cells.fraction)
-    return torch.add(inside, cells.distance(constant), alpha=field.spacing_m)
+    return torch.add(inside, cells.distance, alpha=field.spacing_m)
 
 
 def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False) -> Lookup:
     """Value, exact gradient of the trilinear lookup and of its continuation, and code derivative, in one pass.
 
-    With `constant` nothing will be differentiated again, which takes fewer steps, and a faster sum over the corners'
-    basis vectors.
+    With `constant` nothing will be differentiated again, which allows a faster sum over the corners' basis vectors.
     """
     cells = cells_at(field, points_obj)
-    value, gradient = _value_and_gradient(field, cells, object_index, constant)
+    value, gradient = _value_and_gradient(field, cells, object_index)
     table, corners = field.basis.flatten(0, 2), field.at_corners(cells.lower_node)
     if constant and not torch.compiler.is_compiling():
         return Lookup(value, gradient, _summed(table, corners, cells.fraction))
@@ -209,10 +201,10 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
 
 def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
     """The gradient (3, ...) of `derivatives_at` by itself, for what is not differentiated again."""
-    return _value_and_gradient(field, cells_at(field, points_obj), object_index, constant=True)[1]
+    return _value_and_gradient(field, cells_at(field, points_obj), object_index)[1]
 
 
-def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor, constant: bool) -> tuple[Tensor, Tensor]:
+def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
     lower, along_z = halves(corner_values(field, field.nodes_of(cells.lower_node, object_index)))
     lower, along_y = halves(torch.addcmul(lower, fz, along_z))
@@ -220,9 +212,8 @@ def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor, co
     inside = torch.addcmul(lowest, fx, along_x)[0]
     along_z = _moved(halves(along_z), fy)
     slope = torch.cat([along_x, *(_moved(halves(x), fx) for x in (along_y, along_z))])
-    distance = cells.distance(constant)
-    beyond = cells.outward * (1 / torch.where(distance > 0, distance, 1.0))
-    gradient = torch.where(cells.outward == 0, slope * (1 / field.spacing_m), beyond)
+    distance = cells.distance
+    gradient = torch.where(cells.outward == 0, slope * (1 / field.spacing_m), cells.outward / distance)
     return torch.add(inside, distance, alpha=field.spacing_m), gradient
 
 

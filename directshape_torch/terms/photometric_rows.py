@@ -211,7 +211,7 @@ def _frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor
     _, height, width = images.right.shape
     last_row, last_column = (images.sizes[frame] - 1).unbind(1)
     columns = frame * (height * width), torch.full_like(frame, width), last_column, last_row
-    first, step, last_u, last_v = (x.long()[:, None] for x in columns)
+    first, step, last_u, last_v = (x.int()[:, None] for x in columns)
     return first, step, last_u, last_v
 
 

@@ -244,7 +244,7 @@ class Silhouettes:
         return replace(self, cars=cars, rows=rows, zeta=self.zeta.index_select(0, kept))
 
     def _least_distance(self, sight: Sight) -> Tensor:
-        return sight.field.value(sight.closest.points_obj, self.rows.rays.owner, constant=True)
+        return sight.field.value(sight.closest.points_obj, self.rows.rays.owner)
 
     def _of_distance(self, sdf: Tensor, crosses: Tensor) -> tuple[Tensor, Tensor]:
         """Residual (M, R) of least distances and its derivative by them; rays that miss the bounds have a constant."""

@@ -25,7 +25,7 @@ def test_blocks_are_packed_points(kind: str, leading: tuple[int, ...]) -> None:
     at, expected = field.derivatives(points, OWNER), packed.derivatives(points, OWNER)
     for x, y in zip(at, expected, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(field.value(points, OWNER, constant=True), at.value)
+    torch.testing.assert_close(field.value(points, OWNER), at.value)
     torch.testing.assert_close(field.gradient(points, OWNER), at.gradient)
     assert at.value.shape == (*leading, 3, 64)
 

@@ -60,8 +60,7 @@ def test_constant_lookups_are_the_others(dtype: torch.dtype, num_codes: int, lea
     constant = derivatives_at(shape.field, at, index, constant=True)
     other = derivatives_at(shape.field, at, index, constant=False)
     assert torch.equal(constant.value, other.value)
-    value = value_at(shape.field, at, index, constant=True)
-    assert torch.equal(value, value_at(shape.field, at, index))
+    value = value_at(shape.field, at, index)
     torch.testing.assert_close(value, other.value, rtol=0, atol=30 * torch.finfo(dtype).eps)
     assert torch.equal(constant.gradient, other.gradient)
     eps = torch.finfo(dtype).eps

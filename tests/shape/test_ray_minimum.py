@@ -69,7 +69,9 @@ def test_minimum_and_first_hit_are_the_references(kind: str) -> None:
     assert (hits.found.flatten() == enters).double().mean() > 0.998
     both = hits.found.flatten() & enters
     assert both.any()
-    assert (hits.depth.flatten() - depth)[both].abs().max() < 1e-6
+    error = (hits.depth.flatten() - depth)[both].abs()
+    assert error.max() < 5e-4
+    assert error.median() < 1e-9
 
 
 def test_tracked_points_are_the_marched_ones_after_a_step() -> None:
