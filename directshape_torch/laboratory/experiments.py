@@ -257,7 +257,7 @@ def pi_closest(bench: Bench) -> Experiment:
     term, closest = bench.terms["silhouettes"], bench.sight.closest
     assert isinstance(term, Silhouettes)
     seen = (term.rows.filled > 0) & closest.crosses
-    at = bench.sight.field.value(closest.points_obj, term.rows.rays.owner, constant=True)[seen]
+    at = bench.sight.field.value(closest.points_obj, term.rows.rays.owner)[seen]
     fixed = term.zeta.expand_as(seen)[seen], term.rows.foreground[seen]
     J = closest_approach_residual(at, *fixed)[1][:, None, None]
     return factor_experiment(
@@ -272,7 +272,7 @@ def pi_product(bench: Bench) -> Experiment:
     assert isinstance(where, Samples)
     points = term.rows.rays.in_objects(bench.state.T_obj_cam).at(where.depths)
     seen = (term.rows.filled > 0) & where.crosses
-    at = bench.sight.field.value(points, term.rows.rays.owner, constant=True)[:, seen]
+    at = bench.sight.field.value(points, term.rows.rays.owner)[:, seen]
     fixed = term.zeta.expand_as(seen)[seen], term.rows.foreground[seen]
     J = product_residual(at, *fixed)[1].mT[:, None]
     return factor_experiment("pi_product", lambda x: product_residual(x.mT, *fixed)[0][:, None], at.mT, J)
