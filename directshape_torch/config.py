@@ -18,6 +18,8 @@ from directshape_torch.errors import ConfigError
 
 Unknowns = Literal["both", "pose", "shape"]
 """The unknowns that a stage moves."""
+SamplingMode = Literal["adaptive", "uniform", "dense"]
+"""Which pixels of its region a car gets."""
 
 _T = TypeVar("_T")
 _COMPARISONS = {"above": operator.gt, "at_least": operator.ge, "at_most": operator.le}
@@ -308,14 +310,13 @@ class PriorConfig(Settings):
 class SamplingConfig(Settings):
     """How many pixels a car gets, and which."""
 
-    mode: Literal["adaptive", "round_one", "uniform", "dense"] = setting(
+    mode: SamplingMode = setting(  # noqa: RUF009
         "adaptive",
-        '"adaptive" (both rounds of the paper), "round_one" (only pixels above their threshold), "uniform" (the pixel '
-        'nearest to the centre of each cell) or "dense" (every pixel of the region)',
+        'in the left image: of each small cell the pixel of the strongest gradient ("adaptive", the paper) or the one '
+        'in the middle ("uniform"), or every pixel of the region ("dense")',
     )
-    mode_right: Literal["as_left", "adaptive", "round_one", "uniform", "dense"] = setting(
-        "uniform",
-        'the same for the right image, whose pixels serve the silhouette alone; "as_left": that of the left',
+    mode_right: SamplingMode = setting(  # noqa: RUF009
+        "uniform", "in the right image, whose pixels serve the silhouette alone"
     )
     density: float = setting(0.05, "wanted pixels per pixel of the region", above=0, at_most=1)
     min_pixels: int = setting(400, "fewest wanted pixels; a region of fewer gives all it has", at_least=1)

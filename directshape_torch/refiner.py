@@ -21,7 +21,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
 from directshape_torch.observation.car_points import PointSamples, car_points
-from directshape_torch.observation.mask_extents import scene_extents
+from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
 from directshape_torch.problem import CarProblem, TermFactory

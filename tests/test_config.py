@@ -117,7 +117,7 @@ def test_a_value_out_of_range_is_named(override: str, text: str) -> None:
         (lambda: StageConfig(0.5, 0, 3, unknowns="all"), "unknowns: expected one of both, pose, shape, got 'all'"),  # type: ignore[arg-type]
         (
             lambda: SamplingConfig(mode=["dense"]),  # type: ignore[arg-type]
-            "mode: expected one of adaptive, round_one, uniform, dense, got ['dense']",
+            "mode: expected one of adaptive, uniform, dense, got ['dense']",
         ),
         (lambda: SamplingConfig(density="5 %"), "density: expected a finite number, above 0 and at most 1, got '5 %'"),  # type: ignore[arg-type]
         (

@@ -13,7 +13,7 @@ from directshape_torch.evaluation.shape_truth import SurfaceSource
 from directshape_torch.geometry.camera import project, rays_from_pixels
 from directshape_torch.io.frame_layout import FrameLayout, first_disparity
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.regions import MASK_THRESHOLD
+from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.rig.disparity_maps import FOLDERS, known_depth_from_disparity_map
 from directshape_torch.rig.disparity_observations import KnownDepth
 from directshape_torch.rig.lidar import known_depth_from_lidar

@@ -16,7 +16,7 @@ from directshape_torch.export.painted_cars import PaintedFrame
 from directshape_torch.export.rerun_stream import RerunStream
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.regions import MASK_THRESHOLD
+from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, picture_of
 from directshape_torch.visualize.ground_grid import ground_grid
 

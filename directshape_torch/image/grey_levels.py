@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -67,8 +68,8 @@ def length_2d(
 
 def gradient_magnitude_of_part(
     image: Tensor,  # (3, H, W)
-    size_hw: tuple[int, int],
-    part: tuple[int, int, int, int],
+    size_hw: Sequence[int],
+    part: Sequence[int],
 ) -> Tensor:
     """Length of the image gradient in one part of a frame, by central differences; differentiable by the image.
 

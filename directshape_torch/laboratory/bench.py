@@ -137,7 +137,7 @@ def _settings(regime: Regime, pixels_per_car: int) -> RefinerConfig:
     cells = pixels_per_car if regime.pixels == "sampled" else _CELLS_TO_CHOOSE_FROM
     # Gradients of the image choose the pixels on both sides: there the residuals are not flat.
     sampling = replace(
-        config.sampling, mode_right="as_left", min_pixels=cells, max_pixels=cells, occlusion=regime.occlusion
+        config.sampling, mode_right="adaptive", min_pixels=cells, max_pixels=cells, occlusion=regime.occlusion
     )
     cloud = replace(config.point_cloud, min_points=1)
     return replace(config, priors=priors, sampling=sampling, point_cloud=cloud)

@@ -12,14 +12,11 @@ from torch import Tensor
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
-from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
-from directshape_torch.observation.occlusion import OcclusionCrops, Side, crops_of_sides
-from directshape_torch.observation.regions import region_boxes
-from directshape_torch.observation.sampling import ChosenPixels, chosen_pixels
+from directshape_torch.image.grey_levels import gradient_magnitude_at
+from directshape_torch.observation.extents import SceneExtents, region_boxes, scene_extents
+from directshape_torch.observation.occlusion import OcclusionMap, Side, occlusion_map
+from directshape_torch.observation.sampling import sampled_pixels
 from directshape_torch.scene import Detections, FrameBatch
-
-# Rows that a warped neighbourhood may leave its region by: the pattern on a coarse level, and cameras not quite in row.
-_ROW_MARGIN_PX = 8
 
 
 @dataclass(frozen=True)
@@ -67,7 +64,7 @@ class Observation:
     Attributes:
         left, right: packed pixels of the two images.
         region_left, region_right: (B, 4) integer regions (u0, v0, u1, v1), half open, pixels.
-        hidden_right: where nearer instances cover the right image, by row of the detections; None: not asked for.
+        hidden_right: what hides cars in the right image, by row of the detections; None: not asked for.
         mask_areas: (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent.
     """
 
@@ -75,7 +72,7 @@ class Observation:
     right: PixelSamples
     region_left: Tensor
     region_right: Tensor
-    hidden_right: OcclusionCrops | None
+    hidden_right: OcclusionMap | None
     mask_areas: Tensor
 
     def of_objects(self, keep: Tensor) -> Observation:
@@ -95,8 +92,6 @@ def pack_pixels(
 ) -> Observation:
     """Choose the pixels of every car in both images and gather what the residuals need of them.
 
-    Both images are treated as one: cars 0 .. B-1 are those of the left image, B .. 2B-1 those of the right one.
-
     Args:
         frames: F frames.
         detections: B cars, whose initial poses fix regions and correspondence for the disparity field.
@@ -105,31 +100,17 @@ def pack_pixels(
     """
     extents = scene_extents(detections) if extents is None else extents
     regions = car_regions(frames, detections, extents)
-    both, hidden = torch.cat(regions), None
-    if config.occlusion:
-        hidden = crops_of_sides(detections, ("left", "right"), extents, both, len(frames), config.occlusion_order)
-    left, right = chosen_pixels(frames, detections, both, hidden, config)
-    if hidden is not None:
-        strips = _strips_in_right_image(regions[0], frames.sizes[detections.frame_index])
-        hidden = hidden.objects(slice(len(detections), None)).within(strips)
+    sides: tuple[Side, Side] = ("left", "right")
+    hidden_left, hidden_right = (
+        occlusion_map(detections, side, config.occlusion_order, extents) if config.occlusion else None for side in sides
+    )
     return Observation(
-        _pack_side(frames, detections, "left", left),
-        _pack_side(frames, detections, "right", right),
+        _pack_side(frames, detections, "left", regions[0], hidden_left, config),
+        _pack_side(frames, detections, "right", regions[1], hidden_right, config),
         *regions,
-        hidden,
-        extents.areas(),
+        hidden_right,
+        extents.areas,
     )
-
-
-def _strips_in_right_image(region_left: Tensor, sizes: Tensor) -> Tensor:
-    """Where pixels of the left regions can land in the right image at any depth: their rows, and a few more."""
-    u0, v0, u1, v1 = region_left.unbind(-1)
-    height, width = sizes.unbind(-1)
-    strips = torch.stack(
-        [torch.zeros_like(u0), (v0 - _ROW_MARGIN_PX).clamp_min(0), width, torch.minimum(v1 + _ROW_MARGIN_PX, height)],
-        dim=-1,
-    )
-    return strips * (u1 > u0)[:, None]
 
 
 def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,37 +125,42 @@ def residual_offsets(frames: FrameBatch, uv_left: Tensor) -> tuple[Tensor, Tenso
 def car_regions(frames: FrameBatch, d: Detections, extents: SceneExtents | None = None) -> tuple[Tensor, Tensor]:
     """Regions (B, 4) of the cars in the left and the right image, integer (u0, v0, u1, v1), half open."""
     extents = scene_extents(d) if extents is None else extents
+    sizes, count = frames.sizes[d.frame_index], len(d)
+    left = region_boxes(d.box_2d, extents.boxes_left[:count], sizes)
     # Only the left image has detection boxes. A side without a mask says nothing about the car: no pixels there.
-    left, right = region_boxes(
-        torch.cat([d.box_2d, torch.full_like(d.box_2d, torch.nan)]),
-        torch.cat([extents.left.boxes, extents.right.boxes]),
-        frames.sizes[d.frame_index].repeat(2, 1),
-    ).tensor_split(2)
+    right = region_boxes(torch.full_like(d.box_2d, torch.nan), extents.boxes_right[:count], sizes)
     return left * d.has_mask_left[:, None], right
 
 
-def _pack_side(frames: FrameBatch, detections: Detections, side: Side, chosen: ChosenPixels) -> PixelSamples:
-    left = side == "left"
-    object_index, uv = chosen.object_index, chosen.uv
-    mask = detections.mask_left if left else detections.mask_right
-    uv_float = uv.to(frames.images_left.dtype)
-    origin, ray, (bias, vertical) = (_rays_left if left else _rays_right)(frames, detections, object_index, uv_float)
+def _pack_side(
+    frames: FrameBatch,
+    detections: Detections,
+    side: Side,
+    regions: Tensor,
+    hidden: OcclusionMap | None,
+    config: SamplingConfig,
+) -> PixelSamples:
+    images, mask, mode, rays = (
+        (frames.images_left, detections.mask_left, config.mode, _rays_left)
+        if side == "left"
+        else (frames.images_right, detections.mask_right, config.mode_right, _rays_right)
+    )
+    object_index, uv = sampled_pixels(images, frames.sizes, detections.frame_index, regions, mode, config)
+    if hidden is not None:
+        seen = (~hidden.at(object_index, uv)).nonzero()[:, 0]
+        object_index, uv = object_index[seen], uv[seen]
+    uv_float = uv.to(images.dtype)
+    origin, ray, (bias, vertical) = rays(frames, detections, object_index, uv_float)
     return PixelSamples(
         object_index=object_index,
         uv=uv_float,
         origin_cam=origin,
         ray_cam=ray,
-        foreground=_at_pixels(mask, object_index, uv).to(uv_float.dtype),
-        gradient_magnitude=chosen.gradient_magnitude,
+        foreground=mask[object_index, uv[:, 1], uv[:, 0]].to(uv_float.dtype),
+        gradient_magnitude=gradient_magnitude_at(images, frames.sizes, detections.frame_index[object_index], uv),
         bias_px=bias,
         vertical_px=vertical,
     )
-
-
-def _at_pixels(masks: Tensor, object_index: Tensor, uv: Tensor) -> Tensor:
-    """Values (P,) of masks (B, H, W) at integer pixels, each in the mask of its object."""
-    height, width = masks.shape[1:]
-    return masks.reshape(-1).index_select(0, (object_index * height + uv[:, 1]) * width + uv[:, 0])
 
 
 def _of_pixels(values: Tensor, object_index: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from directshape_torch.numerics.checks import FOLLOWING
 from directshape_torch.numerics.gradient_mode import is_forward_mode
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.observation.car_points import PointSamples
-from directshape_torch.observation.mask_extents import SceneExtents, scene_extents
+from directshape_torch.observation.extents import SceneExtents, scene_extents
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -110,7 +110,7 @@ def without_empty_masks(detections: Detections, extents: SceneExtents | None = N
         detections: B cars.
         extents: of their masks, where they are known already; they hold for the result too.
     """
-    areas = (scene_extents(detections) if extents is None else extents).areas()
+    areas = (scene_extents(detections) if extents is None else extents).areas
     left, right = (areas > 0).unbind(dim=1)
     # A copy and not `replace`, which would check all over again what is not touched.
     same = copy(detections)

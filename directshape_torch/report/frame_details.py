@@ -14,7 +14,7 @@ from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import ShapeArrays
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.occlusion import OcclusionOrder, occlusion_crops
+from directshape_torch.observation.occlusion import OcclusionOrder, occlusion_map
 from directshape_torch.report.car_rows import is_refined
 from directshape_torch.report.drawn_cars import (
     CarState,
@@ -211,8 +211,7 @@ def _hidden(detections: Detections, car: int, window: Window, order: OcclusionOr
     """(H, W), true where an instance in front of the car covers a pixel of the window."""
     u0, v0, u1, v1 = window
     hidden = torch.zeros(detections.mask_left.shape[1:], dtype=torch.bool)
-    windows = torch.tensor(window).expand(len(detections), 4)
-    hidden[v0:v1, u0:u1] = occlusion_crops(detections, "left", windows, order).crop(car)
+    hidden[v0:v1, u0:u1] = occlusion_map(detections, "left", order).window(car, window)
     return np.asarray(hidden.numpy())
 
 

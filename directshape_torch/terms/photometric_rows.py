@@ -18,7 +18,7 @@ from directshape_torch.config import PhotometricConfig
 from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.numerics.tensors import all_along, made_once
-from directshape_torch.observation.occlusion import OcclusionCrops
+from directshape_torch.observation.occlusion import OcclusionMap
 from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.terms.cars import CarBatch
@@ -72,9 +72,9 @@ class RightView(NamedTuple):
     pixels: Tensor  # (A,) grey levels of all frames at the pyramid level, behind one another
     frame: Tensor  # (M, 4) first pixel of the block's frame, pixels from row to row, last column, last row
     to_full: Tensor  # (M, 2) full-resolution pixel per pixel of the level, and that of level pixel 0
-    crop: Tensor  # (M, 6) u0, v0, u1, v1 of where the car can be hidden, first entry and width in `covering`
-    in_front: Tensor  # (M, W) bits of the instances in front of the car
-    covering: Tensor  # (C, W) bits of the instances that cover each pixel
+    crop: Tensor  # (M, 6) where the car is looked up in an `OcclusionMap`
+    in_front: Tensor  # (M, 2) what covers it there must be below this to hide it
+    covering: Tensor  # (C, 2) the foremost instances of that map
 
     def take(self, kept: Tensor) -> RightView:
         """Some of the blocks."""
@@ -108,7 +108,7 @@ class LeftPixels:
     packed: Rows
     rays: Rays
     pyramid: tuple[GreyPair, ...]
-    hidden_right: OcclusionCrops | None
+    hidden_right: OcclusionMap | None
     mask_left: Tensor
 
     @classmethod
@@ -117,7 +117,7 @@ class LeftPixels:
         pixels: PixelSamples,
         packed: Rows,
         pyramid: Sequence[GreyPair],
-        hidden_right: OcclusionCrops | None,
+        hidden_right: OcclusionMap | None,
         mask_left: Tensor,
     ) -> LeftPixels:
         """From pixels, and how they fill blocks."""
@@ -200,9 +200,9 @@ class LeftPixels:
         hidden, row = self.hidden_right, cars.detection_row[owner]
         if hidden is None:
             nowhere = torch.zeros(len(owner), 6, dtype=torch.long, device=owner.device)
-            covered = nowhere, nowhere[:, :1], nowhere.new_zeros(2, 1)
+            covered = nowhere, view.new_zeros(len(owner), 2), view.new_zeros(1, 2)
         else:
-            covered = hidden.table[row], hidden.in_front[row], hidden.covering
+            covered = hidden.crop[row], hidden.in_front[row], hidden.covering
         return RightView(images.right.reshape(-1), view, to_full, *covered)
 
 
@@ -271,15 +271,15 @@ def warped_pixels(rows: PhotometricRows, depth: Tensor) -> Warped:
 
 
 def _is_hidden(right: RightView, u_level: Tensor, v_level: Tensor) -> Tensor:
-    """Whether a nearer instance hides the car at pixels (..., M, 64) of its right image (`OcclusionCrops.at`)."""
+    """Whether a nearer instance hides the car at pixels (..., M, 64) of its right image (`OcclusionMap.at`)."""
     scale, first = right.to_full.mT[..., None]
     u, v = (torch.round(torch.addcmul(first, x, scale)) for x in (u_level, v_level))
     u0, v0, u1, v1, entry, width = right.crop.mT[..., None]
     inside = (u >= u0) & (u < u1) & (v >= v0) & (v < v1)
     column, row = (torch.where(inside, x, torch.zeros_like(x)).long() for x in (u, v))
     entry = torch.where(inside, entry + row * width + column, 0)
-    covering = right.covering.index_select(0, entry.reshape(-1)).view(*entry.shape, right.covering.shape[1])
-    covered: Tensor = ((covering & right.in_front[:, None]) != 0).any(dim=-1) & inside
+    covering = right.covering.index_select(0, entry.reshape(-1)).view(*entry.shape, 2)
+    covered: Tensor = (covering < right.in_front[:, None]).any(dim=-1) & inside
     return covered
 
 

@@ -102,12 +102,8 @@ _COARSE_POSE = "{contour_width_px: 2.0, image_level: 1, max_iterations: 6, over_
 _FINE_POSE = "{contour_width_px: 0.5, image_level: 0, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
 _NO_PRIORS = ("priors.shape_weight=0", "priors.height_weight=0", "priors.tilt_weight=0", "priors.dimensions_weight=0")
 _SAMPLINGS = {
-    name: (f"sampling.mode={mode}", "sampling.mode_right=as_left")
-    for name, mode in {
-        "both rounds in the right image too": "adaptive",
-        "round one only": "round_one",
-        "uniform": "uniform",
-    }.items()
+    name: (f"sampling.mode={mode}", f"sampling.mode_right={mode}")
+    for name, mode in {"by gradient in the right image too": "adaptive", "uniform": "uniform"}.items()
 }
 
 

@@ -90,8 +90,8 @@ def test_what_is_hidden_in_the_right_image_is_not_compared() -> None:
     blocks = len(fixed.filled)
     wall = fixed.rows.right._replace(
         crop=torch.tensor([[80, 0, 160, 120, 0, 80]]).expand(blocks, -1),
-        in_front=torch.ones(blocks, 1, dtype=torch.long),
-        covering=torch.ones(80 * 120, 1, dtype=torch.long),
+        in_front=torch.full((blocks, 2), 20.0),
+        covering=torch.full((80 * 120, 2), 10.0),
     )
     hidden = replace(term, fixed=fixed._replace(rows=fixed.rows._replace(right=wall)))
     behind = replace(stage, terms=tuple(hidden if t is term else t for t in stage.terms))

@@ -26,7 +26,7 @@ DEFAULT = replace(
     silhouette=replace(DEFAULT.silhouette, samples_per_ray=32),
     priors=replace(DEFAULT.priors, dimensions_weight=1.0),
     # Of the few pixels that a toy covers evenly spaced ones leave out much of its contour.
-    sampling=replace(DEFAULT.sampling, mode_right="as_left"),
+    sampling=replace(DEFAULT.sampling, mode_right="adaptive"),
     # The model of trust knows full-size images of real cars; what the solver finds on toys is to be seen as it is.
     acceptance=AcceptanceConfig(min_probability_better=0.0, min_probability_not_worse=0.0),
 )

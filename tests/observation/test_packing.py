@@ -14,10 +14,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch.config import SamplingConfig
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.observation.mask_extents import scene_extents
+from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import Observation, car_regions, pack_pixels
-from directshape_torch.observation.sampling import sampling_settings
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
 from tests.helpers.synthetic_scene import stereo_camera
 
@@ -30,8 +29,8 @@ def whole_frame_side(frames: FrameBatch, d: Detections, side: Side, regions: Ten
         (frames.images_left, d.mask_left) if side == "left" else (frames.images_right, d.mask_right)
     )  # fmt: skip
     magnitude = gradient_magnitude(images, frames.sizes)
-    chosen = select_pixels(magnitude, frames.sizes, d.frame_index, regions, sampling_settings(config, side))
-    object_index, uv = chosen.object_index, chosen.uv
+    mode = config.mode if side == "left" else config.mode_right
+    object_index, uv = select_pixels(magnitude, d.frame_index, regions, mode, config)
     if config.occlusion:
         visible = ~hidden_pixels(d, side, object_index, uv, config.occlusion_order)
         object_index, uv = object_index[visible], uv[visible]
@@ -109,10 +108,10 @@ def test_random_scenes_equal_the_whole_frame_form(seed: int) -> None:
     frames, detections = random_scene(seed, count=9)
     seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig())
     assert len(seen.left) > 100
-    assert torch.equal(seen.mask_areas, scene_extents(detections).areas())
+    assert torch.equal(seen.mask_areas, scene_extents(detections).areas)
 
 
-@pytest.mark.parametrize("mode", ["adaptive", "round_one", "uniform", "dense"])
+@pytest.mark.parametrize("mode", ["adaptive", "uniform", "dense"])
 @pytest.mark.parametrize("order", ["depth", "box_bottom", None])
 def test_every_mode_and_order_equals_the_whole_frame_form(mode: str, order: str | None) -> None:
     config = SamplingConfig(mode=mode, occlusion=order is not None, occlusion_order=order or "depth")
@@ -121,20 +120,13 @@ def test_every_mode_and_order_equals_the_whole_frame_form(mode: str, order: str 
 
 
 @pytest.mark.parametrize("mode", ["adaptive", "uniform", "dense"])
-@pytest.mark.parametrize("mode_right", ["as_left", "adaptive", "round_one", "uniform", "dense"])
+@pytest.mark.parametrize("mode_right", ["adaptive", "uniform", "dense"])
 def test_the_right_image_can_have_a_mode_of_its_own(mode: Any, mode_right: Any) -> None:
     frames, detections = random_scene(14, count=7)
     seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig(mode=mode, mode_right=mode_right))
-    alone = pack_pixels(frames, detections, SamplingConfig(mode=mode, mode_right="as_left"))
+    alone = pack_pixels(frames, detections, SamplingConfig(mode=mode, mode_right=mode))
     assert torch.equal(seen.left.uv, alone.left.uv)
-    assert torch.equal(seen.right.uv, alone.right.uv) == (mode_right in ("as_left", mode))
-
-
-def test_more_instances_in_a_frame_than_bits_in_a_word() -> None:
-    frames, detections = random_scene(12, count=150, num_frames=1, others=30)
-    seen = assert_equal_to_whole_frames(frames, detections, SamplingConfig())
-    assert seen.hidden_right is not None
-    assert seen.hidden_right.covering.shape[1] == 8  # of which 5 are in use
+    assert torch.equal(seen.right.uv, alone.right.uv) == (mode_right == mode)
 
 
 @pytest.mark.parametrize("num_frames", [0, 2])
@@ -157,10 +149,6 @@ def test_hidden_in_the_right_image_wherever_a_car_may_land(seed: int) -> None:
     for number in range(len(detections)):
         index = torch.full((len(uv),), number)
         expected = hidden_pixels(detections, "right", index, uv)
-        frame_height, frame_width = frames.sizes[detections.frame_index[number]].tolist()
-        u0, v0, u1, v1 = seen.region_left[number].tolist()
-        in_strip = (uv[:, 1] >= v0 - 8) & (uv[:, 1] < v1 + 8) & (uv[:, 0] < frame_width) & (uv[:, 1] < frame_height)
-        expected &= in_strip & (u1 > u0)
         assert torch.equal(seen.hidden_right.at(index, uv), expected)
         assert torch.equal(seen.hidden_right.at(index, uv + 0.4), expected)
 
@@ -211,25 +199,18 @@ def enlarged(frames: FrameBatch, d: Detections, factor: int) -> tuple[FrameBatch
     return replace(frames, sizes=frames.sizes * factor, **images), replace(d, **masks)
 
 
-def touched_by_packing(frames: FrameBatch, d: Detections) -> tuple[int, int]:
-    """Elements touched to find the masks' extents, and by all the rest."""
-    with TouchedElements() as finding:
-        extents = scene_extents(d)
+def touched_by_packing(frames: FrameBatch, d: Detections) -> int:
+    """Elements touched by all but finding the masks' extents."""
+    extents = scene_extents(d)
     with TouchedElements() as packing:
         pack_pixels(frames, d, SamplingConfig(), extents)
-    return finding.count, packing.count
+    return packing.count
 
 
 def test_work_follows_the_cars_and_not_the_frame() -> None:
     frames, detections = random_scene(6, count=5, num_frames=1, others=0)
     small, large = (touched_by_packing(*enlarged(frames, detections, factor)) for factor in (4, 8))
-    pixels = [detections.mask_left[0].numel() * factor**2 for factor in (4, 8)]
-    # Four times the frame: every mask is read once more, its rows with foreground, now longer, twice. Nothing else has
-    # the size of a frame.
-    masks_read = 2 * len(detections) * (pixels[1] - pixels[0])
-    assert masks_read <= large[0] - small[0] < 1.5 * masks_read
-    assert large[1] - small[1] < 0.2 * (pixels[1] - pixels[0])  # one number a threshold cell and car
-    assert large[1] < 1.02 * small[1]
+    assert large < 1.02 * small
 
 
 class HostWaits(TorchDispatchMode):
@@ -259,14 +240,12 @@ def test_few_host_synchronisations_however_many_cars(count: int, monkeypatch: py
     with HostWaits() as waits:
         monkeypatch.setattr(Tensor, "tolist", lambda self: (waits.names.append("tolist"), to_list(self))[1])
         pack_pixels(frames, detections, SamplingConfig())
-    assert 0 < len(waits.names) <= 14, waits.names
+    assert 0 < len(waits.names) <= 20, waits.names
 
 
 def test_work_is_linear_in_the_cars() -> None:
     frames, detections = random_scene(7, count=6, num_frames=1, others=0)
-    once = touched_by_packing(frames, detections)
     many = {f.name: getattr(detections, f.name) for f in fields(detections)}
     rows = {name: torch.cat([value] * 8) for name, value in many.items() if isinstance(value, Tensor)}
-    eight = touched_by_packing(frames, replace(detections, **rows))
-    assert eight[0] < 8.1 * once[0]
-    assert eight[1] < 8.1 * once[1]
+    once, eight = (touched_by_packing(frames, d) for d in (detections, replace(detections, **rows)))
+    assert eight < 8.1 * once

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.observation.occlusion import OcclusionOrder, Side, instances_in_front
-from directshape_torch.observation.regions import MASK_THRESHOLD
 from directshape_torch.scene import Detections
 
 

@@ -1,4 +1,4 @@
-"""The sampled pixels of a car in both images, two rounds in two colours, and what hides it (paper, both figures)."""
+"""The sampled pixels of a car in both images, and what hides it (paper, both figures)."""
 
 from __future__ import annotations
 
@@ -12,27 +12,33 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.config import SamplingMode
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.figure_files import new_figure, write_figure
 from directshape_torch.io.instance_masks import SIDES
+from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.observation.occlusion import (
     OcclusionOrder,
     Side,
     instances_in_front,
-    occlusion_crops,
+    occlusion_map,
 )
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.refinable import without_empty_masks
-from directshape_torch.observation.regions import MASK_THRESHOLD
-from directshape_torch.observation.sampling import sampling_settings, selected_pixels
+from directshape_torch.observation.sampling import sampled_pixels
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.visualize.drawing import Picture, picture_of
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.panels import draw_lines, show_crop
 
 _PANEL_INCHES, _ROOM_INCHES = 6.0, 0.8
-_STRONG_INK, _FILL_INK, _EVEN_INK = "lime", "red", "yellow"
+_INKS: dict[SamplingMode, str] = {"adaptive": "lime", "uniform": "yellow", "dense": "yellow"}
+_CHOSEN: dict[SamplingMode, str] = {
+    "adaptive": "by their gradient",
+    "uniform": "evenly spaced",
+    "dense": "of the whole region",
+}
 # Of the region of a far car in the occlusion picture.
 _LEAST_HEIGHT_PX = 180
 
@@ -41,41 +47,28 @@ class SampledPixels(NamedTuple):
     """Pixels of one car in one image that its terms look at."""
 
     uv: NDArray[np.int64]  # (P, 2)
-    above_threshold: NDArray[np.bool_]  # (P,) chosen for a strong gradient, not to fill its cell
     num_hidden: int  # chosen pixels that a nearer instance hides: they are left out
-    by_gradient: bool  # chosen by their gradients at all
-
-    @property
-    def groups(self) -> list[tuple[NDArray[np.bool_], str, str]]:
-        """Which (P,) belong together, with their ink and name."""
-        strong = self.above_threshold
-        if not self.by_gradient:
-            return [(np.ones_like(strong), _EVEN_INK, "whatever the gradient")]
-        return [(strong, _STRONG_INK, "strong gradient"), (~strong, _FILL_INK, "strongest of cell")]
+    mode: SamplingMode
 
     @property
     def in_words(self) -> str:
         """How many there are, and why."""
-        strong = int(self.above_threshold.sum())
-        by_gradient = f"{strong} by their gradient, {len(self.uv) - strong} to fill cells"
-        chosen = by_gradient if self.by_gradient else f"{len(self.uv)} whatever their gradient"
-        return f"{chosen}, {self.num_hidden} hidden"
+        return f"{len(self.uv)} {_CHOSEN[self.mode]}, {self.num_hidden} hidden"
 
 
-def sampled_pixels(view: CarView, side: Side) -> SampledPixels:
-    """The pixels as the refinement chose them, with the round that each comes from."""
+def sampled_pixels_of(view: CarView, side: Side) -> SampledPixels:
+    """The pixels as the refinement chose them."""
     config = view.trace.config.sampling
     frames, detections = view.loaded.frame, without_empty_masks(view.loaded.detections)
     left, right = car_regions(frames, detections)
-    images, regions = (frames.images_left, left) if side == "left" else (frames.images_right, right)
-    settings = sampling_settings(config, side)
-    chosen = selected_pixels(images, frames.sizes, detections.frame_index, regions, settings)
-    mine = chosen.object_index == view.car
-    uv, above = chosen.uv[mine], chosen.above_threshold[mine]
-    hidden = occlusion_crops(detections, side, regions, config.occlusion_order).at(chosen.object_index[mine], uv)
+    images, regions, mode = (
+        (frames.images_left, left, config.mode) if side == "left" else (frames.images_right, right, config.mode_right)
+    )
+    of, uv = sampled_pixels(images, frames.sizes, detections.frame_index, regions, mode, config)
+    uv = uv[of == view.car]
+    hidden = occlusion_map(detections, side, config.occlusion_order).at(torch.tensor(view.car).to(uv.device), uv)
     kept = ~hidden if config.occlusion else torch.ones_like(hidden)
-    by_gradient = settings.mode in ("adaptive", "round_one")
-    return SampledPixels(np.asarray(uv[kept].cpu()), np.asarray(above[kept].cpu()), int((~kept).sum()), by_gradient)
+    return SampledPixels(np.asarray(uv[kept].cpu()), int((~kept).sum()), mode)
 
 
 def write_sampling_figure(path: Path | str, view: CarView) -> None:
@@ -86,15 +79,12 @@ def write_sampling_figure(path: Path | str, view: CarView) -> None:
     """
     figure = new_figure(2 * _PANEL_INCHES, _PANEL_INCHES * view.panel_aspect() + _ROOM_INCHES, "drawing sampled pixels")
     figure.suptitle(view.title)
-    left, right = (sampled_pixels(view, side) for side in SIDES)
-    for axes, side, pixels in zip(figure.subplots(1, 2), SIDES, (left, right), strict=True):
+    for axes, side in zip(figure.subplots(1, 2), SIDES, strict=True):
+        pixels = sampled_pixels_of(view, side)
         show_crop(axes, view.image(side), view.window(side), f"{side}: {pixels.in_words}")
         draw_lines(axes, view.mask_lines(side), "white", "mask", linewidth=1.0)
-        for chosen, ink, name in pixels.groups:
-            axes.plot(*pixels.uv[chosen].T, ".", color=ink, markersize=4, label=name)
-        # One for both where they have the same colours.
-        if side == "right" or left.by_gradient != right.by_gradient:
-            axes.legend(loc="lower right", fontsize=8, facecolor="0.3", labelcolor="white")
+        axes.plot(*pixels.uv.T, ".", color=_INKS[pixels.mode], markersize=4, label=_CHOSEN[pixels.mode])
+        axes.legend(loc="lower right", fontsize=8, facecolor="0.3", labelcolor="white")
     write_figure(path, figure)
 
 
@@ -155,7 +145,7 @@ def occlusion_picture(
         colour = OCCLUDER_COLOURS[rank % len(OCCLUDER_COLOURS)]
         coloured = _tinted(coloured, _array(occluder > MASK_THRESHOLD, view), colour)
 
-    hidden = occlusion_crops(detections, side, regions, order).crop(object_number).cpu().numpy()
+    hidden = occlusion_map(detections, side, order).window(object_number, region).cpu().numpy()
     shown = np.zeros_like(image)
     u0, v0 = region[0] - view[0], region[1] - view[1]
     shown[v0 : v0 + hidden.shape[0], u0 : u0 + hidden.shape[1]] = hidden[..., None] * np.uint8(255)

@@ -1,21 +1,20 @@
-"""Extents of masks: hand-made ones, and random ones against the plain form that reads every pixel."""
+"""Extents of masks against the plain form that reads every pixel, and regions around hand-made boxes."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from helpers.host_traffic import host_traffic
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.mask_extents import mask_extents
+from directshape_torch.observation.extents import mask_extents, region_boxes
 
 
 def plain_extents(masks: Tensor, present: Tensor) -> tuple[list[list[int]], list[int]]:
     """Every pixel of every mask, one mask at a time."""
     boxes, areas = [], []
     for mask, exists in zip(masks, present.tolist(), strict=True):
-        v, u = (mask > 0.5).nonzero(as_tuple=True)
+        v, u = (~(mask <= 0.5)).nonzero(as_tuple=True)
         found = exists and len(u) > 0
         boxes.append([int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1] if found else [0, 0, 0, 0])
         areas.append(int((~(mask <= 0.5)).sum()) if exists else 0)
@@ -36,10 +35,9 @@ def test_random_masks_equal_the_plain_form(seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     stacks = [random_masks(count, generator) for count in (5, 0, 3)]
     present = [torch.rand(len(stack), generator=generator) > 0.3 for stack in stacks]
-    extents = mask_extents(stacks, present)
+    extents = mask_extents(stacks, present, ["a", "b", "c"])
     for got, stack, exists in zip(extents, stacks, present, strict=True):
         assert (got.boxes.tolist(), got.areas.tolist()) == plain_extents(stack, exists)
-        assert torch.equal(got.covers(), (got.boxes != 0).any(dim=1))
 
 
 def test_corners_and_whole_frames() -> None:
@@ -61,10 +59,10 @@ def test_bool_masks_strided_masks_and_absent_ones() -> None:
         assert extents.areas.tolist() == [6, 0]
 
 
-def test_nan_counts_for_the_area_alone() -> None:
+def test_nan_counts_as_foreground() -> None:
     mask = torch.full((1, 4, 6), torch.nan)
     (extents,) = mask_extents([mask], [torch.tensor([True])])
-    assert extents.boxes.tolist() == [[0, 0, 0, 0]]
+    assert extents.boxes.tolist() == [[0, 0, 6, 4]]
     assert extents.areas.tolist() == [24]
 
 
@@ -80,19 +78,6 @@ def test_more_than_a_probability_is_named(value: float) -> None:
     assert extents.areas.tolist() == [0, 0, 1]
 
 
-def test_the_range_is_read_with_the_extents(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A look at it by itself would make the host wait once more."""
-    stacks = [torch.zeros(2, 4, 6), torch.full((1, 4, 6), torch.nan), torch.ones(2, 4, 6) > 0]
-    present = [torch.ones(len(stack), dtype=torch.bool) for stack in stacks]
-    assert host_traffic(lambda: mask_extents(stacks, present)).found == []
-    # What leaves no trace among the operations on a CPU.
-    reads: list[int] = []
-    tolist = torch.Tensor.tolist
-    monkeypatch.setattr(torch.Tensor, "tolist", lambda tensor: (reads.append(tensor.numel()), tolist(tensor))[1])
-    mask_extents(stacks, present)
-    assert len(reads) == 1
-
-
 def test_masks_may_overshoot_by_resampling() -> None:
     """What a mask head gives, brought to the image's size by cubic kernels."""
     small = torch.zeros(1, 1, 14, 14)
@@ -103,6 +88,29 @@ def test_masks_may_overshoot_by_resampling() -> None:
     assert extents.areas.tolist() == [int((masks > 0.5).sum())]
 
 
-def test_wrong_masks_are_named() -> None:
-    with pytest.raises(InputError, match=r"masks: expected shape \(1, H, W\)"):
-        mask_extents([torch.zeros(4, 6)], [torch.tensor([True])])
+def test_masks_of_another_size_are_named() -> None:
+    with pytest.raises(InputError, match=r"right: expected masks of the size of left \(4, 6\), got \(4, 5\)"):
+        mask_extents([torch.zeros(1, 4, 6), torch.zeros(1, 4, 5)], [torch.tensor([True])] * 2, ["left", "right"])
+
+
+def boxes_of(mask_box: tuple[int, int, int, int] | None, box: list[float]) -> list[int]:
+    mask_boxes = torch.zeros(1, 4, dtype=torch.long)
+    if mask_box is not None:
+        u0, v0, u1, v1 = mask_box
+        mask_boxes[0] = torch.tensor([u0, v0, u1 + 1, v1 + 1])
+    result: list[int] = region_boxes(torch.tensor([box]), mask_boxes, torch.tensor([[100, 200]]))[0].tolist()
+    return result
+
+
+def test_region_joins_mask_and_box_and_grows() -> None:
+    # Joined: u 40..100, v 30..50. Margins: 10 % of 60 = 6 horizontally, 4 at least vertically. Half open: + 1.
+    assert boxes_of((40, 35, 70, 50), [60.0, 30.0, 100.0, 45.0]) == [34, 26, 107, 55]
+    assert boxes_of(None, [60.0, 30.0, 100.5, 45.0]) == [55, 26, 106, 50]
+
+
+def test_region_is_clipped_and_may_be_empty() -> None:
+    assert boxes_of(None, [-500.0, -20.0, 10.0, 40.0]) == [0, 0, 15, 45]
+    assert boxes_of(None, [150.0, 60.0, 900.0, 300.0]) == [145, 56, 200, 100]
+    for nowhere in ([-50.0, 0.0, -1.0, 9.0], [200.0, 0.0, 230.0, 9.0], [torch.nan] * 4, [20.0, 20.0, 10.0, 30.0]):
+        assert boxes_of(None, nowhere) == [0, 0, 0, 0]
+        assert boxes_of((40, 40, 60, 60), nowhere) == [36, 36, 65, 65]
