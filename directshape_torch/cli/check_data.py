@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import add_data_options, dataset_of
+from directshape_torch.cli.options import add_data_options, dataset_of
 
 if TYPE_CHECKING:
     from directshape_torch.scene_check.finding import CheckReport

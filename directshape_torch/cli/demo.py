@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from directshape_torch.cli.refine import add_config_option
+from directshape_torch.cli.options import add_config_option, add_device_option, make_refiner
 
 DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 
@@ -26,7 +26,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="folder for the results (default: %(default)s)",
     )
     add_config_option(parser)
-    parser.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
+    add_device_option(parser)
     parser.set_defaults(run=run)
 
 
@@ -41,13 +41,11 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.demo_report import error_table
     from directshape_torch.cli.progress import ProgressBar
-    from directshape_torch.cli.refine import make_refiner
     from directshape_torch.export.gltf_scene import frame_glb
     from directshape_torch.export.painted_cars import PaintedFrame
     from directshape_torch.files.atomic_files import write_bytes
     from directshape_torch.io.kitti_dataset import KittiStereoDataset
     from directshape_torch.io.run_folder import RunFolder
-    from directshape_torch.shape.load_prior import load_prior
 
     dataset = KittiStereoDataset(
         DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training/masks"
@@ -57,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress)
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
-        painted = PaintedFrame(RunFolder(args.out).read(frame_id), load_prior("pca"), loaded)
+        painted = PaintedFrame(RunFolder(args.out).read(frame_id), refiner.prior, loaded)
         write_bytes(args.out / "scene.glb", frame_glb(painted, loaded))
         print(error_table(loaded, args.out))
     print(format_summary(summary))

@@ -10,19 +10,15 @@ from torch import Tensor
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
 from directshape_torch.evaluation.tables import align
-from directshape_torch.io.kitti_labels import KittiObject, read_objects
-from directshape_torch.io.result_files import read_shapes
-from directshape_torch.io.run_folder import result_path, shapes_path
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import LoadedFrame
 
 
 def error_table(loaded: LoadedFrame, out_dir: Path) -> str:
     """Centre, heading and bird's-eye overlap of each car against its label, before and after."""
-    lines = list(loaded.row_of_detection)
-    before = [loaded.input_objects[line] for line in lines]
-    refined = read_objects(result_path(out_dir, loaded.frame_id))
-    after = [refined[line] for line in lines]
-    statuses = read_shapes(shapes_path(out_dir, loaded.frame_id)).statuses
+    before, result = loaded.detected_objects, RunFolder(out_dir).read(loaded.frame_id)
+    after, statuses = result.cars, result.shapes.statuses
     labels = loaded.labels or []
     partners = match_to_labels(before, labels)
     rows = [["car", "depth", "centre [m]", "yaw [deg]", "BEV IoU", "status"]]

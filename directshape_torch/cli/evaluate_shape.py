@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.judging_options import add_frame_choice, add_interval_options, bootstrap_settings
+from directshape_torch.cli.options import add_frame_choice, add_interval_options, bootstrap_settings
 
 if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import mask_source
+from directshape_torch.cli.options import mask_source
 from directshape_torch.cli.run_inputs import add_run_inputs, dataset_of_run, has_detections, prior_of_run
 from directshape_torch.errors import InputError
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from directshape_torch.cli.data_options import add_layout_options
+from directshape_torch.cli.options import add_layout_options
 
 if TYPE_CHECKING:
     import numpy as np

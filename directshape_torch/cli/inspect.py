@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import add_data_options, dataset_of, frame_id_of
 from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.cli.refine import add_config_option
+from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, frame_id_of, make_refiner
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,14 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     data.add_argument("--car", metavar="N", type=int, help="number of its line in the detection file; default: all")
     add_data_options(data, required=False)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a folder of figures a car")
-    settings = parser.add_argument_group("settings")
-    add_config_option(settings)
-    settings.add_argument(
-        "--set", action="extend", nargs="+", default=[], metavar="KEY=VALUE", help="single settings, as for refine"
-    )
-    settings.add_argument(
-        "--prior", metavar="FILE|NAME", help="shape prior of any kind; default, pca or neural are the bundled ones"
-    )
+    add_refiner_options(parser.add_argument_group("settings"))
     meshes = parser.add_argument_group("of a prior alone")
     meshes.add_argument("--meshes", type=Path, metavar="DIR", help="real cars for the prior to be fitted to")
     meshes.add_argument(
@@ -73,7 +65,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _inspect_frames(args: argparse.Namespace) -> int:
     from directshape_torch.cli.inspect_cars import inspect_frame
-    from directshape_torch.cli.refine import make_refiner
 
     dataset = _dataset(args)
     # One frame is not worth a compilation, and pictures need no graphics card.

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import add_data_options, dataset_of
+from directshape_torch.cli.options import (
+    add_data_options,
+    add_device_option,
+    add_refiner_options,
+    dataset_of,
+    make_refiner,
+)
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
-    import torch
-
     from directshape_torch.config import RefinerConfig
     from directshape_torch.io.stereo_files import FileStereoDataset
-    from directshape_torch.problem import TermFactory
-    from directshape_torch.refiner import DirectShapeRefiner
+    from directshape_torch.rig.estimate import RigEstimate
 
 # Enough to tell a mistake from the noise of a detector.
 _CHECKED_FRAMES = 3
@@ -54,12 +56,6 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
     group.add_argument("--meshes", choices=("ply", "glb"), help="write the surface of each refined car")
     group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
-    group.add_argument(
-        "--rerun",
-        type=Path,
-        metavar="FILE.rrd",
-        help="record frames and iterations for Rerun's viewer (extra viewer); refines a second time, for few frames",
-    )
     again = group.add_mutually_exclusive_group()
     # `store_false` alone would make True the default of both.
     again.add_argument(
@@ -71,25 +67,14 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_settings(group: argparse._ArgumentGroup) -> None:
-    add_config_option(group)
+    add_refiner_options(group)
     group.add_argument(
         "--method",
         choices=("direct", "geometric", "combined", "box_alignment"),
         help="images (default), the stereo point cloud (Engelmann et al., GCPR 2016), both, or boxes aligned in "
         "depth alone (Stereo R-CNN)",
     )
-    group.add_argument(
-        "--set",
-        action="extend",
-        nargs="+",
-        default=[],
-        metavar="KEY=VALUE",
-        help="single settings, e.g. photometric.weight=2",
-    )
-    group.add_argument(
-        "--prior", metavar="FILE|NAME", help="shape prior of any kind, or the bundled pca (default) or neural"
-    )
-    group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
+    add_device_option(group)
     group.add_argument(
         "--batch-frames", type=int, metavar="N", help=f"frames in one call (default: 1, of tracks {_TRACK_FRAMES})"
     )
@@ -114,13 +99,6 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
     )
 
 
-def add_config_option(group: argparse._ActionsContainer) -> None:
-    """`--config`, which stays text: ./paper is a file and paper the bundled settings."""
-    group.add_argument(
-        "--config", metavar="FILE|NAME", help="settings of the refinement (YAML), or default, paper or fast"
-    )
-
-
 def run(args: argparse.Namespace) -> int:
     """Refine, write, report; returns the exit code.
 
@@ -131,12 +109,9 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.batch.refine_dataset import refine_dataset
     from directshape_torch.batch.run_summary import format_summary
     from directshape_torch.cli.progress import ProgressBar
-    from directshape_torch.cli.rerun_option import check_rerun, write_recording
-    from directshape_torch.cli.rig_of_run import rigs_of_run
     from directshape_torch.rig.estimate import RigEstimates
     from directshape_torch.terms.lidar import LidarPoints
 
-    check_rerun(args.rerun)
     workers = WorkerOptions(args.workers, args.threads, args.ray, args.retries)
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
@@ -157,8 +132,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))
     print(f"results  {args.out}")
-    if args.rerun is not None:
-        write_recording(args.rerun, args.out, dataset, refiner)
     return summary.exit_code
 
 
@@ -186,45 +159,41 @@ def _check_disparity_is_used(folder: Path | None, method: str) -> None:
         raise InputError("--disparity", "a method that uses it", method, "add --method geometric or combined")
 
 
-def make_refiner(
-    config: str | None,
-    overrides: list[str],
-    prior: Path | str | None,
-    device: str,
-    extra_terms: Sequence[TermFactory] = (),
-) -> DirectShapeRefiner:
-    """The refiner that the options describe.
+def rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool) -> list[RigEstimate]:
+    """The estimates that `--rig` names: those of a file, or of the run's folder, made first where there are none yet.
 
     Raises:
-        ConfigError: unknown settings.
-        DataFormatError: a prior that cannot be used.
-        InputError: no such device.
+        DataFormatError: the folder has a file of that name which is no estimate.
     """
-    from directshape_torch.config_files import load_config
-    from directshape_torch.refiner import DirectShapeRefiner
-    from directshape_torch.shape.load_prior import load_prior
+    from directshape_torch.rig.rig_file import RIG_FILE, holds_rigs, load_rigs, save_rigs
 
-    settings = load_config(config, overrides)
-    refiner = DirectShapeRefiner(load_prior("pca" if prior is None else prior), settings, extra_terms)
-    return refiner.to(find_device(device))
+    if rig != "auto":
+        return load_rigs(rig) if rig != "none" and holds_rigs(rig) else []
+    path = out_dir / RIG_FILE
+    # Whatever lies there is not overwritten, unless it is an estimate.
+    kept = load_rigs(path) if path.is_file() else None
+    rigs = _estimate(dataset) if kept is None or fresh else kept
+    if rigs is not kept:
+        save_rigs(path, rigs)
+        write_rig_picture(out_dir, rigs)
+    for estimate in rigs:
+        print(estimate if rigs is not kept else f"{estimate} (kept)")
+    return rigs
 
 
-def find_device(name: str) -> torch.device:
-    """The device of that name; "auto" is a graphics card where there is one.
+def _estimate(dataset: FileStereoDataset) -> list[RigEstimate]:
+    from directshape_torch.cli.progress import Bar
+    from directshape_torch.rig.of_dataset import estimate_rigs
 
-    Raises:
-        InputError: PyTorch does not know or does not have it.
-    """
-    import torch
+    with Bar(desc="rig", unit="frame", file=sys.stderr) as bar:
+        return estimate_rigs(dataset, lambda _: bar.update())
 
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    # PyTorch has no exception of its own for this: RuntimeError for an unknown name or number, AssertionError for a
-    # backend it was compiled without, ImportError for one that a package must bring. Its reason goes into the message.
-    except (RuntimeError, AssertionError, ImportError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError("--device", "a device of this machine", f"{name!r} ({reason})", "try cpu") from error
-    return device
+
+def write_rig_picture(out_dir: Path, rigs: list[RigEstimate]) -> None:
+    """`rig.png`: each field with the cars that it was estimated from."""
+    from directshape_torch.files.atomic_files import write_png
+    from directshape_torch.rig.rig_file import RIG_PICTURE
+    from directshape_torch.visualize.rig_picture import draw_rigs
+
+    if rigs:
+        write_png(out_dir / RIG_PICTURE, draw_rigs(rigs))

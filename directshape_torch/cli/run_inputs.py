@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from directshape_torch.cli.data_options import LAYOUTS, add_mask_options, add_rig_option, mask_source
+from directshape_torch.cli.options import LAYOUTS, add_mask_options, add_rig_option, mask_source
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:

@@ -93,3 +93,17 @@ class FrameSource:
         if self.inputs.prior is None:
             raise InputError("--prior", "the shape prior of the run", "nothing")
         return self.inputs.prior
+
+
+class Exporter:
+    """Writes a run in one format."""
+
+    def add(self, source: FrameSource) -> None:
+        """Take the next frame."""
+        raise NotImplementedError
+
+    def finish(self) -> None:
+        """Write what can only be written at the end."""
+
+    def abandon(self) -> None:
+        """A frame failed, or another exporter's end: leave nothing half-written behind."""

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from directshape_torch.batch.options import RunObserver
 from directshape_torch.export.coco3d_file import image_numbers
-from directshape_torch.export.exporters import feed
-from directshape_torch.export.frame_source import ExportInputs, FrameSource
+from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.rerun_iterations import IterationLog
 from directshape_torch.export.rerun_scene import clear_cars, log_conventions, log_frame, log_painted_cars
 from directshape_torch.export.rerun_stream import RerunStream, import_rerun
@@ -18,7 +16,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.inspection.residual_figure import car_residuals
 
 
-class RerunExporter:
+class RerunExporter(Exporter):
     """All frames in one recording.
 
     Args:
@@ -89,18 +87,6 @@ class RerunExporter:
         for car in log.cars:
             log.log_residuals(car, residuals[car])
         self.iteration += len(trace)
-
-
-def record_run(path: Path | str, run: RunFolder, inputs: ExportInputs, observer: RunObserver | None = None) -> None:
-    """Write a Rerun recording of a run, and of its iterations where `inputs` have a refiner.
-
-    Raises:
-        MissingDependencyError: Rerun is not installed.
-        InputError: no images.
-        DataFormatError: a file of the run or of the data set is missing or damaged.
-    """
-    exporter = RerunExporter(Path(path), run, inputs.refiner is not None)
-    feed([exporter], run, inputs, observer)
 
 
 def _trace(source: FrameSource, refiner: DirectShapeRefiner) -> RefinementTrace:

@@ -16,7 +16,7 @@ import torch
 
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
-from directshape_torch.cli.refine import find_device
+from directshape_torch.cli.options import find_device
 from directshape_torch.config_files import load_config
 from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.comparison import Comparison, compare_results, lines_with_left_mask

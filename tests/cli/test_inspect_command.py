@@ -12,8 +12,7 @@ import pytest
 from PIL import Image
 
 from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.cli.inspect_cars import inspect_frame, silhouette_trace
-from directshape_torch.cli.inspect_truth import points_of_car, true_points
+from directshape_torch.cli.inspect_cars import inspect_frame, points_of_car, silhouette_trace, true_points
 from directshape_torch.cli.main import main
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError

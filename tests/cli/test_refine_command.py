@@ -11,7 +11,7 @@ import torch
 from helpers.kitti_folder import write_data_set
 
 from directshape_torch.cli.main import main
-from directshape_torch.cli.refine import find_device
+from directshape_torch.cli.options import find_device
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset

@@ -6,7 +6,7 @@ import json
 import re
 from pathlib import Path
 
-from directshape_torch.cli.data_options import LAYOUTS
+from directshape_torch.cli.options import LAYOUTS
 from directshape_torch.io import folder_json
 from directshape_torch.scene_check.box_conventions import all_conventions
 

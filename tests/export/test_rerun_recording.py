@@ -22,7 +22,6 @@ from directshape_torch.config_files import config_from_mapping
 from directshape_torch.errors import DataFormatError, InputError, MissingDependencyError
 from directshape_torch.export.export_run import ExportFormat, export_run
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
-from directshape_torch.export.rerun_recording import record_run
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
@@ -81,10 +80,10 @@ def refiner_of(run: FinishedRun) -> DirectShapeRefiner:
 
 @pytest.fixture(scope="module")
 def path(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("rerun") / "sub" / "run.rrd"
+    path = tmp_path_factory.mktemp("rerun") / "sub" / "recording.rrd"
     inputs = replace(finished.inputs(), has_detections=True, refiner=refiner_of(finished))
-    record_run(path, finished.folder, inputs)
-    assert [file.name for file in path.parent.iterdir()] == ["run.rrd"]
+    export_run(finished.folder, path.parent, ["rerun"], inputs)
+    assert [file.name for file in path.parent.iterdir()] == ["recording.rrd"]
     return path
 
 
@@ -248,8 +247,8 @@ def test_residuals_lie_on_their_cars_and_shrink(finished: FinishedRun, recording
 
 
 def test_without_a_refiner_there_are_frames_alone(finished: FinishedRun, tmp_path: Path) -> None:
-    record_run(tmp_path / "a.rrd", finished.folder, finished.inputs())
-    recording = Recording(tmp_path / "a.rrd")
+    export_run(finished.folder, tmp_path, ["rerun"], finished.inputs())
+    recording = Recording(tmp_path / "recording.rrd")
     assert {place[1] for places in recording.rows.values() for place in places} == {None}
     assert {place[0] for place in recording.of("/world/cam/image", "blob")} == {0, 1}
     assert not any(entity.startswith("/terms/") for entity, _ in recording.rows)
@@ -262,7 +261,7 @@ def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -
     (root / "training" / "image_2" / "000001.png").write_bytes(b"no image")
     dataset = KittiStereoDataset(root, root / "detections", root / "masks")
     with pytest.raises(DataFormatError, match="000001"):
-        record_run(tmp_path / "out" / "a.rrd", finished.folder, replace(finished.inputs(), dataset=dataset))
+        export_run(finished.folder, tmp_path / "out", ["rerun"], replace(finished.inputs(), dataset=dataset))
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -280,7 +279,7 @@ def test_an_end_that_fails_leaves_nothing_half_written(
 
 def test_without_images_there_is_no_recording(finished: FinishedRun, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--data: expected the data set of the run"):
-        record_run(tmp_path / "a.rrd", finished.folder, finished.inputs(with_images=False))
+        export_run(finished.folder, tmp_path, ["rerun"], finished.inputs(with_images=False))
 
 
 def test_iterations_need_the_detections_of_the_run(finished: FinishedRun) -> None:
@@ -300,4 +299,4 @@ def test_without_rerun_the_error_says_what_to_install(
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingDependencyError, match=r"pip install 'directshape_torch\[viewer\]'"):
-        record_run(tmp_path / "a.rrd", finished.folder, finished.inputs())
+        export_run(finished.folder, tmp_path, ["rerun"], finished.inputs())

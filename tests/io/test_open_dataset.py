@@ -23,7 +23,7 @@ from helpers.layouts import (
     write_stereo2015,
 )
 
-from directshape_torch.cli.data_options import LAYOUTS
+from directshape_torch.cli.options import LAYOUTS
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.open_dataset import LayoutName, open_dataset

@@ -1,16 +1,22 @@
-"""The options that say which data a command works on, shared by the commands that read stereo frames."""
+"""The options that several commands share, and what they stand for: data, frames, settings, device, intervals."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from directshape_torch.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
+    from directshape_torch.evaluation.bootstrap import BootstrapSettings
     from directshape_torch.io.instance_masks import MaskSource
     from directshape_torch.io.stereo_files import FileStereoDataset
+    from directshape_torch.problem import TermFactory
+    from directshape_torch.refiner import DirectShapeRefiner
 
 # As in io/open_dataset.py, which is not imported for it loads PyTorch; a test holds the two together.
 LAYOUTS = ("kitti", "raw", "tracking", "stereo2015", "folder")
@@ -69,6 +75,42 @@ def add_mask_options(group: argparse._ActionsContainer) -> None:
     group.add_argument("--masks-right", type=Path, metavar="FILE", help="COCO results of the right images")
 
 
+def add_config_option(group: argparse._ActionsContainer) -> None:
+    """`--config`, which stays text: ./paper is a file and paper the bundled settings."""
+    group.add_argument(
+        "--config", metavar="FILE|NAME", help="settings of the refinement (YAML), or default, paper or fast"
+    )
+
+
+def add_refiner_options(group: argparse._ActionsContainer) -> None:
+    """`--config`, `--set` and `--prior`, for `make_refiner`."""
+    add_config_option(group)
+    words = "single settings, e.g. photometric.weight=2"
+    group.add_argument("--set", action="extend", nargs="+", default=[], metavar="KEY=VALUE", help=words)
+    group.add_argument(
+        "--prior", metavar="FILE|NAME", help="shape prior of any kind, or the bundled pca (default) or neural"
+    )
+
+
+def add_device_option(group: argparse._ActionsContainer) -> None:
+    """`--device`, for `make_refiner`."""
+    group.add_argument("--device", default="auto", help="cpu, cuda, cuda:1 ..; default: cuda where there is one")
+
+
+def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
+    """`--split` or `--frames`; `default` says which frames count without them."""
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--split", type=Path, metavar="FILE", help=f"one frame id a line; default: {default}")
+    chosen.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="only these frames, e.g. 107 7322")
+
+
+def add_interval_options(parser: argparse.ArgumentParser) -> None:
+    """`--tracks`, `--seed` and `--draws` of intervals over physical cars."""
+    parser.add_argument("--tracks", type=Path, metavar="FILE", help="JSON: which labels show the same physical car")
+    parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
+    parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
+
+
 def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
     """The data set that the options describe.
 
@@ -119,3 +161,54 @@ def mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
         return CocoFileMasks(*files)
     masks: Path | None = args.masks
     return masks
+
+
+def bootstrap_settings(args: argparse.Namespace) -> BootstrapSettings:
+    """What `--seed` and `--draws` ask for."""
+    from directshape_torch.evaluation.bootstrap import BootstrapSettings
+
+    return BootstrapSettings(num_draws=args.draws, seed=args.seed)
+
+
+def make_refiner(
+    config: str | None,
+    overrides: list[str],
+    prior: Path | str | None,
+    device: str,
+    extra_terms: Sequence[TermFactory] = (),
+) -> DirectShapeRefiner:
+    """The refiner that the options describe.
+
+    Raises:
+        ConfigError: unknown settings.
+        DataFormatError: a prior that cannot be used.
+        InputError: no such device.
+    """
+    from directshape_torch.config_files import load_config
+    from directshape_torch.refiner import DirectShapeRefiner
+    from directshape_torch.shape.load_prior import load_prior
+
+    settings = load_config(config, overrides)
+    refiner = DirectShapeRefiner(load_prior("pca" if prior is None else prior), settings, extra_terms)
+    return refiner.to(find_device(device))
+
+
+def find_device(name: str) -> torch.device:
+    """The device of that name; "auto" is a graphics card where there is one.
+
+    Raises:
+        InputError: PyTorch does not know or does not have it.
+    """
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    # PyTorch has no exception of its own for this: RuntimeError for an unknown name or number, AssertionError for a
+    # backend it was compiled without, ImportError for one that a package must bring. Its reason goes into the message.
+    except (RuntimeError, AssertionError, ImportError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError("--device", "a device of this machine", f"{name!r} ({reason})", "try cpu") from error
+    return device
