@@ -1,4 +1,4 @@
-"""Writes `configs/default.yaml` from `directshape_torch/config.py`: each key with its description, limits and default.
+"""Writes `configs/default.yaml` from `directshape_torch/config.py`: each key with meaning, type, unit, limits, default.
 
     python scripts/write_default_config.py
 
@@ -10,20 +10,28 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import textwrap
+import typing
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from directshape_torch.config import RefinerConfig, Settings, limits_in_words
+from directshape_torch.config import RefinerConfig, Settings, limits_in_words, type_hints
 from directshape_torch.config_files import config_to_mapping
 
 TARGET = Path(__file__).parent.parent / "directshape_torch" / "assets" / "configs" / "default.yaml"
+_UNITS = {
+    "_m": "metres",
+    "_px": "pixels",
+    "_deg": "degrees",
+    "_grey_levels": "grey levels",
+}
 _UNBROKEN = "\N{NO-BREAK SPACE}"
 HEADER = """\
 # The default settings: the best we know. They are also what the program uses without --config.
 # Written by scripts/write_default_config.py from directshape_torch/config.py; a file may hold any subset of the keys.
-# Brackets: the numbers that are allowed.
+# Brackets: type, unit and what is allowed. Lengths are in metres and image sizes in pixels of full resolution, as the
+# names say; what has no unit is a factor, a share or a count.
 """
 
 
@@ -42,12 +50,14 @@ def default_yaml() -> str:
 def _section(field: dataclasses.Field[Any], part: Any) -> str:
     if isinstance(part, Settings):
         return _title(part, field.name) + "".join(
-            _setting(f, getattr(part, f.name), "  ") for f in dataclasses.fields(part)
+            _setting(type(part), f, getattr(part, f.name), "  ") for f in dataclasses.fields(part)
         )
     if isinstance(part, tuple):
-        keys = "".join(_comment(f"{f.name}: {_description(f)}", "  ") for f in dataclasses.fields(part[0]))
+        keys = "".join(
+            _comment(f"{f.name}: {_description(type(part[0]), f)}", "  ") for f in dataclasses.fields(part[0])
+        )
         return _title(part[0], field.name) + keys + "".join(f"  - {_entry(stage)}" for stage in part)
-    return _setting(field, part, "")
+    return _setting(RefinerConfig, field, part, "")
 
 
 def _title(part: Settings, name: str) -> str:
@@ -58,16 +68,30 @@ def _entry(stage: Settings) -> str:
     return yaml.safe_dump(config_to_mapping(stage), default_flow_style=True, width=200, sort_keys=False)
 
 
-def _setting(field: dataclasses.Field[Any], value: Any, indent: str) -> str:
+def _setting(group: type[Settings], field: dataclasses.Field[Any], value: Any, indent: str) -> str:
     in_line = None if isinstance(value, tuple) else False
     line = yaml.safe_dump({field.name: config_to_mapping(value)}, default_flow_style=in_line)
-    return _comment(_description(field), indent) + indent + line
+    return _comment(_description(group, field), indent) + indent + line
 
 
-def _description(field: dataclasses.Field[Any]) -> str:
+def _description(group: type[Settings], field: dataclasses.Field[Any]) -> str:
     # Brackets stay on one line.
-    limits = limits_in_words(field.metadata["limits"]).replace(" ", _UNBROKEN)
-    return field.metadata["description"] + (f" [{limits}]" if limits else "")
+    allowed = [_kind(type_hints(group)[field.name]) + _unit(field.name), limits_in_words(field.metadata["limits"])]
+    return f"{field.metadata['description']} [{', '.join(filter(None, allowed)).replace(' ', _UNBROKEN)}]"
+
+
+def _kind(hint: Any) -> str:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Literal:
+        return "one of " + " | ".join(arguments)
+    if origin is tuple:
+        return "list of numbers" if arguments[-1] is ... else f"list of {len(arguments)} numbers"
+    kinds: dict[Any, str] = {float: "number", int: "whole number", bool: "true or false"}
+    return kinds[hint]
+
+
+def _unit(name: str) -> str:
+    return next((f" in {unit}" for ending, unit in _UNITS.items() if name.endswith(ending)), "")
 
 
 def _comment(text: str, indent: str) -> str:

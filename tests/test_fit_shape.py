@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from directshape_torch import InputError, PCAShapePrior, ShapeFit, Status, fit_shape
+from directshape_torch.batch.scan_fits import fit_scan
 from directshape_torch.cli.main import main
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box_formats import boxes_to_poses, poses_to_boxes
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.open_dataset import open_dataset
-from directshape_torch.io.scan_fits import fit_scan
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 

@@ -65,9 +65,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _fit_scans(args: argparse.Namespace) -> int:
+    from directshape_torch.batch.scan_fits import fit_scan, write_scan_fit
     from directshape_torch.errors import InputError
     from directshape_torch.io.open_dataset import open_dataset
-    from directshape_torch.io.scan_fits import fit_scan, write_scan_fit
     from directshape_torch.shape.load_prior import load_prior
 
     if args.data is None:

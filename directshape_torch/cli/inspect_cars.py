@@ -22,7 +22,6 @@ from directshape_torch.io.frame_layout import FrameLayout, first_disparity
 from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.extents import MASK_THRESHOLD
-from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.disparity_maps import FOLDERS, known_depth_from_disparity_map
 from directshape_torch.rig.disparity_observations import KnownDepth
@@ -32,6 +31,7 @@ from directshape_torch.visualize.inspection.car_figures import write_car_figures
 from directshape_torch.visualize.inspection.car_view import CarView, KnownPoints
 from directshape_torch.visualize.inspection.point_figures import stereo_points
 from directshape_torch.visualize.overlay import overlay_of_frame
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 
 # Points under the mask's edge may lie far behind the car.
 _REACH_M = 3.5

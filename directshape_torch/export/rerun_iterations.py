@@ -14,7 +14,6 @@ from directshape_torch.export.rerun_stream import RerunStream
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.status import Status
 from directshape_torch.visualize.inspection.residual_figure import (
@@ -22,6 +21,7 @@ from directshape_torch.visualize.inspection.residual_figure import (
     PixelResiduals,
     car_residuals,
 )
+from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 # -log 0.01: what a pixel pays whose mask is certain and wrong.
 _WORST_SILHOUETTE = 4.6

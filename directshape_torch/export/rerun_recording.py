@@ -11,9 +11,9 @@ from directshape_torch.export.rerun_iterations import IterationLog
 from directshape_torch.export.rerun_scene import clear_cars, log_conventions, log_frame, log_painted_cars
 from directshape_torch.export.rerun_stream import RerunStream, import_rerun
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.inspection.residual_figure import car_residuals
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 
 class RerunExporter(Exporter):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,7 +13,9 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.rig.estimate import RigEstimate
+
+if TYPE_CHECKING:
+    from directshape_torch.rig.estimate import RigEstimate
 
 _TITLE_HEIGHT_PX = 34
 _CONTOUR_STEP_PX = 0.25
@@ -155,7 +157,7 @@ def draw_rigs(
     The offsets are less the detector's own bias.
 
     Examples:
-        >>> import torch
+        >>> from directshape_torch.rig.estimate import RigEstimate
         >>> K, T_right_cam = torch.eye(3), torch.eye(4)
         >>> T_right_cam[0, 3] = -0.5
         >>> draw_rigs([RigEstimate((320, 96), K, K, T_right_cam)]).shape

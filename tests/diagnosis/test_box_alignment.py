@@ -15,7 +15,6 @@ from directshape_torch.diagnosis.box_alignment import box_hits
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.rays import ray_box_interval
-from directshape_torch.refinement_trace import trace_refinement
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.rows import Rays
@@ -23,6 +22,7 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.status import Status
 from directshape_torch.terms.lidar import LidarPoints
+from directshape_torch.visualize.refinement_trace import trace_refinement
 
 ALIGNED = replace(DEFAULT, method="box_alignment")
 

@@ -6,8 +6,8 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
-from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.visualize.inspection.car_figures import _OF_ONE_VIEW
+from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 DOCS = Path(__file__).parents[2] / "docs"
 TEXT = (DOCS / "inspect.md").read_text(encoding="utf-8")

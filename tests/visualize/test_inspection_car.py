@@ -17,7 +17,6 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.observation.packing import pack_pixels
-from directshape_torch.refinement_trace import RefinementTrace, trace_refinement
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.drawing import Surface, View, silhouette_mask
 from directshape_torch.visualize.inspection.car_view import CarView, KnownPoints
@@ -30,6 +29,7 @@ from directshape_torch.visualize.inspection.point_figures import (
 )
 from directshape_torch.visualize.inspection.residual_figure import car_residuals
 from directshape_torch.visualize.inspection.sampling_figure import sampled_pixels_of
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 _CAR = 1
 

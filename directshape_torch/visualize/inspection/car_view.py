@@ -22,12 +22,12 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import car_regions, residual_offsets
 from directshape_torch.observation.refinable import without_empty_masks
-from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 from directshape_torch.visualize.drawing import Picture, picture_of
+from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 Array = NDArray[np.float64]
 

@@ -14,13 +14,13 @@ from directshape_torch.io.figure_files import new_figure, write_figure
 from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import PixelSamples
-from directshape_torch.refinement_trace import RefinementTrace
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Part
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.panels import draw_lines, show_crop
+from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 
 class PixelResiduals(NamedTuple):

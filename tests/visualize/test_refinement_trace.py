@@ -12,9 +12,9 @@ from directshape_torch.config_files import load_config
 from directshape_torch.geometry import se3
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 
 _SEARCH = "search.disparity_offsets_px=[-2,2]"
 
