@@ -7,6 +7,7 @@ import dataclasses
 import difflib
 import typing
 from collections.abc import Iterator, Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -17,6 +18,8 @@ from directshape_torch.files.read_files import read_text
 BUNDLED_CONFIGS = ("default", "paper", "fast")
 """Names of the settings that come with the package, for `load_config`."""
 
+# The parser takes a second for ten thousand lines.
+_MOST_BYTES = 2**20
 _CONFIG_FOLDER = Path(__file__).parent / "assets" / "configs"
 _KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 _GroupT = TypeVar("_GroupT", bound=Settings)
@@ -130,6 +133,10 @@ def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -
         >>> load_config("paper").silhouette.form
         'product'
     """
+    if not isinstance(overrides, (list, tuple)) or not all(isinstance(each, str) for each in overrides):
+        raise ConfigError(f"overrides: expected a list of 'key=value', got {shown(overrides)}")
+    if not isinstance(path, (str, PathLike, type(None))):
+        raise ConfigError(f"path: expected a file or a name, got {shown(path)}")
     mapping = {} if path is None else _read(path)
     for override in overrides:
         _override(mapping, override)
@@ -145,7 +152,7 @@ def _read(path: Path | str) -> dict[str, Any]:
 
     file = _CONFIG_FOLDER / f"{path}.yaml" if str(path) in BUNDLED_CONFIGS else Path(path)
     try:
-        mapping = yaml.safe_load(read_text(file)) or {}
+        mapping = yaml.safe_load(read_text(file, _MOST_BYTES)) or {}
     # Of dates that are none, deep nesting and the like the parser raises whatever it comes across.
     except Exception as error:
         names = f"bundled ones are {', '.join(BUNDLED_CONFIGS)}"

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from directshape_torch.errors import InputError, MissingDependencyError, shown
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
 from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
+from directshape_torch.numerics.checks import Dense, check_alike, check_shape, check_type
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -101,22 +102,22 @@ class RefinementResult(CarRecord):
         (torch.Size([6, 7]), torch.Size([6, 8, 3]))
     """
 
-    T_cam_obj: Tensor
-    code: Tensor
-    status_code: Tensor
-    iterations: Tensor
+    T_cam_obj: Annotated[Tensor, Dense("B", 4, 4)]
+    code: Annotated[Tensor, Dense("B", "K")]
+    status_code: Annotated[Tensor, Dense("B", kind="index")]
+    iterations: Annotated[Tensor, Dense("B", kind="index")]
     term_names: tuple[str, ...]
-    cost_before: Tensor
-    cost_after: Tensor
-    covariance: Tensor
-    covariance_xyz_yaw: Tensor
-    cost_history: Tensor
+    cost_before: Annotated[Tensor, Dense("B", "T")]
+    cost_after: Annotated[Tensor, Dense("B", "T")]
+    covariance: Annotated[Tensor, Dense("B", "D", "D")]
+    covariance_xyz_yaw: Annotated[Tensor, Dense("B", 4, 4)]
+    cost_history: Annotated[Tensor, Dense("B", "iterations")]
     quality: FitQuality
     observability: Observability
     profile: DisparityProfile
-    input_dimensions_hwl: Tensor
+    input_dimensions_hwl: Annotated[Tensor, Dense("B", 3)]
     ground_source: tuple[str, ...]
-    t_cam_ref: Tensor
+    t_cam_ref: Annotated[Tensor, Dense("B", 3)]
     prior: ShapePrior
     has_shape: bool = True
 
@@ -171,14 +172,15 @@ class RefinementResult(CarRecord):
             prior: the shapes of the result, which its state does not hold; default the bundled ones.
 
         Raises:
-            InputError: a tensor is missing, or the prior has another number of codes.
+            InputError: a tensor is missing or none of its kind, or the prior has another number of codes.
         """
         shapes = PCAShapePrior.load_bundled() if prior is None else prior
         result = cls._from_state(state, prior=shapes)
         if result.code.shape[1] != shapes.num_codes:
             expected = f"the prior of the result, with {result.code.shape[1]} codes"
             raise InputError("prior", expected, f"one with {shapes.num_codes}", "give the prior of the refiner")
-        return result if prior is not None else replace(result, prior=_moved_prior(shapes, result.T_cam_obj))
+        _check_state(result)
+        return replace(result, prior=_moved_prior(shapes, result.T_cam_obj))
 
     def __repr__(self) -> str:
         """Statuses, and the first cars in a table."""
@@ -319,6 +321,18 @@ class RefinementResult(CarRecord):
         )
 
 
+def _check_state(result: RefinementResult) -> None:
+    """What the shapes of its tensors do not say."""
+    for name in ("code", "input_dimensions_hwl", "t_cam_ref"):
+        check_alike(f"state['{name}']", getattr(result, name), "state['T_cam_obj']", result.T_cam_obj)
+    words = {"term_names": result.cost_after.shape[1], "ground_source": len(result)}
+    for name, count in words.items():
+        if len(getattr(result, name)) != count:
+            raise InputError(f"state[{name!r}]", f"{count} words", f"{len(getattr(result, name))}")
+    if bool(((result.status_code < 0) | (result.status_code >= len(Status))).any()):
+        raise InputError("state['status_code']", f"numbers of 0..{len(Status) - 1}", f"{result.status_code.tolist()}")
+
+
 def _chosen_rows(index: object, count: int) -> Tensor:
     """Numbers of the cars that an index names."""
     if isinstance(index, (int, np.integer)) and not isinstance(index, bool):
@@ -327,7 +341,12 @@ def _chosen_rows(index: object, count: int) -> Tensor:
         return torch.tensor([index % count])
     if isinstance(index, slice):
         return torch.arange(count)[index]
-    chosen = torch.as_tensor(index, device="cpu")
+    check_type("index", index, (int, slice, Tensor, list, np.ndarray))
+    try:
+        chosen = torch.as_tensor(index, device="cpu")
+    except (TypeError, ValueError, RuntimeError) as error:  # a list of words, no memory, ..
+        raise InputError("index", "numbers of cars, or booleans", shown(index)) from error
+    check_shape("index", chosen, ("M",))
     if chosen.ndim != 1 or (chosen.dtype == torch.bool and len(chosen) != count) or chosen.is_floating_point():
         expected = f"a car, a slice, numbers of cars, or {count} booleans"
         raise InputError("index", expected, f"{chosen.dtype} of shape {tuple(chosen.shape)}")

@@ -26,6 +26,7 @@ from directshape_torch.numerics.checks import (
     check_rotation,
     check_shape,
     check_sigmas,
+    check_stored,
     check_type,
     is_no_rotation,
 )
@@ -170,8 +171,9 @@ class FrameBatch(TensorRecord):
         if not isinstance(ground, GroundPlane):
             ground = GroundPlane.from_camera_height(ground, count).to(like.device, like.dtype)
         sizes = torch.tensor([left.shape[2:]] * count, device=left.device).reshape(count, 2)
-        names = tuple(f"{number:06d}" for number in range(count)) if frame_ids is None else tuple(frame_ids)
-        return cls(left, right, sizes, camera, ground, names)
+        names = frame_ids or tuple(f"{number:06d}" for number in range(count))
+        check_type("frame_ids", names, (tuple, list))
+        return cls(left, right, sizes, camera, ground, tuple(names))
 
     def __len__(self) -> int:
         return len(self.images_left)
@@ -355,6 +357,11 @@ def _as_images(name: str, images: Tensor, like: Tensor) -> Tensor:
 def _stacked(name: str, masks: Masks, count: int) -> Tensor:
     """Masks (B, H, W) in bool or floating point."""
     if not isinstance(masks, Tensor):
+        check_type(name, masks, (Tensor, list, tuple))
+        for number, mask in enumerate(masks):
+            if mask is not None:
+                check_shape(f"{name}[{number}]", mask, ("H", "W"))
+                check_stored(f"{name}[{number}]", mask)
         present = [mask for mask in masks if mask is not None]
         if not all(isinstance(mask, Tensor) for mask in present):
             raise InputError(name, "tensors", type(masks).__name__, "torch.as_tensor(masks), or a list with None")

@@ -9,7 +9,8 @@ from typing import Any, ClassVar, Self, get_type_hints
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
+from directshape_torch.errors import InputError, shown
+from directshape_torch.numerics.checks import check_declared, check_shape, check_stored
 
 
 class CarRecord:
@@ -66,25 +67,33 @@ class CarRecord:
         return state
 
     @classmethod
-    def _from_state(cls, state: Mapping[str, Tensor], prefix: str = "", **others: Any) -> Self:
-        """What `state_dict` came from; `others` are the fields that are none of its values."""
-        values = dict(others)
-        hints = get_type_hints(cls)
+    def _from_state(
+        cls, state: Mapping[str, Tensor], prefix: str = "", sizes: dict[int | str, int] | None = None, **others: Any
+    ) -> Self:
+        """What `state_dict` came from; `others` are the fields that are none of its values.
+
+        Raises:
+            InputError: a value is missing or is not what its field declares.
+        """
+        values, sizes = dict(others), {} if sizes is None else sizes
+        hints = get_type_hints(cls, include_extras=True)
         for each in fields(cls):  # type: ignore[arg-type]
             kind, name = hints[each.name], prefix + each.name
             if each.name in others:
                 continue
             if isinstance(kind, type) and issubclass(kind, CarRecord):
-                values[each.name] = kind._from_state(state, f"{name}.")
+                values[each.name] = kind._from_state(state, f"{name}.", sizes)
             elif name not in state:
                 raise InputError("state", f"the tensor {name!r}", f"{len(state)} others", "save result.state_dict()")
-            elif kind is Tensor:
-                values[each.name] = state[name]
             elif kind is bool:
+                check_shape(f"state[{name!r}]", state[name], ())
                 values[each.name] = bool(state[name])
+            elif hasattr(kind, "__metadata__"):
+                check_declared(f"state[{name!r}]", state[name], kind.__metadata__[0], sizes)
+                check_stored(f"state[{name!r}]", state[name])
+                values[each.name] = state[name]
             else:
-                text = bytes(state[name].tolist()).decode()
-                values[each.name] = tuple(text.split("\n")) if text else ()
+                values[each.name] = _words(f"state[{name!r}]", state[name])
         return cls(**values)
 
     def _fields(self) -> Iterator[tuple[Field[Any], Any]]:
@@ -100,6 +109,17 @@ class CarRecord:
             elif isinstance(value, Tensor):
                 changed[each.name] = change(value)
         return replace(self, **changed)  # type: ignore[type-var]
+
+
+def _words(name: str, letters: Tensor) -> tuple[str, ...]:
+    """Words of one line each, from their UTF-8 bytes."""
+    check_shape(name, letters, ("n",))
+    check_stored(name, letters)
+    try:
+        text = bytes(letters.tolist()).decode()
+    except (TypeError, ValueError) as error:  # numbers that are no bytes, bytes that are no letters
+        raise InputError(name, "UTF-8 bytes", shown(letters.tolist()), "save result.state_dict()") from error
+    return tuple(text.split("\n")) if text else ()
 
 
 def placed(values: Tensor, rows: Tensor, count: int) -> Tensor:

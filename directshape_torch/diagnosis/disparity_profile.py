@@ -8,7 +8,7 @@ them, how sharply, and whether a repeated texture offers a second place.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from directshape_torch.compile import compilable
 from directshape_torch.config import PhotometricConfig
 from directshape_torch.diagnosis.car_rows import CarRecord
 from directshape_torch.errors import InputError
+from directshape_torch.numerics.checks import Dense
 from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
 from directshape_torch.terms.photometric import Photometric, Surface, photometric_norm
@@ -74,10 +75,10 @@ class DisparityProfile(CarRecord):
 
     shared = frozenset({"offsets_px"})
 
-    offsets_px: Tensor
-    cost_before: Tensor
-    cost_after: Tensor
-    num_pixels: Tensor
+    offsets_px: Annotated[Tensor, Dense("n")]
+    cost_before: Annotated[Tensor, Dense("B", "n")]
+    cost_after: Annotated[Tensor, Dense("B", "n")]
+    num_pixels: Annotated[Tensor, Dense("B")]
 
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> DisparityProfile:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from directshape_torch.diagnosis.car_rows import CarRecord
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.numerics.checks import Dense
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 
@@ -89,9 +91,9 @@ class Observability(CarRecord):
         viewing_angle_rad: (B,) KITTI's alpha of the car, which says from where it is seen.
     """
 
-    sigmas_m: Tensor
-    directions: Tensor
-    viewing_angle_rad: Tensor
+    sigmas_m: Annotated[Tensor, Dense("B", 7)]
+    directions: Annotated[Tensor, Dense("B", 7, 7)]
+    viewing_angle_rad: Annotated[Tensor, Dense("B")]
 
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> Observability:

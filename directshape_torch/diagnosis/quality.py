@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from torch import Tensor
 from directshape_torch.diagnosis.car_rows import CarRecord
 from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
 from directshape_torch.diagnosis.trust_model import bundled_trust_model
+from directshape_torch.numerics.checks import Dense
 from directshape_torch.problem import CarStage
 from directshape_torch.rows import CarSums
 from directshape_torch.terms.photometric import Photometric
@@ -34,13 +36,13 @@ class FitQuality(CarRecord):
             `not_trusted` speak of the refinement that was not returned.
     """
 
-    mask_iou_left: Tensor
-    mask_iou_right: Tensor
-    photometric_error_grey: Tensor
-    matched_share: Tensor
-    evidence: Tensor
-    probability_better: Tensor
-    probability_not_worse: Tensor
+    mask_iou_left: Annotated[Tensor, Dense("B")]
+    mask_iou_right: Annotated[Tensor, Dense("B")]
+    photometric_error_grey: Annotated[Tensor, Dense("B")]
+    matched_share: Annotated[Tensor, Dense("B")]
+    evidence: Annotated[Tensor, Dense("B", "E")]
+    probability_better: Annotated[Tensor, Dense("B")]
+    probability_not_worse: Annotated[Tensor, Dense("B")]
 
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> FitQuality:

@@ -11,9 +11,11 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, shown
 
-MOST_BYTES = 2**31
+MOST_BYTES = 2**29
+# A line of one letter takes two hundred bytes once it is numbered.
+MOST_TEXT_BYTES = 2**24
 # Parsed JSON takes some twenty times its size.
 MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
@@ -36,6 +38,8 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the 
         ...
         directshape_torch.errors.DataFormatError: /dev/zero: is no regular file; check the path
     """
+    if not isinstance(path, (str, os.PathLike)):  # the number of an open file would do for Python
+        raise DataFormatError(shown(path), "is no path", cure=cure)
     try:
         with open(path, "rb", opener=_open_at_once) as file:
             state = os.fstat(file.fileno())
@@ -58,7 +62,7 @@ def _open_at_once(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
-def read_text(path: Path | str, most: int = MOST_BYTES, cure: str = "check the path") -> str:
+def read_text(path: Path | str, most: int = MOST_TEXT_BYTES, cure: str = "check the path") -> str:
     """The content of a UTF-8 text file; arguments and errors as of `read_bytes`.
 
     Raises:

@@ -17,6 +17,7 @@ from directshape_torch.numerics.checks import (
     Dense,
     TensorRecord,
     check_alike,
+    check_positive,
     check_rotation,
     check_shape,
     check_stored,
@@ -93,13 +94,21 @@ class StereoCamera(TensorRecord):
             tensor([0.5400])
         """
         K_left = _intrinsics("K", K)
-        of_right = K_left.clone() if K_right is None else _intrinsics("K_right", K_right).expand_as(K_left).clone()
+        of_right = K_left if K_right is None else _intrinsics("K_right", K_right)
+        if len(of_right) not in (1, len(K_left)):
+            raise InputError("K_right", f"one matrix, or {len(K_left)}", f"{len(of_right)}")
+        if isinstance(baseline_m, Tensor):
+            check_shape("baseline_m", baseline_m, ("F",) if baseline_m.ndim else ())
+            check_stored("baseline_m", baseline_m)
+        else:
+            check_positive("baseline_m", baseline_m, "in metres")
         baseline = torch.as_tensor(baseline_m, dtype=K_left.dtype, device=K_left.device)
         if baseline.ndim > 1 or (baseline.ndim == 1 and len(baseline) != len(K_left)):
             got = str(tuple(baseline.shape))
             raise InputError("baseline_m", f"a number, or {len(K_left)} of them", f"shape {got}", "in metres")
         T_right_cam = torch.eye(4).to(K_left).repeat(len(K_left), 1, 1)
         T_right_cam[:, 0, 3] = -baseline
+        of_right = of_right.expand_as(K_left).clone()
         return cls(K_left.clone(), of_right, T_right_cam, torch.zeros_like(K_left[:, 0]), disparity_field)
 
     @classmethod
@@ -198,6 +207,7 @@ def _intrinsics(name: str, K: Tensor) -> Tensor:
     """Of F frames, (F, 3, 3)."""
     shape = (3, 3) if isinstance(K, Tensor) and K.ndim == 2 else ("F", 3, 3)
     check_shape(name, K, shape, kind="floating")
+    check_stored(name, K)
     K = K if K.ndim == 3 else K[None]
     last_row = K.new_tensor([0.0, 0.0, 1.0])
     if not bool(((K[:, 2] == last_row).all(1) & (K[:, 1, 0] == 0) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)).all()):

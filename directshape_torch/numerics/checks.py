@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import cache
 from numbers import Integral, Real
@@ -178,6 +178,12 @@ class Dense:
         self.shape, self.kind, self.cure = shape, kind, cure
 
 
+def check_declared(name: str, value: Tensor, spec: Dense, sizes: dict[int | str, int]) -> None:
+    """Raise `InputError` unless a tensor is what its field declares; `sizes` are those of the letters, and grow."""
+    check_shape(name, value, [sizes.get(size, size) for size in spec.shape], spec.cure, spec.kind)
+    sizes |= dict(zip(spec.shape, value.shape, strict=True))
+
+
 class DeclaredTensor(NamedTuple):
     """A tensor of a record, its name from the outermost record on, and the kind of its numbers."""
 
@@ -208,8 +214,7 @@ class TensorRecord:
             value = getattr(self, name)
             if value is None and is_optional:
                 continue
-            check_shape(name, value, [sizes.get(size, size) for size in spec.shape], spec.cure, spec.kind)
-            sizes |= dict(zip(spec.shape, value.shape, strict=True))
+            check_declared(name, value, spec, sizes)
             if spec.kind in FOLLOWING:
                 first = first or DeclaredTensor(name, value, spec.kind)
                 check_alike(name, value, first.name, first.value)
@@ -229,14 +234,20 @@ class TensorRecord:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """A copy on another device and, for floating-point fields, of another dtype."""
+        return self._with(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
-        def convert(value: Any) -> Any:
+    def detach(self) -> Self:
+        """A copy without gradients."""
+        return self._with(Tensor.detach)
+
+    def _with(self, change: Callable[[Tensor], Tensor]) -> Self:
+        def changed(value: Any) -> Any:
             if isinstance(value, Tensor):
-                return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-            return value.to(device=device, dtype=dtype) if isinstance(value, TensorRecord) else value
+                return change(value)
+            return value._with(change) if isinstance(value, TensorRecord) else value
 
-        changed = {each.name: convert(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
-        return replace(self, **changed)  # type: ignore[type-var]
+        values = {each.name: changed(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
+        return replace(self, **values)  # type: ignore[type-var]
 
     def tensors(self, name: str) -> Iterator[DeclaredTensor]:
         """All tensors of the record, named `name`, and of those in it."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
@@ -235,8 +236,20 @@ class RigEstimate(nn.Module):
         return torch.tensor(list(save(state)), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Of `get_extra_state`; nothing of what was known before stays."""
-        read = load(bytes(state.tolist()))
+        """Of `get_extra_state`; nothing of what was known before stays.
+
+        Raises:
+            InputError: it is no such state.
+        """
+        check_shape("state", state, ("n",))
+        check_stored("state", state)
+        try:
+            self._take(load(bytes(state.tolist())))
+        # Bytes that are none, a damaged file, tensors that are missing or of other shapes.
+        except (TypeError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+            raise InputError("state", "what get_extra_state has made", f"something else ({error})") from error
+
+    def _take(self, read: dict[str, Tensor]) -> None:
         matrices = (read[name] for name in ("K_left", "K_right", "T_right_cam"))
         width, height = read["size_wh"].tolist()
         self._blank = DisparityField.constant(0.0, (width, height), *matrices)

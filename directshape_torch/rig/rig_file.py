@@ -90,7 +90,7 @@ def _rig(entry: Mapping[str, Any]) -> RigEstimate:
 
 def _tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
     tensor = torch.tensor(entry[name], dtype=torch.float64)
-    if not tensor.numel():
+    if not tensor.numel() and None in shape:  # JSON has no rows of nothing
         tensor = tensor.reshape([n or 0 for n in shape])
     fits = tensor.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, tensor.shape, strict=True))
     if not fits or not bool(tensor.isfinite().all()):

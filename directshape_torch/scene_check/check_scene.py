@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
 from directshape_torch.scene_check.check_box_2d import check_box_2d, check_corners
@@ -40,6 +41,9 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
     Returns:
         The findings; printed, it says what was measured, what was expected, and how to mend it.
 
+    Raises:
+        InputError: other types.
+
     Examples:
         >>> import torch
         >>> from directshape_torch import StereoCamera
@@ -55,6 +59,9 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
           cure      K is of images 0.48 times as large: multiply fx, fy, cx and cy by 2.07
         ...
     """
+    check_type("frames", frames, (FrameBatch,))
+    check_type("detections", detections, (Detections,))
+    frames, detections = frames.detach(), detections.detach()
     found: list[Finding] = []
     pairs: list[Pair] = []
     for number, (height, width) in enumerate(frames.sizes.cpu().tolist()):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from os import PathLike
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, shown
+from directshape_torch.numerics.checks import check_type
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -37,6 +39,7 @@ def load_prior(source: Path | str) -> ShapePrior:
         >>> load_prior("pca").num_codes == load_prior("neural").num_codes
         True
     """
+    check_type("source", source, (str, PathLike))
     bundled = BUNDLED_PRIORS.get(str(source)) if isinstance(source, str) else None
     if bundled is not None:
         return bundled()

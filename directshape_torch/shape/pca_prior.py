@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_alike, check_positive, check_shape, check_stored
+from directshape_torch.numerics.checks import check_alike, check_positive, check_shape, check_stored, check_type
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.sdf_grid import GridShape, zero_level_extents
 from directshape_torch.shape.shape_prior import DimensionsDerivative
@@ -202,6 +202,9 @@ class PCAShapePrior(nn.Module):
             1.0
         """
         _check_samples(sdf_samples, num_codes)
+        check_shape("origin", origin, (3,), kind="floating")
+        check_stored("origin", origin)
+        check_positive("spacing_m", spacing_m)
         samples = sdf_samples.double().flatten(1)
         mean = samples.mean(dim=0)
         code, explained = _whitened_codes(samples - mean, _surface_weight(samples, surface_band_m), num_codes)
@@ -268,7 +271,9 @@ def training_codes(
 
 
 def _check_samples(sdf_samples: Tensor, num_codes: int) -> None:
-    check_shape("sdf_samples", sdf_samples, ("N", "nx", "ny", "nz"))
+    check_shape("sdf_samples", sdf_samples, ("N", "nx", "ny", "nz"), kind="floating")
+    check_stored("sdf_samples", sdf_samples)
+    check_type("num_codes", num_codes, (int,))
     if num_codes < 1 or len(sdf_samples) <= num_codes:
         raise InputError(
             "sdf_samples", f"more than num_codes = {num_codes} samples", f"{len(sdf_samples)}", "lower num_codes"

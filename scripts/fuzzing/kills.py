@@ -63,7 +63,8 @@ def _one(
     trouble: str | None = None
     try:
         time.sleep(chance.uniform(0.0, whole_s))
-        victims = [run.pid] if whom == "parent" else _children(run.pid)
+        workers = _children(run.pid)
+        victims = [run.pid] if whom == "parent" else workers
         if whom == "worker":
             by = signal.SIGKILL
         name = f"{whom} by {by.name}" if run.poll() is None and victims else "nobody, it had ended"
@@ -74,6 +75,8 @@ def _one(
             code = run.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:
             return name, "the run did not end"
+        if _outlive(workers):
+            trouble = "workers outlive their parent"
         if whom == "worker" and name != "nobody, it had ended" and code != 0:
             trouble = f"a worker's death ended the run with exit code {code}"
     finally:
@@ -107,6 +110,16 @@ def _children(pid: int) -> list[int]:
         found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
         return [int(each) for each in found if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
     return []
+
+
+def _outlive(workers: list[int]) -> bool:
+    """Whether some are there some seconds after their parent has ended."""
+    deadline = time.monotonic() + _PATIENCE_S / 4
+    while any(Path(f"/proc/{each}").exists() for each in workers):
+        if time.monotonic() > deadline:
+            return True
+        time.sleep(0.05)
+    return False
 
 
 def _resume(root: Path, out: Path) -> Any:

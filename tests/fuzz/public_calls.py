@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,10 +26,13 @@ from directshape_torch import (
     RefinementResult,
     RigEstimate,
     StereoCamera,
+    check_scene,
+    fit_shape,
     load_config,
 )
 from directshape_torch.config import RefinerConfig
 from directshape_torch.rig.detections import COLUMNS
+from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.terms.lidar import LidarPoints
 
@@ -128,6 +132,8 @@ def calls() -> dict[str, Call]:
     field = {"coefficients": torch.zeros(10).double(), "hull_uv": torch.tensor([[0.0, 0], [9, 0], [9, 9]]).double()}
     weight = torch.ones(2, dtype=torch.float64)
     street = {"frames": frames, "detections": detections}
+    boxes = torch.tensor([[0.0, 0, 10, 4, 1.6, 1.5, 0.3]]).double()
+    points = boxes[:, :3] + 0.7 * torch.randn(99, 3, generator=torch.Generator().manual_seed(0)).double()
     return {
         "refine": Call(street | {"weight": weight}, _refine, promises=True),
         "gradient": Call(street | {"weight": weight}, _gradient, promises=True),
@@ -139,6 +145,29 @@ def calls() -> dict[str, Call]:
         "field": Call(field | rig | {"uv": torch.zeros(5, 2).double()}, _field),
         "projections": Call({"P_left": P_left, "P_right": P_right}, _projections),
         "camera height": Call({"height_m": 1.65}, lambda a: [GroundPlane.from_camera_height(a["height_m"]).offset]),
+        "images": Call(
+            {"images_left": frames.images_left, "images_right": frames.images_right, "camera": camera}
+            | {"ground": 1.65, "frame_ids": ("000000",)},
+            lambda a: [FrameBatch.from_images(**a).images_left],
+        ),
+        "intrinsics": Call(
+            {"K": camera.K_left, "baseline_m": 0.5, "K_right": camera.K_right},
+            lambda a: [StereoCamera.from_intrinsics(**a).T_right_cam],
+        ),
+        "boxes": Call(_boxes(detections) | {"mask_left": list(detections.mask_left)}, _from_boxes),
+        "boxes of a LiDAR": Call(
+            _boxes(detections) | {"convention": "nuscenes", "T_cam_boxes": torch.eye(4).double()}, _from_boxes
+        ),
+        "fit shape": Call({"points": points, "boxes": boxes, "convention": "opencv", "prior": prior}, _fit),
+        "check scene": Call(street | {"match_images": False}, lambda a: [torch.tensor(len(str(check_scene(**a))))]),
+        "state": Call(dict(_result().state_dict()), lambda a: _of_refined(RefinementResult.from_state_dict(a, prior))),
+        "some cars": Call({"index": torch.tensor([True, False])}, lambda a: [_result()[a["index"]].T_cam_obj]),
+        "words": Call({"convention": "kitti", "frame": "cam"}, lambda a: [_result().to_boxes(**a)]),
+        "rig state": Call({"state": RigEstimate.of_frames(frames).get_extra_state()}, _rig_state),
+        "fit prior": Call({"samples": prior.values(torch.eye(3, prior.num_codes).double()), **_FIT}, _fitted_prior),
+        "overrides": Call({"path": None, "overrides": ["method=direct"]}, lambda a: [_number(load_config(**a))]),
+        "prior file": Call({"source": "pca"}, lambda a: [torch.tensor(load_prior(**a).num_codes)]),
+        "field file": Call({"path": Path("none.json")}, lambda a: [DisparityField.load(a["path"]).coefficients]),
         "mesh": Call({"index": 0}, lambda a: [torch.from_numpy(_result().mesh(a["index"]).vertices)]),
     }
 
@@ -236,6 +265,43 @@ def _field(a: Arguments) -> list[Tensor]:
     names = ("coefficients", "hull_uv", "K_left", "K_right", "T_right_cam")
     field = DisparityField(size_wh=(160, 120), **{name: a[name] for name in names})
     return list(field.offsets(a["uv"]))
+
+
+def _boxes(detections: Detections) -> dict[str, Any]:
+    """Every argument of `Detections.from_boxes`."""
+    zeros = torch.zeros(2).double()
+    boxes = torch.stack([zeros, zeros + 1, zeros + 20, zeros + 1.5, zeros + 1.6, zeros + 4, zeros + 0.3], dim=1)
+    names = ("mask_left", "mask_right", "has_mask_left", "has_mask_right", "frame_index", "score", "box_2d")
+    given = {name: getattr(detections, name) for name in (*names, "pose_sigma")}
+    return {"boxes": boxes, "convention": "kitti", "track_id": torch.tensor([-1, 3]), **given}
+
+
+def _from_boxes(a: Arguments) -> list[Tensor]:
+    found = Detections.from_boxes(**a)
+    return [found.T_cam_obj, found.dimensions_hwl]
+
+
+def _fit(a: Arguments) -> list[Tensor]:
+    fit = fit_shape(**a)
+    return [*_of_refined(fit.cars), fit.num_points]
+
+
+def _rig_state(a: Arguments) -> list[Tensor]:
+    rig = RigEstimate.of_frames(whole_call()[0])
+    rig.set_extra_state(a["state"])
+    return [rig.mean, rig.covariance]
+
+
+_FIT = {"origin": torch.zeros(3).double(), "spacing_m": 0.2, "num_codes": 2}
+
+
+def _fitted_prior(a: Arguments) -> list[Tensor]:
+    fitted = PCAShapePrior.fit(a["samples"], a["origin"], a["spacing_m"], a["num_codes"], PriorProvenance("", "", 3))
+    return [fitted.mean, fitted.basis]
+
+
+def _number(config: RefinerConfig) -> Tensor:
+    return torch.tensor(len(str(config)))
 
 
 def _projections(a: Arguments) -> list[Tensor]:

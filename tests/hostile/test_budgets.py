@@ -18,8 +18,10 @@ from safetensors.torch import load_file, save_file
 
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import ConfigError, DataFormatError, DirectShapeError
-from directshape_torch.files.npz_files import read_npz
-from directshape_torch.files.read_files import read_bytes, read_json
+from directshape_torch.files.mesh_files import read_mesh
+from directshape_torch.files.npz_files import read_npy, read_npz
+from directshape_torch.files.read_files import read_bytes, read_json, read_text
+from directshape_torch.files.text_files import read_lines
 from directshape_torch.io.coco_segmentation import decode_segmentation
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.shape import load_prior as priors
@@ -140,6 +142,18 @@ def test_only_regular_files_are_opened(tmp_path: Path, read: Callable[[Path], ob
     for path in (tmp_path / "pipe", tmp_path / "zero.safetensors", tmp_path, tmp_path / "a\0b", tmp_path / "\ud800"):
         with pytest.raises((DataFormatError, ConfigError), match=r"regular file|cannot be read|is no path"):
             read(path)
+
+
+@pytest.mark.parametrize(
+    "read", [read_bytes, read_text, read_lines, read_json, read_npz, read_npy, read_rgb, load_config, read_mesh]
+)
+@pytest.mark.parametrize("name", ["a.yaml", "a.safetensors", "a.obj"])
+def test_files_of_nothing_but_size(tmp_path: Path, read: Callable[[Path], object], name: str) -> None:
+    path = tmp_path / name
+    with path.open("wb") as file:
+        file.truncate(2**36)
+    with pytest.raises((DataFormatError, ConfigError), match=rf"{name}: .*(at most|is no \.obj)"):
+        read(path)
 
 
 @pytest.mark.parametrize(
