@@ -46,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
     """
     import json
 
-    from directshape_torch.data_check.check_text import report_content, write_report
+    from directshape_torch.data_check.check_dataset import report_content
+    from directshape_torch.files.atomic_files import write_json
 
     report = _report(args)
     if str(args.json) == "-":
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         return report.exit_code
     print(report)
     if args.json is not None:
-        write_report(args.json, report)
+        write_json(args.json, report_content(report))
     return report.exit_code
 
 

@@ -56,12 +56,7 @@ def _add_outputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
     group.add_argument("--meshes", choices=("ply", "glb"), help="write the surface of each refined car")
     group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
-    again = group.add_mutually_exclusive_group()
-    # `store_false` alone would make True the default of both.
-    again.add_argument(
-        "--resume", action="store_false", dest="fresh", default=False, help="go on where DIR was left (the default)"
-    )
-    again.add_argument(
+    group.add_argument(
         "--fresh", action="store_true", help="remove the results that runs have left in DIR, start again"
     )
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
-from directshape_torch.data_check.check_files import check_files
 from directshape_torch.data_check.check_rig import check_rig
 from directshape_torch.data_check.check_times import check_times
 from directshape_torch.data_check.frame_parts import gather_evidence, numbers_of, read_parts
-from directshape_torch.errors import InputError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_calibration import SPOILS_CAMERA, check_calibration
@@ -18,6 +19,8 @@ from directshape_torch.scene_check.check_scene import Pair, check_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 
 DEFAULT_MAX_FRAMES = 20
+REPORT_SCHEMA_VERSION = 1
+_NAMED = 3
 
 
 def check_dataset(
@@ -98,3 +101,45 @@ def _no_cars() -> Finding:
         "lines of class Car (or --classes) with positive h w l and a location",
         "check names of classes and the folder of detections",
     )
+
+
+def check_files(dataset: FileStereoDataset) -> list[Finding]:
+    """One finding for each kind of file that is missing; looks at names only, so all frames can be asked."""
+    missing: dict[str, list[str]] = {}
+    for frame_id in dataset.frame_ids:
+        for role, path in _files(dataset, frame_id):
+            if not path.is_file():
+                missing.setdefault(role, []).append(str(path))
+    return [_finding(role, paths, len(dataset)) for role, paths in missing.items()]
+
+
+def _files(dataset: FileStereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
+    try:
+        return [(role.rstrip("_0123456789"), path) for role, path in dataset.input_files(frame_id).items()]
+    except DataFormatError as error:
+        # A file that names others is itself missing, or damaged: then that is found when the frame is read.
+        left, right = dataset.layout.images(frame_id)
+        return [("image_left", left), ("image_right", right), ("list of masks", error.path)]
+
+
+def _finding(role: str, paths: list[str], num_frames: int) -> Finding:
+    more = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
+    return Finding(
+        "missing_files",
+        "error",
+        f"{len(paths)} of {num_frames} frames",
+        f"no {role.replace('_', ' ')}: {', '.join(paths[:_NAMED])}{more}",
+        "every frame to have all of its files",
+        "add them, or leave the frames out with --split or --frames",
+    )
+
+
+def report_content(report: CheckReport) -> dict[str, Any]:
+    """A report for programs (schema 1)."""
+    return {
+        "schema_version": REPORT_SCHEMA_VERSION,
+        "frames": report.num_frames,
+        "checked_frames": report.num_checked,
+        "cars": report.num_cars,
+        "findings": [asdict(finding) for finding in report.findings],
+    }

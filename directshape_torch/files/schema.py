@@ -14,8 +14,14 @@ from directshape_torch.errors import DataFormatError, shown
 _RecordT = TypeVar("_RecordT")
 
 
-def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "") -> _RecordT:
+def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "", where: str = "") -> _RecordT:
     """A dataclass of plain values, lists and mappings from a JSON object that holds its fields.
+
+    Args:
+        path, cure: for the message.
+        cls: the dataclass.
+        content: the object.
+        where: in the file, before the name of a field, such as "objects[0].".
 
     Raises:
         DataFormatError: a field is missing, unknown, or not of its type; names file, field, type and value.
@@ -30,22 +36,31 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
         directshape_torch.errors.DataFormatError: a.json: frame: expected str, got 107
     """
     if not isinstance(content, dict):
-        raise DataFormatError(path, f"expected an object, got {shown(content)}", cure=cure)
+        raise DataFormatError(path, f"{where.rstrip('.')} expected an object, got {shown(content)}".strip(), cure=cure)
     known = {each.name: each for each in fields(cls)}  # type: ignore[arg-type]
     needed = {name for name, each in known.items() if each.default is MISSING and each.default_factory is MISSING}
     for wrong in sorted({*content} - {*known}) + sorted(needed - {*content}):
-        raise DataFormatError(path, f"{shown(wrong)} is {'missing' if wrong in needed else 'unknown'}", cure=cure)
+        said = "missing" if wrong in needed else "unknown"
+        raise DataFormatError(path, f"{where}{shown(wrong)} is {said}", cure=cure)
     hints = typing.get_type_hints(cls)
     for name, value in content.items():
-        check_type(path, name, value, hints[name], cure)
+        check_type(path, f"{where}{name}", value, hints[name], cure)
     return cls(**content)
 
 
 def check_type(path: Path | str, where: str, value: Any, hint: Any, cure: str = "") -> None:
     """Raise `DataFormatError` where a value, or one within it, is not of its type."""
     for place, wrong, expected in _misfits(where, value, hint):
-        words = getattr(expected, "__name__", str(expected)) if isinstance(expected, type) else str(expected)
-        raise DataFormatError(path, f"{place}: expected {words}, got {shown(wrong)}", cure=cure)
+        raise DataFormatError(path, f"{place}: expected {_words(expected)}, got {shown(wrong)}", cure=cure)
+
+
+def _words(hint: Any) -> str:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(map(_words, arguments))
+    if origin is tuple:
+        return f"a list of {len(arguments)}"
+    return "nothing" if hint is type(None) else hint.__name__ if isinstance(hint, type) else str(hint)
 
 
 def _misfits(where: str, value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]]:
@@ -65,6 +80,10 @@ def _misfits(where: str, value: Any, hint: Any) -> Iterator[tuple[str, Any, Any]
         fits = isinstance(value, list)
         for index, item in enumerate(value if fits else ()):
             yield from _misfits(f"{where}[{index}]", item, arguments[0])
+    elif origin is tuple:
+        fits = isinstance(value, list) and len(value) == len(arguments)
+        for index, item in enumerate(value if fits else ()):
+            yield from _misfits(f"{where}[{index}]", item, arguments[index])
     elif typing.is_typeddict(hint):
         fits = isinstance(value, dict) and hint.__required_keys__ <= value.keys()
         hints = typing.get_type_hints(hint)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -88,22 +90,18 @@ class FolderLayout(FrameLayout):
 
     def calibration(self, frame_id: str) -> KittiCalibration:
         """The projections of the rig, with the left camera's frame as `ref`."""
-        rig = self.rig
-        P2 = np.concatenate([rig.K_left, np.zeros((3, 1))], axis=1)
-        P3 = np.concatenate([rig.K_right, (rig.K_right @ rig.t_right_cam)[:, None]], axis=1)
-        return KittiCalibration(rig.path, P2, P3)
+        return KittiCalibration(self.root / "rig.json", *self.rig.projections())
 
     def plane_path(self, frame_id: str) -> Path | None:
         """The frame's file, where it holds a plane."""
-        frame = self._frame(frame_id)
-        return None if frame.ground_plane_cam is None else frame.path
+        return None if self._frame(frame_id).ground_plane is None else self.detection_path(frame_id)
 
     def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
         """(a, b, c, d) in the left camera's frame."""
-        frame = self._frame(frame_id)
-        if frame.ground_plane_cam is None:
-            raise DataFormatError(frame.path, "holds no 'ground_plane'", cure="add it, or use --ground auto")
-        return upright_plane(frame.path, np.array(frame.ground_plane_cam))
+        plane, path = self._frame(frame_id).ground_plane, self.detection_path(frame_id)
+        if plane is None:
+            raise DataFormatError(path, "holds no 'ground_plane'", cure="add it, or use --ground auto")
+        return upright_plane(path, np.array(plane, np.float64))
 
     def detection_path(self, frame_id: str) -> Path:
         """One file a frame."""
@@ -111,15 +109,12 @@ class FolderLayout(FrameLayout):
 
     def objects(self, frame_id: str) -> list[KittiObject]:
         """The entries of `objects` as KITTI's lines, in which results are written."""
-        frame = self._frame(frame_id)
-        return [self._kitti_object(frame.path, number, entry, True) for number, entry in enumerate(frame.objects, 1)]
+        return self._lines(frame_id, self._frame(frame_id).objects, True)
 
     def labels(self, frame_id: str) -> list[KittiObject] | None:
         """The entries of `labels`, where there are any."""
-        frame = self._frame(frame_id)
-        if frame.labels is None:
-            return None
-        return [self._kitti_object(frame.path, number, entry, False) for number, entry in enumerate(frame.labels, 1)]
+        labels = self._frame(frame_id).labels
+        return None if labels is None else self._lines(frame_id, labels, False)
 
     def sequence_of(self, frame_id: str) -> str:
         """All frames are of one drive."""
@@ -127,7 +122,8 @@ class FolderLayout(FrameLayout):
 
     def times_s(self, frame_id: str) -> tuple[float, float] | None:
         """Those of the frame's file, where it has them."""
-        return self._frame(frame_id).times_s
+        times_s = self._frame(frame_id).times_s
+        return None if times_s is None else (times_s[0], times_s[1])
 
     def masks(self, directory: Path | None) -> MaskSource | None:
         """Those of the frames' files, unless a folder of others is given."""
@@ -136,25 +132,27 @@ class FolderLayout(FrameLayout):
     def given_masks(self, frame_id: str) -> GivenMasks | None:
         """Each object carries its masks."""
         objects = self._frame(frame_id).objects
-        return {side: [-1 if o.masks[side] is None else row for row, o in enumerate(objects)] for side in SIDES}
+        return {side: [-1 if mask_of(o, side) is None else row for row, o in enumerate(objects)] for side in SIDES}
 
     def _frame(self, frame_id: str) -> FolderFrame:
         return read_frame(self.detection_path(frame_id))
 
-    def _kitti_object(self, path: Path, number: int, entry: FolderObject, with_score: bool) -> KittiObject:
-        line = f"{entry.object_class} -1 -1 {self._columns(path, entry)}"
-        text = f"{line} {entry.score!r}" if with_score else line
-        return replace(parse_object(path, Line(number, text, text)), track_id=entry.track_id)
+    def _lines(self, frame_id: str, entries: Sequence[FolderObject], with_score: bool) -> list[KittiObject]:
+        path, lines = self.detection_path(frame_id), []
+        for number, entry in enumerate(entries, 1):
+            score = f" {float(entry.score)!r}" if with_score else ""
+            text = f"{entry.object_class} -1 -1 {self._columns(path, entry)}{score}"
+            lines.append(replace(parse_object(path, Line(number, text, text)), track_id=entry.track_id))
+        return lines
 
     def _columns(self, path: Path, entry: FolderObject) -> str:
         """Observation angle, 2D box and 3D box of a line."""
-        if entry.hwl is None or entry.bottom_center_cam is None or entry.rotation_y is None:
+        if entry.dimensions_hwl_m is None or entry.bottom_center_m is None or entry.rotation_y_rad is None:
             return f"-10 {_words(entry.box_2d or (0.0, 0.0, 0.0, 0.0))} {_NO_BOX_3D}"
-        x, _, z = entry.bottom_center_cam
-        alpha = math.remainder(entry.rotation_y - math.atan2(x, z), 2 * math.pi)
-        box_3d = _words((*entry.hwl, *entry.bottom_center_cam, entry.rotation_y))
-        box_2d = entry.box_2d or self._projected(path, box_3d)
-        return f"{alpha!r} {_words(box_2d)} {box_3d}"
+        x, _, z = entry.bottom_center_m
+        alpha = math.remainder(entry.rotation_y_rad - math.atan2(x, z), 2 * math.pi)
+        box_3d = _words((*entry.dimensions_hwl_m, *entry.bottom_center_m, entry.rotation_y_rad))
+        return f"{alpha!r} {_words(entry.box_2d or self._projected(path, box_3d))} {box_3d}"
 
     def _projected(self, path: Path, box_3d: str) -> tuple[float, ...]:
         """The 2D box around a 3D box, for objects that give none."""
@@ -181,19 +179,18 @@ class FolderMasks:
     frames_dir: Path
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
-        frame = read_frame(self.frames_dir / f"{frame_id}.json")
-        check_count(frame.path, len(frame.objects), size_hw)
-        found = [
-            self._mask(frame.path, index, entry, side, size_hw)
-            for side in SIDES
-            for index, entry in enumerate(frame.objects)
-            if entry.masks[side] is not None
-        ]
+        path = self.frames_dir / f"{frame_id}.json"
+        objects, found = read_frame(path).objects, []
+        check_count(path, len(objects), size_hw)
+        for side in SIDES:
+            for index, entry in enumerate(objects):
+                if mask_of(entry, side) is not None:
+                    found.append(self._mask(path, index, entry, side, size_hw))
         return [mask for mask in found if mask is not None]
 
     def files(self, frame_id: str) -> tuple[Path, ...]:
         objects = read_frame(self.frames_dir / f"{frame_id}.json").objects
-        named = [entry.masks[side] for side in SIDES for entry in objects]
+        named = [mask_of(entry, side) for side in SIDES for entry in objects]
         return tuple(dict.fromkeys(self.root / mask for mask in named if isinstance(mask, str)))
 
     def _mask(
@@ -205,17 +202,24 @@ class FolderMasks:
             return None
         is_car = entry.object_class == _CAR
         category = min(COCO_CAR_IDS) if is_car else _OTHER_CATEGORY
-        box = entry.box_2d if side == "left" and entry.box_2d is not None else mask_box
+        box = mask_box
+        if side == "left" and entry.box_2d is not None:
+            box = (entry.box_2d[0], entry.box_2d[1], entry.box_2d[2], entry.box_2d[3])
         return InstanceMask(side, index, category, is_car, box, mask_box, probability, entry.score)
 
     def _probability(
         self, path: Path, index: int, entry: FolderObject, side: Side, size_hw: tuple[int, int]
     ) -> NDArray[np.bool_] | NDArray[np.float32]:
-        mask = entry.masks[side]
+        mask = mask_of(entry, side)
         if isinstance(mask, str):
             return read_soft_mask(self.root / mask, size_hw)
         return decode_segmentation(path, f"mask_{side} of objects[{index}]", mask, size_hw)
 
 
-def _words(values: tuple[float, ...]) -> str:
-    return " ".join(repr(value) for value in values)
+def mask_of(entry: FolderObject, side: Side) -> Any:
+    """The path of a PNG, a COCO segmentation, or None."""
+    return entry.mask_left if side == "left" else entry.mask_right
+
+
+def _words(values: Sequence[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)

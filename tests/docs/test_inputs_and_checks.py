@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import fields
 from pathlib import Path
 
 from directshape_torch.cli.options import LAYOUTS
@@ -27,8 +28,9 @@ def test_every_layout_is_in_the_table() -> None:
 
 def test_keys_of_the_folder() -> None:
     documented = first_column(INPUTS.split("## A plain folder")[1])
-    keys = folder_json._RIG_KEYS | folder_json._FRAME_KEYS | folder_json._OBJECT_KEYS
-    assert documented == keys - {"comment"}
+    kinds = (folder_json.FolderRig, folder_json.FolderFrame, folder_json.FolderObject)
+    keys = {field.name.replace("object_class", "class") for kind in kinds for field in fields(kind)}
+    assert documented == keys - {"comment"} | {"schema_version"}
 
 
 def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
@@ -36,7 +38,7 @@ def test_the_smallest_frame_is_one(tmp_path: Path) -> None:
     path = tmp_path / "000000.json"
     path.write_text(json.dumps(json.loads(example)))
     (car,) = folder_json.read_frame(path).objects
-    assert car.bottom_center_cam == (-3.2, 1.6, 14.0)
+    assert car.bottom_center_m == [-3.2, 1.6, 14.0]
 
 
 def test_every_finding_is_in_the_table() -> None:
