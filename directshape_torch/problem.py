@@ -29,7 +29,7 @@ from directshape_torch.rows import CarSums, Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.sharing import INDEPENDENT, Groups, Sharing
+from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.check_term import check_term
 from directshape_torch.terms.photometric import Photometric
@@ -77,7 +77,7 @@ class CarProblem:
         factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
         num_extra: how many of the terms, the last ones, are a user's own.
         num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
-        sharing: the views of a track share their shape.
+        sharing: whose shapes are one (`tracks.py`).
     """
 
     prior: ShapePrior
@@ -150,8 +150,7 @@ class CarProblem:
         terms += extra
         if not terms:
             raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
-        sharing = _sharing(cars, prior.num_codes)
-        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets, sharing)
+        problem = cls(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets)
         if extra:
             code = prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
             sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
@@ -159,8 +158,7 @@ class CarProblem:
                 check_term(term, problem.stages()[0], sight, names)
                 names += term.names
         factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
-        factors = None if factors is None else factors[cars.detection_row]
-        return replace(problem, factors=_once_a_track(problem, factors, cars))
+        return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
 
     def parts(
         self, terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...]
@@ -476,34 +474,6 @@ def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: T
             raise InputError(f"term_weights[{name!r}]", "factors of at least 0", got, cure)
     ones = code.new_ones(len(code))
     return torch.stack([weights[name].to(code) if name in weights else ones for name in names], dim=1)
-
-
-def _sharing(cars: CarBatch, num_codes: int) -> Sharing:
-    """The views of a track share the K unknowns of the code."""
-    if cars.track_id is None:
-        return INDEPENDENT
-    # Numbers below zero are of cars by themselves, no two of which are the same.
-    track = [number if number >= 0 else -1 - row for row, number in enumerate(cars.track_id.tolist())]
-    is_alone = len(set(track)) == len(track)
-    if is_alone:
-        return INDEPENDENT
-    unknowns = torch.arange(6 + num_codes + cars.num_offsets, device=cars.track_id.device)
-    is_shared = (unknowns >= 6) & (unknowns < 6 + num_codes)
-    return Groups.of(track, unknowns[~is_shared], unknowns[is_shared])
-
-
-# What is known of the shape beforehand is known once, however many views there are.
-_OF_SHAPE_ALONE = ("shape", "dimensions")
-
-
-def _once_a_track(problem: CarProblem, factors: Tensor | None, cars: CarBatch) -> Tensor | None:
-    """Factors (B, T) with each view's share of the priors of its track's shape; None for 1."""
-    if problem.sharing is INDEPENDENT:
-        return factors
-    ones = torch.ones_like(cars.input_depth)
-    num_views = problem.sharing.total(ones, ones.bool())
-    share = torch.stack([1 / num_views if name in _OF_SHAPE_ALONE else ones for name in problem.term_names], dim=1)
-    return share if factors is None else share * factors
 
 
 def method_stages(config: RefinerConfig) -> list[StageConfig]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import PurePath
 from typing import NamedTuple, Protocol
 
@@ -15,7 +14,7 @@ from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.diagnosis.box_alignment import align_boxes
 from directshape_torch.diagnosis.car_rows import kept, placed
-from directshape_torch.diagnosis.outcome import Outcome, judged, outcome_of, outcome_of_boxes
+from directshape_torch.diagnosis.outcome import Outcome, outcome_of_boxes
 from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
@@ -30,11 +29,11 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.solver.backward import attached_state
-from directshape_torch.solver.gauss_newton import minimise, search_start
+from directshape_torch.solver.gauss_newton import search_start
 from directshape_torch.status import Status, is_refined
 from directshape_torch.stereo_matching.disparity import with_disparity
-from directshape_torch.terms.cars import CarBatch, CarState, following
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.tracks import refined
 
 
 class KnownRig(Protocol):
@@ -243,16 +242,9 @@ class DirectShapeRefiner(nn.Module):
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
         if self.config.method == "box_alignment":
             return outcome_of_boxes(problem, align_boxes(problem, initial, cars))
-        record = torch.is_grad_enabled() and self.config.backward.mode == "unroll"
         with torch.no_grad():
             start = search_start(problem, initial, cars.search_moves(self.config.search))
-            minimum = minimise(problem, initial, self.config.solver, start, record)
-            outcome = judged(minimum, initial, outcome_of(problem, initial, minimum, cars), self.config.acceptance)
-            minimum = replace(minimum, state=outcome.state, status=outcome.status)
-        if record:
-            start = following(initial, start)
-        state = attached_state(problem, start, minimum, self.config.backward, cars.detection_row)
-        return replace(outcome, state=state)
+        return refined(problem, cars, initial, start)
 
 
 def _config_cure(config: object) -> str:

@@ -40,6 +40,16 @@ class CarRecord:
         """What is known where the condition (B,) holds, NaN elsewhere."""
         return self._with(lambda value: kept(value, condition), per_car=True)
 
+    def put(self, rows: Tensor, others: Self) -> Self:
+        """With the cars `rows` (R,) replaced; figures of another width stay as they are."""
+        changed: dict[str, Any] = {}
+        for (each, value), (_, other) in zip(self._fields(), others._fields(), strict=True):
+            if isinstance(value, CarRecord):
+                changed[each.name] = value.put(rows, other)
+            elif isinstance(value, Tensor) and each.name not in self.shared and value.shape[1:] == other.shape[1:]:
+                changed[each.name] = value.index_copy(0, rows, other)
+        return replace(self, **changed)  # type: ignore[type-var]
+
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
         """On another device and, for floating-point tensors, of another dtype."""
         return self._with(lambda value: value.to(device=device, dtype=dtype if value.is_floating_point() else None))
