@@ -64,12 +64,13 @@ def clear_cars(stream: RerunStream) -> None:
 
 
 def log_painted_cars(stream: RerunStream, painted: PaintedFrame) -> None:
-    """The refined surfaces with the image's colours."""
+    """The refined surfaces with the image's colours, under one name through all frames of a track."""
     for index, one in enumerate(painted.objects):
         surface, paint = painted.mesh(index)
         normals = surface.vertex_normals
         content = mesh(stream, surface.vertices, surface.faces, normals=normals, colours=paint.rgb)
-        stream.log(f"world/cars/{one.line.line_number}", content)
+        track = painted.frame.shapes.tracks[one.car]
+        stream.log(f"world/cars/track_{track}" if track else f"world/cars/{one.line.line_number}", content)
 
 
 def mesh(

@@ -36,6 +36,7 @@ class CarRow:
     Attributes:
         frame: number of its frame in the page.
         line: its line in the detection file, from 1.
+        track: the name of its track, "" for none.
         type: its class.
         status: how its refinement ended.
         refined: whether its state is a refined one.
@@ -55,6 +56,7 @@ class CarRow:
 
     frame: int
     line: int
+    track: str
     type: str
     status: str
     refined: bool
@@ -114,6 +116,7 @@ def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) ->
     return CarRow(
         frame=frame,
         line=int(shapes.input_lines[car]),
+        track=shapes.tracks[car],
         type=kitti.type,
         status=shapes.statuses[car],
         refined=is_refined(shapes.statuses[car]),

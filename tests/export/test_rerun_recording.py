@@ -25,6 +25,7 @@ from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
+from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -254,6 +255,16 @@ def test_without_a_refiner_there_are_frames_alone(finished: FinishedRun, tmp_pat
     assert not any(entity.startswith("/terms/") for entity, _ in recording.rows)
     # Nobody said which boxes went in.
     assert recording.of("/world/boxes/before", "centers")[0, None] == []
+
+
+def test_a_car_moves_under_the_name_of_its_track(finished: FinishedRun, tmp_path: Path) -> None:
+    shutil.copytree(finished.out, tmp_path / "run")
+    for frame in ("000000", "000001"):
+        path = tmp_path / "run" / "shapes" / f"{frame}.npz"
+        write_shapes(path, replace(read_shapes(path), tracks=("000007", "")))
+    export_run(RunFolder(tmp_path / "run"), tmp_path, ["rerun"], finished.inputs())
+    recording = Recording(tmp_path / "recording.rrd")
+    assert {place[0] for place in recording.of("/world/cars/track_000007", "vertex_positions")} == {0, 1}
 
 
 def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -> None:

@@ -66,6 +66,7 @@ def test_json_has_the_columns() -> None:
     values = dict(zip(CAR_COLUMNS, as_json(row(2, iou_after=0.5)), strict=True))
     assert values["frame"] == 2
     assert values["iou_after"] == 0.5
+    assert values["track"] == "000031"
 
 
 def test_gains_are_of_one_kind() -> None:

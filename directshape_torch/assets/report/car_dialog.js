@@ -80,6 +80,7 @@ function figures(car, maps) {
     ["Standard deviation of x, y, z", `${sigmas.slice(0, 3).map((sigma) => number(sigma)).join(", ")} m`],
     ["Standard deviation of the heading", sigmas[3] === null ? "–" : `${number(sigmas[3] * 180 / Math.PI, 1)}°`],
     ["Least seen", car.unseen || "–"],
+    ...(car.track ? [["Track", car.track]] : []),
     ["Score of the detector", number(car.score)],
     ["Iterations", String(car.iterations)],
     ["Cost", `${change(car.cost_before, car.cost_after)} (${percent(costChange(car))})`],

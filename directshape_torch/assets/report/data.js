@@ -27,6 +27,7 @@ export const cars = table.rows.map((values, index) => {
 });
 
 export const hasLabels = cars.some((car) => car.iou_after !== null);
+export const hasTracks = cars.some((car) => car.track !== "");
 export const hasErrorsBefore = cars.some((car) => car.iou_before !== null);
 
 export const carsOfFrame = (frame) => cars.filter((car) => car.frame === frame);

@@ -1,7 +1,7 @@
 // All cars: filter, sort by any column, a hundred rows at a time.
 
 import { element, byId } from "report/dom";
-import { cars, run, hasLabels, hasErrorsBefore } from "report/data";
+import { cars, run, hasLabels, hasErrorsBefore, hasTracks } from "report/data";
 import { MISSING, costChange, iouChange, number, percent, signed, tone } from "report/format";
 import { thumbnail } from "report/thumbnails";
 import { openCar } from "report/car_dialog";
@@ -13,6 +13,7 @@ const words = (title, value) => ({ title, value, text: value, kind: "words" });
 
 const iouTone = (car) => tone(car.iou_before, car.iou_after, true);
 const columns = [
+  ...(hasTracks ? [words("Track", (car) => car.track)] : []),
   numeric("Distance [m]", (car) => car.distance_m, (car) => number(car.distance_m, 1)),
   { title: "Status", value: (car) => car.status, text: (car) => car.status, kind: "status" },
   ...(hasErrorsBefore ? [numeric("IoU before", (car) => car.iou_before)] : []),
@@ -52,7 +53,7 @@ function controls() {
   const choose = element("select", { id: "status-filter", onchange: (event) => { state.status = event.target.value; restart(); } },
     element("option", { value: "" }, "all"), ...run.statuses.map((status) => element("option", { value: status.name }, status.name)));
   return element("div", { class: "controls" },
-    element("label", {}, "Frame or type", search), element("label", {}, "Status", choose),
+    element("label", {}, hasTracks ? "Frame, track or type" : "Frame or type", search), element("label", {}, "Status", choose),
     element("label", { class: "narrow" }, "Sort by", sortChoice()));
 }
 
@@ -89,7 +90,7 @@ function sortBy(column) {
 
 function chosenCars() {
   const found = cars.filter((car) => (state.status === "" || car.status === state.status)
-    && (state.search === "" || `${car.frameId} ${car.type}`.toLowerCase().includes(state.search)));
+    && (state.search === "" || `${car.frameId} ${car.type}${car.track && ` track ${car.track}`}`.toLowerCase().includes(state.search)));
   return state.column === null ? found : found.sort((a, b) => compare(state.column.value(a), state.column.value(b)) || a.index - b.index);
 }
 
