@@ -28,7 +28,6 @@ except ImportError:  # only Unix has it; elsewhere nothing is locked, but the ow
     fcntl = None  # type: ignore[assignment]
 
 LOG_SCHEMA_VERSION = 1
-RunState = Literal["checking", "running", "finished", "stopped"]
 _BEGINNING = b'{"schema": "directshape run", '
 # Not every system has them.
 _LOCK_FLAGS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
@@ -112,7 +111,7 @@ class FrameLine:
 
 
 @dataclass(frozen=True)
-class _Refining:
+class Refining:
     """What earlier runs left has been checked: so many frames are done."""
 
     resumed: int
@@ -120,7 +119,7 @@ class _Refining:
 
 
 @dataclass(frozen=True)
-class _End:
+class RunEnd:
     """The last line: frames that are done, and why others are not."""
 
     end: Literal["finished", "stopped"]
@@ -136,25 +135,15 @@ class LogContents:
 
     Attributes:
         beginning: its first line.
-        state: as the run itself says; one that was killed says nothing.
         frames: the ends of frames so far, by name.
-        num_resumed: frames that earlier runs had finished.
-        refining_since: when the first frame was begun, or None.
-        ended_at: or None.
-        num_done: frames that are done, those of earlier runs included.
-        failed: the others, with the reason.
-        reason: why the run was stopped, or None.
+        refining: after the check of what earlier runs left, or None.
+        end: or None; a run that was killed says nothing.
     """
 
     beginning: RunBeginning
-    state: RunState
     frames: Mapping[str, FrameLine]
-    num_resumed: int
-    refining_since: float | None
-    ended_at: float | None
-    num_done: int
-    failed: Mapping[str, str]
-    reason: str | None
+    refining: Refining | None
+    end: RunEnd | None
 
 
 class RunLog:
@@ -200,7 +189,7 @@ class RunLog:
 
     def refining(self, resumed: int) -> None:
         """What earlier runs left is checked."""
-        self._append(asdict(_Refining(resumed, time.time())))
+        self._append(asdict(Refining(resumed, time.time())))
 
     def frame(self, frame_id: str, failure: str | None) -> None:
         """A frame has ended."""
@@ -208,7 +197,9 @@ class RunLog:
 
     def end(self, done: int, failed: Mapping[str, str], reason: str | None) -> None:
         """The run has ended; of one that was stopped with the reason."""
-        self._append(asdict(_End("finished" if reason is None else "stopped", time.time(), done, dict(failed), reason)))
+        self._append(
+            asdict(RunEnd("finished" if reason is None else "stopped", time.time(), done, dict(failed), reason))
+        )
 
     def _append(self, content: Mapping[str, Any]) -> None:
         """All of a line or, where that fails, nothing."""
@@ -284,30 +275,11 @@ def read_log(out_dir: Path) -> LogContents | None:
     first, is_whole, rest = read_bytes(path).partition(b"\n")
     if not is_whole and first[: len(_BEGINNING)] == _BEGINNING[: len(first)]:  # cut short, or not yet written
         return None
-    beginning, frames = _beginning(path, first), dict[str, FrameLine]()
-    refining: _Refining | None = None
-    end: _End | None = None
-    for line in rest.splitlines():
-        found = _line(path, line)
-        if isinstance(found, FrameLine):
-            frames[found.frame] = found
-        elif isinstance(found, _Refining):
-            refining = found
-        elif found is not None:
-            end = found
-    resumed = 0 if refining is None else refining.resumed
-    failed = {name: line.failure for name, line in frames.items() if line.failure is not None}
-    return LogContents(
-        beginning,
-        end.end if end is not None else "checking" if refining is None else "running",
-        frames,
-        resumed,
-        None if refining is None else refining.at,
-        None if end is None else end.at,
-        resumed + len(frames) - len(failed) if end is None else end.done,
-        failed if end is None else end.failed,
-        None if end is None else end.reason,
-    )
+    lines = [found for line in rest.splitlines() if (found := _line(path, line)) is not None]
+    frames = {found.frame: found for found in lines if isinstance(found, FrameLine)}
+    refining = next((found for found in lines if isinstance(found, Refining)), None)
+    end = next((found for found in lines if isinstance(found, RunEnd)), None)
+    return LogContents(_beginning(path, first), frames, refining, end)
 
 
 def _beginning(path: Path, line: bytes) -> RunBeginning:
@@ -321,11 +293,11 @@ def _beginning(path: Path, line: bytes) -> RunBeginning:
     return record_of(path, RunBeginning, content, cure)
 
 
-def _line(path: Path, line: bytes) -> FrameLine | _Refining | _End | None:
+def _line(path: Path, line: bytes) -> FrameLine | Refining | RunEnd | None:
     """None for one that was cut short."""
     with suppress(DataFormatError):
         content = parse_json(path, line)
-        kind = next((kind for name, kind in (("frame", FrameLine), ("resumed", _Refining)) if name in content), _End)
+        kind = next((kind for name, kind in (("frame", FrameLine), ("resumed", Refining)) if name in content), RunEnd)
         return record_of(path, kind, content)  # type: ignore[return-value]
     return None
 

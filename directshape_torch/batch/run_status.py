@@ -63,33 +63,39 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     run = read_log(Path(out_dir))
     if run is None:
         raise DataFormatError(out_dir, "has no run.jsonl, so no run of 'directshape refine' is or was here")
-    has_ended = run.ended_at is not None
-    is_alive = not has_ended and run.beginning.is_alive is not False
+    is_alive = run.beginning.is_alive is not False
+    # It may have ended since it was read.
+    run = run if is_alive else read_log(Path(out_dir)) or run
+    end, is_alive = run.end, is_alive and run.end is None
+    resumed = 0 if run.refining is None else run.refining.resumed
+    failed = {name: line.failure for name, line in run.frames.items() if line.failure is not None}
+    num_done = resumed + len(run.frames) - len(failed)
+    num_left = run.beginning.num_frames - resumed - len(run.frames)
     times = sorted(line.at for line in run.frames.values())
-    rate = None if has_ended else _rate(run, times, (time.time() if now is None else now) if is_alive else None)
-    num_left = run.beginning.num_frames - run.num_done - len(run.failed)
+    rate = None if end is not None else _rate(run, times, (time.time() if now is None else now) if is_alive else None)
+    going = "checking" if run.refining is None else "running"
     return RunStatus(
-        state=run.state if has_ended or is_alive else "killed",
+        state=end.end if end is not None else going if is_alive else "killed",
         owner=run.beginning.owner if is_alive else None,
         work=run.beginning.work,
         num_frames=run.beginning.num_frames,
-        num_done=run.num_done,
-        num_resumed=run.num_resumed,
-        failed=run.failed,
+        num_done=num_done if end is None else end.done,
+        num_resumed=resumed,
+        failed=failed if end is None else end.failed,
         frames_per_s=rate,
         seconds_left=num_left / rate if rate and is_alive else None,
-        last_frame_at=run.ended_at or max(times, default=None),
-        reason=run.reason,
+        last_frame_at=max(times, default=None) if end is None else end.at,
+        reason=None if end is None else end.reason,
     )
 
 
 def _rate(run: LogContents, all_times: Sequence[float], now: float | None) -> float | None:
     """Frames a second, of the latest ones; a run that is stuck becomes slower with every second that passes."""
     times = all_times[-_RECENT_FRAMES:]
-    if not times or run.refining_since is None:
+    if not times or run.refining is None:
         return None
     is_all = len(times) == len(all_times)
-    start, count = (run.refining_since, len(times)) if is_all else (times[0], len(times) - 1)
+    start, count = (run.refining.at, len(times)) if is_all else (times[0], len(times) - 1)
     # The frames in work are between two ends, so the mean gap is past before a silence says anything.
     gap = (times[-1] - start) / count
     end = times[-1] if now is None else max(times[-1], now - gap)

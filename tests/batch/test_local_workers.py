@@ -12,7 +12,7 @@ from helpers.output_folders import result_files
 
 from directshape_torch.batch.options import RefineOptions, SilentObserver, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.batch.run_log import read_log
+from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -61,8 +61,7 @@ def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root:
     assert found == expected
     assert sorted(call.frame_ids for call in summary.timings.calls) == [FRAMES[:2], FRAMES[2:4], FRAMES[4:]]
     assert (summary.timings.workers, summary.timings.threads) == (2, 1)
-    run = read_log(tmp_path / "two")
-    assert run is not None
+    run = read_status(tmp_path / "two")
     assert (run.state, run.num_done) == ("finished", len(FRAMES))
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from directshape_torch.batch.run_log import OutputLostError, RunBeginning, RunLog, log_path, read_log
+from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError, RunInProgressError
 
 # Does not end by itself: holds the folder until it is killed.
@@ -75,23 +76,14 @@ def written(out: Path) -> bytes:
 
 def test_a_log_cut_anywhere_says_what_its_whole_lines_say(tmp_path: Path) -> None:
     content = written(tmp_path)
-    states: list[tuple[str | None, int | None]] = []
+    states: list[tuple[str, int] | None] = []
     for end in range(len(content) + 1):
         log_path(tmp_path).write_bytes(content[:end])
-        log = read_log(tmp_path)
-        states.append((None, None) if log is None else (log.state, log.num_done))
+        status = None if read_log(tmp_path) is None else read_status(tmp_path)
+        states.append(None if status is None else (status.state, status.num_done))
     in_order = list(dict.fromkeys(states))
-    assert in_order == [
-        (None, None),
-        ("checking", 0),
-        ("running", 2),
-        ("running", 3),
-        ("running", 4),
-        ("finished", 4),
-    ]
-    log = read_log(tmp_path)
-    assert log is not None
-    assert log.failed == {"000001": "cut short"}
+    assert in_order == [None, ("checking", 0), ("running", 2), ("running", 3), ("running", 4), ("finished", 4)]
+    assert read_status(tmp_path).failed == {"000001": "cut short"}
 
 
 @pytest.mark.parametrize(
@@ -148,7 +140,8 @@ def test_what_a_full_disk_took_of_a_line_is_taken_back(tmp_path: Path) -> None:
         log.refining(2)
     found = read_log(tmp_path)
     assert found is not None
-    assert (found.state, found.num_resumed) == ("running", 2)
+    assert found.refining is not None
+    assert found.refining.resumed == 2
 
 
 def test_a_beginning_comes_back(tmp_path: Path) -> None:

@@ -86,6 +86,20 @@ def test_states(tmp_path: Path) -> None:
     assert "stopped: the disk is full; the same command again goes on" in format_status(read_status(tmp_path))
 
 
+def test_a_run_that_ends_while_it_is_asked_is_not_taken_for_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ends(_: RunBeginning) -> bool:
+        with log_path(tmp_path).open("a") as file:
+            file.write(json.dumps(end(12, {})) + "\n")
+        return False
+
+    begun(tmp_path, *frames([]))
+    monkeypatch.setattr(RunBeginning, "is_alive", property(ends))
+    status = read_status(tmp_path)
+    assert (status.state, status.num_done, status.num_left) == ("finished", 12, 0)
+
+
 def test_many_failures_are_counted_and_few_shown(tmp_path: Path) -> None:
     begun(tmp_path, end(0, {f"{number:06d}": "cut short" for number in range(30)}), num_frames=30)
     lines = format_status(read_status(tmp_path), num_failures=4).splitlines()
