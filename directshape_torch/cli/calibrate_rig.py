@@ -30,7 +30,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add the command and its options."""
     parser = subparsers.add_parser(
         "calibrate-rig",
-        aliases=["calibrate-stereo"],
         help="what a stereo rig's disparities and a detector's depths are off by",
         description=_DESCRIPTION,
     )

@@ -64,8 +64,8 @@ def add_layout_options(group: argparse._ActionsContainer, required: bool = False
 
 
 def add_rig_option(group: argparse._ActionsContainer, words: str) -> None:
-    """`--rig`, and `--stereo-bias`, which it was called."""
-    group.add_argument("--rig", "--stereo-bias", default="none", metavar="FILE|none", help=words)
+    """`--rig`."""
+    group.add_argument("--rig", default="none", metavar="FILE|none", help=words)
 
 
 def add_mask_options(group: argparse._ActionsContainer) -> None:

@@ -141,7 +141,7 @@ def test_stereo_bias_is_used_and_hashed(source: Path, tmp_path: Path, capsys: py
     rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
     DisparityField(coefficients=coefficients, hull_uv=hull, size_wh=(160, 120), **rig).save(tmp_path / "bias.json")
     assert main(command(source, tmp_path / "without")) == 0
-    assert main(command(source, tmp_path / "with", "--stereo-bias", str(tmp_path / "bias.json"))) == 0
+    assert main(command(source, tmp_path / "with", "--rig", str(tmp_path / "bias.json"))) == 0
     name = "data/000000.txt"
     assert (tmp_path / "with" / name).read_text() != (tmp_path / "without" / name).read_text()
     assert main(command(source, tmp_path / "with")) == 2

@@ -47,7 +47,7 @@ def test_notes_say_what_is_missing(run: FinishedRun, tmp_path: Path, capsys: pyt
         (["--frames", "1", "9"], "got 9"),
         (["--max-frames", "-1"], "most_frames"),
         (["--detections", "."], "--data"),
-        (["--stereo-bias", "field.json"], "--data"),
+        (["--rig", "field.json"], "--data"),
         (["--prior", "neural"], "the prior of the run"),
         (["--data", "nowhere"], "training"),
         (["--masks", "a", "--masks-left", "b", "--data", "{root}"], "either a folder (--masks DIR) or COCO files"),

@@ -104,11 +104,11 @@ def write_frame(root: Path, frame_id: str, bias_px: float, focal_px: float = FOC
     (training / "calib" / f"{frame_id}.txt").write_text("\n".join(lines) + "\n")
 
 
-def calibrate(root: Path, *more: str, command: str = "calibrate-rig") -> int:
+def calibrate(root: Path, *more: str) -> int:
     parser = argparse.ArgumentParser()
     calibrate_rig.add_parser(parser.add_subparsers())
     args = parser.parse_args(
-        [command, "--data", str(root), "--from", "disparity", "--out", str(root / "bias.json"), *more]
+        ["calibrate-rig", "--data", str(root), "--from", "disparity", "--out", str(root / "bias.json"), *more]
     )
     return int(args.run(args))
 
@@ -149,10 +149,10 @@ def test_command_reports_a_damaged_frame_and_goes_on(tmp_path: Path, capsys: pyt
     assert rig.pixels["disparity"].num_frames == 1
 
 
-def test_evidence_of_a_file_stays_and_the_old_name_of_the_command_works(tmp_path: Path) -> None:
+def test_evidence_of_a_file_stays(tmp_path: Path) -> None:
     write_frame(tmp_path, "000001", bias_px=-0.6)
     assert calibrate(tmp_path) == 0
-    assert calibrate(tmp_path, "--rig", str(tmp_path / "bias.json"), command="calibrate-stereo") == 0
+    assert calibrate(tmp_path, "--rig", str(tmp_path / "bias.json")) == 0
     (rig,) = load_rigs(tmp_path / "bias.json")
     assert rig.pixels["disparity"].num_frames == 2
 
