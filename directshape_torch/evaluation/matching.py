@@ -107,11 +107,7 @@ def match_by_iou(
     return partner
 
 
-def match_to_labels(
-    detections: Sequence[KittiObject],
-    labels: Sequence[KittiObject],
-    minimum_iou_2d: float = MINIMUM_IOU_2D,
-) -> list[int]:
+def match_to_labels(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> list[int]:
     """For each detection the index of its label, or -1: largest 2D overlap first, one to one.
 
     Labels of every class with a 3D box compete, so that a detection of a van is not given to the car behind it; which
@@ -119,7 +115,7 @@ def match_to_labels(
     """
     known = [index for index, label in enumerate(labels) if label.has_box_3d]
     boxes = _image_boxes(detections), _image_boxes([labels[index] for index in known])
-    return [known[column] if column >= 0 else -1 for column in match_by_iou(box_iou_2d(*boxes), minimum_iou_2d)]
+    return [known[column] if column >= 0 else -1 for column in match_by_iou(box_iou_2d(*boxes))]
 
 
 def named_frames(frames: Iterable[str | int] | None, split: Path | str | None) -> tuple[str, ...] | None:

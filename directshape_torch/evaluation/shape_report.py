@@ -22,6 +22,7 @@ SURFACES = {
     "visible": "points that the left image shows, of the truth and of 4000 uniform by area on the estimate",
     "whole": "the true surface points as supplied, and 4000 uniform by area on the closed estimate",
 }
+_CARS_NAMED = 8
 _PLAIN = ("frame_id", "detection_line", "label_line", "car", "status", "depth_m", "segment")
 
 
@@ -68,14 +69,10 @@ def _heading(scores: ShapeScores) -> str:
     if scores.truth == "disparity":
         lines.append(
             "segments are the given masks, not an object map: "
-            + ", ".join(f"{c.frame_id} {c.segment}" for c in _few(scores))
+            + ", ".join(f"{c.frame_id} {c.segment}" for c in scores.cars[:_CARS_NAMED])
         )
     lines.append("in brackets: 95 % intervals, bootstrap over cars" if cars > 1 else "one car: no intervals")
     return "\n".join(lines)
-
-
-def _few(scores: ShapeScores, most: int = 8) -> Sequence[EvaluatedCar]:
-    return scores.cars[:most]
 
 
 def _surface_heading(surface: SurfaceSummary) -> str:

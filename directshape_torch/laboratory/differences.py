@@ -53,13 +53,12 @@ class DifferenceSweep:
     rounding: Tensor
 
 
-def sweep(evaluate: Evaluate, units: Tensor, seed: int = 0) -> list[DifferenceSweep]:
+def sweep(evaluate: Evaluate, units: Tensor) -> list[DifferenceSweep]:
     """Difference several functions at zero displacement by each of their D unknowns.
 
     Args:
         evaluate: the functions.
         units: (D,) the length that a step of one stands for in each unknown.
-        seed: of the jitter that measures the noise.
 
     Examples:
         >>> found = sweep(lambda delta: [torch.sin(1 + delta)], torch.ones(1, dtype=torch.float64))[0]
@@ -67,7 +66,7 @@ def sweep(evaluate: Evaluate, units: Tensor, seed: int = 0) -> list[DifferenceSw
         True
     """
     centre = evaluate(torch.zeros_like(units))
-    noise = _noise(evaluate, centre, units, seed)
+    noise = _noise(evaluate, centre, units)
     # (S, D) pairs of ends, for each function.
     moves = torch.diag(units)
     ends = [[(evaluate(step * move), evaluate(-step * move)) for move in moves] for step in STEPS]
@@ -80,8 +79,8 @@ def sweep(evaluate: Evaluate, units: Tensor, seed: int = 0) -> list[DifferenceSw
     return sweeps
 
 
-def _noise(evaluate: Evaluate, centre: Sequence[Tensor], units: Tensor, seed: int) -> list[Tensor]:
-    generator = torch.Generator().manual_seed(seed)
+def _noise(evaluate: Evaluate, centre: Sequence[Tensor], units: Tensor) -> list[Tensor]:
+    generator = torch.Generator().manual_seed(0)
     noise = [torch.finfo(units.dtype).eps * value.abs() for value in centre]
     for _ in range(_NUM_JITTERS):
         direction = torch.rand(len(units), generator=generator, dtype=torch.float64).to(units) * 2 - 1

@@ -36,16 +36,8 @@ class FieldDifference:
         )
 
 
-def compare_fields(
-    first: DisparityField,
-    second: DisparityField,
-    rows: tuple[float, float] | None = None,
-) -> FieldDifference:
-    """Compare two fields of one rig inside of both hulls.
-
-    Args:
-        first, second: of the same images and calibration.
-        rows: only between these image rows; cars are near the horizon.
+def compare_fields(first: DisparityField, second: DisparityField) -> FieldDifference:
+    """Compare two fields of the same images and calibration inside of both hulls.
 
     Raises:
         InputError: they belong to different rigs, or their hulls have nothing in common.
@@ -59,8 +51,6 @@ def compare_fields(
     first.check_rig(second.size_wh, second.K_left, second.K_right, second.T_right_cam)
     uv = _grid(first.size_wh)
     common = _inside(uv, first) & _inside(uv, second)
-    if rows is not None:
-        common = common & (uv[:, 1] >= rows[0]) & (uv[:, 1] <= rows[1])
     if not bool(common.any()):
         raise InputError("fields", "hulls with a common part", "none", "fit the fields to more of the image")
     inside = uv[common]

@@ -71,7 +71,6 @@ def observe_disparity(
     image_right: NDArray[np.uint8],  # (H, W, 3)
     camera: StereoCamera,  # one frame; its disparity field is not used
     known: KnownDepth,
-    subpixel: bool = True,
 ) -> DisparityObservations:
     """Measure the disparity at pixels of known depth: semi-global matching, then alignment of small patches.
 
@@ -79,7 +78,6 @@ def observe_disparity(
         image_left, image_right: rectified pair.
         camera: calibration of the frame.
         known: at most 30 000 of them are used, evenly over the image.
-        subpixel: False keeps the semi-global disparity, which leans towards whole pixels.
 
     Returns:
         the observations where both methods found the point; deterministic.
@@ -95,11 +93,10 @@ def observe_disparity(
     usable = torch.nonzero((measured - displacement[:, 0]).abs() < _LARGEST_DIFFERENCE_PX)[:, 0]
     chosen = usable[_evenly(known.uv_left[usable], (width, height), _POINTS_PER_FRAME)]
     uv, true, measured = known.uv_left[chosen], displacement[chosen], measured[chosen]
-    keep, row_shift = torch.ones(len(uv), dtype=torch.bool), true[:, 1]
-    if subpixel:
-        left, right = (_grey(image) for image in (image_left, image_right))
-        measured, row_shift, keep = refine_disparity(left, right, uv, measured, true[:, 1])
-        keep = keep & ((measured - true[:, 0]).abs() < _LARGEST_DIFFERENCE_PX)
+    # The semi-global disparity leans towards whole pixels.
+    left, right = (_grey(image) for image in (image_left, image_right))
+    measured, row_shift, keep = refine_disparity(left, right, uv, measured, true[:, 1])
+    keep = keep & ((measured - true[:, 0]).abs() < _LARGEST_DIFFERENCE_PX)
     bias, vertical = measured - true[:, 0], true[:, 1] - row_shift
     return DisparityObservations(uv[keep], bias[keep], vertical[keep], known.depth_m[chosen][keep])
 

@@ -22,7 +22,9 @@ from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 from directshape_torch.shape.tensor_file import read_tensors, write_tensors
 
-_CURE = "make one with: python scripts/build_kernel_prior.py"
+_CURE = "make one with: python scripts/build_bundled_prior.py --kernel 32 --out FILE"
+# Of the Gaussian kernel between cars, in units of their root mean square distance.
+_FEATURE_WIDTH = 4.0
 _GRIDS = ("subspace.mean", "subspace.basis")
 
 
@@ -154,7 +156,6 @@ class KernelPCAShapePrior(nn.Module):
         num_codes: int,
         provenance: PriorProvenance,
         num_components: int = 32,
-        feature_width: float = 4.0,
         kernel_width: float = 4.0,
         ridge: float = 1.0,
     ) -> KernelPCAShapePrior:
@@ -164,7 +165,6 @@ class KernelPCAShapePrior(nn.Module):
             sdf_samples, origin, spacing_m, provenance: as for `PCAShapePrior.fit`.
             num_codes: K kernel principal components.
             num_components: M linear components that hold the grids, num_codes <= M < N.
-            feature_width: of the Gaussian kernel between cars, in units of their root mean square distance.
             kernel_width: of the kernels of the pre-image, in standard deviations of the code.
             ridge: regularisation of the pre-image; larger is smoother.
 
@@ -176,7 +176,7 @@ class KernelPCAShapePrior(nn.Module):
         subspace = PCAShapePrior.fit(sdf_samples, origin, spacing_m, num_components, provenance).double()
         coordinates = training_codes(sdf_samples, num_components)  # (N, M), variance 1 each
         scale = subspace.explained_variance_ratio.sqrt()
-        anchors = _kernel_components(coordinates * scale, num_codes, feature_width)
+        anchors = _kernel_components(coordinates * scale, num_codes)
         offset, linear, weights = _ridge_regression(anchors, coordinates, kernel_width, ridge)
         width = anchors.new_tensor(kernel_width)
         fitted = cls(subspace, anchors=anchors, weights=weights, linear=linear, offset=offset, kernel_width=width)
@@ -228,9 +228,9 @@ class CurvedGridShape:
         return SdfDerivatives(at.value, at.gradient, J_value_code)
 
 
-def _kernel_components(coordinates: Tensor, num_codes: int, feature_width: float) -> Tensor:
+def _kernel_components(coordinates: Tensor, num_codes: int) -> Tensor:
     """Leading kernel principal components (N, K) of the samples (N, M), mean 0 and variance 1 each."""
-    width = feature_width * float((torch.cdist(coordinates, coordinates) ** 2).mean().sqrt())
+    width = _FEATURE_WIDTH * float((torch.cdist(coordinates, coordinates) ** 2).mean().sqrt())
     kernel = _gaussian(coordinates, coordinates, width)
     centred = kernel - kernel.mean(0) - kernel.mean(1, keepdim=True) + kernel.mean()
     vectors = torch.linalg.eigh(centred).eigenvectors.flip(1)[:, :num_codes]

@@ -16,6 +16,8 @@ from directshape_torch.shape.shape_prior import DimensionsDerivative
 
 # Codes within this many standard deviations of the mean are 'in use': the Lipschitz bound covers them.
 CODE_NORM_IN_USE = 3.0
+# Spread of the weight of grid nodes about the samples' surfaces.
+_SURFACE_BAND_M = 0.2
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,7 @@ class PCAShapePrior(nn.Module):
         spacing_m: float,
         num_codes: int,
         provenance: PriorProvenance,
-        surface_band_m: float | None = 0.2,
+        surface_band_m: float | None = _SURFACE_BAND_M,
     ) -> PCAShapePrior:
         """Principal components of N signed distance grids.
 
@@ -255,19 +257,15 @@ class PCAShapePrior(nn.Module):
         self.spacing_m = float(state)
 
 
-def training_codes(
-    sdf_samples: Tensor,  # (N, nx, ny, nz)
-    num_codes: int,
-    surface_band_m: float | None = 0.2,
-) -> Tensor:  # (N, K)
-    """The whitened codes of the samples that `PCAShapePrior.fit` with the same arguments is made from, float64.
+def training_codes(sdf_samples: Tensor, num_codes: int) -> Tensor:
+    """The whitened codes (N, K) of the samples that `PCAShapePrior.fit` is made from, float64.
 
     Raises:
         InputError: too few samples, or non-finite ones.
     """
     _check_samples(sdf_samples, num_codes)
     samples = sdf_samples.double().flatten(1)
-    return _whitened_codes(samples - samples.mean(dim=0), _surface_weight(samples, surface_band_m), num_codes)[0]
+    return _whitened_codes(samples - samples.mean(dim=0), _surface_weight(samples, _SURFACE_BAND_M), num_codes)[0]
 
 
 def _check_samples(sdf_samples: Tensor, num_codes: int) -> None:

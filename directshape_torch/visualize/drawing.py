@@ -123,12 +123,11 @@ def draw_box(
     view: View,
     corners_cam: Array,  # (8, 3) in the order of `box_corners`
     colour: Colour,
-    thickness: int = 1,
 ) -> None:
     """The 12 edges of a 3D box, and a line on the ground from its centre to its front."""
     for first, second in BOX_EDGES:
-        draw_segment(view, corners_cam[first], corners_cam[second], colour, thickness)
-    draw_segment(view, corners_cam[:4].mean(axis=0), corners_cam[:2].mean(axis=0), colour, thickness)
+        draw_segment(view, corners_cam[first], corners_cam[second], colour)
+    draw_segment(view, corners_cam[:4].mean(axis=0), corners_cam[:2].mean(axis=0), colour)
 
 
 def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour, thickness: int = 1) -> None:

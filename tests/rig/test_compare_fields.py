@@ -31,12 +31,6 @@ def test_only_the_common_part_of_the_hulls_counts() -> None:
     assert "mean +0.500" in str(difference)
 
 
-def test_rows_limit_the_comparison() -> None:
-    slope = replace(constant(0.0), coefficients=torch.eye(10).double()[2])
-    # Rows 96 and 104 of 0 .. 200 are v = -0.04 and 0.04.
-    assert compare_fields(slope, constant(0.0), rows=(95, 105)).rms_px == pytest.approx(0.04)
-
-
 def test_other_rigs_and_disjoint_hulls_are_refused() -> None:
     other = DisparityField.constant(0.0, (401, 200), torch.eye(3), torch.eye(3), torch.eye(4))
     with pytest.raises(InputError, match="401 x 201"):

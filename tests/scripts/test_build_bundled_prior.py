@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import build_kernel_prior as script
+import build_bundled_prior as script
 import pytest
 
 from directshape_torch.refiner import DirectShapeRefiner
@@ -14,8 +14,8 @@ from directshape_torch.shape.load_prior import load_prior
 
 def test_a_prior_of_five_cars(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "prior.safetensors"
-    words = ["--num-cars", "5", "--num-codes", "2", "--num-components", "3", "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", ["build_kernel_prior", *words])
+    words = ["--num-cars", "5", "--num-codes", "2", "--kernel", "3", "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["build_bundled_prior", *words])
     script.main()
     refiner = DirectShapeRefiner(load_prior(out))
     assert refiner.prior.num_codes == 2
