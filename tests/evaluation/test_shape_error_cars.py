@@ -273,7 +273,7 @@ def test_the_label_of_a_real_frame_beats_a_noisy_detection(tmp_path: Path) -> No
     data = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
     detections = data / "detections" / "noisy_stereo"
     words = ["refine", "--data", data, "--detections", detections, "--masks", data / "training" / "masks"]
-    words += ["--frames", "007322", "--out", tmp_path, "--device", "cpu", "--threads", "1"]
+    words += ["--frames", "007322", "--rig", "none", "--out", tmp_path, "--device", "cpu", "--threads", "1"]
     assert main([*map(str, words), "--set", "stages=[{max_iterations: 1}]"]) == 0
     path = tmp_path / "shapes" / "007322.npz"
     shapes = read_shapes(path)

@@ -144,15 +144,15 @@ def test_one_wall_cannot_tell_bias_from_way(tmp_path: Path) -> None:
 @pytest.mark.skipif(
     "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
 )
-def test_five_real_frames_come_near_the_field_of_ground_truth(
+def test_three_real_frames_come_near_the_field_of_ground_truth(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
     out = tmp_path / "bias.json"
-    assert calibrate(root / "tracking" / "0005", out, "--frames", *(f"{k:06d}" for k in range(5))) == 0
+    assert calibrate(root / "tracking" / "0005", out, "--frames", *(f"{k:06d}" for k in range(3))) == 0
     assert calibrate(root / "tracking" / "0005", out, "--frames", "000000", "000001", "--against", str(out)) == 0
     printed = capsys.readouterr().out
-    assert "from motion (5 frames)" in printed
+    assert "from motion (3 frames)" in printed
     assert "where both have data: mean" in printed
     (field,) = load_fields(out)
     left, middle, right = field.bias(torch.tensor([[60.0, 180.0], [620.0, 180.0], [1180.0, 150.0]]).double()).tolist()
