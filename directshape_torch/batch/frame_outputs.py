@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.refinement_files import write_refinement
-from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.refinement_files import write_result
+from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import (
     FrameRecord,
     frame_entry,
@@ -29,7 +30,9 @@ def write_frame_outputs(
     loaded: LoadedFrame,
     result: RefinementResult,
     first_row: int,
-    made_of: tuple[str, str, Mapping[str, str]],
+    run: str,
+    prior_sha256: str,
+    inputs: Mapping[str, str],
     options: RefineOptions,
 ) -> FrameEntry:
     """Write what the options ask for; the shapes come last, so that where they exist the frame is complete.
@@ -39,13 +42,14 @@ def write_frame_outputs(
         loaded: the frame.
         result: of a call with this frame's detections, alone or in a batch.
         first_row: where the frame's detections begin in `result`.
-        made_of: hashes of the run, of the shape prior and of the frame's input files.
+        run, prior_sha256, inputs: hashes of the manifest, of the shape prior and of the frame's input files.
         options: kinds of files.
 
     Returns:
         The frame's entry in `summary.json`.
     """
-    run, prior_sha256, inputs = made_of
+    path = shapes_path(out_dir, loaded.frame_id)
+    earlier = _earlier_record(path, run, inputs)
     files = [result_path(out_dir, loaded.frame_id)]
     if options.meshes is not None:
         from directshape_torch.batch.mesh_files import write_car_meshes
@@ -56,18 +60,15 @@ def write_frame_outputs(
 
         files.append(overlay_path(out_dir, loaded.frame_id))
         write_png(files[-1], overlay_of_frame(loaded, result, first_row))
-    earlier = _earlier_record(shapes_path(out_dir, loaded.frame_id), run, inputs)
-
-    def record() -> FrameRecord:
-        hashes = {path.relative_to(out_dir).as_posix(): hash_bytes(path.read_bytes()) for path in files}
-        outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
-        # Those of an earlier run stay.
-        if earlier is not None:
-            hashes, outputs = {**earlier.files, **hashes}, outputs.union(earlier.outputs)
-        return FrameRecord(run, inputs, sorted(outputs), hashes, len(loaded.input_objects), masks_right)
-
-    shapes = write_refinement(out_dir, loaded, result, prior_sha256, first_row, lambda: record().text())
-    return frame_entry(shapes, record())
+    shapes = write_result(out_dir, loaded, result, prior_sha256, first_row)
+    hashes = {file.relative_to(out_dir).as_posix(): hash_bytes(file.read_bytes()) for file in files}
+    outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
+    # Those of an earlier run stay.
+    if earlier is not None:
+        hashes, outputs = {**earlier.files, **hashes}, outputs.union(earlier.outputs)
+    record = FrameRecord(run, inputs, sorted(outputs), hashes, len(loaded.input_objects), masks_right)
+    write_shapes(path, replace(shapes, made_of=record.text()))
+    return frame_entry(shapes, record)
 
 
 def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRecord | None:

@@ -186,9 +186,10 @@ class _GroupStep:
 
     def _write(self, ready: _Ready, result: RefinementResult, first_row: int) -> None:
         loaded, job = ready.loaded, self.job
-        made_of = job.run, job.prior_sha256, ready.inputs
         try:
-            entry = write_frame_outputs(job.out_dir, loaded, result, first_row, made_of, job.options)
+            entry = write_frame_outputs(
+                job.out_dir, loaded, result, first_row, job.run, job.prior_sha256, ready.inputs, job.options
+            )
         except _STOPS_THE_RUN:
             raise
         except (DirectShapeError, OSError) as error:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +21,17 @@ from directshape_torch.result import RefinementResult
 
 
 def write_refinement(
-    out_dir: Path | str,
-    loaded: LoadedFrame,
-    result: RefinementResult,
-    prior_sha256: str,
-    first_row: int = 0,
-    made_of: Callable[[], str] = str,
+    out_dir: Path | str, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, first_row: int = 0
+) -> None:
+    """Write both files of a frame, outside of a run; arguments and errors as of `write_result`."""
+    shapes = write_result(out_dir, loaded, result, prior_sha256, first_row)
+    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
+
+
+def write_result(
+    out_dir: Path | str, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, first_row: int = 0
 ) -> ShapeArrays:
-    """Write both files of a frame, and return the content of the second one.
+    """Write the result file of a frame, and return what belongs into the file of its shapes.
 
     Args:
         out_dir: the output folder.
@@ -37,7 +39,6 @@ def write_refinement(
         result: of a call with this frame's detections, alone or in a batch (`collate`).
         prior_sha256: of the shape prior.
         first_row: where the frame's detections begin in `result`.
-        made_of: tells what goes into the shapes, once the result file is there.
 
     Raises:
         InputError: the result does not cover the frame's detections.
@@ -49,9 +50,6 @@ def write_refinement(
     shapes = shape_arrays(loaded, result, prior_sha256, rows)
     boxes = refined_boxes(loaded, shapes, result.refined[rows].tolist())
     write_result_text(result_path(out_dir, loaded.frame_id), loaded.input_objects, boxes)
-    # The shapes last: where they exist, the frame is complete.
-    shapes = replace(shapes, made_of=made_of())
-    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
     return shapes
 
 
