@@ -36,6 +36,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         DirectShapeError: an output folder of another run, or no such device; for the main program to show.
     """
+    from directshape_torch.batch.group_refinement import limited_threads
     from directshape_torch.batch.options import RefineOptions
     from directshape_torch.batch.refine_dataset import refine_dataset
     from directshape_torch.batch.run_summary import format_summary
@@ -51,14 +52,15 @@ def run(args: argparse.Namespace) -> int:
         DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training/masks"
     )
     refiner = make_refiner(args.config, [], "pca", args.device)
-    with ProgressBar() as progress:
+    # Where others share the cores, several threads wait for each other: minutes instead of seconds for one frame.
+    with ProgressBar() as progress, limited_threads(1):
         summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress)
-    for frame_id in dataset.frame_ids:
+        (frame_id,) = dataset.frame_ids
         loaded = dataset.load(frame_id)
         painted = PaintedFrame(RunFolder(args.out).read(frame_id), refiner.prior, loaded)
         write_bytes(args.out / "scene.glb", frame_glb(painted, loaded))
-        print(error_table(loaded, args.out))
+    print(error_table(loaded, args.out))
     print(format_summary(summary))
-    print(f"picture  {args.out / 'overlays' / f'{dataset.frame_ids[0]}.png'}")
+    print(f"picture  {args.out / 'overlays' / f'{frame_id}.png'}")
     print(f"scene    {args.out / 'scene.glb'}")
     return summary.exit_code
