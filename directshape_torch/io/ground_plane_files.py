@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files import atomic_files
@@ -66,3 +67,19 @@ def write_plane(path: Path | str, plane_ref: Sequence[float] | NDArray[np.float6
     """Write a plane `(a, b, c, d)` of the `ref` frame in AVOD's four lines."""
     numbers = " ".join(f"{value:.6e}" for value in plane_ref)
     atomic_files.write_text(path, f"# Plane\nWidth 4\nHeight 1\n{numbers}\n")
+
+
+def plane_ref_to_cam(
+    normal: Tensor,  # (*, 3), the same in both frames
+    offset_ref: Tensor,  # (*,) metres
+    t_cam_ref: Tensor,  # (*, 3) `x_cam = x_ref + t_cam_ref`
+) -> Tensor:  # (*,)
+    """Offset of a plane in camera coordinates, given in KITTI's reference frame: `d_cam = d_ref - n . t_cam_ref`.
+
+    Examples:
+        >>> import torch
+        >>> up = torch.tensor([0.0, -1.0, 0.0])
+        >>> plane_ref_to_cam(up, torch.tensor(1.65), torch.tensor([0.06, 0.01, 0.0]))
+        tensor(1.6600)
+    """
+    return offset_ref - (normal * t_cam_ref).sum(dim=-1)

@@ -18,11 +18,11 @@ from directshape_torch.errors import DataFormatError, DirectShapeError, InputErr
 from directshape_torch.files.names import check_frame_id
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.io.frame_detections import MatchingSummary, build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
+from directshape_torch.io.ground_plane_files import plane_ref_to_cam
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig, to_stereo_camera

@@ -12,7 +12,7 @@ from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.subpixel import refine_disparity
+from directshape_torch.stereo_matching.patch_alignment import refine_disparity
 
 _SETBACK_M = 0.1
 # Share of the box's height in which its sides are near the car's.

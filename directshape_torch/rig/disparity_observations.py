@@ -14,7 +14,7 @@ from directshape_torch.geometry.camera import disparity_of_depth
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.subpixel import refine_disparity
+from directshape_torch.stereo_matching.patch_alignment import refine_disparity
 
 # A match farther from the truth is a wrong match or a hidden point, not a bias.
 _LARGEST_DIFFERENCE_PX = 4.0

@@ -1,4 +1,4 @@
-"""Whether 3D boxes are written as KITTI writes them: axes, origin, heading, order of lengths, units."""
+"""Whether boxes are written as KITTI writes them: axes, origin, heading, order of lengths, units; corners in 2D."""
 
 from __future__ import annotations
 
@@ -8,14 +8,23 @@ import numpy as np
 
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_masks import check_placement
-from directshape_torch.scene_check.convention_scores import ConventionScores, score_conventions
+from directshape_torch.scene_check.conventions import (
+    BoxConvention,
+    ConventionScores,
+    project_conventions,
+    score_conventions,
+)
 from directshape_torch.scene_check.finding import Finding
+from directshape_torch.scene_check.image_boxes import box_iou
+from directshape_torch.scene_check.known_mistakes import found
 
 ALL_FRAMES = "all frames"
 # Mean overlap that another convention must gain for boxes to be taken as written in it: with the observation angles,
 # and without them for many and for few cars. Intact sets gain nothing, single frames of two to six cars up to 0.05.
 MIN_GAIN, MIN_GAIN_IMAGE, MIN_GAIN_OF_FEW = 0.08, 0.06, 0.12
 MANY_CARS = 8
+# Of 2D boxes read as corner and size.
+MIN_GAIN_2D = 0.15
 TIE = 0.04
 MIN_OVERLAP = 0.45
 LENGTHS_M = (2.3, 9.0)
@@ -23,26 +32,17 @@ MIN_CARS_FOR_SHAPE = 4
 MAX_HEIGHT_TO_WIDTH = 1.03
 _ONE_TURN = 2 * np.pi + 0.01
 
-_EXPECTED = {
-    "axes": "x right, y down, z forward, metres, in the frame of the rectified camera",
-    "origin": "the centre of the box's bottom face",
-    "yaw": "rotation_y in radians about the y axis, 0 where the car drives along +x, -pi/2 where it drives along +z",
-    "order": "height, width, length",
-    "focal": "focal lengths of the images as they are",
-    "distance": "metres",
-    "size": "full lengths in metres",
+# Parts of a convention that are a factor: the check that names it, what it multiplies, what is expected, the cure.
+_FACTORS = {
+    "focal": (
+        "focal_length",
+        "focal lengths",
+        "focal lengths of the images as they are",
+        "check K: is it of these images, or of others in size or crop?",
+    ),
+    "distance": ("box_units", "locations", "metres", "write locations in metres"),
+    "size": ("box_units", "lengths", "full lengths in metres", "write full lengths, not halves, in metres"),
 }
-_CURE = {
-    "axes": "turn locations to x right, y down, z forward before writing them",
-    "origin": "write the centre of the bottom face: add half a height to y of a centre (y points down)",
-    "yaw": "convert headings: negate them, add or subtract pi / 2, or turn degrees into radians as found here",
-    "order": "write height, width, length in this order",
-    "focal": "check K: is it of these images, or of others in size or crop?",
-    "distance": "write locations in metres",
-    "size": "write full lengths, not halves, in metres",
-}
-_CHECK = {"focal": "focal_length", "distance": "box_units", "size": "box_units"}
-_FACTOR = {"focal": "focal lengths", "distance": "locations", "size": "lengths"}
 
 
 def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
@@ -84,7 +84,8 @@ def _deviations(scores: ConventionScores, best: int) -> list[Finding]:
     before, after = scores.overlap[0].mean(), scores.overlap[best].mean()
     findings = []
     for part, value in scores.conventions[best].deviations.items():
-        way = f"their {_FACTOR[part]} are multiplied by {value:.4g}" if part in _FACTOR else f"read as '{value}'"
+        check, what, expected, cure = _FACTORS.get(part, (f"box_{part}", "", "", ""))
+        way = f"their {what} are multiplied by {value:.4g}" if what else f"read as '{value}'"
         measured = (
             f"they fit when {way}: projected boxes overlap 2D boxes or masks by {after:.2f} instead of {before:.2f}"
         )
@@ -92,36 +93,29 @@ def _deviations(scores: ConventionScores, best: int) -> list[Finding]:
         if scores.has_angles and shares[0] > shares[1]:
             measured += f", alpha agrees in {shares[0]:.0%} instead of {shares[1]:.0%}"
         where = f"{ALL_FRAMES}, {scores.overlap.shape[1]} cars"
-        findings.append(
-            Finding(_CHECK.get(part, f"box_{part}"), "error", where, measured, _EXPECTED[part], _CURE[part])
-        )
+        findings.append(found(check, where, measured, expected=expected, cure=cure))
     return findings
 
 
 def _unexplained(overlap: float, scores: ConventionScores) -> Finding:
-    return Finding(
-        "box_projection",
-        "error",
-        f"{ALL_FRAMES}, {scores.overlap.shape[1]} cars",
-        f"projected boxes overlap 2D boxes and masks by {overlap:.2f} in the mean, and no known convention does better",
-        f"at least {MIN_OVERLAP}",
-        "check that detections, masks, images and calibration are of the same frames; then frame, origin and units",
+    measured = (
+        f"projected boxes overlap 2D boxes and masks by {overlap:.2f} in the mean, and no known convention does better"
     )
+    return found("box_projection", f"{ALL_FRAMES}, {scores.overlap.shape[1]} cars", measured, limit=MIN_OVERLAP)
 
 
 def _check_lengths(frames: Sequence[FrameEvidence]) -> list[Finding]:
     hwl = np.concatenate([frame.boxes.hwl for frame in frames])
     height, width, _ = np.median(hwl, axis=0)
     longest = float(np.median(hwl.max(axis=1)))
-    where = f"{ALL_FRAMES}, {len(hwl)} cars"
-    if not LENGTHS_M[0] < longest < LENGTHS_M[1]:
-        measured = f"the longest side of a box is {longest:.3g} in the median"
-        cure = "write metres (for larger vehicles use --classes)"
-        return [Finding("box_units", "error", where, measured, f"{LENGTHS_M[0]} to {LENGTHS_M[1]} m", cure)]
+    where, (low, high) = f"{ALL_FRAMES}, {len(hwl)} cars", LENGTHS_M
+    if not low < longest < high:
+        return [
+            found("box_units", where, f"the longest side of a box is {longest:.3g} in the median", low=low, high=high)
+        ]
     if len(hwl) >= MIN_CARS_FOR_SHAPE and height > MAX_HEIGHT_TO_WIDTH * width:
         measured = f"boxes are {height:.2f} m high and {width:.2f} m wide in the median"
-        expected = "cars that are wider than high"
-        return [Finding("box_order", "warning", where, measured, expected, _CURE["order"])]
+        return [found("box_order", where, measured, severity="warning", expected="cars that are wider than high")]
     return []
 
 
@@ -129,5 +123,41 @@ def _check_turns(frames: Sequence[FrameEvidence]) -> list[Finding]:
     yaw = np.concatenate([frame.boxes.rotation_y for frame in frames])
     if np.abs(yaw).max() <= _ONE_TURN:
         return []
-    measured = f"rotation_y reaches {np.abs(yaw).max():.1f}"
-    return [Finding("box_yaw", "error", f"{ALL_FRAMES}, {len(yaw)} cars", measured, _EXPECTED["yaw"], _CURE["yaw"])]
+    return [found("box_yaw", f"{ALL_FRAMES}, {len(yaw)} cars", f"rotation_y reaches {np.abs(yaw).max():.1f}")]
+
+
+def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
+    """Whether `x y width height` fits the projected 3D boxes better than `u_min v_min u_max v_max`."""
+    as_corners, as_size = [], []
+    for frame in frames:
+        projected = project_conventions(frame, [BoxConvention()])[0]
+        for seen, box in zip(frame.boxes.box_2d, projected, strict=True):
+            other = np.array([seen[0], seen[1], seen[0] + seen[2], seen[1] + seen[3]])
+            both = box_iou(box[None], np.stack([seen, other]))[0]
+            as_corners.append(both[0])
+            as_size.append(both[1])
+    if not as_corners or np.mean(as_size) <= np.mean(as_corners) + MIN_GAIN_2D:
+        return []
+    measured = (
+        f"projected 3D boxes overlap 2D boxes by {np.mean(as_corners):.2f}, "
+        f"and by {np.mean(as_size):.2f} when these are read as x y width height"
+    )
+    return [found("box_2d", f"{ALL_FRAMES}, {len(as_corners)} cars", measured)]
+
+
+def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
+    """Whether 2D boxes end after they begin."""
+    boxes = np.concatenate([frame.boxes.box_2d for frame in frames]) if frames else np.empty((0, 4))
+    empty = int(np.sum((boxes[:, 2] <= boxes[:, 0]) | (boxes[:, 3] <= boxes[:, 1])))
+    if not empty:
+        return []
+    return [
+        found(
+            "box_2d",
+            f"{ALL_FRAMES}, {len(boxes)} cars",
+            f"{empty} 2D boxes end before they begin",
+            severity="error" if 2 * empty > len(boxes) else "warning",
+            expected="u_min v_min u_max v_max, pixels, with u_min < u_max and v_min < v_max",
+            cure="leave out detections that are not in the image; masks are found by these boxes",
+        )
+    ]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.scene_check.finding import Finding, Severity
+from directshape_torch.scene_check.known_mistakes import found
 
 # With these wrong, what disparities and projections show says nothing more.
 SPOILS_CAMERA = frozenset({"baseline_sign", "baseline_length", "focal_length", "principal_point"})
@@ -50,16 +51,7 @@ def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: s
         return [_focal(fx, width, where)]
     findings = []
     if abs(fx / fy - 1) > ASPECT_TOLERANCE:
-        findings.append(
-            Finding(
-                "focal_length",
-                "error",
-                where,
-                f"fx = {fx:.1f}, fy = {fy:.1f} px",
-                "the same within 5 percent, as rectified images have",
-                "scale fx, cx with the width and fy, cy with the height of resized images",
-            )
-        )
+        findings.append(found("focal_length", where, f"fx = {fx:.1f}, fy = {fy:.1f} px"))
     return findings + _check_centre((cx, cy), (width, height), where)
 
 
@@ -68,14 +60,8 @@ def _focal(fx: float, width: int, where: str) -> Finding:
     cure = "check the order of the numbers and whether images were resized"
     if 0 < fx < low:
         cure = "divide a focal length in millimetres by the size of a pixel (mm); or were the intrinsics normalised?"
-    return Finding(
-        "focal_length",
-        "error",
-        where,
-        f"fx = {fx:.4g} px for images {width} px wide",
-        f"between {low:.0f} and {high:.0f} px (15 to 150 degrees of view)",
-        cure,
-    )
+    expected = f"between {low:.0f} and {high:.0f} px (15 to 150 degrees of view)"
+    return found("focal_length", where, f"fx = {fx:.4g} px for images {width} px wide", expected=expected, cure=cure)
 
 
 def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:
@@ -86,34 +72,16 @@ def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: 
     resized = across > 0 and abs(across / down - 1) < _SAME_FACTOR and max(across, 1 / across) > _LEAST_FACTOR
     inside = all(0 <= c < n for c, n in zip(centre, size_wh, strict=True))
     severity: Severity = "error" if resized or not inside else "warning"
-    cure = "use the intrinsics of this size of image; cutting moves the point, resizing scales it"
-    if resized:
-        cure = f"K is of images {across:.2f} times as large: multiply fx, fy, cx and cy by {1 / across:.2f}"
+    cure = f"K is of images {across:.2f} times as large: multiply fx, fy, cx and cy by {1 / across:.2f}"
     measured = f"({centre[0]:.1f}, {centre[1]:.1f}) in images of {size_wh[0]} x {size_wh[1]} pixels"
-    return [Finding("principal_point", severity, where, measured, "near the middle of the image", cure)]
+    return [found("principal_point", where, measured, severity=severity, cure=cure if resized else "")]
 
 
 def _check_baseline(baseline_m: float, where: str) -> list[Finding]:
     if baseline_m <= 0:
-        return [
-            Finding(
-                "baseline_sign",
-                "error",
-                where,
-                f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one",
-                "a positive baseline: P3[0, 3] / fx below P2[0, 3] / fx",
-                "swap P2 and P3, or flip the sign of the fourth columns",
-            )
-        ]
-    if BASELINES_M[0] <= baseline_m <= BASELINES_M[1] or np.isnan(baseline_m):
+        measured = f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one"
+        return [found("baseline_sign", where, measured)]
+    low, high = BASELINES_M
+    if low <= baseline_m <= high or np.isnan(baseline_m):
         return []
-    return [
-        Finding(
-            "baseline_length",
-            "error",
-            where,
-            f"baseline {baseline_m:.4g} m",
-            f"{BASELINES_M[0]} to {BASELINES_M[1]} m",
-            "give it in metres; the fourth column of P3 is -fx times the baseline, not the baseline",
-        )
-    ]
+    return [found("baseline_length", where, f"baseline {baseline_m:.4g} m", low=low, high=high)]

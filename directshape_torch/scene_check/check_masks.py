@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from directshape_torch.scene_check.box_conventions import BoxConvention
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence, Side
-from directshape_torch.scene_check.convention_scores import project_conventions
+from directshape_torch.scene_check.conventions import BoxConvention, project_conventions
 from directshape_torch.scene_check.finding import Finding, Severity
 from directshape_torch.scene_check.image_boxes import box_iou
+from directshape_torch.scene_check.known_mistakes import found
 
 # Mean overlap of masks and 2D boxes, over as many pairs as there could be.
 OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37
@@ -32,7 +32,11 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
         return [_none(counts["left"], counts["right"], sum(len(frame.boxes) for frame in frames))]
     left, right = _mean_overlap(frames, "left"), _mean_overlap(frames, "right")
     if right > max(left + MIN_SWAP_GAIN, OVERLAP_WARNING) or _are_crossed(frames):
-        return [_swapped()]
+        measured = (
+            "the left boxes fit the right masks better, or cars lie farther right in the right masks than in the left "
+            "ones"
+        )
+        return [found("masks_swapped", "all frames", measured)]
     return _check_overlap(left, frames)
 
 
@@ -65,16 +69,9 @@ def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[F
     (words, (overlap, cure)) = max(ways.items(), key=lambda way: way[1][0])
     if overlap < MOVED_OVERLAP or overlap < as_given + MOVED_GAIN or overlap < explained - 0.02:
         return []
-    return [
-        Finding(
-            "masks_elsewhere",
-            "error",
-            f"all frames, {len(boxes)} cars",
-            f"masks {words}: then 3D boxes overlap them by {overlap:.2f} instead of {as_given:.2f}",
-            "the mask of each car where its box is",
-            cure,
-        )
-    ]
+    measured = f"masks {words}: then 3D boxes overlap them by {overlap:.2f} instead of {as_given:.2f}"
+    expected = "the mask of each car where its box is"
+    return [found("masks_elsewhere", f"all frames, {len(boxes)} cars", measured, expected=expected, cure=cure)]
 
 
 def _pairs_of(frame: FrameEvidence) -> tuple[Floats, Floats]:
@@ -111,8 +108,8 @@ def _are_crossed(frames: Sequence[FrameEvidence]) -> bool:
 
 def _mean_overlap(frames: Sequence[FrameEvidence], side: Side) -> float:
     """Over all pairs that the frames could have made: as many as there are masks or boxes, whichever are fewer."""
-    found = float(sum(np.nan_to_num(frame.overlap[side]).sum() for frame in frames))
-    return found / max(1, sum(_pairs(frame, side) for frame in frames))
+    overlap = float(sum(np.nan_to_num(frame.overlap[side]).sum() for frame in frames))
+    return overlap / max(1, sum(_pairs(frame, side) for frame in frames))
 
 
 def _check_overlap(overlap: float, frames: Sequence[FrameEvidence]) -> list[Finding]:
@@ -138,35 +135,11 @@ def _pairs(frame: FrameEvidence, side: Side = "left") -> int:
 
 
 def _mismatch(severity: Severity, where: str, overlap: float) -> Finding:
-    return Finding(
-        "masks_elsewhere",
-        severity,
-        where,
-        f"masks and 2D boxes of cars overlap by {overlap:.2f} in the mean",
-        f"at least {OVERLAP_WARNING}",
-        "check that masks and detections are of the same frames and the same size of image, and that 2D boxes are "
-        "u_min v_min u_max v_max",
-    )
-
-
-def _swapped() -> Finding:
-    return Finding(
-        "masks_swapped",
-        "error",
-        "all frames",
-        "the left boxes fit the right masks better, or cars lie farther right in the right masks than in the left ones",
-        "left boxes that fit left masks, and cars farther left in the right image",
-        "swap the two sides of the masks (or detections and masks were made on the right image)",
-    )
+    measured = f"masks and 2D boxes of cars overlap by {overlap:.2f} in the mean"
+    return found("masks_elsewhere", where, measured, severity=severity, limit=OVERLAP_WARNING)
 
 
 def _none(num_left: int, num_right: int, num_cars: int) -> Finding:
     severity: Severity = "warning" if num_left + num_right else "error" if num_cars >= MIN_PAIRS else "note"
-    return Finding(
-        "no_masks",
-        severity,
-        f"all frames, {num_cars} cars",
-        f"{num_left} masks of cars in the left images, {num_right} in the right ones",
-        "masks of the left images, better of both",
-        "check the side ('image') and the class (category_id 3, or 1 and 26 in PNG) of the masks",
-    )
+    measured = f"{num_left} masks of cars in the left images, {num_right} in the right ones"
+    return found("no_masks", f"all frames, {num_cars} cars", measured, severity=severity)

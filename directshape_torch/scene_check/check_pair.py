@@ -1,6 +1,8 @@
-"""The two images against each other: swapped, the same, of different scenes, not rectified."""
+"""The two images against each other, by feature matches: swapped, the same, of different scenes, not rectified."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +10,7 @@ from numpy.typing import NDArray
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene_check.check_stereo import swapped
 from directshape_torch.scene_check.finding import Finding, Severity
-from directshape_torch.scene_check.pair_matches import PairMatches, match_pair, mirror
+from directshape_torch.scene_check.known_mistakes import found
 
 # With these wrong, what disparities and projections show says nothing more.
 SPOILS_PAIR = frozenset(
@@ -26,6 +28,11 @@ SAME_IMAGE_PX = 0.05
 MAX_NEGATIVE_SHARE = 0.2
 VERTICAL_WARNING_PX, VERTICAL_ERROR_PX = 0.75, 1.5
 SCATTER_WARNING_PX = 1.0
+NUM_FEATURES = 3000
+# Lowe's ratio test.
+BEST_TO_SECOND = 0.75
+EPIPOLAR_TOLERANCE_PX = 1.0
+CONFIDENCE = 0.999
 
 
 def check_images(
@@ -52,12 +59,14 @@ def check_pair(
         where: named in the findings.
     """
     if matches.num_candidates < MIN_MATCHES and matches.num_features < MANY_FEATURES:
-        return [_too_few(matches, where)]
+        measured = f"{matches.num_candidates} feature matches between the images"
+        return [found("few_matches", where, measured, limit=MIN_MATCHES)]
     if len(matches) < MIN_MATCHES or len(matches) < MIN_INLIER_SHARE * matches.num_candidates:
-        return [_other_scene(matches, where)]
+        measured = f"{len(matches)} of {matches.num_candidates} feature matches obey a common geometry"
+        return [found("different_scenes", where, measured, share=MIN_INLIER_SHARE)]
     disparity = _disparity(matches, camera)
     if float(np.median(np.hypot(disparity, matches.vertical))) < SAME_IMAGE_PX:
-        return [_same_image(where)]
+        return [found("same_image", where, "matched points have the same place in both images")]
     return _check_side(disparity, where) + _check_rows(
         matches, _row_residual(matches, disparity, camera), size_hw, where
     )
@@ -67,16 +76,8 @@ def check_mirrored(matches: PairMatches, with_mirrored: PairMatches, where: str)
     """Whether far more features match the mirrored right image than the right image as it is."""
     if len(with_mirrored) < max(MIN_MATCHES, 3 * len(matches)):
         return []
-    return [
-        Finding(
-            "image_mirrored",
-            "error",
-            where,
-            f"{len(with_mirrored)} features match the mirrored right image, {len(matches)} the image as it is",
-            "two images of the same sense",
-            "mirror the one that is read in the wrong direction",
-        )
-    ]
+    measured = f"{len(with_mirrored)} features match the mirrored right image, {len(matches)} the image as it is"
+    return [found("image_mirrored", where, measured)]
 
 
 def _disparity(matches: PairMatches, camera: StereoCamera | None) -> NDArray[np.float64]:
@@ -111,29 +112,15 @@ def _check_rows(
     worst = max(abs(offset), abs(across), abs(down))
     if worst > VERTICAL_WARNING_PX:
         severity: Severity = "error" if worst > VERTICAL_ERROR_PX else "warning"
-        return [
-            Finding(
-                "not_rectified",
-                severity,
-                where,
-                f"rows differ by {offset:+.2f} px in the median, {across:+.2f} px more from left to right edge, "
-                f"{down:+.2f} px more from top to bottom ({len(residual)} matches)",
-                f"within {VERTICAL_WARNING_PX} px of what the calibration says",
-                "rectify the pair (cv2.stereoRectify and initUndistortRectifyMap) with the calibration that is given",
-            )
-        ]
+        measured = (
+            f"rows differ by {offset:+.2f} px in the median, {across:+.2f} px more from left to right edge, "
+            f"{down:+.2f} px more from top to bottom ({len(residual)} matches)"
+        )
+        return [found("not_rectified", where, measured, severity=severity, limit=VERTICAL_WARNING_PX)]
     if scatter <= SCATTER_WARNING_PX:
         return []
-    return [
-        Finding(
-            "not_synchronous",
-            "warning",
-            where,
-            f"rows of matched points scatter by {scatter:.2f} px (median absolute deviation)",
-            f"at most {SCATTER_WARNING_PX} px",
-            "give images taken at the same moment, with lens distortion removed",
-        )
-    ]
+    measured = f"rows of matched points scatter by {scatter:.2f} px (median absolute deviation)"
+    return [found("not_synchronous", where, measured, limit=SCATTER_WARNING_PX)]
 
 
 def fit_rows(
@@ -162,34 +149,69 @@ def fit_rows(
     return float(np.median(residual)), float(solution[1]), float(solution[2]), float(np.median(rest))
 
 
-def _too_few(matches: PairMatches, where: str) -> Finding:
-    return Finding(
-        "few_matches",
-        "note",
-        where,
-        f"{matches.num_candidates} feature matches between the images",
-        f"at least {MIN_MATCHES}",
-        "nothing, where the images have little texture; the pair was not checked",
-    )
+@dataclass(frozen=True)
+class PairMatches:
+    """Points that show the same thing in both images.
+
+    Attributes:
+        uv_left, uv_right: (N, 2) pixels.
+        num_candidates: matches before those were dropped that obey no common epipolar geometry.
+        num_features: of the image that has fewer of them.
+    """
+
+    uv_left: NDArray[np.float64]
+    uv_right: NDArray[np.float64]
+    num_candidates: int
+    num_features: int = 0
+
+    def __len__(self) -> int:
+        return len(self.uv_left)
+
+    @property
+    def vertical(self) -> NDArray[np.float64]:
+        """(N,) v_right - v_left, pixels."""
+        return np.asarray(self.uv_right[:, 1] - self.uv_left[:, 1])
 
 
-def _other_scene(matches: PairMatches, where: str) -> Finding:
-    return Finding(
-        "different_scenes",
-        "error",
-        where,
-        f"{len(matches)} of {matches.num_candidates} feature matches obey a common geometry",
-        f"at least {MIN_INLIER_SHARE:.0%} of them",
-        "check that left and right file of a frame carry the same name, and that neither is mirrored",
-    )
+def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches:
+    """SIFT features matched both ways with the ratio test, then a fundamental matrix by RANSAC (of fixed seed).
+
+    Args:
+        left, right: (H, W, 3) RGB.
+    """
+    import cv2
+
+    sift = cv2.SIFT_create(NUM_FEATURES)  # type: ignore[attr-defined]
+    features = [sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None) for image in (left, right)]
+    if any(descriptors is None or len(descriptors) < 2 for _, descriptors in features):
+        return PairMatches(np.empty((0, 2)), np.empty((0, 2)), 0)
+    points = [np.array([key.pt for key in keys], dtype=np.float64) for keys, _ in features]
+    forward, backward = _best(features[0][1], features[1][1]), _best(features[1][1], features[0][1])
+    pairs = np.array([(a, b) for a, b in forward.items() if backward.get(b) == a], dtype=np.int64).reshape(-1, 2)
+    uv_left, uv_right = points[0][pairs[:, 0]], points[1][pairs[:, 1]]
+    keep = _epipolar_inliers(uv_left, uv_right)
+    return PairMatches(uv_left[keep], uv_right[keep], len(pairs), min(map(len, points)))
 
 
-def _same_image(where: str) -> Finding:
-    return Finding(
-        "same_image",
-        "error",
-        where,
-        "matched points have the same place in both images",
-        "disparity between the two images",
-        "give the right camera's images, not copies of the left ones",
-    )
+def mirror(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image with left and right exchanged."""
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _best(descriptors: NDArray[np.float32], others: NDArray[np.float32]) -> dict[int, int]:
+    import cv2
+
+    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, others, k=2)
+    return {
+        first.queryIdx: first.trainIdx for first, second in nearest if first.distance < BEST_TO_SECOND * second.distance
+    }
+
+
+def _epipolar_inliers(uv_left: NDArray[np.float64], uv_right: NDArray[np.float64]) -> NDArray[np.bool_]:
+    import cv2
+
+    if len(uv_left) < 16:
+        return np.zeros(len(uv_left), dtype=np.bool_)
+    cv2.setRNGSeed(0)
+    _, mask = cv2.findFundamentalMat(uv_left, uv_right, cv2.FM_RANSAC, EPIPOLAR_TOLERANCE_PX, CONFIDENCE, 5000)
+    return np.zeros(len(uv_left), dtype=np.bool_) if mask is None else np.asarray(mask[:, 0] > 0)

@@ -11,14 +11,14 @@ from torch import Tensor
 from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
-from directshape_torch.scene_check.check_box_2d import check_box_2d, check_corners
-from directshape_torch.scene_check.check_boxes import check_boxes
+from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
 from directshape_torch.scene_check.check_calibration import SPOILS_CAMERA, check_calibration
 from directshape_torch.scene_check.check_heading import check_heading
 from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_pair import SPOILS_PAIR, check_images
 from directshape_torch.scene_check.check_stereo import check_distances, check_swapped, measure_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
+from directshape_torch.scene_check.known_mistakes import found as found_mistake
 
 # Left and right image, (H, W, 3) RGB.
 Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
@@ -124,13 +124,5 @@ def _mask_sizes(frames: FrameBatch, detections: Detections) -> list[Finding]:
     images, masks = tuple(frames.images_left.shape[2:]), tuple(detections.mask_left.shape[1:])
     if not len(detections) or images == masks:
         return []
-    return [
-        Finding(
-            "mask_size",
-            "error",
-            "all frames",
-            f"masks of {masks[1]} x {masks[0]}, images of {images[1]} x {images[0]} pixels",
-            "masks of the size of their image",
-            "resize the masks to the size of the images, not the images to that of the masks",
-        )
-    ]
+    measured = f"masks of {masks[1]} x {masks[0]}, images of {images[1]} x {images[0]} pixels"
+    return [found_mistake("mask_size", "all frames", measured)]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from directshape_torch.geometry.camera import depth_from_disparity
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.finding import Finding, Severity
+from directshape_torch.scene_check.known_mistakes import found
 
 # The visible surface lies before the centre by about a third of the box's depth.
 _SURFACE_SHARE = 0.33
@@ -111,7 +112,7 @@ def _surface_depth(frame: FrameEvidence, car: int) -> float:
 
 def check_swapped(cars: Sequence[StereoCars]) -> list[Finding]:
     """Whether cars lie farther right in the right image."""
-    disparity = np.concatenate([found.disparity for found in cars]) if cars else np.empty(0)
+    disparity = np.concatenate([car.disparity for car in cars]) if cars else np.empty(0)
     if len(disparity) < _FEWEST_SWAPPED or np.mean(disparity < -1.0) < 0.7:
         return []
     return [
@@ -121,21 +122,15 @@ def check_swapped(cars: Sequence[StereoCars]) -> list[Finding]:
 
 def swapped(where: str, negative: float, median: float) -> Finding:
     """That a share of what both images show has a negative disparity."""
-    return Finding(
-        "images_swapped",
-        "error",
-        where,
-        f"{negative:.0%} of what matches lies farther right in the right image (median disparity {median:.1f} px)",
-        "disparities u_left - u_right above 0: everything lies farther left in the right image",
-        "swap the left and the right images (or were they mirrored?)",
+    measured = (
+        f"{negative:.0%} of what matches lies farther right in the right image (median disparity {median:.1f} px)"
     )
+    return found("images_swapped", where, measured)
 
 
 def check_distances(cars: Sequence[StereoCars]) -> list[Finding]:
     """Whether boxes stand where the disparity says, over the cars of all frames."""
-    ratios = (
-        np.concatenate([np.stack([found.stereo, found.size], axis=1) for found in cars]) if cars else np.empty((0, 2))
-    )
+    ratios = np.concatenate([np.stack([car.stereo, car.size], axis=1) for car in cars]) if cars else np.empty((0, 2))
     ratios = ratios[np.isfinite(ratios).all(axis=1)]
     if not len(ratios):
         return []
@@ -145,17 +140,12 @@ def check_distances(cars: Sequence[StereoCars]) -> list[Finding]:
     if off < limit:
         return []
     severity: Severity = "error" if off > ERROR_RATIO else "warning"
-    measured = f"cars are {scale:.2f} times as far by their disparity as their boxes say"
-    return [
-        Finding(
-            "distance_scale",
-            severity,
-            f"all frames, {len(ratios)} cars with masks",
-            f"{measured} (by the height of the masks {by_size:.2f} times)",
-            f"within {limit - 1:.0%}",
-            _cure(scale, by_size),
-        )
-    ]
+    measured = (
+        f"cars are {scale:.2f} times as far by their disparity as their boxes say "
+        f"(by the height of the masks {by_size:.2f} times)"
+    )
+    where, cure = f"all frames, {len(ratios)} cars with masks", _cure(scale, by_size)
+    return [found("distance_scale", where, measured, severity=severity, cure=cure, limit=limit - 1)]
 
 
 def _cure(scale: float, by_size: float) -> str:
@@ -166,4 +156,4 @@ def _cure(scale: float, by_size: float) -> str:
         )
     if abs(np.log(scale / by_size)) < np.log(WARNING_RATIO):
         return "both agree against the boxes: check the units and the frame of the boxes' locations"
-    return "check focal length, baseline and the units of the boxes"
+    return ""

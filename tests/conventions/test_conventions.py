@@ -23,10 +23,9 @@ from torch import Tensor
 from directshape_torch.depth import march
 from directshape_torch.geometry import box3d, se3
 from directshape_torch.geometry.camera import project, rays_from_pixels, right_rays, warp_to_right
-from directshape_torch.geometry.ground_plane import plane_ref_to_cam
 from directshape_torch.image.grey_levels import grey_levels, halve
 from directshape_torch.image.interpolate import bilinear_with_gradient
-from directshape_torch.io.ground_plane_files import read_plane
+from directshape_torch.io.ground_plane_files import plane_ref_to_cam, read_plane
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import RefinedBox, write_result_text

@@ -19,13 +19,12 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.open_dataset import open_dataset
-from directshape_torch.scene_check.box_conventions import AS_DOCUMENTED, BoxConvention, all_conventions
 from directshape_torch.scene_check.car_evidence import CarBoxes
 from directshape_torch.scene_check.check_calibration import check_calibration
-from directshape_torch.scene_check.check_pair import check_pair, fit_rows
+from directshape_torch.scene_check.check_pair import PairMatches, check_pair, fit_rows, match_pair
 from directshape_torch.scene_check.check_stereo import StereoCars, check_distances
+from directshape_torch.scene_check.conventions import AS_DOCUMENTED, BoxConvention, all_conventions
 from directshape_torch.scene_check.finding import CheckReport, Finding
-from directshape_torch.scene_check.pair_matches import PairMatches, match_pair
 
 SIZE_HW = (400, 1200)
 K = np.array([[700.0, 0, 600], [0, 700, 200], [0, 0, 1]])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.subpixel import refine_disparity
+from directshape_torch.stereo_matching.patch_alignment import refine_disparity
 
 
 def waves(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
