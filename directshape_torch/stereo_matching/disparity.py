@@ -143,7 +143,7 @@ def with_disparity(frames: FrameBatch, matcher: Literal["sgbm", "elas"], needed:
 
     Examples:
         >>> from directshape_torch.geometry.stereo_camera import StereoCamera
-        from directshape_torch.scene import GroundPlane
+        >>> from directshape_torch.scene import GroundPlane
         >>> K = torch.tensor([[[700.0, 0, 40], [0, 700.0, 20], [0, 0, 1]]])
         >>> T_right_cam = torch.eye(4)[None].clone()
         >>> T_right_cam[0, 0, 3] = -0.5
