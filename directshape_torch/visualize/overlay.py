@@ -78,7 +78,7 @@ def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult, first_row: i
         picture_of(frame.images_left[0]),
         frame.camera.K_left[0].double().cpu().numpy(),
         before=_initial_cars(loaded, result),
-        after=_refined_cars(loaded, result, first_row),
+        after=refined_cars(loaded, result, first_row),
         truth_corners_cam=_true_corners(loaded),
         title=f"frame {loaded.frame_id}",
     )
@@ -170,7 +170,7 @@ def _initial_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCa
     return cars
 
 
-def _refined_cars(loaded: LoadedFrame, result: RefinementResult, first_row: int) -> list[DrawnCar]:
+def refined_cars(loaded: LoadedFrame, result: RefinementResult, first_row: int) -> list[DrawnCar]:
     """The refined shape with the box of the result file; the initial state where there is none."""
     boxes = result.boxes()
     statuses, refined = result.status, result.refined.tolist()
