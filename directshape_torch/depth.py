@@ -110,12 +110,12 @@ def march(field: Field, owner: Tensor, rays: ObjectRays, bounds_obj: Tensor, num
     depths, crosses = sample_depths(rays, bounds_obj, num_samples)
     at_once = max(1, _POINTS_AT_ONCE // max(1, num_samples * depths.shape[2]))
     if torch.compiler.is_compiling() or len(owner) <= at_once or depths.device.type != "cpu":
-        return March(depths, field.value(rays.at(depths), owner), crosses)
+        return March(depths, field.value(rays.at(depths), owner, inside=True), crosses)
     parts = []
     for first in range(0, len(owner), at_once):
         some = slice(first, first + at_once)
         points = ObjectRays(rays.centre_obj[:, some], rays.direction_obj[:, some]).at(depths[:, some])
-        parts.append(field.value(points, owner[some]))
+        parts.append(field.value(points, owner[some], inside=True))
     return March(depths, torch.cat(parts, dim=1), crosses)
 
 
@@ -149,7 +149,7 @@ def tracked_closest(field: Field, rays: Rays, in_objects: ObjectRays, bounds_obj
     """The point of closest approach next to where a ray was closest at a state nearby."""
     next_to = in_objects.depth_next_to(before.points_obj)
     samples = torch.stack([next_to - _SAMPLE_M, next_to, next_to + _SAMPLE_M])
-    sdf = field.value(in_objects.at(samples), rays.owner)
+    sdf = field.value(in_objects.at(samples), rays.owner, inside=True)
     vertex = _vertex(sdf[0], sdf[1], sdf[2], 1.0)
     # A minimum in the next cell is found from here, and one that is here stays the one that is looked at.
     start = torch.add(next_to, vertex * (vertex.abs() > _NEXT_CELL), alpha=_SAMPLE_M)
@@ -217,10 +217,10 @@ def first_hits(field: Field, owner: Tensor, rays: ObjectRays, marched: March, cl
 
     The point of closest approach counts as a sample too, so that thin parts between two samples are not missed.
     """
-    closest_sdf = field.value(rays.at(closest.depth), owner)
+    closest_sdf = field.value(rays.at(closest.depth), owner, inside=True)
     bracket, found = _first_bracket(marched, closest.depth, closest_sdf)
     for _ in range(_PROBES):
-        bracket = bracket.probed(field.value(rays.at(bracket.depth), owner))
+        bracket = bracket.probed(field.value(rays.at(bracket.depth), owner, inside=True))
     depth = torch.where(found, bracket.best, closest.depth)
     points = rays.at(depth)
     normal = field.gradient(points, owner)
@@ -265,12 +265,12 @@ def tracked_depth(field: Field, rays: Rays, in_objects: ObjectRays, before: Hits
     to_plane = ((before.points_obj - in_objects.centre_obj) * before.normal_obj).sum(0) / slope
     next_to = in_objects.depth_next_to(before.points_obj)
     depth = next_to + (to_plane - next_to).clamp(-_MAX_STEP_M, _MAX_STEP_M)
-    sdf = field.value(in_objects.at(depth), rays.owner)
+    sdf = field.value(in_objects.at(depth), rays.owner, inside=True)
     # The old slope was that of another point: after a long step of the car only further secants reach the surface.
     for _ in range(_SECANTS):
         step = -(sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
         depth = depth + step
-        before_sdf, sdf = sdf, field.value(in_objects.at(depth), rays.owner)
+        before_sdf, sdf = sdf, field.value(in_objects.at(depth), rays.owner, inside=True)
         slope = _secant_slope(step, before_sdf, sdf, slope)
     return depth - (sdf / slope).clamp(-_MAX_STEP_M, _MAX_STEP_M)
 

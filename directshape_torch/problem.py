@@ -161,9 +161,9 @@ class CarProblem:
         return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
 
     def parts(
-        self, terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...]
+        self, terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...], fisher: bool = True
     ) -> tuple[Part, ...]:
-        """What the terms, or the same ones of fewer cars, say of a state.
+        """What the terms, or the same ones of fewer cars, say of a state; with the Fisher information if that is asked.
 
         Ours in one function, which is compiled as a whole; terms of one's own by themselves, for what the compiler
         makes of them must not concern ours: they may mark their functions `compile.compilable`.
@@ -171,7 +171,8 @@ class CarProblem:
         own = len(terms) - self.num_extra
         extra = zip(terms[own:], wheres[own:], strict=True)
         of_extra = tuple(part_of(term, linear_of(term, field, state, where)) for term, where in extra)
-        return parts_of(terms[:own], field, state, wheres[:own]) + of_extra
+        # Compiled code has one form for both.
+        return parts_of(terms[:own], field, state, wheres[:own], fisher or will_compile()) + of_extra
 
     def look(self, state: CarState) -> Sight:
         """What every ray sees at a state, marched: constants; state and field keep their graphs."""
@@ -407,7 +408,7 @@ class CarIterations:
     def evaluated(self, field: Field, state: CarState, wheres: tuple[Where, ...]) -> Evaluation:
         """The energy at a state, looking near the points given."""
         problem, terms = self.stage.problem, self.terms
-        parts = problem.parts(terms, field, state, wheres)
+        parts = problem.parts(terms, field, state, wheres, fisher=False)
         if problem.config.solver.jacobian == "autograd":
             looked = [part.where for part in parts]
             rows = by_autograd(terms, problem.prior, state, looked)

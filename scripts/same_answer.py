@@ -1,10 +1,10 @@
 """How far the same cars end apart when nothing that matters has changed.
 
-Refines the frames of a data set one by one, eight in a call, from boxes moved by a millionth of their place, and, on
-request, compiled; compares the boxes with those of the frames one by one. With `--long` once more with 80 iterations in
-the last stage, which tells a rule that stops too early (the differences vanish) from flat minima (they stay).
+Refines the frames of a data set one by one, eight in a call, from boxes moved by a millionth of their place, with rays
+marched at every state, with such rays and boxes moved by a thousandth, and, on request, compiled; compares the boxes
+with those of the frames one by one. With `--long` once more with 80 iterations in the last stage, which tells a rule that stops too early (the differences vanish) from flat minima (they stay).
 
-    python scripts/same_answer.py --long --data KITTI --detections DETECTIONS --masks MASKS
+    python scripts/same_answer.py --long --marched --data KITTI --detections DETECTIONS --masks MASKS
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
 
 EIGHT = 8
-MILLIONTH = 1e-6
+MILLIONTH, THOUSANDTH = 1e-6, 1e-3
 LONG = (
     "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 6, over_relaxation: 1.6}, "
     "{contour_width_px: 0.5, image_level: 0, max_iterations: 80, over_relaxation: 1.6}]"
@@ -80,10 +80,17 @@ def run(args: argparse.Namespace) -> None:
             "8 frames in a call": refined(frames, settings, EIGHT),
             "moved by 1e-6": refined(frames, settings, 1, MILLIONTH),
         }
+        if args.marched:
+            marched = [*settings, "solver.rays=marched"]
+            others["rays marched"] = at_rest = refined(frames, marched)
+            moved = refined(frames, marched, 1, THOUSANDTH)
         if args.compiled:
             others["compiled"] = refined(frames, [*settings, "compile=on"])
-        for name, other in others.items():
-            median, largest, share, flips, count = one.apart(other)
+        pairs = {name: (one, other) for name, other in others.items()}
+        if args.marched:
+            pairs["marched, against those moved by 1e-3"] = at_rest, moved
+        for name, (mine, other) in pairs.items():
+            median, largest, share, flips, count = mine.apart(other)
             rows.append(
                 (length, name, f"{median:.2f}", f"{largest:.0f}", f"{100 * share:.1f} %", str(flips), str(count))
             )
@@ -99,6 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
     parser.add_argument("--most", type=int, metavar="N", help="frames at most")
     parser.add_argument("--long", action="store_true", help="with 80 iterations too")
+    parser.add_argument("--marched", action="store_true", help="against marched rays too, and these from moved boxes")
     parser.add_argument("--compiled", action="store_true", help="against compiled code too")
     return run_command(parser, run, arguments)
 

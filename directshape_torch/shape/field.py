@@ -21,8 +21,8 @@ from directshape_torch.shape.shape_prior import BoundShape
 class Field(Protocol):
     """Signed distances of B cars; points are (3, ..., M, R) and belong to the cars (M,) of their blocks."""
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
-        """Signed distance (..., M, R), metres."""
+    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
+        """Signed distance (..., M, R), metres; `inside`: no point that counts lies outside of the prior's bounds."""
         ...
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
@@ -56,8 +56,8 @@ class Grids(NamedTuple):
 
     grids: GridField
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
-        return value_at(self.grids, points_obj, owner[:, None])
+    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
+        return value_at(self.grids, points_obj, owner[:, None], inside)
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
         return gradient_at(self.grids, points_obj, owner[:, None])
@@ -86,7 +86,7 @@ class PackedField(NamedTuple):
 
     shape: BoundShape
 
-    def value(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
         return self.shape.value(*_packed(points_obj, owner)).view(points_obj.shape[1:])
 
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:

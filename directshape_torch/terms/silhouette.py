@@ -271,16 +271,11 @@ def closest_approach_residual(
         (tensor([0.6931]), tensor([0.5000]))
     """
     x = zeta * closest_sdf
-    is_outside = x > 0
-    # Not `abs`, whose derivative at zero is zero: on the contour itself the residual has one.
-    distance = torch.where(is_outside, x, -x)
-    decay = torch.exp(-distance.clamp_max(SATURATION))
-    larger = 1 / (1 + decay)
-    smaller = decay * larger
-    hit, miss = torch.where(is_outside, smaller, larger), torch.where(is_outside, larger, smaller)
-    likelihood = hit * foreground + miss * (1 - foreground)
-    derivative = zeta * smaller * larger * (2 * foreground - 1) / likelihood
-    return -likelihood.log(), torch.where(distance < SATURATION, derivative, torch.zeros_like(derivative))
+    within = x.clamp(-SATURATION, SATURATION)
+    hit, miss = torch.sigmoid(-within), torch.sigmoid(within)
+    likelihood = torch.addcmul(hit * foreground, miss, 1 - foreground)
+    derivative = zeta * hit * miss * (2 * foreground - 1) / likelihood
+    return -likelihood.log(), torch.where(x == within, derivative, 0.0)
 
 
 def sdf_state_jacobian(

@@ -113,7 +113,7 @@ class Part(NamedTuple):
 
     cost: Tensor  # (M,)
     products: Tensor  # (M, D + 1, D) the Gauss-Newton matrix and, as one more row, the gradient
-    information: Tensor  # (M, D, D) the matrix with the weights of the Fisher information
+    information: Tensor  # (M, D, D) the matrix with the weights of the Fisher information; without `fisher` the other
     residual: Tensor  # (M, R, N)
     where: Where  # the points at which they were taken
 
@@ -126,8 +126,11 @@ def linear_of(term: Term, field: Field, state: CarState, where: Where) -> Linear
     return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, num_offsets)))
 
 
-def part_of(term: Term, at: Linear) -> Part:
-    """The sums over the rows of each block, from residuals and their Jacobian in factors."""
+def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:
+    """The sums over the rows of each block, from residuals and their Jacobian in factors.
+
+    Without `fisher` nobody asks for the information, and the Gauss-Newton matrix stands in its place.
+    """
     norm = term.norm(at.residual)
     weight = term.row_weight
     # All residuals of a row share one inner scalar, so their Jacobians are multiples of one: sum the multiples first.
@@ -136,7 +139,7 @@ def part_of(term: Term, at: Linear) -> Part:
     second = (weight * norm.hessian_weight * squared).sum(dim=-1)
     products = weighted_products(at.J_inner_state, first, second)
     information = products[:, :-1]
-    if norm.information_weight is not norm.hessian_weight:
+    if fisher and norm.information_weight is not norm.hessian_weight:
         third = (weight * norm.information_weight * squared).sum(dim=-1)
         information = weighted_products(at.J_inner_state, first, third)[:, :-1]
     return Part(_block_costs(weight, norm), products, information, at.residual, at.where)
@@ -186,9 +189,12 @@ def with_varying_blocks(term: Term) -> Term:
 
 
 @compilable(sizes=_SIZES)
-def parts_of(terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...]) -> tuple[Part, ...]:
+def parts_of(
+    terms: tuple[Term, ...], field: Field, state: CarState, wheres: tuple[Where, ...], fisher: bool = True
+) -> tuple[Part, ...]:
     """All terms at a state, looking near the points given, with their hand-derived Jacobians."""
-    return tuple(part_of(term, linear_of(term, field, state, where)) for term, where in zip(terms, wheres, strict=True))
+    ats = [linear_of(term, field, state, where) for term, where in zip(terms, wheres, strict=True)]
+    return tuple(part_of(term, at, fisher) for term, at in zip(terms, ats, strict=True))
 
 
 def weighted_products(

@@ -1,12 +1,12 @@
 """`--against CHECKOUT`: how many times as long as another version do we take, and how many operations more?
 
-Each version has a process of its own, and the two are asked in turn: what else the machine does slows down both. Eager,
-and with nothing that a version of this project could lack: frames, presets, the refiner.
+Each version has a process of its own, and the two are asked in turn, for the processor's time: what else the machine
+does slows down both. With nothing that a version of this project could lack: frames, default settings, the refiner.
 
     PYTHONPATH=CHECKOUT:scripts python -m benchmark_suites.checkouts
 
-is one such process: it says which scenes it has, then answers each line `PRESET SCENE FIRST COUNT`, a call of so many
-frames, with its seconds, or its operations where the line ends in `operations`.
+is one such process: it says which scenes it has, then answers each line `MODE SCENE FIRST COUNT`, a call of so many
+frames with `compile` on or off, with its seconds, or its operations where the line ends in `operations`.
 """
 
 from __future__ import annotations
@@ -56,17 +56,20 @@ def run_against(checkout: Path, settings: SuiteSettings) -> SuiteResult:
             calls = {f"{scene}, one frame in a call": [(f, 1) for f in range(min(count, _SINGLE_FRAMES))]}
             if not settings.quick:
                 calls[f"{scene}, {_BATCH_FRAMES} frames in a call"] = [(0, _BATCH_FRAMES)]
-            for preset in ("default",) if settings.quick else ("default", "fast"):
+            for mode in ("off",) if settings.quick else ("off", "on"):
                 for what, frames in calls.items():
-                    settings.progress(f"against {checkout}: {what}, {preset}")
-                    asked = [f"{preset} {number} {first} {size}" for first, size in frames]
+                    what = f"{what}, {'compiled' if mode == 'on' else 'eager'}"
+                    settings.progress(f"against {checkout}: {what}")
+                    asked = [f"{mode} {number} {first} {size}" for first, size in frames]
                     ratios = [ratio for line in asked for ratio in _ratios(ours, theirs, line, rounds)]
-                    rows.append(Row.of(_SUITE, f"{what}, {preset}, time", Spread.of(ratios), "", "ratio"))
+                    rows.append(Row.of(_SUITE, f"{what}, time", Spread.of(ratios), "", "ratio"))
+                    if mode == "on":
+                        continue
                     found = [[v.ask(f"{line} operations") for line in asked] for v in (ours, theirs)]
                     note = f"{' '.join(map(str, found[0]))} over {' '.join(map(str, found[1]))}"
                     ratio = Spread.of([a / b for a, b in zip(*found, strict=True)])
-                    rows.append(Row.of(_SUITE, f"{what}, {preset}, operations", ratio, "", "ratio", note=note))
-    return SuiteResult(_SUITE, tuple(rows), (f"this version over {checkout}, eager, by the ratios within the rounds",))
+                    rows.append(Row.of(_SUITE, f"{what}, operations", ratio, "", "ratio", note=note))
+    return SuiteResult(_SUITE, tuple(rows), (f"this version over {checkout}, by the ratios within the rounds",))
 
 
 def _ratios(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterator[float]:
@@ -119,20 +122,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(arguments)
     torch.set_num_threads(args.threads)
-    scenes = load_scenes(args.data, _BATCH_FRAMES)
-    refiner = cache(lambda preset: DirectShapeRefiner(config=load_config(preset, ["compile=off"])))
+    scenes = load_scenes(args.data, _BATCH_FRAMES, with_rig=False)
+    refiner = cache(lambda mode: DirectShapeRefiner(config=load_config("default", [f"compile={mode}"])))
     print(json.dumps([(scene.name, len(scene.frames)) for scene in scenes]), flush=True)
     for line in sys.stdin:
-        preset, number, first, count, *operations = line.split()
+        mode, number, first, count, *operations = line.split()
         frames = scenes[int(number)].frames
         inputs = collate([frames[n % len(frames)] for n in range(int(first), int(first) + int(count))])
-        refine = refiner(preset)
+        refine = refiner(mode)
         if operations:
             print(count_operations(lambda: refine(*inputs)), flush=True)  # noqa: B023
             continue
-        start = time.perf_counter()
+        start = time.process_time()
         refine(*inputs)
-        print(time.perf_counter() - start, flush=True)
+        print(time.process_time() - start, flush=True)
 
 
 if __name__ == "__main__":

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import directshape_torch
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.frames_with_truth import add_truth, observe_frame, truth_files
 from directshape_torch.scene import Detections, FrameBatch
 
 # The frame that the README fits the rig of the KITTI frames from.
@@ -41,17 +39,18 @@ class Scene:
         return sum(len(frame.detections) for frame in self.frames)
 
 
-def load_scenes(data_root: Path | None, max_frames: int | None = None) -> tuple[Scene, ...]:
+def load_scenes(data_root: Path | None, max_frames: int | None = None, with_rig: bool = True) -> tuple[Scene, ...]:
     """The rendered and the KITTI frames below a data folder, or else the bundled demo frame.
 
     Args:
         data_root: holds `rendered` or `kitti` (DIRECTSHAPE_DATA), or None.
         max_frames: of each, the first; None for all.
+        with_rig: KITTI's frames bring the disparity field of their rig.
 
     Raises:
         InputError: the folder holds neither.
     """
-    return tuple(_scenes(data_root, max_frames))
+    return tuple(_scenes(data_root, max_frames, with_rig))
 
 
 def first_scene(data_root: Path | None, max_frames: int | None = None) -> Scene:
@@ -59,7 +58,7 @@ def first_scene(data_root: Path | None, max_frames: int | None = None) -> Scene:
     return next(_scenes(data_root, max_frames))
 
 
-def _scenes(data_root: Path | None, max_frames: int | None) -> Iterator[Scene]:
+def _scenes(data_root: Path | None, max_frames: int | None, with_rig: bool = True) -> Iterator[Scene]:
     if data_root is None:
         yield demo_scene()
         return
@@ -68,7 +67,7 @@ def _scenes(data_root: Path | None, max_frames: int | None) -> Iterator[Scene]:
     if rendered.is_dir():
         yield _scene(rendered, "stereo", None, max_frames)
     if kitti.is_dir():
-        yield _scene(kitti, "noisy_stereo", _rig_field(kitti), max_frames)
+        yield _scene(kitti, "noisy_stereo", _rig_field(kitti) if with_rig else None, max_frames)
 
 
 def check_data_root(data_root: Path) -> None:
@@ -83,7 +82,7 @@ def demo_scene() -> Scene:
     return _scene(Path(directshape_torch.__file__).parent / "assets" / "demo", "noisy_stereo", None, None)
 
 
-def _scene(root: Path, detector: str, field: DisparityField | None, max_frames: int | None) -> Scene:
+def _scene(root: Path, detector: str, field: Any, max_frames: int | None) -> Scene:
     detections, masks = root / "detections" / detector, root / "training" / "masks"
     dataset = KittiStereoDataset(root, detections, masks, disparity_field=field)
     frames: list[LoadedFrame] = []
@@ -96,8 +95,12 @@ def _scene(root: Path, detector: str, field: DisparityField | None, max_frames: 
     return Scene(root.name, root / "training" / "label_2", detections, tuple(frames))
 
 
-def _rig_field(root: Path) -> DisparityField:
-    """As `directshape calibrate-rig --from disparity --frames 007322` fits it."""
+def _rig_field(root: Path) -> Any:
+    """A `DisparityField`, as `directshape calibrate-rig --from disparity --frames 007322` fits it."""
+    # Here, for what `--against` compares with may have no such module.
+    from directshape_torch.rig.estimate import RigEstimate
+    from directshape_torch.rig.frames_with_truth import add_truth, observe_frame, truth_files
+
     frame = observe_frame(root, _FRAME_OF_FIELD, truth_files(root, "disparity")[_FRAME_OF_FIELD], "disparity")
     rigs: list[RigEstimate] = []
     add_truth(rigs, "disparity", [frame])

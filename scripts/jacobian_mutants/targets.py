@@ -160,7 +160,7 @@ TARGETS: dict[str, Target] = {
             "GridField.lower_nodes",
             "GridField.nodes_of",
             "GridField.at_corners",
-            "Cells.distance",
+            "Cells.outward",
             "cells_at",
             "corner_values",
             "halves",
