@@ -1,8 +1,9 @@
 """How far the same cars end apart when nothing that matters has changed.
 
-Refines the frames of a data set one by one, eight in a call, from boxes moved by a millionth of their place, with rays
-marched at every state, with such rays and boxes moved by a thousandth, and, on request, compiled; compares the boxes
-with those of the frames one by one. With `--long` once more with 80 iterations in the last stage, which tells a rule that stops too early (the differences vanish) from flat minima (they stay).
+Refines the frames of a data set one by one, eight in a call, from boxes moved by a millionth of their place and, on
+request, with rays marched at every state, the same from boxes moved by a thousandth, and compiled; compares the boxes
+with those of the frames one by one. With `--long` once more with 80 iterations in the last stage, which tells a rule
+that stops too early (the differences vanish) from flat minima (they stay).
 
     python scripts/same_answer.py --long --marched --data KITTI --detections DETECTIONS --masks MASKS
 """
