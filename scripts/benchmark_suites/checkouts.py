@@ -35,7 +35,7 @@ from directshape_torch.io.frame_collation import collate
 
 _SUITE = "against"
 _SINGLE_FRAMES, _BATCH_FRAMES = 3, 8
-_ROUNDS = 11
+_ROUNDS = 7
 
 
 def run_against(checkout: Path, settings: SuiteSettings) -> SuiteResult:

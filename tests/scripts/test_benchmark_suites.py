@@ -398,8 +398,8 @@ def test_no_part_of_a_refinement_is_empty_and_they_add_up() -> None:
 
 def test_a_version_against_itself() -> None:
     rows = {row.name: row for row in checkouts.run_against(Path(__file__).parents[2], SMALLEST).rows}
-    assert rows["demo, one frame in a call, default, operations"].value == 1
-    assert 0.2 < rows["demo, one frame in a call, default, time"].value < 5
+    assert rows["demo, one frame in a call, eager, operations"].value == 1
+    assert 0.2 < rows["demo, one frame in a call, eager, time"].value < 5
 
 
 def test_a_folder_that_is_no_version_is_refused(tmp_path: Path) -> None:
