@@ -21,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
@@ -61,8 +62,10 @@ def run_against(checkout: Path, settings: SuiteSettings) -> SuiteResult:
                     what = f"{what}, {'compiled' if mode == 'on' else 'eager'}"
                     settings.progress(f"against {checkout}: {what}")
                     asked = [f"{mode} {number} {first} {size}" for first, size in frames]
-                    ratios = [ratio for line in asked for ratio in _ratios(ours, theirs, line, rounds)]
-                    rows.append(Row.of(_SUITE, f"{what}, time", Spread.of(ratios), "", "ratio"))
+                    seconds = [pair for line in asked for pair in _seconds(ours, theirs, line, rounds)]
+                    note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
+                    ratio = Spread.of([a / b for a, b in seconds])
+                    rows.append(Row.of(_SUITE, f"{what}, time", ratio, "", "ratio", note=note))
                     if mode == "on":
                         continue
                     found = [[v.ask(f"{line} operations") for line in asked] for v in (ours, theirs)]
@@ -72,13 +75,13 @@ def run_against(checkout: Path, settings: SuiteSettings) -> SuiteResult:
     return SuiteResult(_SUITE, tuple(rows), (f"this version over {checkout}, by the ratios within the rounds",))
 
 
-def _ratios(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterator[float]:
-    """Of the seconds of calls in turn, in reversed order in every second round, after one that does not count."""
+def _seconds(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterator[tuple[float, float]]:
+    """Of calls in turn, ours and theirs, in reversed order in every second round, after one that does not count."""
     for number in range(rounds + 1):
         order = (ours, theirs) if number % 2 else (theirs, ours)
         seconds = {version: version.ask(line) for version in order}
         if number:
-            yield seconds[ours] / seconds[theirs]
+            yield seconds[ours], seconds[theirs]
 
 
 class _Version:
