@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.numerics.tensors import length
-from directshape_torch.shape.sdf_grid import GridField, corner_values, halves
+from directshape_torch.shape.sdf_grid import GridField, corner_values, halves, moved, scaled
 
 # Distance of the three samples that begin a search where nothing but values is known.
 _FIRST_SAMPLES_M = 0.06
@@ -124,12 +124,12 @@ def _derivatives_along(field: GridField, node: Tensor, place: Tensor, step: Tens
     (ux, uy, uz), (dx, dy, dz) = place, step
     # Interpolated along z, then y, then x: each time a polynomial of the distance gains a degree.
     lower, rise = halves(corner_values(field, node))
-    (a0, rise_0), (a1, rise_1) = halves(torch.addcmul(lower, uz, rise)), halves(dz * rise)
-    b1 = torch.addcmul(torch.addcmul(a1, uy, rise_1), dy, rise_0)
-    (_, rise_0), (b1, rise_1), (b2, rise_2) = map(halves, (torch.addcmul(a0, uy, rise_0), b1, dy * rise_1))
-    first = torch.addcmul(torch.addcmul(b1, ux, rise_1), dx, rise_0)
-    second = torch.addcmul(torch.addcmul(b2, ux, rise_2), dx, rise_1)
-    return _AlongRay(first[0], second[0], (dx * rise_2)[0])
+    (a0, rise_0), (a1, rise_1) = halves(moved(lower, uz, rise)), halves(scaled(dz, rise))
+    b1 = moved(moved(a1, uy, rise_1), dy, rise_0)
+    (_, rise_0), (b1, rise_1), (b2, rise_2) = map(halves, (moved(a0, uy, rise_0), b1, scaled(dy, rise_1)))
+    first = moved(moved(b1, ux, rise_1), dx, rise_0)
+    second = moved(moved(b2, ux, rise_2), dx, rise_1)
+    return _AlongRay(first[0], second[0], scaled(dx, rise_2)[0])
 
 
 def _first_root(along: _AlongRay) -> Tensor:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -166,19 +166,39 @@ def cells_at(field: GridField, points_obj: Tensor) -> Cells:
     return Cells(field.lower_nodes(lower), clamped - lower, position, clamped)
 
 
-def corner_values(field: GridField, node: Tensor) -> Tensor:
+# Values (n, ...) at ends of edges; for the compiler, which makes one loop of tensors of one shape, n of them (...).
+Ends: TypeAlias = Tensor | list[Tensor]
+
+
+def corner_values(field: GridField, node: Tensor) -> Ends:
     """Signed distances (8, ...) at the corners of cells with lower node (...) among those of all grids."""
     corners = field.at_corners(node)
     if torch.compiler.is_compiling():
-        # Whose indices are known not to be negative.
-        return embedding(corners, field.values[:, None])[..., 0]
+        # An embedding's indices are known not to be negative.
+        return [embedding(corner, field.values[:, None])[..., 0] for corner in corners.unbind(0)]
     return field.values.index_select(0, corners.view(-1)).view(corners.shape)
 
 
-def halves(ends: Tensor) -> tuple[Tensor, Tensor]:
+def halves(ends: Ends) -> tuple[Ends, Ends]:
     """The lower ends (n, ...) along the outermost axis that is left, and by how much the upper ones are above them."""
+    if isinstance(ends, list):
+        half = len(ends) // 2
+        return ends[:half], [upper - lower for lower, upper in zip(ends[:half], ends[half:], strict=True)]
     lower, upper = ends.chunk(2)
     return lower, upper - lower
+
+
+def moved(lower: Ends, fraction: Tensor, rise: Ends) -> Ends:
+    """`lower + fraction rise`."""
+    if isinstance(lower, list):
+        return [torch.addcmul(low, fraction, along) for low, along in zip(lower, rise, strict=True)]
+    assert isinstance(rise, Tensor)
+    return torch.addcmul(lower, fraction, rise)
+
+
+def scaled(factor: Tensor, ends: Ends) -> Ends:
+    """`factor ends`."""
+    return [factor * end for end in ends] if isinstance(ends, list) else factor * ends
 
 
 def value_at(field: GridField, points_obj: Tensor, object_index: Tensor, inside: bool = False) -> Tensor:
@@ -201,7 +221,8 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     table, corners = field.basis.flatten(0, 2), field.at_corners(cells.lower_node)
     if constant and not torch.compiler.is_compiling():
         return Lookup(value, gradient, _summed(table, corners, cells.fraction))
-    return Lookup(value, gradient, _interpolated(embedding(corners, table), cells.fraction[..., None]))
+    rows = [embedding(corner, table) for corner in corners.unbind(0)]
+    return Lookup(value, gradient, _interpolated(rows, cells.fraction[..., None]))
 
 
 def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
@@ -212,25 +233,25 @@ def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> T
 def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
     lower, along_z = halves(corner_values(field, field.nodes_of(cells.lower_node, object_index)))
-    lower, along_y = halves(torch.addcmul(lower, fz, along_z))
-    lowest, along_x = halves(torch.addcmul(lower, fy, along_y))
-    inside = torch.addcmul(lowest, fx, along_x)[0]
-    along_z = _moved(halves(along_z), fy)
-    slope = torch.cat([along_x, *(_moved(halves(x), fx) for x in (along_y, along_z))])
+    lower, along_y = halves(moved(lower, fz, along_z))
+    lowest, along_x = halves(moved(lower, fy, along_y))
+    inside = moved(lowest, fx, along_x)[0]
+    along_z = _between(along_z, fy)
+    slope = torch.stack([x[0] for x in (along_x, _between(along_y, fx), _between(along_z, fx))])
     outward, distance = cells.outward
     gradient = torch.where(outward == 0, slope * (1 / field.spacing_m), outward / distance)
     return torch.add(inside, distance, alpha=field.spacing_m), gradient
 
 
-def _moved(ends: tuple[Tensor, Tensor], fraction: Tensor) -> Tensor:
-    """From lower ends on by a fraction of the differences."""
-    return torch.addcmul(ends[0], fraction, ends[1])
+def _between(ends: Ends, fraction: Tensor) -> Ends:
+    lower, rise = halves(ends)
+    return moved(lower, fraction, rise)
 
 
-def _interpolated(corners: Tensor, fraction: Tensor) -> Tensor:
+def _interpolated(corners: Ends, fraction: Tensor) -> Tensor:
     """Of the corners (8, ...) of cells, at fractions (3, ...) along the axes."""
     for along in reversed(fraction.unbind(0)):
-        corners = _moved(halves(corners), along)
+        corners = _between(corners, along)
     return corners[0]
 
 

@@ -146,7 +146,7 @@ TARGETS: dict[str, Target] = {
             "gradient_at",
             "_value_and_gradient",
             "_interpolated",
-            "_moved",
+            "_between",
             "_summed",
         ),
         ("tests/shape/test_grid_lookup.py", "tests/shape/test_sdf_grid.py", "tests/shape/test_many_lookups.py"),
@@ -164,6 +164,8 @@ TARGETS: dict[str, Target] = {
             "cells_at",
             "corner_values",
             "halves",
+            "moved",
+            "scaled",
         ),
         (
             "tests/shape/test_grid_lookup.py",
