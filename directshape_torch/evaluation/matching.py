@@ -36,13 +36,13 @@ class CountedLabels:
     def counts(self, label: KittiObject) -> bool:
         """Whether a label counts.
 
-                Examples:
-                    >>> from directshape_torch.files.text_files import read_lines
-        >>> from directshape_torch.io.kitti_labels import parse_object
-                    >>> from directshape_torch.files.text_files import Line
-                    >>> line = Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.6 20 0", "")
-                    >>> CountedLabels().counts(parse_object("labels", line))
-                    True
+        Examples:
+            >>> from directshape_torch.files.text_files import read_lines
+            >>> from directshape_torch.io.kitti_labels import parse_object
+            >>> from directshape_torch.files.text_files import Line
+            >>> line = Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.6 20 0", "")
+            >>> CountedLabels().counts(parse_object("labels", line))
+            True
         """
         height_px = label.box_2d[3] - label.box_2d[1]
         return (
