@@ -297,7 +297,8 @@ def _line(path: Path, line: bytes) -> FrameLine | Refining | RunEnd | None:
     """None for one that was cut short."""
     with suppress(DataFormatError):
         content = parse_json(path, line)
-        kind = next((kind for name, kind in (("frame", FrameLine), ("resumed", Refining)) if name in content), RunEnd)
+        names = content if isinstance(content, dict) else ()
+        kind = next((kind for name, kind in (("frame", FrameLine), ("resumed", Refining)) if name in names), RunEnd)
         return record_of(path, kind, content)  # type: ignore[return-value]
     return None
 

@@ -86,6 +86,13 @@ def test_a_log_cut_anywhere_says_what_its_whole_lines_say(tmp_path: Path) -> Non
     assert read_status(tmp_path).failed == {"000001": "cut short"}
 
 
+@pytest.mark.parametrize("line", ["7", "null", "[]", '"frame"', '{"frame": 7}', '{"resumed": null}', "{"])
+def test_lines_that_no_run_has_written_count_for_nothing(tmp_path: Path, line: str) -> None:
+    content = written(tmp_path)
+    log_path(tmp_path).write_bytes(content + line.encode() + b"\n")
+    assert read_status(tmp_path).num_done == 4
+
+
 @pytest.mark.parametrize(
     ("content", "problem"),
     [

@@ -9,6 +9,8 @@ import sys
 import threading
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ import torch
 from helpers.quick_runs import dataset, refiner
 from helpers.synthetic_scene import cached_street
 
-from directshape_torch import DirectShapeRefiner, load_config
+from directshape_torch import DirectShapeRefiner, RigEstimate, check_scene, fit_shape, load_config
 from directshape_torch.batch.options import RefineOptions, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.cli.main import main
@@ -96,7 +98,47 @@ def write(_: Path, out: Path) -> None:
         write_json(out / "a.json", float("nan"))
 
 
-CALLS = (forward, run, refine_command, failing_command, failing_run, priors, check_data, write)
+def gradient(_: Path, __: Path) -> None:
+    prior, street = cached_street()
+    masks = street.detections.mask_left.double().clone().requires_grad_()
+    config = load_config("fast", ["backward.mode=unroll", "acceptance.min_probability_better=0"])
+    result = DirectShapeRefiner(prior, config)(street.frames, replace(street.detections, mask_left=masks))
+    result.T_cam_obj.sum().backward()
+
+
+def tensors(_: Path, __: Path) -> None:
+    frames, detections = cached_street()[1].frames, cached_street()[1].detections
+    check_scene(frames, detections)
+    rig = RigEstimate.of_frames(frames)
+    rig.update(frames, detections)
+    RigEstimate.of_frames(frames).load_state_dict(rig.state_dict())
+    boxes = torch.tensor([[0.0, 0.0, 10.0, 4.0, 1.6, 1.5, 0.3]])
+    assert len(fit_shape(torch.zeros(40, 3), boxes, "opencv").cars.to_boxes("opencv")) == 1
+
+
+def commands(root: Path, out: Path) -> None:
+    """What a run leaves, seen by all others."""
+    run(root, out)
+    data, labels, results = data_options(root), str(root / "training" / "label_2"), str(out / "out" / "data")
+    with_prior = [*data, "--prior", str(root / "prior.npz")]
+    for command in (
+        ["status", str(out / "out")],
+        ["report", str(out / "out"), "--html", str(out / "page.html"), *with_prior],
+        ["export", str(out / "out"), "--out", str(out / "exports"), "--format", "glb", "kitti", *with_prior],
+        ["compare", "--labels", labels, "--before", str(root / "detections"), "--after", results, "--frames", "0"],
+        ["evaluate", "--labels", labels, "--results", str(root / "detections")],
+        ["calibrate-rig", *data, "--out", str(out / "rig.json")],
+        ["inspect", "--frame", "000000", "--car", "0", *with_prior, "--out", str(out / "figures")],
+    ):
+        assert main(command) == 0, command
+    with suppress(SystemExit):
+        main(["no-such-command"])
+
+
+CALLS = (
+    *(forward, gradient, tensors, run, refine_command, failing_command, failing_run, priors, check_data, commands),
+    write,
+)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="asks /proc")
