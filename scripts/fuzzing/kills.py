@@ -113,8 +113,8 @@ def _children(pid: int) -> list[int]:
 
 
 def _outlive(workers: list[int]) -> bool:
-    """Whether some are there some seconds after their parent has ended."""
-    deadline = time.monotonic() + _PATIENCE_S / 4
+    """Whether some are there long after their parent has ended."""
+    deadline = time.monotonic() + _PATIENCE_S
     while any(Path(f"/proc/{each}").exists() for each in workers):
         if time.monotonic() > deadline:
             return True
