@@ -303,6 +303,7 @@ def _assembled(
         input_dimensions_hwl=detections.dimensions_hwl.clone(),
         ground_source=_ground_sources(frames, detections),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
+        track_part=torch.full_like(status, -1).index_copy(0, rows, outcome.track_part),
         prior=prior,
         has_shape=outcome.has_shape,
     )

@@ -85,6 +85,8 @@ class RefinementResult(CarRecord):
         input_dimensions_hwl: (B, 3) of the detections, metres.
         ground_source: where the ground plane of each car's frame came from, B entries.
         t_cam_ref: (B, 3) `x_cam = x_ref + t_cam_ref`.
+        track_part: (B,) int64, 0 for cars that share their shape with other views of their track, or the number of the
+            part, where a track's views cannot be of one car and it was split; -1 for shapes of one view.
         prior: the shapes.
         has_shape: the shape was refined, so that boxes are measured on it; False for the method "box_alignment".
 
@@ -118,6 +120,7 @@ class RefinementResult(CarRecord):
     input_dimensions_hwl: Annotated[Tensor, Dense("B", 3)]
     ground_source: tuple[str, ...]
     t_cam_ref: Annotated[Tensor, Dense("B", 3)]
+    track_part: Annotated[Tensor, Dense("B", kind="index")]
     prior: ShapePrior
     has_shape: bool = True
 

@@ -1,12 +1,11 @@
 """Cars refined by themselves, then the views of each track together: one shape, and steps in common.
 
-So a view that is not trusted by itself never joins a track, and whoever is not trusted in it keeps what it was alone.
+So a view that is not trusted by itself never joins a track, one that is not trusted in it keeps what it was alone, and
+what each says of the shape is known before they are made to agree: a track of two cars is split.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,13 +17,17 @@ from directshape_torch.solver.backward import attached_state
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, take_rows
-from directshape_torch.solver.sharing import Groups
+from directshape_torch.solver.sharing import Groups, said_of_shared
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState, following, retract
 
 # What the family of shapes says is known once, however many views there are; each detection's dimensions are a
 # measurement of their own.
 _KNOWN_ONCE = "shape"
+# Two halves of a track are of one car if their codes differ by no more than this squared Mahalanobis length, with
+# standard deviations of codes as long again as the uncalibrated ones, and at least so many: what each side of a car
+# that is not as the family of shapes has it makes of its code.
+_MOST_DIFFERENCE, _SIGMA_FACTOR, _CODE_FLOOR = 10.0, 2.0, 0.3
 
 
 def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarState) -> Outcome:
@@ -52,6 +55,7 @@ def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarSt
         minimum = replace(minimum, status=status)
     alone = _attached(problem, cars, origin, minimum)
     of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), in_track)
+    of_track = replace(of_track, track_part=shared.part)
     outcome = outcome.going_on(rows[chosen], of_track.rows(chosen))
     return replace(outcome, state=put_rows(alone, rows[chosen], take_rows(of_views, chosen)))
 
@@ -78,11 +82,13 @@ class Together:
         keep: (B,) bool, which of the cars of the call they are.
         problem: of these R views, its last stage alone.
         hessian: (R, D, D) of each by itself.
+        part: (R,) of its track, 0 unless it was split.
     """
 
     keep: Tensor
     problem: CarProblem
     hessian: Tensor
+    part: Tensor
 
     def agreed(self, alone: CarState) -> CarState:
         """States (R) with the one shape on which the views agree best, and poses as they go with it.
@@ -105,20 +111,33 @@ def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState]) ->
         return None
     hessian = minimum.after.hessian.sum(dim=1)
     _, solvable = damped_step(hessian, hessian[:, 0], torch.zeros_like(minimum.after.cost))
-    usable = is_refined(minimum.status) & solvable
-    groups = _tracks(cars, usable)
-    if not groups:
+    own, shared = _unknowns(problem, hessian.device)
+    information, has_any = said_of_shared(minimum.after.information.sum(dim=1), own, shared)
+    code = minimum.end.code.to(information)
+    part_of_row: dict[int, tuple[int, int]] = {}  # number of the group, and of the part of its track
+    for views in _tracks(cars, is_refined(minimum.status) & solvable & has_any):
+        for number, part in enumerate(_of_one_car(views, information, code)):
+            if len(part) > 1:
+                part_of_row |= dict.fromkeys(part, (part[0], number))
+    if not part_of_row:
         return None
-    of_row = {row: number for number, rows in enumerate(groups) for row in rows}
-    numbers = sorted(of_row)
-    index = torch.tensor(numbers, device=usable.device)
-    keep = torch.zeros_like(usable).index_fill(0, index, True)
-    part = _sharing_a_shape(problem.of_problems(keep), [of_row[row] for row in numbers])
-    return Together(keep, part, hessian[index])
+    numbers = sorted(part_of_row)
+    index = torch.tensor(numbers, device=code.device)
+    keep = torch.zeros_like(solvable).index_fill(0, index, True)
+    sharing = Groups.of([part_of_row[row][0] for row in numbers], own, shared)
+    parts = torch.tensor([part_of_row[row][1] for row in numbers], device=code.device)
+    return Together(keep, _sharing_a_shape(problem.of_problems(keep), sharing), hessian[index], parts)
+
+
+def _unknowns(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Numbers of a view's own unknowns, and of those of the shape."""
+    number = torch.arange(6 + problem.prior.num_codes + problem.num_offsets, device=device)
+    of_shape = (number >= 6) & (number < 6 + problem.prior.num_codes)
+    return number[~of_shape], number[of_shape]
 
 
 def _tracks(cars: CarBatch, usable: Tensor) -> list[list[int]]:
-    """Rows of the usable views of each track that has several, in the order of the frames."""
+    """Rows of the usable views of each track, in the order of the frames."""
     assert cars.track_id is not None
     views: dict[int, list[int]] = {}
     order = cars.frame_index.argsort(stable=True).tolist()
@@ -126,19 +145,38 @@ def _tracks(cars: CarBatch, usable: Tensor) -> list[list[int]]:
     for row in order:
         if track_id[row] >= 0 and is_usable[row]:
             views.setdefault(track_id[row], []).append(row)
-    return [rows for rows in views.values() if len(rows) > 1]
+    return list(views.values())
 
 
-def _sharing_a_shape(problem: CarProblem, group: Sequence[int]) -> CarProblem:
-    """The last stage of a problem of R views, whose shapes are one where the group (R,) is."""
-    number = torch.arange(6 + problem.prior.num_codes + problem.num_offsets, device=problem.masks.filled.device)
-    is_shared = (number >= 6) & (number < 6 + problem.prior.num_codes)
-    sizes = Counter(group)
-    share = torch.tensor([1 / sizes[name] for name in group], dtype=torch.float64, device=number.device)
-    once = torch.stack([share if name == _KNOWN_ONCE else share * 0 + 1 for name in problem.term_names], dim=1)
-    return replace(
-        problem,
-        config=replace(problem.config, stages=problem.config.stages[-1:]),
-        sharing=Groups.of(group, number[~is_shared], number[is_shared]),
-        factors=once if problem.factors is None else once * problem.factors,
-    )
+def _of_one_car(views: list[int], information: Tensor, code: Tensor) -> list[list[int]]:
+    """The views (rows of a track), cut in time where what is before and after cannot be one shape.
+
+    Each view's cost is a quadratic of its code about where it ended; the cut is where the two halves, each with the
+    code of its own least sum, differ most.
+    """
+    if len(views) < 2:
+        return [views]
+    A = information[views].cumsum(dim=0)
+    b = (information[views] @ code[views, :, None]).cumsum(dim=0)
+    halves = A[:-1], A[-1] - A[:-1]
+    solved = [torch.linalg.inv_ex(half)[0] for half in halves]
+    difference = solved[0] @ b[:-1] - solved[1] @ (b[-1] - b[:-1])
+    floor = 2 * _CODE_FLOOR**2 * torch.eye(code.shape[1], dtype=code.dtype, device=code.device)
+    covariance = _SIGMA_FACTOR**2 * (solved[0] + solved[1]) + floor
+    lengths = (difference.mT @ torch.linalg.solve_ex(covariance, difference)[0])[:, 0, 0].tolist()
+    cut = max(range(len(lengths)), key=lengths.__getitem__)
+    if not lengths[cut] > _MOST_DIFFERENCE:
+        return [views]
+    first, second = views[: cut + 1], views[cut + 1 :]
+    return _of_one_car(first, information, code) + _of_one_car(second, information, code)
+
+
+def _sharing_a_shape(problem: CarProblem, sharing: Groups) -> CarProblem:
+    """The last stage of a problem of R views, whose shapes are one in each group."""
+    everybody = torch.ones_like(sharing.is_alone)
+    share = 1 / sharing.total(everybody.to(torch.float64), everybody)
+    columns = [share if name == _KNOWN_ONCE else torch.ones_like(share) for name in problem.term_names]
+    once = torch.stack(columns, dim=1)
+    config = replace(problem.config, stages=problem.config.stages[-1:])
+    factors = once if problem.factors is None else once * problem.factors
+    return replace(problem, config=config, sharing=sharing, factors=factors)

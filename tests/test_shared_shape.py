@@ -22,6 +22,7 @@ from helpers.synthetic_scene import (
 )
 from torch import Tensor
 
+from directshape_torch import tracks
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
 from directshape_torch.refiner import DirectShapeRefiner
@@ -33,10 +34,10 @@ HEADINGS = (0.3, 1.2, 2.4)
 
 
 @cache
-def drive() -> tuple[FrameBatch, Detections, Tensor]:
+def drive(contrast: float = 1.0) -> tuple[FrameBatch, Detections, Tensor]:
     """Three frames of a car that turns and of another one that stands: frames, boxes that are off, the true codes."""
     prior = ellipsoid_prior()
-    code = torch.tensor([[0.9, -0.4, 0.5], [-0.8, 0.3, -0.4]], dtype=torch.float64)
+    code = contrast * torch.tensor([[0.9, -0.4, 0.5], [-0.8, 0.3, -0.4]], dtype=torch.float64)
     height = CAMERA_HEIGHT_M
     seen: list[Street] = [
         street(prior, [(-1.3, height, 8.0 + n), (2.1, height, 12.0 - n)], [heading, -1.2], code)
@@ -48,9 +49,9 @@ def drive() -> tuple[FrameBatch, Detections, Tensor]:
     return frames, replace(disturbed(detections), dimensions_hwl=mean), code.repeat(len(seen), 1)
 
 
-def refined(detections: Detections, track_id: list[int] | None = None) -> RefinementResult:
+def refined(detections: Detections, track_id: list[int] | None = None, contrast: float = 1.0) -> RefinementResult:
     ids = None if track_id is None else torch.tensor(track_id)
-    return DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(drive()[0], replace(detections, track_id=ids))
+    return DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(drive(contrast)[0], replace(detections, track_id=ids))
 
 
 def assert_same(one: RefinementResult, other: RefinementResult) -> None:
@@ -94,6 +95,28 @@ def test_a_batch_of_tracks_equals_a_loop() -> None:
         one = refined(detections, track_id)
         torch.testing.assert_close(together.T_cam_obj[rows], one.T_cam_obj[rows], rtol=0, atol=1e-9)
         torch.testing.assert_close(together.code[rows], one.code[rows], rtol=0, atol=1e-9)
+
+
+def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The few pixels of a toy know its shape less well than those of a street.
+    monkeypatch.setattr(tracks, "_MOST_DIFFERENCE", 1.5)
+    _, detections, _ = drive(contrast=2.5)
+    right, swapped = (refined(detections, ids, contrast=2.5) for ids in ([0, 1] * 3, [0, 1, 0, 1, 1, 0]))
+    assert right.track_part.tolist() == [0] * 6
+    assert swapped.track_part.tolist() == [0] * 4 + [-1] * 2
+    alone = refined(detections, [-1] * 6, contrast=2.5)
+    assert torch.equal(swapped.code[4:], alone.code[4:])
+
+
+@pytest.mark.parametrize("cut", [1, 3, 6])
+def test_the_cut_is_where_the_shape_changes(cut: int) -> None:
+    generator = torch.Generator().manual_seed(2)
+    A = 3 * torch.randn(7, 20, 3, generator=generator, dtype=torch.float64)
+    code = 0.1 * torch.randn(7, 3, generator=generator, dtype=torch.float64)
+    views = [6, 0, 3, 1, 5, 2, 4]
+    assert tracks._of_one_car(views, A.mT @ A, code) == [views]
+    code[views[cut:]] += torch.tensor([1.5, -1.0, 0.8])
+    assert tracks._of_one_car(views, A.mT @ A, code) == [views[:cut], views[cut:]]
 
 
 def test_a_view_without_a_mask_touches_nothing_else() -> None:

@@ -56,6 +56,7 @@ class Outcome(CarRecord):
     quality: FitQuality
     observability: Observability
     profile: DisparityProfile
+    track_part: Tensor
     has_shape: bool = True
 
     @classmethod
@@ -78,6 +79,7 @@ class Outcome(CarRecord):
             quality=FitQuality.nothing(nan, count),
             observability=Observability.nothing(nan, count),
             profile=DisparityProfile.nothing(nan, count),
+            track_part=none - 1,
         )
 
     def going_on(self, rows: Tensor, later: Outcome) -> Outcome:
@@ -134,6 +136,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         # The directions are mostly those of the depth, so its factor brings them to size.
         observability=unseen.scaled(bundled_trust_model().sigma_factors[0]),
         profile=course.profile,
+        track_part=torch.full_like(minimum.status, -1),
     )
 
 

@@ -171,8 +171,7 @@ class Groups:
         return self._unless_alone(newton_step(J, gradient), together)
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
-        nothing = torch.zeros_like(information[:, 0])
-        _, of_each, _, solvable = self._reduced(information, nothing, _undamped_solution)
+        of_each, solvable = said_of_shared(information, self.own, self.shared)
         members = members & solvable
         of_each = torch.where(members[:, None, None], of_each, 0.0)
         widened = information.clone()
@@ -189,29 +188,45 @@ class Groups:
         step = torch.where(self.is_alone[:, None], alone[0], together[0])
         return step, torch.where(self.is_alone, alone[1], together[1])
 
-    def _reduced(self, matrix: Tensor, gradient: Tensor, solve: _Solve) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Each problem's own unknowns as they follow the shared ones, and what it then says of these alone.
-
-        Returns:
-            W (B, P, 1 + K) of `own = W[:, :, 0] + W[:, :, 1:] @ shared`; matrix (B, K, K) and right side (B, K) of the
-            shared unknowns; where (B,) there are these.
-        """
-        rows, own, shared = matrix[:, self.own], self.own, self.shared
-        W, solvable = solve(rows[:, :, own], -torch.cat([gradient[:, own, None], rows[:, :, shared]], dim=2))
-        rows = matrix[:, shared]
-        of_each = torch.cat([-gradient[:, shared, None], rows[:, :, shared]], dim=2)
-        signs = torch.tensor([-1.0] + [1.0] * len(shared), dtype=matrix.dtype, device=matrix.device)
-        of_each = of_each + rows[:, :, own] @ W * signs
-        return W, of_each[:, :, 1:], of_each[:, :, 0], solvable & of_each.flatten(1).isfinite().all(dim=1)
-
     def _step(self, matrix: Tensor, gradient: Tensor, solve: _Solve, members: Tensor) -> tuple[Tensor, Tensor]:
-        W, of_each, right, solvable = self._reduced(matrix, gradient, solve)
+        W, of_each, right, solvable = _reduced(matrix, gradient, self.own, self.shared, solve)
         members = members & solvable
         common, has_step = solve(self.total(of_each, members), self.total(right, members)[:, :, None])
         own = W[:, :, :1] + W[:, :, 1:] @ common
         nothing, solvable = torch.zeros_like(gradient), members & has_step
         step = nothing.index_copy(1, self.own, own[:, :, 0]).index_copy(1, self.shared, common[:, :, 0])
         return torch.where(solvable[:, None], step, 0.0), solvable
+
+
+def said_of_shared(information: Tensor, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
+    """Information (B, K, K) of the shared unknowns whatever the own ones are, of (B, D, D) of all; where (B,) there is.
+
+    Examples:
+        >>> of_all = torch.tensor([[[2.0, 1.0], [1.0, 1.0]]])
+        >>> said_of_shared(of_all, own=torch.tensor([0]), shared=torch.tensor([1]))[0]
+        tensor([[[0.5000]]])
+    """
+    nothing = torch.zeros_like(information[:, 0])
+    _, of_each, _, solvable = _reduced(information, nothing, own, shared, _undamped_solution)
+    return of_each, solvable
+
+
+def _reduced(
+    matrix: Tensor, gradient: Tensor, own: Tensor, shared: Tensor, solve: _Solve
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Each problem's own unknowns as they follow the shared ones, and what it then says of these alone.
+
+    Returns:
+        W (B, P, 1 + K) of `own = W[:, :, 0] + W[:, :, 1:] @ shared`; matrix (B, K, K) and right side (B, K) of the
+        shared unknowns; where (B,) there are these.
+    """
+    rows = matrix[:, own]
+    W, solvable = solve(rows[:, :, own], -torch.cat([gradient[:, own, None], rows[:, :, shared]], dim=2))
+    rows = matrix[:, shared]
+    of_each = torch.cat([-gradient[:, shared, None], rows[:, :, shared]], dim=2)
+    signs = torch.tensor([-1.0] + [1.0] * len(shared), dtype=matrix.dtype, device=matrix.device)
+    of_each = of_each + rows[:, :, own] @ W * signs
+    return W, of_each[:, :, 1:], of_each[:, :, 0], solvable & of_each.flatten(1).isfinite().all(dim=1)
 
 
 def _undamped_solution(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:

@@ -102,6 +102,7 @@ def result(statuses: list[Status]) -> RefinementResult:
         input_dimensions_hwl=torch.ones(B, 3, dtype=torch.float64),
         ground_source=("file",) * B,
         t_cam_ref=T_CAM_REF.expand(B, 3),
+        track_part=torch.full((B,), -1),
         prior=box_prior(),
     )
 
