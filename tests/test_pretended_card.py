@@ -86,7 +86,7 @@ def test_a_whole_call_lets_the_host_wait_some_forty_times(found: dict[str, Any])
 
 def test_the_demo_writes_the_same_files(found: dict[str, Any]) -> None:
     demo = _of(found, "demo")
-    assert len(demo["names"]) > 10
+    assert len(demo["names"]) > 5
     # These name the device, and what it took.
     assert demo["differ"] == ["run.jsonl", "timings.json"]
 

@@ -94,7 +94,8 @@ def _cell(
     last: Tensor | int,  # broadcastable to (...)
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Fraction within the cell, whether inside, first index of the cell, step to its second (0 where there is none)."""
-    last = torch.as_tensor(last, dtype=torch.int32, device=coordinate.device)
+    # A number from the host would be waited for.
+    last = last.int() if isinstance(last, Tensor) else coordinate.new_full((), last, dtype=torch.int32)
     # Not a choice by `inside`, which takes four times as long; NaN must not become an index.
     clamped = coordinate.nan_to_num(0.0).clamp_min(0).minimum(last)
     index = clamped.detach().int().minimum((last - 1).clamp_min(0))
