@@ -79,13 +79,13 @@ def bilinear_patch(
     u, inside_u, column, right = _cell(u, last_column)
     v, inside_v, row, below = _cell(v, last_row)
     upper = first_pixel + row * row_step + column
-    corners = torch.stack([upper, upper + right])
-    upper, lower = take(pixels, corners), take(pixels, corners + below * row_step)
-    down = lower - upper
-    (on_left, on_right), (d_v, d_v_right) = torch.addcmul(upper, v, down), down
-    d_u = on_right - on_left
+    lower = upper + below * row_step
+    upper_left, upper_right = take(pixels, upper), take(pixels, upper + right)
+    down_left, down_right = take(pixels, lower) - upper_left, take(pixels, lower + right) - upper_right
+    on_left = torch.addcmul(upper_left, v, down_left)
+    d_u = torch.addcmul(upper_right, v, down_right) - on_left
     value = torch.addcmul(on_left, u, d_u)
-    d_v = torch.addcmul(d_v, u, d_v_right - d_v)
+    d_v = torch.addcmul(down_left, u, down_right - down_left)
     return BilinearPatch(value, d_u * inside_u, d_v * inside_v, inside_u & inside_v)
 
 
