@@ -12,7 +12,7 @@ what the others are compared with. The same cars count in all: those that can be
 with the box that is returned, refined or not. Prints tables in markdown: all cars, those that turn to the camera by
 more than `--turn-deg` within their sequence, and median errors of near and far faces by distance. Writes one line a
 car, frame and number of frames to `OUT/cars.csv`. With `--swap` two cars of each sequence exchange their tracks half
-way, and nothing may get worse.
+way: both must be split, and nothing may get worse.
 """
 
 from __future__ import annotations
@@ -47,12 +47,20 @@ _DISTANCES_M = (0.0, 12.0, 20.0, 30.0, np.inf)
 
 @dataclass(frozen=True)
 class CarOfFrame:
-    """A car in one frame, refined with `views` frames in a call; errors in metres, above 0 too long or too far."""
+    """A car in one frame, refined with `views` frames in a call; errors in metres, above 0 too long or too far.
+
+    Attributes:
+        track: of the label.
+        given_track: of the detection, another one with `--swap`.
+        part: see `RefinementResult.track_part`.
+    """
 
     sequence: str
     frame_id: str
     track: int
     views: int
+    given_track: int
+    part: int
     distance_m: float
     alpha: float
     refined: bool
@@ -121,7 +129,7 @@ def _cars(
     errors, before = pose_errors(boxes, true), pose_errors(boxes_of([objects[k] for k in rows]), true)
     reach, true_reach = _reach(boxes, true), _reach(true, true)
     status = result.status
-    assert item.detections.track_id is not None
+    given, part = _track_id(item).tolist(), result.track_part.tolist()
     for number, k in enumerate(rows):
         label, row = labels[partners[k]], first_row + k
         near, far = (reach[number] - true_reach[number]).tolist()
@@ -130,6 +138,8 @@ def _cars(
             frame_id=item.frame_id,
             track=label.track_id,
             views=views,
+            given_track=given[k],
+            part=part[row],
             distance_m=label.location_ref[2],
             alpha=label.alpha,
             refined=status[row].is_refined,
@@ -191,6 +201,7 @@ def table(found: Sequence[CarOfFrame], turn_deg: float) -> list[str]:
         for views in lengths if chosen else []:
             cars, alone = ([by_views[n][key] for key in chosen] for n in (views, lengths[0]))
             lines.append(_line(cars, alone))
+    lines += ["", *(f"{views} frames: {_split(list(by_views[views].values()))}" for views in lengths[1:])]
     lines += ["", "| frames | " + " | ".join(f"near, far face, {name}" for name in _DISTANCE_NAMES) + " |"]
     lines.append("|---" * (1 + len(_DISTANCE_NAMES)) + "|")
     for views in lengths:
@@ -204,6 +215,13 @@ _HEADING = (
     "|---|---|---|---|---|---|---|---|---|---|",
 )
 _DISTANCE_NAMES = ("0 to 12 m", "12 to 20 m", "20 to 30 m", "beyond")
+
+
+def _split(cars: Sequence[CarOfFrame]) -> str:
+    tracks: dict[tuple[str, int], list[int]] = {}
+    for car in cars:
+        tracks.setdefault((car.sequence, car.given_track), []).append(car.part)
+    return f"{sum(max(parts) > 0 for parts in tracks.values())} of {len(tracks)} tracks split"
 
 
 def _turning(cars: Sequence[CarOfFrame], turn_deg: float) -> set[tuple[str, int]]:

@@ -82,6 +82,7 @@ def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: st
         ground_source=loaded.frame.ground.source[0],
         input_lines=np.array(lines, dtype=np.int64),
         tracks=_tracks(loaded),
+        track_parts=_numpy(result.track_part[rows]).astype(np.int64),
         T_cam_obj=_numpy(result.T_cam_obj[rows]),
         T_ref_obj=_numpy(result.T_ref_obj[rows]),
         boxes_hwl=_numpy(boxes.dimensions_hwl[rows]),

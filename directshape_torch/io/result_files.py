@@ -101,6 +101,7 @@ class ShapeArrays:
         ground_source: "file", "stereo" or "camera_height".
         input_lines: (B,) line numbers in the detection file, from 1.
         tracks: (B,) text, the name of the track of which each car is a view, "" for none.
+        track_parts: (B,) 0 for views that share a shape, 1, 2 .. for the parts of a track that was split, -1 for none.
         T_cam_obj, T_ref_obj: (B, 4, 4) object to left camera, and to the frame of the labels.
         boxes_hwl: (B, 3) metres.
         boxes_location_ref: (B, 3) bottom centres, metres.
@@ -131,6 +132,7 @@ class ShapeArrays:
     ground_source: str
     input_lines: NDArray[np.int64] = field(metadata=shaped("B"))
     tracks: tuple[str, ...] = field(metadata=shaped("B"))
+    track_parts: NDArray[np.int64] = field(metadata=shaped("B"))
     T_cam_obj: Floats = field(metadata=shaped("B", 4, 4))
     T_ref_obj: Floats = field(metadata=shaped("B", 4, 4))
     boxes_hwl: Floats = field(metadata=shaped("B", 3))

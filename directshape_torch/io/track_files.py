@@ -37,6 +37,8 @@ class TrackArrays:
         frame_ids: (F,) text, in the order of the frames.
         input_lines: (F,) line numbers in the detection files, from 1.
         statuses: (F,) text.
+        parts: (F,) 0 for views that share a shape, 1, 2 .. for later ones that cannot be the same car, -1 for a view
+            that shares with none.
         T_cam_obj, T_ref_obj: (F, 4, 4) object to left camera, and to the frame of the labels.
         boxes_hwl, boxes_location_ref: (F, 3), and boxes_rotation_y (F,): the boxes of the result lines.
         codes: (F, K) one and the same in all views of a call; views that were not trusted keep their own.
@@ -51,6 +53,7 @@ class TrackArrays:
     frame_ids: tuple[str, ...] = field(metadata=shaped("F"))
     input_lines: NDArray[np.int64] = field(metadata=shaped("F"))
     statuses: tuple[str, ...] = field(metadata=shaped("F"))
+    parts: NDArray[np.int64] = field(metadata=shaped("F"))
     T_cam_obj: Floats = field(metadata=shaped("F", 4, 4))
     T_ref_obj: Floats = field(metadata=shaped("F", 4, 4))
     boxes_hwl: Floats = field(metadata=shaped("F", 3))
@@ -130,6 +133,7 @@ def _track(track: str, views: list[tuple[ShapeArrays, int]]) -> TrackArrays:
         frame_ids=tuple(shapes.frame_id for shapes, _ in views),
         input_lines=stacked("input_lines").astype(np.int64),
         statuses=statuses,
+        parts=stacked("track_parts").astype(np.int64),
         T_cam_obj=stacked("T_cam_obj"),
         T_ref_obj=stacked("T_ref_obj"),
         boxes_hwl=boxes_hwl,

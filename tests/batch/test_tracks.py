@@ -51,6 +51,7 @@ def test_views_of_a_track_share_a_shape_and_get_a_file(shared_kitti: Path, seque
     assert track.statuses == tuple(frame.statuses[0] for frame in frames)
     np.testing.assert_array_equal(track.T_cam_obj, np.stack([frame.T_cam_obj[0] for frame in frames]))
     np.testing.assert_array_equal(track.codes, np.broadcast_to(track.code, track.codes.shape))
+    assert track.parts.tolist() == [0] * len(FRAMES)
     np.testing.assert_array_equal(track.dimensions_hwl, track.boxes_hwl[0])
     assert np.isfinite(track.code_covariance).all()
 

@@ -20,6 +20,7 @@ def shape_arrays(num_cars: int, **changes: Any) -> ShapeArrays:
         ground_source="file",
         input_lines=np.arange(B, dtype=np.int64) + 1,
         tracks=("000031", "", "000007")[:B],
+        track_parts=np.full(B, -1, dtype=np.int64),
         T_cam_obj=random.random((B, 4, 4)),
         T_ref_obj=random.random((B, 4, 4)),
         boxes_hwl=random.random((B, 3)),
