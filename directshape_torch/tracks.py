@@ -54,7 +54,7 @@ def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarSt
         status = minimum.status.index_fill(0, rows[chosen], Status.rejected_worse.code)
         minimum = replace(minimum, status=status)
     alone = _attached(problem, cars, origin, minimum)
-    of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), in_track)
+    of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), _of_all_members(in_track))
     of_track = replace(of_track, track_part=shared.part)
     outcome = outcome.going_on(rows[chosen], of_track.rows(chosen))
     return replace(outcome, state=put_rows(alone, rows[chosen], take_rows(of_views, chosen)))
@@ -68,6 +68,12 @@ def _judged(
     minimum = minimise(problem, initial, problem.config.solver, start, record)
     outcome = judged(minimum, initial, outcome_of(problem, initial, minimum, cars), problem.config.acceptance)
     return replace(minimum, state=outcome.state, status=outcome.status), outcome
+
+
+def _of_all_members(in_track: Minimum[CarState]) -> Minimum[CarState]:
+    """With the ends of all who went along with their track, whom its steps depend on, trusted or not."""
+    left = (in_track.status == Status.singular.code) | (in_track.status == Status.non_finite.code)
+    return replace(in_track, state=in_track.end, status=torch.where(left, in_track.status, Status.converged.code))
 
 
 def _attached(problem: CarProblem, cars: CarBatch, start: CarState, minimum: Minimum[CarState]) -> CarState:

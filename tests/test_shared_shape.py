@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import pytest
 import torch
@@ -24,11 +25,16 @@ from torch import Tensor
 
 from directshape_torch import tracks
 from directshape_torch.config import RefinerConfig
+from directshape_torch.diagnosis import outcome as outcomes
+from directshape_torch.diagnosis.outcome import Outcome
 from directshape_torch.errors import InputError
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.solver.gauss_newton import Minimum
+from directshape_torch.solver.sharing import Groups
 from directshape_torch.status import Status
+from directshape_torch.terms.cars import CarState
 
 HEADINGS = (0.3, 1.2, 2.4)
 
@@ -147,8 +153,39 @@ def test_a_view_that_is_not_trusted_by_itself_does_not_join() -> None:
     assert (result.code[4] == result.code[0]).all()
 
 
+def doubt_in_track(monkeypatch: pytest.MonkeyPatch, row: int) -> None:
+    """Have one view trusted by itself and not in its track."""
+
+    def judged(minimum: Minimum[CarState], *others: Any) -> Outcome:
+        outcome = outcomes.judged(minimum, *others)
+        if not isinstance(minimum.stage.problem.sharing, Groups):
+            return outcome
+        doubted = torch.arange(len(outcome.status)) == row
+        return replace(outcome, status=torch.where(doubted, Status.not_trusted.code, outcome.status))
+
+    monkeypatch.setattr(tracks, "judged", judged)
+
+
+def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, detections, _ = drive()
+    alone, trusted = refined(detections), refined(detections, [0, 1] * 3)
+    doubt_in_track(monkeypatch, 2)
+    result = refined(detections, [0, 1] * 3)
+    others = [0, 1, 3, 4, 5]
+    for name, values in result.state_dict().items():
+        if name in ("T_cam_obj", "code", "covariance", "cost_after", "quality.mask_iou_left"):
+            assert torch.equal(values[2], alone.state_dict()[name][2]), name
+            assert torch.equal(values[others], trusted.state_dict()[name][others]), name
+    assert result.status == [Status.converged] * 6
+
+
+@pytest.mark.parametrize("doubted", [False, True])
 @pytest.mark.parametrize("mode", ["unroll", "implicit"])
-def test_gradients_of_a_track_are_those_of_differences(mode: str) -> None:
+def test_gradients_of_a_track_are_those_of_differences(
+    mode: str, doubted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if doubted:
+        doubt_in_track(monkeypatch, 1)
     prior, scene = cached_street()
     frames = joined_frames([scene.frames] * 2)
     # The same picture twice: a minimum without a kink.
@@ -156,11 +193,13 @@ def test_gradients_of_a_track_are_those_of_differences(mode: str) -> None:
     first = select(first, torch.tensor([0]))
     track = replace(joined_detections([first, first], (120, 160)), track_id=torch.tensor([5, 5]))
     direction = 0.02 * torch.randn(frames.images_right.shape, generator=torch.Generator().manual_seed(5)).double()
+    # One view holds back the other, whose pictures change.
+    direction[1] = 0
 
     def summary_at(config: RefinerConfig, by: Tensor | float) -> Tensor:
         moved = replace(frames, images_right=frames.images_right + by * direction)
         result = DirectShapeRefiner(prior, config)(moved, track)
-        assert (result.code[0] == result.code[1]).all()
+        assert doubted != bool((result.code[0] == result.code[1]).all())
         return summary(result)
 
     by = torch.zeros((), dtype=torch.float64, requires_grad=True)

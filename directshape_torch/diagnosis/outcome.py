@@ -24,7 +24,7 @@ from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.problem import CarProblem, CarStage
 from directshape_torch.solver.gauss_newton import Minimum
-from directshape_torch.solver.problem import put_rows, where_rows
+from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.priors import RIG_WEIGHT, detector_pose_sigma
@@ -83,11 +83,10 @@ class Outcome(CarRecord):
         )
 
     def going_on(self, rows: Tensor, later: Outcome) -> Outcome:
-        """With what came of the cars `rows` (R,), ascending, when they were minimised again."""
+        """With the figures of the cars `rows` (R,), ascending, when they were minimised again; the state stays."""
         done = self.iterations.index_add(0, rows, later.iterations)
         history = torch.cat([self.cost_history, placed(later.cost_history, rows, len(self.status))], dim=1)
-        state = put_rows(self.state, rows, later.state)
-        return replace(self.put(rows, later), state=state, iterations=done, cost_history=history)
+        return replace(self.put(rows, later), iterations=done, cost_history=history)
 
 
 def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState], cars: CarBatch) -> Outcome:
