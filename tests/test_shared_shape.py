@@ -103,6 +103,16 @@ def test_a_batch_of_tracks_equals_a_loop() -> None:
         torch.testing.assert_close(together.code[rows], one.code[rows], rtol=0, atol=1e-9)
 
 
+def test_the_order_of_the_detections_does_not_matter() -> None:
+    _, detections, _ = drive()
+    order, track_id = torch.tensor([4, 1, 0, 5, 3, 2]), [7, 1, 7, 1, 7, -1]
+    shuffled = select(replace(detections, track_id=torch.tensor(track_id)), order)
+    assert shuffled.track_id is not None
+    moved, result = refined(shuffled, shuffled.track_id.tolist()), refined(detections, track_id)
+    torch.testing.assert_close(moved.T_cam_obj, result.T_cam_obj[order], rtol=0, atol=1e-9)
+    torch.testing.assert_close(moved.code, result.code[order], rtol=0, atol=1e-9)
+
+
 def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
     # The few pixels of a toy know its shape less well than those of a street.
     monkeypatch.setattr(tracks, "_MOST_DIFFERENCE", 1.5)

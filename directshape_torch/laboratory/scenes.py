@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -85,12 +85,8 @@ def _detections_folder(root: Path) -> Path:
 
 def select_detections(d: Detections, rows: Tensor) -> Detections:
     """Some of the detections, in that order; a row may be repeated. Other instances stay as occluders."""
-    names = (
-        "frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score", "mask_left", "mask_right",
-        "has_mask_left", "has_mask_right",
-    )  # fmt: skip
-    given = (*names, *(name for name in ("pose_sigma", "offset_sigma_px") if getattr(d, name) is not None))
-    return replace(d, **{name: getattr(d, name)[rows] for name in given})
+    own = (field.name for field in fields(d) if isinstance(getattr(d, field.name), Tensor))
+    return replace(d, **{name: getattr(d, name)[rows] for name in own})
 
 
 def place_cars(
