@@ -162,8 +162,8 @@ def _of_one_car(views: list[int], information: Tensor, code: Tensor) -> list[lis
     """
     if len(views) < 2:
         return [views]
-    A = information[views].cumsum(dim=0)
-    b = (information[views] @ code[views, :, None]).cumsum(dim=0)
+    of_views, codes = (x.index_select(0, torch.tensor(views, device=x.device)) for x in (information, code))
+    A, b = of_views.cumsum(dim=0), (of_views @ codes[:, :, None]).cumsum(dim=0)
     halves = A[:-1], A[-1] - A[:-1]
     solved = [torch.linalg.inv_ex(half)[0] for half in halves]
     difference = solved[0] @ b[:-1] - solved[1] @ (b[-1] - b[:-1])

@@ -223,10 +223,8 @@ def _reduced(
     rows = matrix[:, own]
     W, solvable = solve(rows[:, :, own], -torch.cat([gradient[:, own, None], rows[:, :, shared]], dim=2))
     rows = matrix[:, shared]
-    of_each = torch.cat([-gradient[:, shared, None], rows[:, :, shared]], dim=2)
-    signs = torch.tensor([-1.0] + [1.0] * len(shared), dtype=matrix.dtype, device=matrix.device)
-    of_each = of_each + rows[:, :, own] @ W * signs
-    return W, of_each[:, :, 1:], of_each[:, :, 0], solvable & of_each.flatten(1).isfinite().all(dim=1)
+    of_each = torch.cat([gradient[:, shared, None], rows[:, :, shared]], dim=2) + rows[:, :, own] @ W
+    return W, of_each[:, :, 1:], -of_each[:, :, 0], solvable & of_each.flatten(1).isfinite().all(dim=1)
 
 
 def _undamped_solution(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:

@@ -58,10 +58,10 @@ SETTINGS: dict[str, RefinerConfig] = {
 }
 
 
-def compare(config: RefinerConfig, prior: ShapePrior | None = None) -> dict[str, float]:
+def compare(config: RefinerConfig, prior: ShapePrior | None = None, tracks: bool = False) -> dict[str, float]:
     """The largest difference between the devices of each figure, its gradients among them."""
     if config.method == "direct":
-        street_prior, frames, detections = five_cars()
+        street_prior, frames, detections = _numbered() if tracks else five_cars()
     else:
         street_prior, street = measured_street()
         frames, detections = street.frames, disturbed(street.detections, 0.25, 0.08)
@@ -69,6 +69,12 @@ def compare(config: RefinerConfig, prior: ShapePrior | None = None) -> dict[str,
     expected = _figures(DirectShapeRefiner(prior, config), frames, detections, torch.device("cpu"))
     found = _figures(DirectShapeRefiner(copy.deepcopy(prior).to(CARD), config), frames, detections, CARD)
     return {name: _difference(found[name], expected[name]) for name in expected}
+
+
+def _numbered() -> tuple[ShapePrior, FrameBatch, Detections]:
+    """The five cars, those of one shape as views of one."""
+    prior, frames, detections = five_cars()
+    return prior, frames, replace(detections, track_id=torch.tensor([0, 1, -1, 0, 1]))
 
 
 def _figures(
@@ -111,9 +117,9 @@ def _difference(found: Tensor, expected: Tensor) -> float:
     return float((found.double() - expected.double()).abs().nan_to_num(nan=torch.inf).max())
 
 
-def waits_of_blocks() -> dict[str, Any]:
+def waits_of_blocks(tracks: bool = False) -> dict[str, Any]:
     """Of the iterations of a refinement: what the host waits for between the beginnings and ends of stages."""
-    prior, frames, detections = five_cars()
+    prior, frames, detections = _numbered() if tracks else five_cars()
     # Else all of the toys stay until the last block of a stage.
     config = with_solver(_SHIPPED, cost_tolerance=0.01)
     block = config.solver.block_iterations
@@ -169,7 +175,10 @@ def demo() -> dict[str, list[str]]:
 CASES: dict[str, Callable[[], Any]] = {
     **{name: lambda config=config: compare(config) for name, config in SETTINGS.items()},  # type: ignore[misc]
     "neural prior": lambda: compare(DEFAULT, prior_of("neural")),
+    "tracks": lambda: compare(_SHIPPED, tracks=True),
+    "tracks, unrolled gradients": lambda: compare(SETTINGS["unrolled gradients"], tracks=True),
     "waits of blocks": waits_of_blocks,
+    "waits of blocks of tracks": lambda: waits_of_blocks(tracks=True),
     "the card itself": waits_of_nothing,
     "demo": demo,
 }
