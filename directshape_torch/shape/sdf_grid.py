@@ -161,7 +161,8 @@ def cells_at(field: GridField, points_obj: Tensor) -> Cells:
     """The cells at points (3, ...). A NaN point gets a valid cell, at a distance of NaN: it cannot disturb others."""
     position = field.positions(points_obj)
     last = field.last_nodes(position)
-    clamped = position.clamp_min(0).minimum(last)
+    # Not `minimum`, which halves derivatives on the last faces.
+    clamped = position.clamp_min(0).clamp_max(last)
     lower = clamped.detach().floor().minimum(last - 1)
     return Cells(field.lower_nodes(lower), clamped - lower, position, clamped)
 

@@ -88,6 +88,14 @@ def test_gradient_is_the_derivative_of_the_value(where: str) -> None:
     torch.testing.assert_close(other, by_autograd, rtol=1e-12, atol=1e-12)
 
 
+def test_the_last_faces_belong_to_their_cells() -> None:
+    shape, index = random_shape(1), torch.zeros(3, dtype=torch.long)
+    shape = GridShape(shape.values, shape.basis, torch.zeros(3, dtype=torch.float64), 0.5)
+    points = torch.tensor([[2.5, 0.7, 0.3], [0.2, 2.0, 0.3], [0.2, 0.3, 1.5]], dtype=torch.float64, requires_grad=True)
+    (from_autograd,) = torch.autograd.grad(shape.value(points, index).sum(), points)
+    torch.testing.assert_close(shape.value_and_derivatives(points, index).gradient, from_autograd)
+
+
 def test_gradient_by_central_differences() -> None:
     shape, points = random_shape(), torch.cat([points_inside(20), points_outside(20)])
     index = torch.arange(40) % 2
