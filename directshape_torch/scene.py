@@ -357,14 +357,13 @@ def _as_images(name: str, images: Tensor, like: Tensor) -> Tensor:
 def _stacked(name: str, masks: Masks, count: int) -> Tensor:
     """Masks (B, H, W) in bool or floating point."""
     if not isinstance(masks, Tensor):
-        check_type(name, masks, (Tensor, list, tuple))
+        if not isinstance(masks, (list, tuple)):
+            raise InputError(name, "tensors", type(masks).__name__, "torch.as_tensor(masks), or a list with None")
         for number, mask in enumerate(masks):
             if mask is not None:
                 check_shape(f"{name}[{number}]", mask, ("H", "W"))
                 check_stored(f"{name}[{number}]", mask)
         present = [mask for mask in masks if mask is not None]
-        if not all(isinstance(mask, Tensor) for mask in present):
-            raise InputError(name, "tensors", type(masks).__name__, "torch.as_tensor(masks), or a list with None")
         if len(masks) != count or not present or len({mask.shape for mask in present}) > 1:
             got = f"{len(masks)} entries of sizes {sorted({tuple(mask.shape) for mask in present})}"
             raise InputError(name, f"{count} masks of one size (H, W), or None where a car has none", got)

@@ -15,7 +15,7 @@ from helpers.street_inputs import SETTLED, StreetInputs, gradient_by, summary, w
 from helpers.synthetic_scene import cached_street, disturbed
 from torch import Tensor
 
-from directshape_torch import refiner as refiner_module
+from directshape_torch import tracks as tracks_module
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError, NoGradientWarning
 from directshape_torch.refiner import DirectShapeRefiner
@@ -172,8 +172,8 @@ def test_products_have_all_digits_whatever_the_network_around_is_allowed(monkeyp
         asked.append(torch.get_float32_matmul_precision())
         return minimise(*args, **kwargs)
 
-    minimise = refiner_module.minimise
-    monkeypatch.setattr(refiner_module, "minimise", watched)
+    minimise = tracks_module.minimise
+    monkeypatch.setattr(tracks_module, "minimise", watched)
     _, scene = cached_street()
     refiner = DirectShapeRefiner(ellipsoid_prior(torch.float64), DEFAULT)
     torch.set_float32_matmul_precision("high")

@@ -28,7 +28,7 @@ _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 
 
 
 def read_mesh(path: Path | str, cure: str = "") -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (V, 3) and triangles (F, 3) of an obj, ply, glb, off or stl file, all its parts in one.
+    r"""Vertices (V, 3) and triangles (F, 3) of an obj, ply, glb, off or stl file, all its parts in one.
 
     Raises:
         DataFormatError: no such file, none of these formats, damaged, too large (256 MiB, 8 million lines; glb: what

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, Required, TypedDict
+from typing import Any, Literal, TypedDict
 
 from directshape_torch.errors import DataFormatError, ResumeError, shown
 from directshape_torch.files import atomic_files
@@ -35,10 +35,14 @@ class RunSettings(TypedDict, total=False):
     refiner: dict[str, Any]
 
 
-class FrameEntry(TypedDict, total=False):
+class _FrameState(TypedDict):
+    # By itself: `Required` in an annotation that is a string, as all are here, is overlooked at run time.
+    state: Literal["done", "failed"]
+
+
+class FrameEntry(_FrameState, total=False):
     """What `frames` says of one frame: of one that is done all but the reason, of a failed one the reason."""
 
-    state: Required[Literal["done", "failed"]]
     reason: str
     lines: int
     cars: int

@@ -216,10 +216,10 @@ def _surface_points(mesh_obj: trimesh.Trimesh, step_m: float) -> Iterator[Array]
 
 def _solid(surface: Voxels, mesh_obj: trimesh.Trimesh, options: MeshOptions, name: str) -> Voxels:
     """What the outside cannot reach, with the narrowest closing that makes the mesh solid."""
-    from scipy.spatial import QhullError
+    from scipy.spatial import ConvexHull, QhullError
 
     try:
-        hull_m3 = float(mesh_obj.convex_hull.volume)
+        hull_m3 = float(ConvexHull(mesh_obj.vertices).volume)
     except QhullError as problem:
         raise MeshError(f"{name}: is flat, or has fewer than four corners") from problem
     share = 0.0
