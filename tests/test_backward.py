@@ -182,7 +182,7 @@ def test_the_brightness_follows_the_images(
     # One car ends a little beside its root.
     modes = (with_mode("implicit", matched, max_remaining_step=0.1), with_mode("unroll", matched))
     implicit, unrolled = (gradient_by(inputs, mode, "images") for mode in modes)
-    step = 1e-5
+    step = 3e-4  # a shorter one drowns in what the ends are settled to
     ends = [float(summary(inputs.refine(matched, "images", sign * step))) for sign in (1, -1)]
     numeric = (ends[0] - ends[1]) / (2 * step)
     # `implicit` leaves out that the state at which the stage begins follows the images. Constants: 20 and 50 % off.
