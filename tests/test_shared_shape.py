@@ -89,6 +89,12 @@ def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
         assert (views == views[0]).all()
     errors = [(result.code - code)[0::2].square().mean().sqrt() for result in (alone, together)]
     assert errors[1] < 0.85 * errors[0]
+    # The family of shapes is known once, dimensions as often as they were measured.
+    priors, costs = DEFAULT.priors, dict(zip(together.term_names, together.cost_after.unbind(dim=1), strict=True))
+    torch.testing.assert_close(costs["shape"], priors.shape_weight * together.code.square().sum(dim=1) / 2 / 3)
+    off = ellipsoid_prior().dimensions_and_derivative(together.code).hwl - detections.dimensions_hwl
+    off = off / torch.tensor(priors.dimensions_sigma_m)
+    torch.testing.assert_close(costs["dimensions"], priors.dimensions_weight * off.square().sum(dim=1) / 2)
     # What the other views say counts: no direction is known less.
     variances = [result.covariance.diagonal(dim1=1, dim2=2)[:, 6:] for result in (alone, together)]
     assert (variances[1] < variances[0]).all()
