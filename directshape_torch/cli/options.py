@@ -31,7 +31,11 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
     )
     add_mask_options(group)
     group.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all detection files")
-    add_rig_option(group, "correct the stereo rig by a file of 'directshape calibrate-rig' or of a run (default: none)")
+    add_rig_option(
+        group,
+        "a file of 'directshape calibrate-rig' or of a run corrects the stereo rig; auto: refine estimates it "
+        "(default: %(default)s)",
+    )
     if with_disparity:
         group.add_argument(
             "--disparity",
