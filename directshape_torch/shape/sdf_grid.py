@@ -126,10 +126,13 @@ class GridField(NamedTuple):
         """Flat index (...) among the nodes of all grids, from that within the grid of an object; 32 bits, for speed."""
         return node + (object_index * self.num_nodes).int()
 
-    def at_corners(self, node: Tensor) -> Tensor:
+    def at_corners(self, node: Tensor) -> Ends:
         """Flat indices (8, ...) of the corners of cells, z outermost: 000, 100, 010, 110, 001, 101, 011, 111."""
         x, y, z = self._strides
         offsets = tuple(i * x + j * y + k * z for k in (0, 1) for j in (0, 1) for i in (0, 1))
+        if torch.compiler.is_compiling():
+            # From a table of numbers the compiler makes choices, which keep it from vector instructions.
+            return [node + offset for offset in offsets]
         return node + constant_like(offsets, node).view(8, *[1] * node.ndim)
 
 
@@ -174,9 +177,9 @@ Ends: TypeAlias = Tensor | list[Tensor]
 def corner_values(field: GridField, node: Tensor) -> Ends:
     """Signed distances (8, ...) at the corners of cells with lower node (...) among those of all grids."""
     corners = field.at_corners(node)
-    if torch.compiler.is_compiling():
+    if isinstance(corners, list):
         # An embedding's indices are known not to be negative.
-        return [embedding(corner, field.values[:, None])[..., 0] for corner in corners.unbind(0)]
+        return [embedding(corner, field.values[:, None])[..., 0] for corner in corners]
     return field.values.index_select(0, corners.view(-1)).view(corners.shape)
 
 
@@ -220,9 +223,9 @@ def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, c
     cells = cells_at(field, points_obj)
     value, gradient = _value_and_gradient(field, cells, object_index)
     table, corners = field.basis.flatten(0, 2), field.at_corners(cells.lower_node)
-    if constant and not torch.compiler.is_compiling():
+    if constant and isinstance(corners, Tensor):
         return Lookup(value, gradient, _summed(table, corners, cells.fraction))
-    rows = [embedding(corner, table) for corner in corners.unbind(0)]
+    rows = [embedding(corner, table) for corner in corners]
     return Lookup(value, gradient, _interpolated(rows, cells.fraction[..., None]))
 
 
