@@ -98,6 +98,7 @@ def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
     # What the other views say counts: no direction is known less.
     variances = [result.covariance.diagonal(dim1=1, dim2=2)[:, 6:] for result in (alone, together)]
     assert (variances[1] < variances[0]).all()
+    assert (together.observability.sigmas_m.amax(dim=1) < alone.observability.sigmas_m.amax(dim=1)).all()
 
 
 def test_a_batch_of_tracks_equals_a_loop() -> None:
