@@ -346,7 +346,7 @@ def test_kornias_pair_is_checked() -> None:
 
 def test_moving_to_a_dtype_keeps_integers_and_masks() -> None:
     scene = cached_street()[1]
-    frames, detections = scene.frames.to(dtype=torch.float32), scene.detections.to(dtype=torch.float32)
+    frames, detections = scene.frames.to(torch.float32), scene.detections.to(dtype=torch.float32)
     assert frames.images_left.dtype == frames.camera.K_left.dtype == frames.ground.normal.dtype == torch.float32
     assert frames.sizes.dtype == detections.frame_index.dtype == torch.int64
     assert detections.has_mask_left.dtype == torch.bool

@@ -232,8 +232,10 @@ class TensorRecord:
             if isinstance(spec, Dense)
         }
 
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """A copy on another device and, for floating-point fields, of another dtype."""
+    def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """A copy on another device and, for floating-point fields, of another dtype, which may come alone."""
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
         return self._with(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
     def detach(self) -> Self:
