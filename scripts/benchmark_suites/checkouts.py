@@ -12,6 +12,7 @@ frames with `compile` on or off, with its seconds, or its operations where the l
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import subprocess
@@ -26,20 +27,18 @@ from typing import Any
 
 import torch
 
-from benchmark_suites.figures import Row, SuiteResult, SuiteSettings
 from benchmark_suites.measures import count_operations
-from benchmark_suites.timing import Spread
+from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import load_scenes
 from directshape_torch import DirectShapeRefiner, load_config
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.frame_collation import collate
 
-_SUITE = "against"
 _SINGLE_FRAMES, _BATCH_FRAMES = 3, 8
 _ROUNDS = 7
 
 
-def run_against(checkout: Path, settings: SuiteSettings) -> SuiteResult:
+def against_rows(checkout: Path, data_root: Path | None, quick: bool = False) -> Iterator[Row]:
     """Ratios of time and operations, here over there, for frames by themselves and 8 in a call.
 
     Raises:
@@ -49,30 +48,25 @@ def run_against(checkout: Path, settings: SuiteSettings) -> SuiteResult:
     if not (checkout / "directshape_torch" / "__init__.py").is_file():
         raise InputError("--against", "a checkout of this project", str(checkout))
     here = Path(__file__).resolve().parents[2]
-    rounds, rows = 1 if settings.quick else _ROUNDS, []
-    with _version(here, settings) as ours, _version(checkout.resolve(), settings) as theirs:
+    rounds = 1 if quick else _ROUNDS
+    with _version(here, data_root) as ours, _version(checkout.resolve(), data_root) as theirs:
         scenes = ours.answer()
         theirs.answer()
         for number, (scene, count) in enumerate(scenes):
             calls = {f"{scene}, one frame in a call": [(f, 1) for f in range(min(count, _SINGLE_FRAMES))]}
-            if not settings.quick:
+            if not quick:
                 calls[f"{scene}, {_BATCH_FRAMES} frames in a call"] = [(0, _BATCH_FRAMES)]
-            for mode in ("off",) if settings.quick else ("off", "on"):
-                for what, frames in calls.items():
-                    what = f"{what}, {'compiled' if mode == 'on' else 'eager'}"
-                    settings.progress(f"against {checkout}: {what}")
-                    asked = [f"{mode} {number} {first} {size}" for first, size in frames]
-                    seconds = [pair for line in asked for pair in _seconds(ours, theirs, line, rounds)]
-                    note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
-                    ratio = Spread.of([a / b for a, b in seconds])
-                    rows.append(Row.of(_SUITE, f"{what}, time", ratio, "", "ratio", note=note))
-                    if mode == "on":
-                        continue
-                    found = [[v.ask(f"{line} operations") for line in asked] for v in (ours, theirs)]
-                    note = f"{' '.join(map(str, found[0]))} over {' '.join(map(str, found[1]))}"
-                    ratio = Spread.of([a / b for a, b in zip(*found, strict=True)])
-                    rows.append(Row.of(_SUITE, f"{what}, operations", ratio, "", "ratio", note=note))
-    return SuiteResult(_SUITE, tuple(rows), (f"this version over {checkout}, by the ratios within the rounds",))
+            for mode, (what, frames) in itertools.product(("off",) if quick else ("off", "on"), calls.items()):
+                what = f"{what}, {'compiled' if mode == 'on' else 'eager'}"
+                asked = [f"{mode} {number} {first} {size}" for first, size in frames]
+                seconds = [pair for line in asked for pair in _seconds(ours, theirs, line, rounds)]
+                note = " over ".join(f"{1e3 * median(side):.0f} ms" for side in zip(*seconds, strict=True))
+                yield Row(f"{what}, time", Spread.of([a / b for a, b in seconds]), note)
+                if mode == "on":
+                    continue
+                found = [[version.ask(f"{line} operations") for line in asked] for version in (ours, theirs)]
+                note = f"{' '.join(map(str, found[0]))} over {' '.join(map(str, found[1]))}"
+                yield Row(f"{what}, operations", Spread.of([a / b for a, b in zip(*found, strict=True)]), note)
 
 
 def _seconds(ours: _Version, theirs: _Version, line: str, rounds: int) -> Iterator[tuple[float, float]]:
@@ -106,10 +100,10 @@ class _Version:
 
 
 @contextmanager
-def _version(root: Path, settings: SuiteSettings) -> Iterator[_Version]:
+def _version(root: Path, data_root: Path | None) -> Iterator[_Version]:
     scripts = Path(__file__).resolve().parents[1]
     command = [sys.executable, "-m", "benchmark_suites.checkouts", "--threads", str(torch.get_num_threads())]
-    command += ["--data", str(settings.data_root.resolve())] if settings.data_root else []
+    command += ["--data", str(data_root.resolve())] if data_root else []
     # In the root, for the folder in which a module is started comes first in its path.
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(root), str(scripts)))}
     with subprocess.Popen(
@@ -125,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(arguments)
     torch.set_num_threads(args.threads)
-    scenes = load_scenes(args.data, _BATCH_FRAMES, with_rig=False)
+    scenes = load_scenes(args.data, _BATCH_FRAMES)
     refiner = cache(lambda mode: DirectShapeRefiner(config=load_config("default", [f"compile={mode}"])))
     print(json.dumps([(scene.name, len(scene.frames)) for scene in scenes]), flush=True)
     for line in sys.stdin:

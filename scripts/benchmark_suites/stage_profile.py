@@ -16,10 +16,9 @@ from functools import partial
 from types import CodeType, FrameType
 from typing import Any
 
-from benchmark_suites.figures import Row, SuiteResult, SuiteSettings
 from benchmark_suites.measures import OperationCount
-from benchmark_suites.refiners import make_refiner
-from benchmark_suites.timing import Spread
+from benchmark_suites.times import make_refiner
+from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import demo_scene
 from directshape_torch import depth
 from directshape_torch.diagnosis.outcome import outcome_of
@@ -34,7 +33,6 @@ from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.priors import PriorTerm
 from directshape_torch.terms.silhouette import Silhouettes
 
-_SUITE = "profile"
 _REST = "everything else"
 _OUTCOME = "outcome: covariance, quality, profile, trust"
 # Of the functions themselves, so that one that goes takes its line with it.
@@ -55,25 +53,20 @@ PARTS: dict[str, tuple[Any, ...]] = {
 }
 
 
-def run_profile(settings: SuiteSettings) -> SuiteResult:
-    """Median over a few calls of the milliseconds of each part, and its operations."""
-    frames, detections = collate(demo_scene().frames)
-    call = partial(make_refiner("default", "eager"), frames, detections)
-    settings.progress("profile: one eager refinement, by part")
-    for _ in range(settings.repetitions.warm_up):
-        call()
-    times = [profile_parts(call, time.perf_counter) for _ in range(1 if settings.quick else 5)]
+def profile_rows(rounds: int) -> list[Row]:
+    """Milliseconds of each part of an eager call of the bundled frame's cars, default settings, and its operations."""
+    call = partial(make_refiner("default", False), *collate(demo_scene().frames))
+    call()
+    times = [profile_parts(call, time.perf_counter) for _ in range(rounds)]
     with OperationCount() as count:
         operations = profile_parts(call, lambda: count.total)
-    whole = Spread.of([sum(each.values()) for each in times])
+    whole = Spread.of([1e3 * sum(each.values()) for each in times])
     rows = []
     for part in (*PARTS, _REST):
         spread = Spread.of([1e3 * each[part] for each in times])
-        note = f"{spread.median / whole.median / 10:.1f} %, {operations[part]:.0f} operations"
-        rows.append(Row.of(_SUITE, part, spread, "ms", "time", note=note))
-    rows.append(Row.of(_SUITE, "whole call", whole.scaled(1e3), "ms", "time", note=f"{count.total} operations"))
-    notes = f"default preset, eager, the bundled frame with {len(detections)} cars; exclusive, with the hook's own cost"
-    return SuiteResult(_SUITE, tuple(rows), (notes,))
+        note = f"{100 * spread.median / whole.median:.1f} %, {operations[part]:.0f} operations"
+        rows.append(Row(f"{part}: ms", spread, note))
+    return [*rows, Row("whole call, with the hook's own cost: ms", whole, f"{count.total} operations")]
 
 
 def profile_parts(call: Callable[[], object], reading: Callable[[], float]) -> Counter[str]:

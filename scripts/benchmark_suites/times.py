@@ -1,0 +1,89 @@
+"""Times, operations and memory of whole calls; on a graphics card its agreement with the CPU and its waits too."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+import torch
+
+from benchmark_suites.measures import count_operations, count_synchronisations, peak_tensor_bytes
+from benchmark_suites.timing import Row, Spread, time_interleaved
+from benchmark_suites.workloads import Scene
+from directshape_torch.compile import compiler_problem
+from directshape_torch.config_files import load_config
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.scene import Detections, FrameBatch
+
+_BATCH_FRAMES = 8  # of a call by somebody who refines a data set and does not wait for single frames
+_PRESETS = ("default", "fast")
+# Sums in another order change a step's last digits, and a convergence test that is met one iteration sooner changes the
+# result by less than the test's own tolerance. Cars that settle in another minimum are what the share is for.
+_SAME_CENTRE_M = 0.01
+# Settings with which no car settles, so that every car takes part in every iteration.
+_ENDLESS = ("solver.cost_tolerance=0", "solver.step_tolerance=0", "solver.accept_every_step=true")
+_FEW_BLOCKS, _MANY_BLOCKS, _BLOCK = 2, 6, 4
+
+
+def make_refiner(preset: str, compiled: bool, *overrides: str) -> DirectShapeRefiner:
+    """A refiner with a preset's settings, on the CPU.
+
+    Examples:
+        >>> make_refiner("fast", False, "silhouette.weight=6").config.silhouette.weight
+        6.0
+    """
+    return DirectShapeRefiner(config=load_config(preset, [f"compile={'on' if compiled else 'off'}", *overrides]))
+
+
+def time_rows(scene: Scene, device: torch.device, rounds: int, quick: bool = False) -> Iterator[Row]:
+    """Both presets, eager and compiled, single frames and 8 in a call: milliseconds, operations, memory of tensors."""
+    modes = (False,) if quick or compiler_problem() is not None else (False, True)
+    refiners = {
+        f"{preset}, {'compiled' if compiled else 'eager'}": make_refiner(preset, compiled).to(device)
+        for preset in (_PRESETS[:1] if quick else _PRESETS)
+        for compiled in modes
+    }
+    for size in (1,) if quick else (1, _BATCH_FRAMES):
+        # The last call is filled up with the first frames again: each is of the size that its name says.
+        endless, count = itertools.cycle(scene.frames), -(-len(scene.frames) // size)
+        calls = [on_device(*collate(list(itertools.islice(endless, size))), device) for _ in range(count)]
+        sides = [{name: partial(refiner, *call) for name, refiner in refiners.items()} for call in calls]
+        times = [time_interleaved(each, rounds, device) for each in sides]
+        for name, first in sides[0].items():
+            what = f"{scene.name}, {size} frame{'s' if size > 1 else ''} in a call, {name}"
+            per_car = [1e3 * t[name] / len(call[1]) for t, call in zip(times, calls, strict=True)]
+            note = f"{count_operations(first)} operations, " if name.endswith("eager") else ""
+            note += f"{peak_tensor_bytes(first, device) / 2**20 / len(calls[0][1]):.1f} MB a car, of the first call"
+            yield Row(f"{what}: ms a call", Spread.of([1e3 * t[name] for t in times]), note)
+            yield Row(f"{what}: ms a car", Spread.of(per_car))
+
+
+def device_rows(scenes: Sequence[Scene], device: torch.device) -> Iterator[Row]:
+    """Of a graphics card: the share of cars with the CPU's result, and how often a block of iterations waits for it."""
+    for scene in scenes:
+        refiner, call = make_refiner("default", False), collate(scene.frames)
+        expected = refiner(*call).T_cam_obj
+        found = refiner.to(device)(*on_device(*call, device)).T_cam_obj.cpu()
+        distance_m = (found[:, :3, 3] - expected[:, :3, 3]).norm(dim=-1)
+        note = f"within {_SAME_CENTRE_M} m; differences of centres, median {1e3 * float(distance_m.median()):.3g} mm"
+        share = float((distance_m < _SAME_CENTRE_M).double().mean())
+        yield Row(f"{scene.name}: share of cars with the CPU's result", Spread.of([share]), note)
+    call = on_device(*collate(scenes[0].frames[:1]), device)
+    found = [_synchronisations(blocks, call, device) for blocks in (_FEW_BLOCKS, _MANY_BLOCKS)]
+    a_block = (found[1] - found[0]) / (_MANY_BLOCKS - _FEW_BLOCKS)
+    note = f"{_BLOCK} iterations, no car finished; {found[1]} in a call of {_MANY_BLOCKS} blocks"
+    yield Row("waits for the device in a block", Spread.of([a_block]), note)
+
+
+def _synchronisations(blocks: int, call: tuple[FrameBatch, Detections], device: torch.device) -> int:
+    stage = f"stages=[{{contour_width_px: 0.5, image_level: 0, max_iterations: {blocks * _BLOCK}}}]"
+    refiner = make_refiner("default", False, stage, f"solver.block_iterations={_BLOCK}", *_ENDLESS).to(device)
+    refiner(*call)
+    return count_synchronisations(partial(refiner, *call)).total()
+
+
+def on_device(frames: FrameBatch, detections: Detections, device: torch.device) -> tuple[FrameBatch, Detections]:
+    """A call's inputs there."""
+    return frames.to(device), detections.to(device)
