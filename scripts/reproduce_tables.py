@@ -1,103 +1,175 @@
-"""The paper's experiments, one command each: pose, ablation.
+"""The paper's experiments on a data set: average precision of every method, and the ablation, row by row.
 
-    export DIRECTSHAPE_DATA=...                      # or --data ROOT, a full KITTI with detections and masks
-    python scripts/reproduce_tables.py pose          # AP before and after: ours, the geometric baseline, both together
-    python scripts/reproduce_tables.py ablation      # scripts/paper_tables/rows.py, row by row
+    R=$DIRECTSHAPE_DATA/rendered
+    python scripts/reproduce_tables.py pose --data $R --detections $R/detections/stereo --masks $R/training/masks
+    python scripts/reproduce_tables.py ablation --data $R --detections $R/detections/stereo --masks $R/training/masks
 
-Which folders a data set has: scripts/paper_tables/data_sets.py. Written to --out: NAME.md, NAME_*.csv, and under runs/
-every refinement, as `directshape refine` writes it. Refinements are kept: a second call makes tables only, and one that
-was stopped goes on. They are told apart by settings, prior, stereo field and masks, not by the program's code: after a
-change of that, choose another --out. --quick tries everything in a minute or two (two frames, one row of each group).
+A row is a call of `directshape refine` with the words that stand beside its name below, in a folder of its own under
+--out: a second call makes the table only, and one that was stopped goes on. Other data, detections or masks want
+another --out. What the ablation calls a difference is the mean change of BEV IoU to the default, of the same cars, with
+its 95 % interval over cars.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Callable, Sequence
+import contextlib
+import shlex
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-import torch
+import numpy as np
 from command_line import run_command
-from paper_tables.data_sets import DataSet, field_file, find_data_sets
-from paper_tables.rows import ROWS
-from paper_tables.runs import Experiment
-from paper_tables.tables import make_ablation_table, make_pose_table
 
-from directshape_torch.errors import InputError
-from directshape_torch.evaluation.bootstrap import BootstrapSettings
+from directshape_torch.cli.main import main as directshape
+from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.evaluation.bootstrap import CarBootstrap, weighted_mean
+from directshape_torch.evaluation.comparison import Comparison, compare_results, lines_with_left_mask
+from directshape_torch.evaluation.kitti_ap import evaluate_kitti
+from directshape_torch.evaluation.tables import number, with_interval
 
-TABLES: dict[str, Callable[[Experiment], None]] = {
-    "pose": make_pose_table,
-    "ablation": make_ablation_table,
+DEFAULT = "default"
+METHODS = {
+    DEFAULT: "",
+    "input where not trusted": "--trusted",
+    "paper": "--config paper",
+    "fast": "--config fast",
+    "geometric": "--method geometric",
+    "combined": "--method combined",
+    "box alignment": "--method box_alignment",
 }
+_COARSE = "{contour_width_px: 2.0, image_level: 1, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
+_FINE = "{contour_width_px: 0.5, image_level: 0, max_iterations: 6, over_relaxation: 1.6, unknowns: pose}"
+_NO_GROUND = "priors.height_weight=0 priors.tilt_weight=0"
+ABLATION = {
+    DEFAULT: "",
+    "input where not trusted": "--trusted",
+    "rig taken to be exact": "--rig none",
+    "silhouette only": "photometric.weight=0",
+    "photometric only": "silhouette.weight=0",
+    "the paper's product silhouette": "silhouette.form=product",
+    "patches without brightness and contrast": "photometric.patch=normalised",
+    "factor and offset a car": "photometric.brightness=affine",
+    "no priors at all": f"priors.shape_weight=0 priors.dimensions_weight=0 {_NO_GROUND}",
+    "no shape prior": "priors.shape_weight=0",
+    "no prior on dimensions (the paper)": "priors.dimensions_weight=0",
+    "no ground": _NO_GROUND,
+    "mean shape, pose only": f"'stages=[{_COARSE}, {_FINE}]'",
+    "network": "--prior neural",
+    "no occlusion handling": "sampling.occlusion=false",
+    "uniform instead of adaptive pixels": "sampling.mode=uniform sampling.mode_right=uniform",
+    "50 pixels a car": "sampling.min_pixels=50 sampling.max_pixels=50",
+    "100 pixels a car": "sampling.min_pixels=100 sampling.max_pixels=100",
+    "3000 pixels a car": "sampling.min_pixels=3000 sampling.max_pixels=3000",
+    "fine stage only": f"'stages=[{_FINE}]'".replace("pose", "both"),
+    "rays marched at every state": "solver.rays=marched",
+    "headings +-20 degrees, kept by cost": "search.yaw_offsets_deg=[-20,20]",
+    "disparities +-1, +-2 px, kept by cost": "search.disparity_offsets_px=[-2,-1,1,2]",
+}
+TABLES = {"pose": METHODS, "ablation": ABLATION}
 
 
-def chosen_data_sets(args: argparse.Namespace) -> tuple[DataSet, ...]:
-    """The data sets that the options name.
+def words_of(row: str) -> list[str]:
+    """The words that a row adds to a call of `directshape refine`: options, or settings; every result is returned.
+
+    Examples:
+        >>> words_of("solver.rays=marched")[-1]
+        'solver.rays=marched'
+        >>> words_of("--trusted")
+        []
+    """
+    if row == "--trusted":
+        return []
+    words, every = shlex.split(row), ["acceptance.min_probability_better=0", "acceptance.min_probability_not_worse=0"]
+    return [*words, "--set", *every] if row.startswith("-") else ["--set", *every, *words]
+
+
+def folder_of(args: argparse.Namespace, name: str) -> Path:
+    """Where a row is refined."""
+    return Path(args.out) / "".join(c if c.isalnum() else "_" for c in name)
+
+
+def refined(args: argparse.Namespace, name: str) -> Path:
+    """The folder of a row, refined where it is not yet.
 
     Raises:
-        InputError: no data, or an unknown name.
+        InputError: no such row.
+        DirectShapeError: a run that did not end well; it has said why.
     """
-    root = args.data or os.environ.get("DIRECTSHAPE_DATA")
-    if not root:
-        raise InputError("--data", "a folder in KITTI's layout", "none", "or set DIRECTSHAPE_DATA")
-    found = find_data_sets(Path(root), args.masks)
-    unknown = sorted(set(args.sets or ()) - set(found))
-    if unknown:
-        raise InputError("--sets", f"names among {', '.join(found)}", ", ".join(unknown))
-    # Rendered scenes first, where the truth is exact.
-    chosen = [data_set for name, data_set in found.items() if not args.sets or name in args.sets]
-    return tuple(sorted(chosen, key=lambda data_set: not data_set.has_exact_truth))
+    rows, out = TABLES[args.table], folder_of(args, name)
+    if name not in rows:
+        raise InputError("--rows", f"names among {', '.join(rows)}", name)
+    words = ["refine", "--data", args.data, "--detections", args.detections, "--masks", args.masks, "--out", out]
+    words += [] if args.frames is None else ["--frames", *args.frames]
+    with contextlib.redirect_stdout(sys.stderr):
+        code = directshape([*map(str, words), *words_of(rows[name])])
+    if code:
+        raise DirectShapeError(f"the row {name!r} could not be refined, see above")
+    return out
 
 
 def run(args: argparse.Namespace) -> None:
-    """Make one experiment's tables."""
-    torch.set_num_threads(args.threads)
-    data_sets = chosen_data_sets(args)
-    given = None if args.stereo_bias in ("none", "auto") else Path(args.stereo_bias)
-    experiment = Experiment(
-        out=args.out,
-        data_sets=data_sets,
-        fields={
-            d.name: field_file(d.root, args.out / "fields") if args.stereo_bias == "auto" else given for d in data_sets
-        },
-        device=args.device,
-        frames=None if args.frames is None else tuple(frame.zfill(6) for frame in args.frames),
-        detectors=None if args.detections is None else tuple(args.detections),
-        bootstrap=BootstrapSettings(num_draws=args.draws, seed=args.seed),
-        quick=args.quick,
-        groups=tuple(args.groups),
-    )
-    TABLES[args.table](experiment)
-    print(f"{args.out / args.table}.md")
+    """Refine and compare row by row; the table is printed as Markdown and kept in `TABLE.md`."""
+    default, lines = comparison(args, DEFAULT), []
+    for when, name in (("before", "input"), ("after", DEFAULT)):
+        folder = args.detections if when == "before" else folder_of(args, DEFAULT) / "data"
+        lines.append([name, *box_cells(default, when), "", *ap_cells(args, folder)])
+    for name in args.rows or TABLES[args.table]:
+        if name != DEFAULT:
+            found = comparison(args, name)
+            ap = ap_cells(args, folder_of(args, name) / "data")
+            lines.append([name, *box_cells(found, "after"), difference(default, found), *ap])
+    table = "\n".join(["| " + " | ".join(line) + " |" for line in (HEAD, ["---"] * len(HEAD), *lines)]) + "\n"
+    (args.out / f"{args.table}.md").write_text(table, encoding="utf-8")
+    print(table, end="")
+
+
+HEAD = ("", "BEV IoU, mean", "3D IoU, mean", "worse", "against default",
+        *(f"AP_R11 {metric} {iou}" for metric in ("BEV", "3D") for iou in (0.5, 0.7)))  # fmt: skip
+
+
+def comparison(args: argparse.Namespace, name: str) -> Comparison:
+    """A row's boxes against the labels, of the cars that have a mask."""
+    out = refined(args, name)
+    labels = args.data / "training" / "label_2"
+    with_mask = lines_with_left_mask(out / "shapes")
+    return compare_results(labels, args.detections, out / "data", frames=args.frames, keep_line=with_mask)
+
+
+def box_cells(found: Comparison, when: str) -> list[str]:
+    """Mean overlaps, and the share made worse."""
+    bev, in_3d = (getattr(found.overall.metrics[key], when) for key in ("bev_iou_mean", "iou_3d_mean"))
+    worse = found.overall.worse_share
+    is_after = when == "after" and worse is not None
+    return [with_interval("", bev), number("", in_3d.value), number("%", worse.value) if is_after else ""]
+
+
+def difference(default: Comparison, found: Comparison) -> str:
+    """Mean BEV IoU of a row less that of the default, the same cars in every draw."""
+    cars = [{(car.frame_id, car.detection_line): car.after.bev_iou for car in side.cars} for side in (default, found)]
+    common = sorted(set(cars[0]) & set(cars[1]))
+    before, after = (np.array([side[key] for key in common]) for side in cars)
+    return with_interval("", CarBootstrap(np.arange(len(common))).change(before, after, weighted_mean), sign=True)
+
+
+def ap_cells(args: argparse.Namespace, results: Path) -> list[str]:
+    """Average precision over 11 recall points, moderate, as in the paper."""
+    frames = args.frames or sorted(path.stem for path in (folder_of(args, DEFAULT) / "data").glob("*.txt"))
+    scores = evaluate_kitti(args.data / "training" / "label_2", results, split=frames)
+    return [f"{scores.score(m, iou, 'moderate').ap_r11:.1f}" for m in ("bev", "3d") for iou in (0.5, 0.7)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=tuple(TABLES))
-    parser.add_argument("--data", type=Path, metavar="ROOT", help="default: DIRECTSHAPE_DATA")
-    parser.add_argument("--out", type=Path, default=Path("out/tables"), metavar="DIR", help="default: %(default)s")
-    parser.add_argument("--sets", nargs="+", metavar="NAME", help="data sets below ROOT; default all")
-    parser.add_argument("--detections", nargs="+", metavar="NAME", help="folders of detections/; default the table's")
+    parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="KITTI's layout, with labels")
+    parser.add_argument("--detections", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--masks", type=Path, required=True, metavar="DIR")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
-    parser.add_argument("--masks", type=Path, metavar="DIR", help="instead of the data set's own")
-    parser.add_argument(
-        "--stereo-bias", default="auto", metavar="FILE|auto|none", help="auto fits it, where all frames are of one rig"
-    )
-    parser.add_argument("--quick", action="store_true", help="two frames of each detector, one row of each group")
-    parser.add_argument(
-        "--groups",
-        nargs="+",
-        default=[],
-        choices=sorted({row.group for row in ROWS}),
-        help="of the ablation; default all",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of simulated detections and intervals")
-    parser.add_argument("--draws", type=int, default=2000, help="of the intervals")
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="auto")
+    parser.add_argument("--rows", nargs="+", metavar="NAME", help="of the table; default all")
+    parser.add_argument("--out", type=Path, default=Path("out/tables"), metavar="DIR", help="default: %(default)s")
     return run_command(parser, run, arguments)
 
 
