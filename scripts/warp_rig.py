@@ -1,14 +1,11 @@
 """Proof of the rig's estimate: right images bent by known smooth fields, and what detections alone say of them.
 
     R=$DIRECTSHAPE_DATA/rendered
-    python scripts/warp_rig.py draws --data $R --exact $R/detections/gt --fields-px 0.3 0.6 1 1.5
-    python scripts/warp_rig.py write --data $R --field-px 1 --seed 0 --out out/warped
-    directshape refine --data out/warped --detections $R/detections/stereo --masks out/warped/training --out out/run
+    python scripts/warp_rig.py --data $R --exact $R/detections/gt --fields-px 0.3 0.6 1 1.5
 
-`draws` draws detections round the exact ones, estimates the rig from them and compares its field, at the cars, with the
-true one: errors in pixels and in the standard deviations that the estimate states. `write` makes a data set in KITTI's
-layout whose right images and right instances are bent; everything else is linked. A field is a polynomial of fourth
-degree over the right image, as lenses bend it, of which `--field-px` is the largest value; rows are bent by
+Detections are drawn round the exact ones, the rig is estimated from them, and its field is compared at the cars with
+the true one: errors in pixels and in the standard deviations that the estimate states. A field is a polynomial of
+fourth degree over the right image, as lenses bend it, of which `--fields-px` are the largest values; rows are bent by
 `--rows-px`. The same seed bends in the same way.
 """
 
@@ -19,7 +16,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from command_line import run_command
@@ -27,7 +23,7 @@ from quality_calibration.bend import Bend
 from quality_calibration.noise import LEVELS, NoiseLevel, noisy
 from torch import Tensor
 
-from directshape_torch.io.image_files import read_rgb, read_single_channel
+from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.estimate import RigEstimate
@@ -87,25 +83,6 @@ def _line(field: str, level: NoiseLevel, num_draws: int, found: Tensor) -> str:
     )
 
 
-def write(args: argparse.Namespace) -> None:
-    """Write the bent data set."""
-    source, target = args.data / "training", args.out / "training"
-    target.mkdir(parents=True, exist_ok=True)
-    bend = Bend.drawn(args.field_px, args.rows_px, _size_wh(source / "image_3"), args.seed)
-    for folder in sorted(p for p in source.iterdir() if p.name not in ("image_3", "instance_3", "masks")):
-        link = target / folder.name
-        if not link.is_symlink():
-            link.symlink_to(folder.resolve(), target_is_directory=True)
-    for folder, read, interpolation in (
-        ("image_3", lambda path: read_rgb(path)[..., ::-1], cv2.INTER_LANCZOS4),
-        ("instance_3", read_single_channel, cv2.INTER_NEAREST),
-    ):
-        (target / folder).mkdir(exist_ok=True)
-        for path in sorted((source / folder).glob("*.png")):
-            cv2.imwrite(str(target / folder / path.name), bend.image(np.ascontiguousarray(read(path)), interpolation))
-    print(f"wrote {target}: disparities off by up to {args.field_px:g} px, rows by {args.rows_px:g} px")
-
-
 def _size_wh(folder: Path) -> tuple[int, int]:
     height, width = read_rgb(min(folder.glob("*.png"))).shape[:2]
     return width, height
@@ -114,24 +91,17 @@ def _size_wh(folder: Path) -> tuple[int, int]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    draws, writes = commands.add_parser("draws"), commands.add_parser("write")
-    for command in (draws, writes):
-        command.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/")
-        command.add_argument("--rows-px", type=float, default=0.3, help="largest error of the rows (default 0.3)")
-        command.add_argument("--seed", type=int, default=0)
-    draws.add_argument("--exact", type=Path, required=True, metavar="DIR", help="labels as result files")
-    draws.add_argument("--fields-px", type=float, nargs="+", default=[0.3, 0.6, 1.0, 1.5], metavar="PX")
+    parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/")
+    parser.add_argument("--rows-px", type=float, default=0.3, help="largest error of the rows (default 0.3)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--exact", type=Path, required=True, metavar="DIR", help="labels as result files")
+    parser.add_argument("--fields-px", type=float, nargs="+", default=[0.3, 0.6, 1.0, 1.5], metavar="PX")
     names = [level.name for level in LEVELS]
-    draws.add_argument("--levels", nargs="+", choices=names, default=names, help="noise of the detector")
-    draws.add_argument("--draws", type=int, default=9, help="for each field and detector (default 9)")
-    draws.add_argument("--frames-per-draw", type=int, default=12)
-    draws.add_argument("--threads", type=int, default=1)
-    draws.set_defaults(run=draw)
-    writes.add_argument("--field-px", type=float, default=1.0, help="largest error of the disparities (default 1)")
-    writes.add_argument("--out", type=Path, required=True, metavar="DIR")
-    writes.set_defaults(run=write)
-    return run_command(parser, lambda args: args.run(args), arguments)
+    parser.add_argument("--levels", nargs="+", choices=names, default=names, help="noise of the detector")
+    parser.add_argument("--draws", type=int, default=9, help="for each field and detector (default 9)")
+    parser.add_argument("--frames-per-draw", type=int, default=12)
+    parser.add_argument("--threads", type=int, default=1)
+    return run_command(parser, draw, arguments)
 
 
 if __name__ == "__main__":

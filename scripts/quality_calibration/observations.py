@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
-from directshape_torch.evaluation.rotated_iou import bev_iou
+from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.files.npz_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -26,6 +26,7 @@ from quality_calibration.bend import Bend
 from quality_calibration.noise import LEVELS, NoiseLevel, noisy
 
 Array = NDArray[np.floating[Any]]
+WORSE_BY = 0.05
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,16 @@ class Observations:
     def where(self, condition: NDArray[np.bool_]) -> Observations:
         """Those for which the condition (N,) holds."""
         return Observations(**{f.name: getattr(self, f.name)[condition] for f in fields(self)})
+
+    @property
+    def is_better(self) -> NDArray[np.bool_]:
+        """(N,) whose overlap grew."""
+        return np.asarray(self.iou_after > self.iou_before)
+
+    @property
+    def is_worse(self) -> NDArray[np.bool_]:
+        """(N,) made worse by more than 0.05."""
+        return np.asarray(self.iou_after < self.iou_before - WORSE_BY)
 
     @classmethod
     def joined(cls, parts: Sequence[Observations]) -> Observations:
@@ -156,18 +167,20 @@ def observe(
     rows, labels = _counted(loaded, result)
     if not len(rows):
         return []
-    boxes_after, boxes_before = _after(result)[rows], _before(result, detections)[rows]
-    truth = torch.tensor([[*o.location_ref, *o.hwl, o.rotation_y] for o in labels], dtype=torch.float64)
-    errors = torch.cat([boxes_after[:, :3], boxes_after[:, 6:]], 1) - torch.cat([truth[:, :3], truth[:, 6:]], 1)
+    truth, after = boxes_of(labels), result.to_boxes("kitti", "ref")[rows].double()
+    errors = (after - truth)[:, [0, 1, 2, 6]]
     # A flip by half a turn is the detector's affair: the sigma of the heading does not speak of it.
     errors[:, 3] = wrap_angle(2 * errors[:, 3]) / 2
     ray = truth[:, [0, 2]] / truth[:, [0, 2]].norm(dim=1, keepdim=True)
+    location = detections.T_cam_obj[:, :3, 3] - result.t_cam_ref
+    yaw = rotation_y_from_pose(detections.T_cam_obj)
+    before = torch.cat([location, detections.dimensions_hwl, yaw[:, None]], 1)[rows].double()
     columns = (
         np.array([loaded.frame_id] * len(rows)),
         np.array([source] * len(rows)),
         result.quality.evidence[rows].numpy(),
-        _overlap(boxes_before, truth),
-        _overlap(boxes_after, truth),
+        pose_errors(before, truth).bev_iou.numpy(),
+        pose_errors(after, truth).bev_iou.numpy(),
         errors.numpy(),
         result.covariance_xyz_yaw[rows].numpy(),
         ray.numpy(),
@@ -185,20 +198,3 @@ def _counted(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[int], 
         if partner >= 0 and refined[row] and masked[row] and counts.counts(loaded.labels[partner])
     ]
     return [row for row, _ in pairs], [label for _, label in pairs]
-
-
-def _after(result: RefinementResult) -> torch.Tensor:
-    """(B, 7) x, y, z, h, w, l, yaw."""
-    boxes = result.boxes()
-    return torch.cat([boxes.location_ref, boxes.dimensions_hwl, boxes.rotation_y[:, None]], 1).double()
-
-
-def _before(result: RefinementResult, detections: Detections) -> torch.Tensor:
-    location = detections.T_cam_obj[:, :3, 3] - result.t_cam_ref
-    yaw = rotation_y_from_pose(detections.T_cam_obj)
-    return torch.cat([location, detections.dimensions_hwl, yaw[:, None]], 1).double()
-
-
-def _overlap(boxes: torch.Tensor, truth: torch.Tensor) -> Array:
-    columns = [0, 2, 5, 4, 6]
-    return bev_iou(boxes[:, columns], truth[:, columns]).numpy()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.synthetic_scene import cached_street
-from quality_calibration import fit, judgement, noise, observations
+from quality_calibration import fit, noise, observations, report
 from quality_calibration.bend import Bend
 
 import directshape_torch
@@ -53,7 +53,7 @@ FACTORS, FLOORS = np.array([2.0, 1.5, 1.0, 1.0]), np.array([0.05, 0.1, 0.03, 0.0
 
 def test_the_weights_are_recovered() -> None:
     cars = simulated()
-    head = fit.fit_head(cars.evidence, ~judgement.is_worse(cars), EVIDENCE_NAMES[:2])
+    head = fit.fit_head(cars.evidence, ~cars.is_worse, EVIDENCE_NAMES[:2])
     assert head.weights[0] == pytest.approx(-1.5, abs=0.12)
     assert head.weights[1] == pytest.approx(0.0, abs=0.12)
     assert head.bias == pytest.approx(2.0, abs=0.12)
@@ -64,7 +64,7 @@ def test_factors_and_floors_of_the_sigmas_are_recovered() -> None:
     scales = fit.fit_sigmas(errors, raw)
     np.testing.assert_allclose(scales.factors, FACTORS, rtol=0.15)
     np.testing.assert_allclose(scales.floors, FLOORS, rtol=0.25)
-    one, two = judgement.coverage(errors, scales(raw))
+    one, two = report.coverage(errors, scales(raw))
     np.testing.assert_allclose(one, 0.683, atol=0.02)
     np.testing.assert_allclose(two, 0.954, atol=0.02)
 
@@ -80,51 +80,45 @@ def test_no_prediction_has_seen_its_frame() -> None:
     assert np.unique(predictions).tolist() == [220.0]
 
 
-def test_true_probabilities_are_found_reliable_and_false_ones_are_not() -> None:
-    cars = simulated()
-    truth = 1 / (1 + np.exp(-(2 - 1.5 * cars.evidence[:, 0])))
-    outcome = ~judgement.is_worse(cars)
-    bins = judgement.reliability(truth, outcome, cars.group, 8)
-    assert sum(b.count for b in bins) == len(cars)
-    assert sum(b.low <= b.predicted <= b.high for b in bins) >= 7
-    boasting = judgement.reliability(0.5 + 0.5 * truth, outcome, cars.group, 8)
-    assert not boasting[0].low <= boasting[0].predicted <= boasting[0].high
-    fair, constant = (judgement.discrimination(p, outcome) for p in (truth, np.full_like(truth, outcome.mean())))
-    assert fair.log_loss < fair.base_log_loss == pytest.approx(constant.log_loss)
-    assert (fair.auc > 0.75, constant.auc) == (True, 0.5)
+def judged(cars: observations.Observations, probabilities: np.ndarray) -> report.Judged:
+    errors, raw = fit.in_view(cars)
+    return report.Judged("cars", cars, probabilities, errors, raw)
+
+
+def test_the_area_under_the_roc_curve_by_hand() -> None:
+    outcome = np.array([True, True, False, False])
+    # Of four pairs three are in order, one is tied.
+    assert report.area_under_roc(np.array([0.9, 0.5, 0.5, 0.1]), outcome) == 0.875
+    assert np.isnan(report.area_under_roc(np.ones(2), np.ones(2, dtype=bool)))
 
 
 def test_the_policy_by_hand() -> None:
-    cars = simulated(4)
-    cars = type(cars)(**{**vars(cars), "iou_before": np.full(4, 0.7), "iou_after": np.array([0.9, 0.8, 0.66, 0.5])})
-    probability = np.array([0.9, 0.3, 0.6, 0.5])
+    cars = replace(simulated(4), iou_before=np.full(4, 0.7), iou_after=np.array([0.9, 0.8, 0.66, 0.5]))
     # 0.66 is less, but not by 0.05; at 0.55 the second and the fourth car keep their input.
-    assert judgement.is_worse(cars).tolist() == [False, False, False, True]
-    probabilities = np.column_stack([probability, np.ones(4)])
-    kept = judgement.is_kept(probabilities, judgement.Thresholds(0.55, 0.9))
-    assert kept.tolist() == [True, False, True, False]
-    outcome = judgement.policy(cars, kept)
+    assert cars.is_worse.tolist() == [False, False, False, True]
+    found = judged(cars, np.column_stack([[0.9, 0.3, 0.6, 0.5], np.ones(4)]))
+    outcome = report.policy(found, report.Thresholds(0.55, 0.9))
     assert (outcome.kept, outcome.worse) == (0.5, 0.0)
     assert outcome.iou == pytest.approx((0.9 + 0.7 + 0.66 + 0.7) / 4)
     # To lose the last car, the second must go as well; the third, a little worse, can go too.
-    assert judgement.choose_thresholds(cars, probabilities) == (0.62, 0.0)
+    assert report.choose_thresholds(found) == (0.62, 0.0)
 
 
 def test_drawn_detections_have_the_errors_of_their_level() -> None:
     _, scene = cached_street()
     level, detections = noise.LEVELS[1], scene.detections
-    draws = [noise.noisy(detections, level, seed) for seed in range(400)]
+    draws = [noise.noisy(detections, level, seed) for seed in range(200)]
     first = torch.stack([d.T_cam_obj[0] for d in draws])
     exact = detections.T_cam_obj[0]
     distance = float(exact[[0, 2], 3].norm())
     along = (first[:, :3, 3] - exact[:3, 3]) @ (exact[:3, 3] * torch.tensor([1.0, 0.0, 1.0]).double()) / distance
-    assert float(along.std()) == pytest.approx(level.depth_share * distance, rel=0.15)
+    assert float(along.std()) == pytest.approx(level.depth_share * distance, rel=0.2)
     yaw = rotation_y_from_pose(first) - rotation_y_from_pose(exact[None])
-    assert float(torch.rad2deg(yaw).std()) == pytest.approx(level.yaw_deg, rel=0.15)
+    assert float(torch.rad2deg(yaw).std()) == pytest.approx(level.yaw_deg, rel=0.2)
     assert torch.equal(draws[7].T_cam_obj, noise.noisy(detections, level, 7).T_cam_obj)
     assert all(torch.equal(d.box_2d, detections.box_2d) for d in draws[:3])
     biased = replace(level, depth_bias=-0.1)
-    nearer = torch.stack([noise.noisy(detections, biased, seed).T_cam_obj[0] for seed in range(400)])
+    nearer = torch.stack([noise.noisy(detections, biased, seed).T_cam_obj[0] for seed in range(200)])
     moved = (nearer - first)[:, :3, 3].norm(dim=1)
     torch.testing.assert_close(moved, torch.full_like(moved, 0.1 * distance))
 
@@ -162,32 +156,18 @@ def test_runs_learn_of_rig_and_detector_before_they_refine() -> None:
     assert np.isnan(bent.evidence[:, right]).all()
 
 
-def test_cars_that_are_kept_make_model_report_and_pictures(tmp_path: Path) -> None:
+def test_cars_that_are_kept_make_model_and_report(tmp_path: Path) -> None:
     simulated(480).save(tmp_path / "out" / "cars_masks_0.npz")
     simulated(48).save(tmp_path / "out" / "cars_kitti_noisy.npz")
-    arguments = [
-        "--data",
-        ".",
-        "--exact",
-        ".",
-        "--masks",
-        "masks",
-        "--seeds",
-        "0",
-        "--other",
-        "kitti",
-        "noisy",
-        "m",
-        "--out",
-    ]
+    arguments = ["--data", ".", "--exact", ".", "--masks", "masks", "--seeds", "0"]
+    arguments += ["--other", "kitti", "noisy", "m", "--out"]
     model = tmp_path / "model.json"
     assert calibrate_quality.main([*arguments, str(tmp_path / "out"), "--model", str(model)]) == 0
     assert load_trust_model(model).provenance["cars"] == 480
-    report = (tmp_path / "out" / "report.md").read_text()
-    assert "| rendered, all | 480 | better |" in report
-    assert "| kitti noisy | 48 | not worse |" in report
-    for name in ("trust_reliability.png", "trust_policy.png"):
-        assert (tmp_path / "out" / name).stat().st_size > 5000
+    text = (tmp_path / "out" / "report.md").read_text()
+    assert text.count("| rendered, all | ") == 5
+    assert "| rendered, all | 480 | " in text
+    assert "| kitti noisy | 48 | " in text
 
 
 def test_heads_read_the_columns_that_are_named() -> None:
@@ -195,4 +175,4 @@ def test_heads_read_the_columns_that_are_named() -> None:
     model = calibrate_quality.fitted(simulated(600), {}, read)
     assert model.better.columns == ("log_profile_sigma", "turned")
     assert model.not_worse.columns == ("outside_basin",)
-    assert calibrate_quality.fitted(simulated(600), {}).better.columns == calibrate_quality.columns.BETTER
+    assert calibrate_quality.fitted(simulated(600), {}).better.columns == calibrate_quality.BETTER
