@@ -175,7 +175,8 @@ class RefinementResult(CarRecord):
             prior: the shapes of the result, which its state does not hold; default the bundled ones.
 
         Raises:
-            InputError: a tensor is missing or none of its kind, or the prior has another number of codes.
+            InputError: a tensor is missing or none of its kind, the prior has another number of codes, or a refined car
+                has no finite box and standard deviations.
         """
         shapes = PCAShapePrior.load_bundled() if prior is None else prior
         result = cls._from_state(state, prior=shapes)
@@ -183,7 +184,9 @@ class RefinementResult(CarRecord):
             expected = f"the prior of the result, with {result.code.shape[1]} codes"
             raise InputError("prior", expected, f"one with {shapes.num_codes}", "give the prior of the refiner")
         _check_state(result)
-        return replace(result, prior=_moved_prior(shapes, result.T_cam_obj))
+        result = replace(result, prior=_moved_prior(shapes, result.T_cam_obj))
+        _check_refined(result.detach())
+        return result
 
     def __repr__(self) -> str:
         """Statuses, and the first cars in a table."""
@@ -334,6 +337,17 @@ def _check_state(result: RefinementResult) -> None:
             raise InputError(f"state[{name!r}]", f"{count} words", f"{len(getattr(result, name))}")
     if bool(((result.status_code < 0) | (result.status_code >= len(Status))).any()):
         raise InputError("state['status_code']", f"numbers of 0..{len(Status) - 1}", f"{result.status_code.tolist()}")
+
+
+def _check_refined(result: RefinementResult) -> None:
+    """Refined cars have finite figures, as the refiner gives them."""
+    boxes = result.boxes()
+    figures = (result.code, result.cost_after, result.covariance, result.sigma_xyz_yaw, *vars(boxes).values())
+    finite = torch.stack([x[:, None].isfinite().flatten(1).all(dim=1) for x in figures]).all(dim=0)
+    wrong = (result.refined & ~finite).nonzero().flatten().tolist()
+    if wrong:
+        expected = "finite boxes and standard deviations of refined cars"
+        raise InputError("state", expected, f"none of cars {wrong}", "save result.state_dict() with its own prior")
 
 
 def _chosen_rows(index: object, count: int) -> Tensor:

@@ -171,7 +171,7 @@ class FrameBatch(TensorRecord):
         if not isinstance(ground, GroundPlane):
             ground = GroundPlane.from_camera_height(ground, count).to(like.device, like.dtype)
         sizes = torch.tensor([left.shape[2:]] * count, device=left.device).reshape(count, 2)
-        names = frame_ids or tuple(f"{number:06d}" for number in range(count))
+        names = tuple(f"{number:06d}" for number in range(count)) if frame_ids is None else frame_ids
         check_type("frame_ids", names, (tuple, list))
         return cls(left, right, sizes, camera, ground, tuple(names))
 

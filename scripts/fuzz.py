@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
             found = tally(kind, iter(range(args.seed, args.seed + count)), args.timeout, _say)
             figures[kind] = {**{name: found.counts[name] for name in OUTCOMES}, "found": found.found}
     if args.kills:
-        figures["kills"] = kill_runs(args.kills, args.seed, _say)
+        figures["kills"] = kill_runs(args.kills, args.seed, args.timeout, _say)
     if args.faults:
         figures["faults"] = inject_faults(args.faults, _say)
     table = as_table(figures)
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=0, metavar="N", help="runs that are ended at a random moment")
     parser.add_argument("--faults", type=int, default=0, metavar="N", help="fail every N-th write and rename, in turn")
     parser.add_argument("--seed", type=int, default=0, help="of the first case")
-    parser.add_argument("--timeout", type=float, default=60.0, metavar="S", help="of a case (default 60 seconds)")
+    parser.add_argument("--timeout", type=float, default=120.0, metavar="S", help="of a case, and for a killed run to end")
     parser.add_argument("--out", type=Path, metavar="DIR", help="for fuzz.json and fuzz.txt")
     parser.add_argument("--serve", choices=("calls", "files"), help=argparse.SUPPRESS)
     return run_command(parser, run, arguments)

@@ -24,7 +24,7 @@ from directshape_torch.batch.workers import GroupDispatch, ThisProcess, Workers
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
-from directshape_torch.io.run_manifest import RunManifest
+from directshape_torch.io.run_manifest import RunManifest, SharedHashes
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.track_files import write_tracks
 from directshape_torch.problem import TermFactory
@@ -276,7 +276,7 @@ def run_manifest(
         settings["track_frames"] = batch_frames
     if refiner.extra_terms:
         settings["extra_terms"] = [_described(make) for make in refiner.extra_terms]
-    hashes = {"prior": prior_sha256, "stereo_bias": hash_fields(dataset.disparity_fields)}
+    hashes = SharedHashes(prior=prior_sha256, stereo_bias=hash_fields(dataset.disparity_fields))
     return RunManifest(package_version(), settings, hashes)
 
 

@@ -97,6 +97,7 @@ class CarRecord:
                 raise InputError("state", f"the tensor {name!r}", f"{len(state)} others", "save result.state_dict()")
             elif kind is bool:
                 check_shape(f"state[{name!r}]", state[name], ())
+                check_stored(f"state[{name!r}]", state[name])
                 values[each.name] = bool(state[name])
             elif hasattr(kind, "__metadata__"):
                 check_declared(f"state[{name!r}]", state[name], kind.__metadata__[0], sizes)

@@ -37,6 +37,13 @@ class RunSettings(TypedDict, total=False):
     refiner: dict[str, Any]
 
 
+class SharedHashes(TypedDict):
+    """sha256 of what serves all frames: of the shape prior, and of the bias maps where there are any."""
+
+    prior: str
+    stereo_bias: str | None
+
+
 class _FrameState(TypedDict):
     # By itself: `Required` in an annotation that is a string, as all are here, is overlooked at run time.
     state: Literal["done", "failed"]
@@ -61,13 +68,13 @@ class RunManifest:
     Attributes:
         package_version: of this package.
         config: every setting that bears on the results, nested as in the configuration file.
-        sha256: hashes of the files that serve all frames, by their role ("prior", "stereo_bias").
+        sha256: hashes of what serves all frames.
         frames: how each frame ended.
     """
 
     package_version: str
     config: Mapping[str, Any]
-    sha256: Mapping[str, str | None]
+    sha256: SharedHashes
     frames: dict[str, FrameEntry] = field(default_factory=dict)
 
     @property

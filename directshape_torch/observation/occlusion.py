@@ -149,7 +149,7 @@ def _instances(detections: Detections, side: Side, order: str) -> tuple[Tensor, 
     if order not in ("depth", "box_bottom"):
         raise InputError("order", "'depth' or 'box_bottom'", repr(order))
     d, others = detections, detections.occluders
-    frame, depth_m, bottom_v = d.frame_index, d.T_cam_obj[:, 2, 3].detach(), d.box_2d[:, 3]
+    frame, depth_m, bottom_v = d.frame_index, d.T_cam_obj[:, 2, 3], d.box_2d[:, 3]
     present = d.has_mask_left if side == "left" else d.has_mask_right
     limits = torch.stack([torch.where(depth_m > 0, depth_m, -torch.inf), -bottom_v], dim=1)
     if others is not None:
@@ -157,6 +157,8 @@ def _instances(detections: Detections, side: Side, order: str) -> tuple[Tensor, 
         depth_m = torch.cat([depth_m, others.depth_m.to(depth_m)])
         bottom_v = torch.cat([bottom_v, others.bottom_v.to(bottom_v)])
         present = torch.cat([present, present.new_ones(len(others.frame_index))])
+    # What stands in front of what has no derivative.
+    limits, depth_m, bottom_v = limits.detach(), depth_m.detach(), bottom_v.detach()
     by_depth = (depth_m > 0) & (order == "depth")  # False for NaN
     numbers = torch.where(
         torch.stack([by_depth, ~by_depth & bottom_v.isfinite()], dim=1),

@@ -161,7 +161,7 @@ class _PageOfRun:
         if self._prior is None:
             reason = "the prior is not that of the run" if self._prior_was_given else "the prior was not given"
             notes.append(f"no residual maps, and no meshes but saved ones: {reason} (--prior)")
-        has_field = self._run.manifest.sha256.get("stereo_bias") is not None
+        has_field = self._run.manifest.sha256["stereo_bias"] is not None
         if has_field and dataset is not None and not dataset.disparity_fields:
             notes.append("photometric residuals without the run's disparity field, so biased (--rig)")
         if num_detailed < num_frames:

@@ -61,6 +61,7 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
     """
     check_type("frames", frames, (FrameBatch,))
     check_type("detections", detections, (Detections,))
+    check_type("match_images", match_images, (bool,))
     frames, detections = frames.detach(), detections.detach()
     found: list[Finding] = []
     pairs: list[Pair] = []

@@ -27,10 +27,9 @@ from directshape_torch.batch.refine_dataset import refine_dataset
 FRAMES = tuple(f"{number:06d}" for number in range(6))
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 _SLOW_RUN = Path(__file__).parents[2] / "tests" / "helpers" / "slow_run.py"
-_PATIENCE_S = 120.0
 
 
-def kill_runs(count: int, seed: int, report: Callable[[str], None]) -> dict[str, Any]:
+def kill_runs(count: int, seed: int, patience_s: float, report: Callable[[str], None]) -> dict[str, Any]:
     """End `count` runs; how many of what, and those after which the next run did not end as an undisturbed one."""
     folder = Path(tempfile.mkdtemp(prefix="kills"))
     counts: Counter[str] = Counter()
@@ -40,10 +39,10 @@ def kill_runs(count: int, seed: int, report: Callable[[str], None]) -> dict[str,
         write_data_set(root, FRAMES)
         _resume(root, folder / "undisturbed")
         expected = result_files(folder / "undisturbed")
-        whole_s = _length_of_a_run(root, folder / "timed")
+        whole_s = _length_of_a_run(root, folder / "timed", patience_s)
         for number in range(count):
             chance, out = random.Random(seed + number), folder / "out"
-            name, trouble = _one(root, out, expected, chance, whole_s)
+            name, trouble = _one(root, out, expected, chance, whole_s, patience_s)
             counts[name] += 1
             if trouble:
                 found.append({"seed": seed + number, "name": name, "said": trouble})
@@ -55,7 +54,7 @@ def kill_runs(count: int, seed: int, report: Callable[[str], None]) -> dict[str,
 
 
 def _one(
-    root: Path, out: Path, expected: dict[str, bytes], chance: random.Random, whole_s: float
+    root: Path, out: Path, expected: dict[str, bytes], chance: random.Random, whole_s: float, patience_s: float
 ) -> tuple[str, str | None]:
     """Who was ended by what, and what went wrong."""
     by, whom = chance.choice(SIGNALS), chance.choice(("parent", "parent", "worker"))
@@ -72,10 +71,10 @@ def _one(
             with suppress(ProcessLookupError):
                 os.kill(victim, by)
         try:
-            code = run.wait(_PATIENCE_S)
+            code = run.wait(patience_s)
         except subprocess.TimeoutExpired:
             return name, "the run did not end"
-        if _outlive(workers):
+        if _outlive(workers, patience_s):
             trouble = "workers outlive their parent"
         if whom == "worker" and name != "nobody, it had ended" and code != 0:
             trouble = f"a worker's death ended the run with exit code {code}"
@@ -98,9 +97,9 @@ def _started(root: Path, out: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, env=environment, stdout=nowhere, stderr=nowhere, start_new_session=True)
 
 
-def _length_of_a_run(root: Path, out: Path) -> float:
+def _length_of_a_run(root: Path, out: Path, patience_s: float) -> float:
     start = time.monotonic()
-    assert _started(root, out).wait(_PATIENCE_S) == 0, "a run that nobody disturbs fails"
+    assert _started(root, out).wait(patience_s) == 0, "a run that nobody disturbs fails"
     return time.monotonic() - start
 
 
@@ -112,9 +111,9 @@ def _children(pid: int) -> list[int]:
     return []
 
 
-def _outlive(workers: list[int]) -> bool:
+def _outlive(workers: list[int], patience_s: float) -> bool:
     """Whether some are there long after their parent has ended."""
-    deadline = time.monotonic() + _PATIENCE_S
+    deadline = time.monotonic() + patience_s
     while any(Path(f"/proc/{each}").exists() for each in workers):
         if time.monotonic() > deadline:
             return True

@@ -11,7 +11,7 @@ import torch
 from helpers.synthetic_scene import cached_street
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from public_calls import at, calls, changed, odd_call, whole_call
+from public_calls import at, calls, changed, odd_call, odd_numbers, whole_call
 from tensor_values import MUTATIONS
 
 from directshape_torch import Detections, DirectShapeRefiner
@@ -65,6 +65,13 @@ def test_a_part_of_other_precision_is_named(place: str) -> None:
     parts[record] = replace(parts[record], **{name: getattr(parts[record], name).to(dtype=torch.float32)})
     with pytest.raises(InputError, match=rf"^{place}\.\w+: expected dtype torch.float64 on cpu.*, got torch.float32"):
         DirectShapeRefiner(cached_street()[0])(parts["frames"], parts["detections"])
+
+
+@pytest.mark.parametrize("name", list(calls()))
+def test_each_odd_value_for_what_is_no_tensor(name: str) -> None:
+    for odd in odd_numbers(name):
+        with suppress(DirectShapeError):
+            assert odd.outcome(), f"{odd.name}: silently not finite"
 
 
 # More of them, and what they cost: scripts/fuzz.py.

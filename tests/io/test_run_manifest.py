@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
@@ -73,6 +74,15 @@ def test_schema_and_damage(tmp_path: Path) -> None:
         path.write_text(content)
         with pytest.raises(DataFormatError, match=r"summary\.json: .*(no summary|valid JSON|'x' is unknown)"):
             read_manifest(path)
+
+
+@pytest.mark.parametrize("hashes", [{"stereo_bias": None}, {"prior": A}, {"prior": None, "stereo_bias": None}, {}])
+def test_what_all_frames_share_is_needed(tmp_path: Path, hashes: dict[str, str | None]) -> None:
+    path = tmp_path / "summary.json"
+    write_manifest(path, manifest())
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"sha256": hashes}))
+    with pytest.raises(DataFormatError, match=r"summary\.json: sha256.*expected (an object with 'prior'|str)"):
+        read_manifest(path)
 
 
 def test_hashes(tmp_path: Path) -> None:

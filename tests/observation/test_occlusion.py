@@ -120,6 +120,16 @@ def test_other_classes_hide() -> None:
     assert hidden.tolist() == [True, False, True, False]
 
 
+def test_what_stands_in_front_has_no_gradient() -> None:
+    depth_m, bottom_v = (torch.tensor([x], requires_grad=True) for x in (5.0, 17.0))
+    others = Occluders(torch.tensor([0]), squares((2, 2, 6, 12)), squares((2, 2, 6, 12)), depth_m, bottom_v)
+    detections = scene([10.0, 20.0], [18.0, 15.0], squares((0, 0, 1, 1), (0, 0, 30, 20)), occluders=others)
+    detections.box_2d.requires_grad_()
+    hidden = occlusion_map(detections, "left")
+    assert not hidden.covering.requires_grad and not hidden.in_front.requires_grad
+    assert hidden.at(torch.tensor(0), torch.tensor([3, 3])).item()
+
+
 def test_random_scenes_equal_a_loop() -> None:
     generator = torch.Generator().manual_seed(0)
     count = 7
