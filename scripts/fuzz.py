@@ -84,7 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kills", type=int, default=0, metavar="N", help="runs that are ended at a random moment")
     parser.add_argument("--faults", type=int, default=0, metavar="N", help="fail every N-th write and rename, in turn")
     parser.add_argument("--seed", type=int, default=0, help="of the first case")
-    parser.add_argument("--timeout", type=float, default=120.0, metavar="S", help="of a case, and for a killed run to end")
+    parser.add_argument(
+        "--timeout", type=float, default=120.0, metavar="S", help="of a case, and for a killed run to end"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="for fuzz.json and fuzz.txt")
     parser.add_argument("--serve", choices=("calls", "files"), help=argparse.SUPPRESS)
     return run_command(parser, run, arguments)

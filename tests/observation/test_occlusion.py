@@ -126,7 +126,8 @@ def test_what_stands_in_front_has_no_gradient() -> None:
     detections = scene([10.0, 20.0], [18.0, 15.0], squares((0, 0, 1, 1), (0, 0, 30, 20)), occluders=others)
     detections.box_2d.requires_grad_()
     hidden = occlusion_map(detections, "left")
-    assert not hidden.covering.requires_grad and not hidden.in_front.requires_grad
+    assert not hidden.covering.requires_grad
+    assert not hidden.in_front.requires_grad
     assert hidden.at(torch.tensor(0), torch.tensor([3, 3])).item()
 
 

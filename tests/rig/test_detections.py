@@ -14,7 +14,7 @@ from directshape_torch import DirectShapeRefiner, RigEstimate
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.rig.detections import observe_detections
+from directshape_torch.rig.detections import observe_detections, size_error
 from directshape_torch.scene import Detections, FrameBatch
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
@@ -64,6 +64,18 @@ def test_boxes_that_are_far_off_or_not_there_say_nothing(demo: LoadedFrame) -> N
     assert len(observe_detections(demo.frame, nothing)) == 0
     blank = replace(demo.frame, images_right=torch.full_like(demo.frame.images_right, 0.5))
     assert len(observe_detections(blank, demo.detections)) == 0
+
+
+@pytest.mark.parametrize("row", range(3))
+def test_a_box_beyond_all_numbers_has_no_size_in_the_image(row: int) -> None:
+    K, T_cam_obj = torch.tensor([[700.0, 0, 100], [0, 700, 50], [0, 0, 1]]), torch.eye(4)
+    T_cam_obj[:3, 3] = torch.tensor([0.0, 1.6, 30.0])
+    mask = torch.zeros(120, 200, dtype=torch.bool)
+    mask[51:88, 60:140] = True
+    dimensions_hwl = torch.tensor([1.5, 1.6, 4.0])
+    assert size_error(T_cam_obj, dimensions_hwl, mask, K) > 0
+    dimensions_hwl[row] = 1e30
+    assert size_error(T_cam_obj, dimensions_hwl, mask, K) == 0
 
 
 def test_without_masks_the_boxes_themselves_are_looked_at(demo: LoadedFrame) -> None:
