@@ -66,7 +66,7 @@ def test_boxes_that_are_far_off_or_not_there_say_nothing(demo: LoadedFrame) -> N
     assert len(observe_detections(blank, demo.detections)) == 0
 
 
-@pytest.mark.parametrize("row", range(3))
+@pytest.mark.parametrize("row", [0, 1])  # height and width, which lies along the ray
 def test_a_box_beyond_all_numbers_has_no_size_in_the_image(row: int) -> None:
     K, T_cam_obj = torch.tensor([[700.0, 0, 100], [0, 700, 50], [0, 0, 1]]), torch.eye(4)
     T_cam_obj[:3, 3] = torch.tensor([0.0, 1.6, 30.0])
