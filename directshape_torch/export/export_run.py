@@ -12,7 +12,7 @@ from directshape_torch.batch.options import RunObserver, SilentObserver
 from directshape_torch.errors import InputError
 from directshape_torch.export.coco3d_file import Coco3dDataset, image_numbers
 from directshape_torch.export.frame_source import Exporter, ExportInputs, FrameSource
-from directshape_torch.export.gltf_scene import frame_glb
+from directshape_torch.export.gltf_scene import GlbExporter
 from directshape_torch.export.kitti_files import kitti_json
 from directshape_torch.export.nuscenes_file import nuscenes_results
 from directshape_torch.export.ply_files import mesh_ply, points_ply
@@ -70,9 +70,11 @@ def export_run(
 
 
 def _make(name: str, folder: Path, run: RunFolder, inputs: ExportInputs) -> Exporter:
-    framewise = {"glb": _write_glb, "ply": _write_ply, "points": _write_points, "kitti": _write_kitti}
+    framewise = {"ply": _write_ply, "points": _write_points, "kitti": _write_kitti}
     if name in framewise:
         return _Framewise(folder, framewise[name])
+    if name == "glb":
+        return GlbExporter(folder / "glb")
     if name == "coco3d":
         return _Coco3d(folder / "coco3d.json", run)
     if name == "nuscenes":
@@ -118,11 +120,6 @@ class _Nuscenes(Exporter):
 
     def finish(self) -> None:
         write_json(self.path, nuscenes_results(self.frames))
-
-
-def _write_glb(folder: Path, source: FrameSource) -> None:
-    """`glb/NNNNNN.glb`: all refined cars of the frame."""
-    write_bytes(folder / "glb" / f"{source.frame_id}.glb", frame_glb(source.painted, source.loaded))
 
 
 def _write_ply(folder: Path, source: FrameSource) -> None:

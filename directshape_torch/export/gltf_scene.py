@@ -1,15 +1,19 @@
-"""Painted cars of a frame as one binary glTF scene."""
+"""Painted cars as binary glTF scenes: those of a frame, and one that moves through the frames of its track."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, MutableMapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.batch.mesh_files import T_GLTF_CAM
+from directshape_torch.export.coco3d_file import image_numbers
+from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.painted_cars import Paint, PaintedFrame
+from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.run_folder import FrameResult, ResultObject
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.visualize.ground_grid import ground_grid
@@ -20,7 +24,33 @@ if TYPE_CHECKING:
 _LINEAR = "_LINEAR"
 _SOURCE = "_COLOR_SOURCE"
 _GREY_OF_GROUND = (120, 120, 120)
-_UNSIGNED_SHORT = 5123
+_UNSIGNED_SHORT, _FLOAT = 5123, 5126
+_SECONDS_A_FRAME = 0.1
+_CAR, _CAMERA = "car", "left camera"
+
+
+class GlbExporter(Exporter):
+    """A scene of each frame, and one of each car that shares its shape over several frames."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._moving: dict[tuple[str, int], _MovingCar] = {}
+
+    def add(self, source: FrameSource) -> None:
+        painted = source.painted
+        write_bytes(self.folder / f"{source.frame_id}.glb", frame_glb(painted, source.loaded))
+        for index, one in enumerate(painted.objects):
+            shapes = painted.frame.shapes
+            key = shapes.tracks[one.car], int(shapes.track_parts[one.car])
+            if key[0] and key[1] >= 0:
+                self._moving.setdefault(key, _MovingCar()).add(painted, index)
+
+    def finish(self) -> None:
+        for (track, part), car in self._moving.items():
+            if len(car.T_cam_obj) > 1:
+                # The later parts of a track that was split are other cars.
+                name = f"track_{track}_part{part}" if part else f"track_{track}"
+                write_bytes(self.folder / f"{name}.glb", car.glb(track.rpartition("_")[0]))
 
 
 def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
@@ -30,7 +60,6 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
         A file in glTF's axes, y up: its nodes turn vertices that are in the left camera frame, metres.
     """
     import trimesh
-    from trimesh.exchange.gltf import export_glb
 
     scene = trimesh.Scene(metadata={"frame_id": painted.frame.frame_id, "vertices": "left camera frame, metres"})
     for index, one in enumerate(painted.objects):
@@ -41,8 +70,77 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
         ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
         count = len(ground.vertices)
         _add(scene, "ground", ground, Paint(np.full((count, 3), _GREY_OF_GROUND, np.uint8), np.zeros(count, np.uint8)))
-    export: Callable[..., bytes] = export_glb
-    return export(scene, include_normals=True, tree_postprocessor=_finish)
+    return _glb(scene)
+
+
+class _MovingCar:
+    """A car in several frames; its surface and colours are those of the nearest view."""
+
+    def __init__(self) -> None:
+        self.T_cam_obj: dict[str, NDArray[np.float64]] = {}
+        self._depth_m = np.inf
+
+    def add(self, painted: PaintedFrame, index: int) -> None:
+        T_cam_obj = painted.cars[index].T_cam_obj.double().numpy()
+        self.T_cam_obj[painted.frame.frame_id] = T_cam_obj
+        if T_cam_obj[2, 3] < self._depth_m:
+            self._depth_m, self._nearest = float(T_cam_obj[2, 3]), (painted, index)
+
+    def glb(self, sequence: str) -> bytes:
+        """The car at the origin of a node that moves in the left camera frame, below one that turns it to y up."""
+        import trimesh
+
+        painted, index = self._nearest
+        one, frame = painted.objects[index], painted.frame
+        mesh, paint = painted.mesh(index, finer=True)
+        mesh.apply_transform(np.linalg.inv(self.T_cam_obj[frame.frame_id]))
+        mesh.metadata.update(car_extras(one, frame))
+        scene = trimesh.Scene(metadata={"frame_ids": list(self.T_cam_obj), "vertices": "object frame, metres"})
+        place: Callable[..., None] = scene.graph.update
+        place(frame_to=_CAMERA, matrix=T_GLTF_CAM)
+        _add(scene, _CAR, mesh, paint, _CAMERA)
+        numbers = image_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
+        seconds = _SECONDS_A_FRAME * np.array(list(numbers.values()))
+        return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], self._poses()))
+
+    def _poses(self) -> NDArray[np.float64]:
+        return np.stack(list(self.T_cam_obj.values()))
+
+
+def _animate(
+    buffers: MutableMapping[str, bytes],
+    tree: dict[str, Any],
+    seconds: NDArray[np.float64],  # (F,) rising
+    T_cam_obj: NDArray[np.float64],  # (F, 4, 4)
+) -> None:
+    """Let the car's node go through its poses; trimesh, which writes no animations, calls this with all it wrote."""
+    from scipy.spatial.transform import Rotation
+
+    node = next(number for number, each in enumerate(tree["nodes"]) if each["name"] == _CAR)
+    moves = {"translation": T_cam_obj[:, :3, 3], "rotation": Rotation.from_matrix(T_cam_obj[:, :3, :3]).as_quat()}
+    times = _accessor(buffers, tree, "times", seconds)
+    tree["accessors"]["times"] |= {"min": [float(seconds[0])], "max": [float(seconds[-1])]}
+    tree["animations"] = [{"name": "track", "channels": [], "samplers": []}]
+    for number, (name, values) in enumerate(moves.items()):
+        # Viewers that play nothing show the first frame.
+        tree["nodes"][node][name] = values[0].tolist()
+        sampler = {"input": times, "output": _accessor(buffers, tree, name, values), "interpolation": "LINEAR"}
+        tree["animations"][0]["samplers"].append(sampler)
+        tree["animations"][0]["channels"].append({"sampler": number, "target": {"node": node, "path": name}})
+
+
+def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: str, values: NDArray[np.float64]) -> int:
+    """The number of a new accessor to some numbers."""
+    buffers[name] = values.astype("<f4").tobytes()
+    kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
+    tree["accessors"][name] = {
+        "bufferView": len(buffers) - 1,
+        "componentType": _FLOAT,
+        "count": len(values),
+        "type": kind,
+        "byteOffset": 0,
+    }
+    return len(tree["accessors"]) - 1
 
 
 def car_extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
@@ -69,11 +167,20 @@ def srgb_to_linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
     return np.asarray(np.round(65535 * linear).astype(np.uint16))
 
 
-def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, paint: Paint) -> None:
+def _glb(scene: trimesh.Scene, extend: Callable[..., None] | None = None) -> bytes:
+    from trimesh.exchange.gltf import export_glb
+
+    export: Callable[..., bytes] = export_glb
+    return export(scene, include_normals=True, tree_postprocessor=_finish, buffer_postprocessor=extend)
+
+
+def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, paint: Paint, below: str | None = None) -> None:
+    """Below a node, or in the left camera frame."""
     opaque = np.full((len(paint.rgb), 1), 65535, dtype=np.uint16)
     mesh.vertex_attributes[_LINEAR] = np.concatenate([srgb_to_linear(paint.rgb), opaque], axis=1)
     mesh.vertex_attributes[_SOURCE] = paint.source.astype(np.float32)
-    scene.add_geometry(mesh, node_name=name, geom_name=name, transform=T_GLTF_CAM)
+    transform = T_GLTF_CAM if below is None else None
+    scene.add_geometry(mesh, node_name=name, geom_name=name, parent_node_name=below, transform=transform)
 
 
 def _finish(tree: dict[str, Any]) -> None:

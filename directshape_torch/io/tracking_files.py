@@ -15,7 +15,9 @@ _MOST_DIGITS = 9
 
 
 def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
-    """The objects of every frame number that occurs, with their tracks; their `raw_line` leaves frame and track out.
+    """The objects of every frame number that occurs, with their tracks.
+
+    Their `raw_line` leaves frame and track out and their `line_number` counts within the frame, as in its own file.
 
     Args:
         path: of a label file (17 columns) or a result file (18 columns, the score last).
@@ -35,8 +37,9 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
                 cure=f"write one object a line: {_COLUMNS}",
             )
         text = " ".join(words[_LEADING:])
-        found = replace(parse_object(path, Line(line.number, text, text)), track_id=int(words[1]))
-        frames.setdefault(int(words[0]), []).append(found)
+        objects = frames.setdefault(int(words[0]), [])
+        found = parse_object(path, Line(line.number, text, text))
+        objects.append(replace(found, track_id=int(words[1]), line_number=len(objects) + 1))
     return frames
 
 

@@ -18,6 +18,7 @@ from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import ResumeError
 from directshape_torch.io.open_dataset import open_dataset
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.track_files import read_track, track_path
 
 
@@ -54,6 +55,9 @@ def test_views_of_a_track_share_a_shape_and_get_a_file(shared_kitti: Path, seque
     assert track.parts.tolist() == [0] * len(FRAMES)
     np.testing.assert_array_equal(track.dimensions_hwl, track.boxes_hwl[0])
     assert np.isfinite(track.code_covariance).all()
+    # Lines are those of the frame, not of the sequence's file.
+    run = RunFolder(tmp_path)
+    assert [len(run.read(frame_id).refined_cars) for frame_id in run.frame_ids] == [2] * len(FRAMES)
 
 
 def test_an_interrupted_run_keeps_to_its_windows(shared_kitti: Path, sequence: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import torch
 from helpers.finished_run import FinishedRun
 from numpy.typing import NDArray
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
@@ -45,14 +47,17 @@ class Glb:
     def attribute(self, name: str, attribute: str) -> NDArray[np.generic]:
         primitive = self.gltf.meshes[self.nodes[name].mesh].primitives[0]
         accessors = {**vars(primitive.attributes), "indices": primitive.indices}
-        accessor = self.gltf.accessors[accessors[attribute]]
+        assert self.gltf.accessors[accessors[attribute]].normalized == (attribute == "COLOR_0")
+        return self.numbers(accessors[attribute])
+
+    def numbers(self, place: int) -> NDArray[np.generic]:
+        accessor = self.gltf.accessors[place]
         view = self.gltf.bufferViews[accessor.bufferView]
         kind = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor.componentType]
         width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor.type]
         content = self.gltf.binary_blob()[view.byteOffset + (accessor.byteOffset or 0) :]
-        array = np.frombuffer(content, kind, accessor.count * width).reshape(-1, width)
-        assert accessor.normalized == (attribute == "COLOR_0")
-        return array
+        assert accessor.count * width * np.dtype(kind).itemsize <= view.byteLength
+        return np.frombuffer(content, kind, accessor.count * width).reshape(-1, width)
 
     def matrix(self, name: str) -> Floats:
         """Node to world; glTF stores columns first."""
@@ -180,6 +185,53 @@ def test_glb_carries_what_is_known_of_a_car(finished: FinishedRun, exported: Pat
     assert extras["line"] == 3
     assert extras["status"] == arrays["statuses"][1]
     np.testing.assert_allclose(extras["dimensions_hwl_m"], arrays["boxes_hwl"][1])
+
+
+def with_tracks(
+    finished: FinishedRun, folder: Path, tracks: tuple[str, str], parts: Sequence[Sequence[int]]
+) -> RunFolder:
+    """A copy of the run whose cars have tracks; `parts` of each frame."""
+    shutil.copytree(finished.out, folder)
+    for frame_id, part in zip(("000000", "000001"), parts, strict=True):
+        path = folder / "shapes" / f"{frame_id}.npz"
+        write_shapes(path, replace(read_shapes(path), tracks=tracks, track_parts=np.array(part)))
+    return RunFolder(folder)
+
+
+def test_a_car_moves_through_the_poses_of_its_track(finished: FinishedRun, tmp_path: Path) -> None:
+    run = with_tracks(finished, tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
+    export_run(run, tmp_path, ["glb"], finished.inputs())
+    assert sorted(path.stem for path in (tmp_path / "glb").iterdir()) == ["000000", "000001", "track_000007"]
+    file = glb(tmp_path / "glb" / "track_000007.glb")
+    (animation,) = file.gltf.animations
+    samplers = {each.target.path: animation.samplers[each.sampler] for each in animation.channels}
+    assert all(file.gltf.nodes[each.target.node].name == "car" for each in animation.channels)
+    times = file.gltf.accessors[samplers["rotation"].input]
+    assert (times.min, times.max) == ([0.0], pytest.approx([0.1]))
+    translation, rotation = (
+        file.numbers(samplers[path].output).astype(np.float64) for path in ("translation", "rotation")
+    )
+    points = file.attribute("car", "POSITION").astype(np.float64)
+    for view, frame_id in enumerate(("000000", "000001")):
+        expected = state(finished, frame_id)["T_cam_obj"][0].astype(np.float64)
+        R = Rotation.from_quat(rotation[view]).as_matrix()
+        np.testing.assert_allclose(translation[view], expected[:3, 3], atol=1e-5)
+        np.testing.assert_allclose(R, expected[:3, :3], atol=1e-6)
+    nearest = min(("000000", "000001"), key=lambda name: state(finished, name)["T_cam_obj"][0, 2, 3])
+    T = state(finished, nearest)["T_cam_obj"][0].astype(np.float64)
+    assert np.abs(distances(finished, nearest, 0, points @ T[:3, :3].T + T[:3, 3])).max() < 0.02
+    # A viewer that plays nothing shows the first view, and y is up.
+    np.testing.assert_allclose(file.nodes["car"].translation, translation[0], atol=1e-6)
+    (root,) = file.gltf.scenes[0].nodes
+    np.testing.assert_array_equal(np.array(file.gltf.nodes[root].matrix).reshape(4, 4), np.diag([1.0, -1, -1, 1]))
+
+
+def test_what_shares_no_shape_does_not_move(finished: FinishedRun, tmp_path: Path) -> None:
+    """Of a track that was split each part is a car, if it has two views; its name says which."""
+    run = with_tracks(finished, tmp_path / "run", ("0005_000007", "0005_000008"), [(2, 0), (2, 1)])
+    export_run(run, tmp_path, ["glb"], finished.inputs())
+    moving = [path.stem for path in (tmp_path / "glb").iterdir() if path.stem.startswith("track")]
+    assert moving == ["track_0005_000007_part2"]
 
 
 @pytest.mark.parametrize("car", [0, 1])
