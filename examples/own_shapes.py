@@ -21,6 +21,7 @@ from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.parametric_cars import car_mesh
 from directshape_torch.shape.parametric_cars_types import sample_car
+from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PriorProvenance
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
@@ -39,7 +40,7 @@ def build(meshes: Path, num_codes: int = 4) -> PCAShapePrior:
     options = MeshOptions(forward_axis="+x", up_axis="-y", voxel_m=0.05)  # of the files; coarse voxels, for speed
     sdfs = np.stack([mesh_to_sdf(load_mesh_obj(path, options), grid, options) for path in sorted(meshes.glob("*.ply"))])
     made = PriorProvenance("examples/own_shapes.py", "that of the meshes", len(sdfs))
-    return PCAShapePrior.fit(torch.from_numpy(sdfs).float(), torch.tensor(grid.origin), grid.spacing_m, num_codes, made)
+    return fit_pca(torch.from_numpy(sdfs).float(), torch.tensor(grid.origin), grid.spacing_m, num_codes, made)
 
 
 def main(out_dir: Path, meshes: Path | None = None) -> RefinementResult:

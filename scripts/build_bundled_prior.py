@@ -22,7 +22,8 @@ from tqdm import tqdm
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.mesh_to_sdf import GridSpec
 from directshape_torch.shape.parametric_cars import car_sdf, sample_car
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_fit import fit_pca
+from directshape_torch.shape.pca_prior import PriorProvenance
 
 GRID = GridSpec.for_cars(spacing_m=0.1)
 
@@ -57,7 +58,7 @@ def main() -> None:
     if args.kernel:
         KernelPCAShapePrior.fit(*cars, num_components=args.kernel).save(args.out)
         return
-    prior = PCAShapePrior.fit(*cars)
+    prior = fit_pca(*cars)
     prior.save(args.out, grid_dtype="float16")
     mean, std = prior.dimensions_mean_hwl.tolist(), prior.dimensions_std_hwl.tolist()
     print("height, width, length, m: " + ", ".join(f"{m:.2f} +- {s:.2f}" for m, s in zip(mean, std, strict=True)))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from directshape_torch.errors import DataFormatError, InputError, MeshError
 from directshape_torch.files import atomic_files
+from directshape_torch.shape.pca_fit import fit_pca
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     import torch
 
     from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions
-    from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+    from directshape_torch.shape.pca_prior import PriorProvenance
 
     _check_options(args)
     options = MeshOptions(
@@ -100,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     _check_enough(len(grids), skipped, args.num_codes)
     samples = torch.stack(list(grids.values()))
     provenance = PriorProvenance("directshape build-prior", args.licence, len(grids), ", ".join(grids))
-    prior = PCAShapePrior.fit(samples, torch.tensor(grid.origin), grid.spacing_m, args.num_codes, provenance)
+    prior = fit_pca(samples, torch.tensor(grid.origin), grid.spacing_m, args.num_codes, provenance)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     prior.save(args.out)
     report = _make_report(prior, samples, tuple(grids), skipped)

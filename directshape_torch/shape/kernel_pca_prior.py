@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.numerics.checks import check_shape
-from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance, training_codes
+from directshape_torch.shape.pca_fit import fit_pca, training_codes
+from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
 from directshape_torch.shape.tensor_file import read_tensors, write_tensors
@@ -110,15 +111,6 @@ class KernelPCAShapePrior(nn.Module):
     def spacing_m(self) -> float:
         return self.subspace.spacing_m
 
-    @property
-    def lipschitz(self) -> float:
-        """Bound of |gradient|: the subspace's over the largest |c| that a code of norm `CODE_NORM_IN_USE` can have."""
-        largest = self.offset.norm() + CODE_NORM_IN_USE * torch.linalg.matrix_norm(self.linear, 2)
-        # No value of a function is larger than its norm in the space of the kernel, because k(z, z) = 1.
-        norms_squared = (self.weights * (_gaussian(self.anchors, self.anchors, self.kernel_width) @ self.weights)).sum()
-        largest = largest + norms_squared.clamp_min(0).sqrt()
-        return self.subspace.lipschitz_within(float(largest))
-
     def initial_code(self, num_objects: int) -> Tensor:
         """Codes of the mean of the training cars, (B, K) zeros."""
         return self.anchors.new_zeros(num_objects, self.num_codes)
@@ -162,7 +154,7 @@ class KernelPCAShapePrior(nn.Module):
         """Kernel principal components of N signed distance grids and the regression back to grids.
 
         Args:
-            sdf_samples, origin, spacing_m, provenance: as for `PCAShapePrior.fit`.
+            sdf_samples, origin, spacing_m, provenance: as for `fit_pca`.
             num_codes: K kernel principal components.
             num_components: M linear components that hold the grids, num_codes <= M < N.
             kernel_width: of the kernels of the pre-image, in standard deviations of the code.
@@ -173,7 +165,7 @@ class KernelPCAShapePrior(nn.Module):
         """
         if num_components < num_codes:
             raise InputError("num_components", f"at least num_codes = {num_codes}", f"{num_components}")
-        subspace = PCAShapePrior.fit(sdf_samples, origin, spacing_m, num_components, provenance).double()
+        subspace = fit_pca(sdf_samples, origin, spacing_m, num_components, provenance).double()
         coordinates = training_codes(sdf_samples, num_components)  # (N, M), variance 1 each
         scale = subspace.explained_variance_ratio.sqrt()
         anchors = _kernel_components(coordinates * scale, num_codes)

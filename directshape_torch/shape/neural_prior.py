@@ -112,14 +112,6 @@ class NeuralShapePrior(nn.Module):
         last_node = constant_like(self.grid_shape, self.origin) - 1
         return torch.stack([self.origin, self.origin + self.spacing_m * last_node])
 
-    @property
-    def lipschitz(self) -> float:
-        """Bound of |gradient| for every code: the product of the layers' gains. True, but far from tight."""
-        gain = 1.0
-        for layer in self.coded_layers():
-            gain *= float(torch.linalg.matrix_norm(layer.weight.detach().double(), 2))
-        return gain * _SILU_SLOPE ** (len(self.layer_widths) - 1)
-
     def initial_code(self, num_objects: int) -> Tensor:
         """Codes of the mean of the training cars, (B, K) zeros."""
         return self.origin.new_zeros(num_objects, self.num_codes)
@@ -261,9 +253,6 @@ class NeuralShape:
 
     def _linear(self, i: int, x: Tensor, object_index: Tensor) -> Tensor:
         return torch.addmm(self._shifts[i].index_select(0, object_index), x, self._weights[i].T)
-
-
-_SILU_SLOPE = 1.0998393  # its largest derivative
 
 
 def _in_parts(points_obj: Tensor, object_index: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

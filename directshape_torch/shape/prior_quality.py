@@ -10,6 +10,7 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.shape.mesh_to_sdf import GridSpec
+from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 
@@ -108,6 +109,6 @@ def leave_one_out_errors_cm(
     errors = []
     for k in left_out:
         others = torch.cat([sdf_samples[:k], sdf_samples[k + 1 :]])
-        prior_of_others = PCAShapePrior.fit(others, prior.origin, prior.spacing_m, num_codes, prior.provenance)
+        prior_of_others = fit_pca(others, prior.origin, prior.spacing_m, num_codes, prior.provenance)
         errors.append(fit_car(prior_of_others, sdf_samples[k]).error_cm)
     return torch.tensor(errors, dtype=torch.float64)

@@ -75,11 +75,6 @@ class ShapePrior(Protocol):
         """Distance between the nodes of that grid."""
         ...
 
-    @property
-    def lipschitz(self) -> float:
-        """Bound of |gradient| over the codes in use, for step lengths of ray tracing."""
-        ...
-
     def initial_code(self, num_objects: int) -> Tensor:
         """Codes (B, K) of the mean shape."""
         ...

@@ -18,6 +18,7 @@ from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.pca_fit import first_components
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 _PICTURES = ("sampling", "occlusion", "residuals", "iterations", "costs", "shape", "points", "drift")
@@ -99,7 +100,7 @@ def test_the_only_car_of_a_frame_may_fail_unless_it_was_asked_for(
 
 def test_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     file, folder = tmp_path / "two.npz", tmp_path / "out"
-    PCAShapePrior.load_bundled().with_num_codes(2).save(file)
+    first_components(PCAShapePrior.load_bundled(), 2).save(file)
     monkeypatch.setattr("directshape_torch.cli.inspect_prior.BODY_TYPES", ("estate", "coupe"))
     assert main(["inspect", "--prior", str(file), "--out", str(folder)]) == 0
     out = capsys.readouterr().out

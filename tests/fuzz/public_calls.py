@@ -33,6 +33,7 @@ from directshape_torch import (
 from directshape_torch.config import RefinerConfig
 from directshape_torch.rig.detections import COLUMNS
 from directshape_torch.shape.load_prior import load_prior
+from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.terms.lidar import LidarPoints
 
@@ -310,7 +311,7 @@ _FIT = {"origin": torch.zeros(3).double(), "spacing_m": 0.2, "num_codes": 2}
 
 
 def _fitted_prior(a: Arguments) -> list[Tensor]:
-    fitted = PCAShapePrior.fit(a["samples"], a["origin"], a["spacing_m"], a["num_codes"], PriorProvenance("", "", 3))
+    fitted = fit_pca(a["samples"], a["origin"], a["spacing_m"], a["num_codes"], PriorProvenance("", "", 3))
     return [fitted.mean, fitted.basis]
 
 

@@ -9,12 +9,13 @@ import pytest
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
+from directshape_torch.shape.pca_fit import first_components
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
 @cache
 def small_prior() -> PCAShapePrior:
-    return PCAShapePrior.load_bundled().double().with_num_codes(2)
+    return first_components(PCAShapePrior.load_bundled().double(), 2)
 
 
 @cache

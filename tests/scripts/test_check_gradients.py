@@ -13,6 +13,7 @@ import torch
 from directshape_torch.laboratory.regimes import regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
 from directshape_torch.laboratory.study import StudyPlan, run_study
+from directshape_torch.shape.pca_fit import first_components
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.priors import PriorTerm
 from directshape_torch.terms.term import Linear
@@ -22,7 +23,7 @@ _QUICK = ["--states", "1", "--pixels", "4", "--regime", "far_80m"]
 
 @pytest.fixture(autouse=True)
 def _small_prior(monkeypatch: pytest.MonkeyPatch) -> None:
-    small = PCAShapePrior.load_bundled().with_num_codes(2)
+    small = first_components(PCAShapePrior.load_bundled(), 2)
     monkeypatch.setattr(PCAShapePrior, "load_bundled", lambda: small)
 
 

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
-from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance, training_codes
+from directshape_torch.shape.pca_fit import fit_pca, training_codes
+from directshape_torch.shape.pca_prior import PriorProvenance
 
 MADE = PriorProvenance("a test", "Apache-2.0", 40)
 ORIGIN = torch.full((3,), -1.0, dtype=torch.float64)
@@ -44,7 +45,7 @@ def test_a_curved_family_is_held_by_fewer_codes_than_pca_needs() -> None:
     curved = KernelPCAShapePrior.fit(
         samples, ORIGIN, SPACING_M, 2, MADE, num_components=12, kernel_width=1.0, ridge=1e-3
     )
-    linear = PCAShapePrior.fit(samples, ORIGIN, SPACING_M, 2, MADE)
+    linear = fit_pca(samples, ORIGIN, SPACING_M, 2, MADE)
     near = samples.abs() < 0.1
     errors = [
         float((values - samples)[near].abs().mean())

@@ -1,5 +1,3 @@
-import copy
-
 import numpy as np
 import pytest
 import torch
@@ -8,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.shape.pca_prior import CODE_NORM_IN_USE, PCAShapePrior, PriorProvenance
+from directshape_torch.shape.pca_fit import first_components, fit_pca
+from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
 
@@ -41,7 +40,7 @@ def samples() -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def prior(samples) -> PCAShapePrior:
-    return PCAShapePrior.fit(samples, ORIGIN, SPACING_M, 4, MADE)
+    return fit_pca(samples, ORIGIN, SPACING_M, 4, MADE)
 
 
 def test_implements_the_protocol(prior):
@@ -55,7 +54,7 @@ def test_bounds_are_computed_without_the_host(prior):
 
 
 def test_unweighted_components_equal_those_of_a_singular_value_decomposition(samples):
-    prior = PCAShapePrior.fit(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
+    prior = fit_pca(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
     centred = (samples - samples.mean(0)).flatten(1)
     _, singular, directions = torch.linalg.svd(centred, full_matrices=False)
     sigma = singular[:3] / (len(samples) - 1) ** 0.5
@@ -67,7 +66,7 @@ def test_unweighted_components_equal_those_of_a_singular_value_decomposition(sam
 
 
 def test_codes_of_the_training_samples_are_white(samples):
-    prior = PCAShapePrior.fit(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
+    prior = fit_pca(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
     basis = prior.basis.reshape(-1, 3)
     codes = torch.linalg.lstsq(basis, (samples - prior.mean).flatten(1).T).solution.T
     torch.testing.assert_close(
@@ -79,7 +78,7 @@ def test_reconstruction_improves_with_each_component_and_is_exact_with_all():
     few = box_samples(6)
     errors = []
     for k in (1, 3, 5):
-        prior = PCAShapePrior.fit(few, ORIGIN, SPACING_M, k, MADE, surface_band_m=None)
+        prior = fit_pca(few, ORIGIN, SPACING_M, k, MADE, surface_band_m=None)
         basis = prior.basis.reshape(-1, k)
         target = (few - prior.mean).flatten(1).T
         errors.append(float((basis @ torch.linalg.lstsq(basis, target).solution - target).abs().max()))
@@ -101,28 +100,14 @@ def test_linear_dimensions_follow_the_zero_level(prior):
     torch.testing.assert_close(prior.dimensions_hwl(code), measured, atol=0.06, rtol=0)
 
 
-def test_the_lipschitz_bound_is_that_of_the_present_tensors(prior):
-    changed = copy.deepcopy(prior)
-    before = changed.lipschitz
-    with torch.no_grad():
-        changed.mean.mul_(2)
-        changed.basis.mul_(2)
-    assert changed.lipschitz == pytest.approx(2 * before)
-
-
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_values_are_linear_and_within_the_lipschitz_bound(prior, seed):
+def test_values_are_linear_in_the_code(prior, seed):
     generator = torch.Generator().manual_seed(seed)
     code = torch.randn(2, prior.num_codes, generator=generator, dtype=torch.float64)
-    code = code / code.norm(dim=1, keepdim=True) * CODE_NORM_IN_USE
+    code = code / code.norm(dim=1, keepdim=True) * 3.0
     values = prior.values(code)
     torch.testing.assert_close(prior.values(code.mean(0, keepdim=True))[0], values.mean(0))
-    points = prior.bounds_obj[0] + torch.rand(300, 3, generator=generator, dtype=torch.float64) * (
-        prior.bounds_obj[1] - prior.bounds_obj[0]
-    )
-    index = torch.arange(300) % 2
-    assert prior.bind(code).value_and_derivatives(points, index).gradient.norm(dim=1).max() <= prior.lipschitz + 1e-9
 
 
 def test_bind_agrees_with_the_sum_over_components(prior):
@@ -135,23 +120,23 @@ def test_bind_agrees_with_the_sum_over_components(prior):
 
 
 def test_fewer_codes(prior):
-    short = prior.with_num_codes(2)
+    short = first_components(prior, 2)
     code = torch.tensor([[0.3, -0.8]], dtype=torch.float64)
     padded = torch.cat([code, torch.zeros(1, 2, dtype=torch.float64)], dim=1)
     torch.testing.assert_close(short.values(code), prior.values(padded))
     torch.testing.assert_close(short.dimensions_hwl(code), prior.dimensions_hwl(padded))
     for count in (0, 5):
         with pytest.raises(InputError, match=r"num_codes: expected 1\.\.4"):
-            prior.with_num_codes(count)
+            first_components(prior, count)
 
 
 def test_state_dict_and_dtype(prior, samples):
-    other = PCAShapePrior.fit(samples * 1.1, ORIGIN, 0.3, 4, MADE)
+    other = fit_pca(samples * 1.1, ORIGIN, 0.3, 4, MADE)
     other.load_state_dict(prior.state_dict())
     assert other.spacing_m == prior.spacing_m
     code = torch.ones(1, 4, dtype=torch.float64)
     torch.testing.assert_close(other.values(code), prior.values(code))
-    single = prior.with_num_codes(4).to(torch.float32)
+    single = first_components(prior, 4).to(torch.float32)
     assert single.values(single.initial_code(1)).dtype == torch.float32
     torch.testing.assert_close(single.values(code.float()).double(), prior.values(code), atol=1e-5, rtol=0)
 
@@ -205,11 +190,11 @@ def test_bad_files_say_what_is_wrong(prior, tmp_path):
 
 def test_fit_refuses_samples_that_make_no_prior(samples):
     with pytest.raises(InputError, match="more than num_codes = 4"):
-        PCAShapePrior.fit(samples[:4], ORIGIN, SPACING_M, 4, MADE)
+        fit_pca(samples[:4], ORIGIN, SPACING_M, 4, MADE)
     with pytest.raises(InputError, match="finite distances"):
-        PCAShapePrior.fit(samples.where(samples > -0.3, torch.nan), ORIGIN, SPACING_M, 2, MADE)
+        fit_pca(samples.where(samples > -0.3, torch.nan), ORIGIN, SPACING_M, 2, MADE)
     with pytest.raises(InputError, match="without surface"):
-        PCAShapePrior.fit(samples.abs() + 0.1, ORIGIN, SPACING_M, 2, MADE)
+        fit_pca(samples.abs() + 0.1, ORIGIN, SPACING_M, 2, MADE)
 
 
 def test_wrong_code_shape(prior):

@@ -8,6 +8,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.parametric_cars import car_sdf, sample_car
+from directshape_torch.shape.pca_fit import first_components, fit_pca
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 from directshape_torch.shape.prior_quality import NEAR_SURFACE_M, fit_car, grid_of, leave_one_out_errors_cm
 
@@ -63,7 +64,7 @@ def test_leaving_one_ball_out_costs_nothing_but_a_cube_does():
     made = PriorProvenance("a test", "Apache-2.0", 5)
     samples = balls([0.4, 0.5, 0.6, 0.7, 0.8])
     origin = torch.full((3,), -1.0, dtype=torch.float64)
-    prior = PCAShapePrior.fit(samples, origin, 0.125, 1, made)
+    prior = fit_pca(samples, origin, 0.125, 1, made)
     assert leave_one_out_errors_cm(samples, prior).max() < 1e-3
     x = torch.linspace(-1, 1, 17, dtype=torch.float64)
     cube = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), dim=-1).abs().amax(dim=-1) - 0.5
@@ -82,5 +83,5 @@ def test_bundled_prior_takes_on_a_real_saloon():
     file = Path(root) / "meshes" / "comrade1280" / "sedan.obj"
     sdf = torch.from_numpy(mesh_to_sdf(load_mesh_obj(file), GridSpec.for_cars()))
     prior = PCAShapePrior.load_bundled()
-    assert fit_car(prior.with_num_codes(5), sdf).error_cm < 3.0
+    assert fit_car(first_components(prior, 5), sdf).error_cm < 3.0
     assert fit_car(prior, sdf).error_cm < 2.8
