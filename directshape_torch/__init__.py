@@ -2,9 +2,6 @@
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.config_files import load_config
-from directshape_torch.diagnosis.disparity_profile import DisparityProfile
-from directshape_torch.diagnosis.observability import Observability
-from directshape_torch.diagnosis.quality import FitQuality
 from directshape_torch.errors import (
     ConfigError,
     DataFormatError,
@@ -14,6 +11,9 @@ from directshape_torch.errors import (
     MissingDependencyError,
     ResumeError,
 )
+from directshape_torch.figures.disparity_profile import DisparityProfile
+from directshape_torch.figures.observability import Observability
+from directshape_torch.figures.quality import FitQuality
 from directshape_torch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.diagnosis.box_alignment import align_boxes
-from directshape_torch.diagnosis.car_rows import kept, placed
 from directshape_torch.diagnosis.outcome import Outcome, outcome_of_boxes
 from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
+from directshape_torch.figures.car_record import kept, placed
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform

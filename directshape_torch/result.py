@@ -14,12 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from directshape_torch.diagnosis.car_rows import CarRecord
-from directshape_torch.diagnosis.disparity_profile import DisparityProfile
-from directshape_torch.diagnosis.observability import Observability
-from directshape_torch.diagnosis.quality import FitQuality
-from directshape_torch.diagnosis.trust_model import bundled_trust_model
 from directshape_torch.errors import InputError, MissingDependencyError, shown
+from directshape_torch.figures.car_record import CarRecord
+from directshape_torch.figures.disparity_profile import DisparityProfile
+from directshape_torch.figures.observability import Observability
+from directshape_torch.figures.quality import FitQuality
+from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
 from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
@@ -342,7 +342,9 @@ def _check_state(result: RefinementResult) -> None:
 def _check_refined(result: RefinementResult) -> None:
     """Refined cars have finite figures, as the refiner gives them."""
     boxes = result.boxes()
-    figures = (result.code, result.cost_after, result.covariance, result.sigma_xyz_yaw, *vars(boxes).values())
+    figures = (result.code, result.cost_after, *vars(boxes).values())
+    if result.has_shape:
+        figures += result.covariance, result.sigma_xyz_yaw
     finite = torch.stack([x[:, None].isfinite().flatten(1).all(dim=1) for x in figures]).all(dim=0)
     wrong = (result.refined & ~finite).nonzero().flatten().tolist()
     if wrong:

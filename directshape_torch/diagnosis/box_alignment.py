@@ -15,12 +15,10 @@ from torch import Tensor
 
 from directshape_torch.depth import Hits
 from directshape_torch.diagnosis.disparity_profile import (
-    DisparityProfile,
     disparity_profile,
-    profile_figures,
-    profile_offsets,
     shifted_costs,
 )
+from directshape_torch.figures.disparity_profile import DisparityProfile, profile_figures, profile_offsets
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.problem import CarProblem

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.diagnosis.disparity_profile import DisparityProfile
+from directshape_torch.figures.disparity_profile import DisparityProfile
+from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.numerics.tensors import constant_like
@@ -17,53 +18,6 @@ from directshape_torch.problem import CarStage
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.term import Figures, Sight
-
-EVIDENCE_NAMES = (
-    "log_depth",
-    "log_sigma_depth",
-    "log_sigma_side",
-    "log_sigma_yaw",
-    "log_expected_misfit",
-    "log_expected_gain",
-    "moved_depth",
-    "turned",
-    "log_moved_sigmas",
-    "length_change",
-    "mask_misfit_left",
-    "mask_misfit_right",
-    "log_photometric_error",
-    "unmatched_share",
-    "log_support",
-    "log_silhouette_cost",
-    "log_prior_cost",
-    "silhouette_decrease",
-    "photometric_decrease",
-    "relative_decrease",
-    "log_conflict",
-    "code_size",
-    "unsettled",
-    "log_profile_sigma",
-    "log_profile_offset",
-    "log_profile_contrast",
-    "profile_offset_before",
-    "log_profile_fall_before",
-    "outside_basin",
-    "log_detector_sigma",
-)
-"""Columns of the evidence; `docs/results.md` says which of them the bundled model reads.
-
-`log_depth` metres over 20; `log_sigma_*` of the uncalibrated covariance, along and across the viewing ray in the ground
-plane (metres) and of the heading (radians); `log_expected_misfit` the share of the box, seen from above, that these
-sigmas let one expect to be wrong, `log_expected_gain` by how much more it would be at the input; `moved_depth` motion
-along the viewing ray, metres; `turned` radians; `log_moved_sigmas` Mahalanobis length of the motion; `length_change`
-metres; `mask_misfit_*` one minus the overlap with the mask; `*_decrease` log of cost before over cost after;
-`log_conflict` share of the cost that photometry alone would still gain by a step; `code_size` root mean square;
-`unsettled` 1 where the iterations ran out. Of the disparity profile at the end: `log_profile_sigma` and
-`log_profile_offset` of its minimum, pixels, `log_profile_contrast`, how much more a pixel of disparity to the better
-side costs, `outside_basin` 1 where a ridge lies between the state and the minimum. Of the one at the input:
-`profile_offset_before` of its minimum, pixels, and `log_profile_fall_before`, cost there over that at the minimum.
-`log_detector_sigma` of what the detector's depth is known to be off by, as a share of the depth.
-"""
 
 _TINY = 1e-9
 # Round figures of the calibration: what the sigmas are short of, and the least errors of length, width and heading.

@@ -9,18 +9,20 @@ from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.diagnosis.box_alignment import ROUNDS_PX, BoxAlignment
-from directshape_torch.diagnosis.car_rows import CarRecord, placed
-from directshape_torch.diagnosis.disparity_profile import DisparityProfile, disparity_profile
+from directshape_torch.diagnosis.disparity_profile import disparity_profile
 from directshape_torch.diagnosis.evidence import Course
 from directshape_torch.diagnosis.observability import (
-    Observability,
     covariance_of,
     covariance_xyz_yaw,
     observability_of,
     without_offset,
 )
-from directshape_torch.diagnosis.quality import FitQuality, fit_quality
-from directshape_torch.diagnosis.trust_model import bundled_trust_model
+from directshape_torch.diagnosis.quality import fit_quality
+from directshape_torch.figures.car_record import CarRecord, placed
+from directshape_torch.figures.disparity_profile import DisparityProfile
+from directshape_torch.figures.observability import Observability
+from directshape_torch.figures.quality import FitQuality
+from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.problem import CarProblem, CarStage
 from directshape_torch.solver.gauss_newton import Minimum

@@ -1,54 +1,18 @@
-"""How well a car fits what the images show: figures that say when not to trust a result."""
+"""How a `FitQuality` is made: masks and images against the shape at the end, and the probabilities of the evidence."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
-from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from directshape_torch.diagnosis.car_rows import CarRecord
-from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES, Agreement, Course, evidence_of
-from directshape_torch.diagnosis.trust_model import bundled_trust_model
-from directshape_torch.numerics.checks import Dense
+from directshape_torch.diagnosis.evidence import Agreement, Course, evidence_of
+from directshape_torch.figures.quality import FitQuality
+from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.problem import CarStage
 from directshape_torch.rows import CarSums
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.silhouette import MaskRows
 from directshape_torch.terms.term import Part, Sight
-
-
-@dataclass(frozen=True)
-class FitQuality(CarRecord):
-    """Agreement of B refined cars with the images; NaN where there is nothing to compare.
-
-    Attributes:
-        mask_iou_left, mask_iou_right: (B,) overlap of the projected shape with the instance mask over the sampled,
-            unoccluded pixels. Good fits stand above 0.9; below 0.8 mask or fit is wrong.
-        photometric_error_grey: (B,) mean absolute difference between the images over the pixels that count, in grey
-            levels of 0..255, after matching the brightness.
-        matched_share: (B,) share of the photometric pixel set that could be compared at the end.
-        evidence: (B, E) what is known of the refinement's course, columns `evidence.EVIDENCE_NAMES`.
-        probability_better: (B,) calibrated probability that the refined box overlaps the true one more than the input
-            does, seen from above; NaN for all methods but "direct".
-        probability_not_worse: (B,) that its overlap is at least the input's less 0.05. Figures of cars whose status is
-            `not_trusted` speak of the refinement that was not returned.
-    """
-
-    mask_iou_left: Annotated[Tensor, Dense("B")]
-    mask_iou_right: Annotated[Tensor, Dense("B")]
-    photometric_error_grey: Annotated[Tensor, Dense("B")]
-    matched_share: Annotated[Tensor, Dense("B")]
-    evidence: Annotated[Tensor, Dense("B", "E")]
-    probability_better: Annotated[Tensor, Dense("B")]
-    probability_not_worse: Annotated[Tensor, Dense("B")]
-
-    @classmethod
-    def nothing(cls, like: Tensor, count: int) -> FitQuality:
-        """No figures for `count` cars."""
-        nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
-        return cls(nan, nan, nan, nan, nan[:, None].expand(-1, len(EVIDENCE_NAMES)), nan, nan)
 
 
 @torch.no_grad()

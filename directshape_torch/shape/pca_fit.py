@@ -71,27 +71,6 @@ def fit_pca(
     )
 
 
-def first_components(prior: PCAShapePrior, num_codes: int) -> PCAShapePrior:
-    """The prior of the first components only.
-
-    Raises:
-        InputError: more components asked for than there are, or none.
-    """
-    if not 1 <= num_codes <= prior.num_codes:
-        raise InputError("num_codes", f"1..{prior.num_codes}", f"{num_codes}", "build a prior with more components")
-    return PCAShapePrior(
-        prior.mean.clone(),
-        prior.basis[..., :num_codes].clone(),
-        prior.origin.clone(),
-        prior.spacing_m,
-        explained_variance_ratio=prior.explained_variance_ratio[:num_codes].clone(),
-        dimensions_mean_hwl=prior.dimensions_mean_hwl.clone(),
-        dimensions_basis_hwl=prior.dimensions_basis_hwl[:, :num_codes].clone(),
-        dimensions_std_hwl=prior.dimensions_std_hwl.clone(),
-        provenance=prior.provenance,
-    )
-
-
 def training_codes(sdf_samples: Tensor, num_codes: int) -> Tensor:
     """The whitened codes (N, K) of the samples that `fit_pca` is made from, float64.
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
-from directshape_torch.diagnosis.trust_model import LogisticHead
+from directshape_torch.figures.quality import EVIDENCE_NAMES
+from directshape_torch.figures.trust_model import LogisticHead
 from quality_calibration.observations import Array, Observations
 
 # Median of |x| of a standard normal variable.

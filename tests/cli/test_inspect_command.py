@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.priors import first_components
 from PIL import Image
 
 from directshape_torch.cli.demo import DEMO_FOLDER
@@ -18,7 +19,6 @@ from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.pca_fit import first_components
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 _PICTURES = ("sampling", "occlusion", "residuals", "iterations", "costs", "shape", "points", "drift")

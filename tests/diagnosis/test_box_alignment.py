@@ -72,6 +72,8 @@ def test_boxes_come_back_to_their_depth(dtype: torch.dtype, factors: tuple[float
     assert result.term_names == ("photometric",)
     assert result.quality.mask_iou_left.isnan().all()
     assert result.covariance.isnan().all()
+    read = RefinementResult.from_state_dict(result.state_dict(), box_street(dtype)[0])
+    assert torch.equal(read.boxes().location_ref, boxes.location_ref)
     if factors != (1.0, 1.0):
         assert (result.cost_after < 0.5 * result.cost_before).all()
 

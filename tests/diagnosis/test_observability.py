@@ -13,13 +13,12 @@ from helpers.problems import DEFAULT, begun_stage, figures_at
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, street
 from torch import Tensor
 
-from directshape_torch.diagnosis.observability import (
+from directshape_torch.diagnosis.observability import observability_of, quantities_jacobian
+from directshape_torch.figures.observability import (
     CAR_QUANTITIES,
     HEADING_LEVER_M,
     Observability,
     direction_in_words,
-    observability_of,
-    quantities_jacobian,
     view_in_words,
 )
 from directshape_torch.geometry import se3

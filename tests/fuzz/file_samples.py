@@ -23,9 +23,9 @@ from helpers.synthetic_scene import cached_street
 from directshape_torch import load_config
 from directshape_torch.batch.run_status import format_status, read_status
 from directshape_torch.cli.fit_shape import read_boxes
-from directshape_torch.diagnosis.trust_model import load_trust_model
 from directshape_torch.errors import MeshError
 from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, read_tracks, write_tracks
+from directshape_torch.figures.trust_model import load_trust_model
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.disparity_files import read_disparity, write_disparity

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.diagnosis.disparity_profile import DisparityProfile
-from directshape_torch.diagnosis.observability import Observability
-from directshape_torch.diagnosis.quality import FitQuality
 from directshape_torch.errors import InputError
+from directshape_torch.figures.disparity_profile import DisparityProfile
+from directshape_torch.figures.observability import Observability
+from directshape_torch.figures.quality import FitQuality
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import MatchingSummary

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
+from helpers.priors import first_components
 
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
-from directshape_torch.shape.pca_fit import first_components
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 

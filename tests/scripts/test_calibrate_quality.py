@@ -14,8 +14,8 @@ from quality_calibration import fit, noise, observations, report
 from quality_calibration.bend import Bend
 
 import directshape_torch
-from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
-from directshape_torch.diagnosis.trust_model import load_trust_model
+from directshape_torch.figures.quality import EVIDENCE_NAMES
+from directshape_torch.figures.trust_model import load_trust_model
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.io.kitti_dataset import KittiStereoDataset

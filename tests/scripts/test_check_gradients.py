@@ -9,11 +9,11 @@ from typing import Any
 import check_gradients as script
 import pytest
 import torch
+from helpers.priors import first_components
 
 from directshape_torch.laboratory.regimes import regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
 from directshape_torch.laboratory.study import StudyPlan, run_study
-from directshape_torch.shape.pca_fit import first_components
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.priors import PriorTerm
 from directshape_torch.terms.term import Linear

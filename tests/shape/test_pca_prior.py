@@ -2,11 +2,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.host_traffic import host_traffic
+from helpers.priors import first_components
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.shape.pca_fit import first_components, fit_pca
+from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -125,9 +126,6 @@ def test_fewer_codes(prior):
     padded = torch.cat([code, torch.zeros(1, 2, dtype=torch.float64)], dim=1)
     torch.testing.assert_close(short.values(code), prior.values(padded))
     torch.testing.assert_close(short.dimensions_hwl(code), prior.dimensions_hwl(padded))
-    for count in (0, 5):
-        with pytest.raises(InputError, match=r"num_codes: expected 1\.\.4"):
-            first_components(prior, count)
 
 
 def test_state_dict_and_dtype(prior, samples):

@@ -16,8 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from directshape_torch.diagnosis.evidence import EVIDENCE_NAMES
 from directshape_torch.errors import DataFormatError
+from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.files.read_files import read_json
 from directshape_torch.numerics.tensors import constant_like
 
