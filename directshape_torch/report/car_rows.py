@@ -37,10 +37,11 @@ class CarRow:
         frame: number of its frame in the page.
         line: its line in the detection file, from 1.
         track: the name of its track, "" for none.
+        track_part: 0 where it shares the track's shape, 1, 2 .. for a later part of one that was split, -1 alone.
         type: its class.
         status: how its refinement ended.
         refined: whether its state is a refined one.
-        distance_m: depth of the result along the optical axis.
+        x_m, y_m, distance_m: of the result in the left camera frame, on the ground.
         score: the detector's.
         cost_before, cost_after: sum over the terms.
         mask_iou: overlap with the left mask, with the right one where there is no left.
@@ -57,9 +58,12 @@ class CarRow:
     frame: int
     line: int
     track: str
+    track_part: int
     type: str
     status: str
     refined: bool
+    x_m: float | None
+    y_m: float | None
     distance_m: float | None
     score: float | None
     cost_before: float | None
@@ -113,14 +117,18 @@ def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) ->
     before, after = (None, None) if judged is None else (judged.before, judged.after)
     ious = [known(array[car]) for array in (shapes.mask_iou_left, shapes.mask_iou_right)]
     height, width, length = (known(size, 3) for size in shapes.boxes_hwl[car])
+    x_m, y_m, distance_m = (known(coordinate, 2) for coordinate in shapes.T_cam_obj[car, :3, 3])
     return CarRow(
         frame=frame,
         line=int(shapes.input_lines[car]),
         track=shapes.tracks[car],
+        track_part=int(shapes.track_parts[car]),
         type=kitti.type,
         status=shapes.statuses[car],
         refined=is_refined(shapes.statuses[car]),
-        distance_m=known(shapes.T_cam_obj[car, 2, 3], 2),
+        x_m=x_m,
+        y_m=y_m,
+        distance_m=distance_m,
         score=known(kitti.score),
         cost_before=known(shapes.costs_before[car].sum()),
         cost_after=known(shapes.costs_after[car].sum()),

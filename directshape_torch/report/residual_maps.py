@@ -6,6 +6,7 @@ which the energy leaves pixels out, but for other instances that lie in front.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,11 +88,12 @@ class ResidualMaps:
 def pixel_grid(window: Window) -> Tensor:
     """Pixels (h, w, 2) that cover a window, at most 240 columns."""
     u0, v0, u1, v1 = window
-    step = max(1.0, (u1 - u0) / _MOST_COLUMNS)
-    u = torch.arange(u0, u1, step, dtype=torch.float32)
-    v = torch.arange(v0, v1, step, dtype=torch.float32)
-    rows, columns = torch.meshgrid(v, u, indexing="ij")
-    return torch.stack([columns, rows], dim=-1)
+    width, height = u1 - u0, v1 - v0
+    # Counted in whole numbers: a range of float steps may end on the window's border, outside of the image.
+    columns = min(width, _MOST_COLUMNS)
+    rows = math.ceil(height * columns / width)
+    u, v = u0 + torch.arange(columns) * (width / columns), v0 + torch.arange(rows) * (width / columns)
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
 
 
 @torch.no_grad()

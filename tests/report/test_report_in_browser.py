@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import pytest
 from helpers.browser import chromium, console_problems, requested_urls, screenshot_of, set_viewport
 from helpers.report_runs import finished_run
 
+from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.report.make_report import make_report
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 FRAMES = ("<img src=x onerror=boom()>", '"><script>boom()', "zz'&amp;{{data}}")
 FIRST_FRAME = sorted(FRAMES)[0]
 CAR_TYPE = "<script>boom()</script>"
+TRACK = "<b>7</b>"
 OUT_NAME = "<svg onload=boom()>&lt;"
 # Software rendering on a busy machine takes its time.
 PATIENCE_S = 40.0
@@ -28,6 +31,9 @@ PATIENCE_S = 40.0
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = finished_run(tmp_path_factory.mktemp("browser"), FRAMES, out_name=OUT_NAME, car_type=CAR_TYPE)
+    # The first car goes through all frames, in the last one as somebody else.
+    for path, part in zip(sorted((run.out / "shapes").iterdir()), (0, 0, 1), strict=True):
+        write_shapes(path, replace(read_shapes(path), tracks=(TRACK, ""), track_parts=np.array([part, -1])))
     return make_report(run.folder(), run.out.parent / "a page#1.html", run.dataset, run.prior).path
 
 
@@ -94,7 +100,7 @@ def test_sort_by_click_and_by_key(opened: Chrome) -> None:
     button = head.find_element("css selector", "button")
 
     def distances() -> list[float]:
-        return [float(text) for text in texts(opened, "#car-rows td:nth-child(4)")]
+        return [float(text) for text in texts(opened, "td[data-title='Distance [m]']")]
 
     assert head.get_attribute("aria-sort") == "none"
     button.click()
@@ -203,6 +209,18 @@ def test_3d_turns_by_a_finger(opened: Chrome) -> None:
     assert not find(opened, "#car-dialog").is_displayed()
 
 
+def test_tracks_are_named(opened: Chrome) -> None:
+    """The table says which views are of one car, the summary what was split, and each view knows the whole path."""
+    tracks = dict(zip(texts(opened, ".open-car"), texts(opened, "td[data-title='Track']"), strict=True))
+    assert sorted(tracks.values()) == [TRACK, TRACK, f"{TRACK}, part 1"] + ["\u2013"] * 3
+    assert "1, 1 of them split" in find(opened, "#summary").text
+    find(opened, "#search").send_keys(f"track {TRACK}, part")
+    assert len(texts(opened, ".open-car")) == 1
+    path = "const done = arguments[0]; import('report/data').then(({cars, pathOf}) => done(cars.map(pathOf)))"
+    lengths = [len(places) for places in opened.execute_async_script(path)]
+    assert lengths == [3, 0] * 3
+
+
 def test_frames_change_and_boxes_can_be_hidden(opened: Chrome) -> None:
     scene = show_scene(opened)
     find(opened, "#next-frame").click()
@@ -242,7 +260,7 @@ def test_the_table_of_cars_fits_a_desk_and_becomes_cards_on_a_phone(opened: Chro
     from selenium.webdriver.support.ui import Select
 
     Select(find(opened, "#sort-choice")).select_by_visible_text("Distance [m]")
-    distances = [float(text) for text in texts(opened, "#car-rows td:nth-child(4)")]
+    distances = [float(text) for text in texts(opened, "td[data-title='Distance [m]']")]
     assert distances == sorted(distances, reverse=True)
 
 

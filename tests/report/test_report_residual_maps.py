@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 from helpers.synthetic_scene import cached_street
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from directshape_torch.report.drawn_cars import car_window
 from directshape_torch.report.residual_maps import (
@@ -123,3 +125,12 @@ def test_colours() -> None:
 def test_no_window_for_what_is_not_seen(points: list[list[float]], expected: None) -> None:
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     assert car_window(np.zeros((100, 100, 3), np.uint8), K, np.array(points)) is expected
+
+
+@example(3, 1239, 0, 9)  # a range of float steps ends on the border here
+@given(st.integers(0, 1300), st.integers(1, 1300), st.integers(0, 400), st.integers(1, 400))
+def test_a_grid_stays_in_its_window(u: int, width: int, v: int, height: int) -> None:
+    grid = pixel_grid((u, v, u + width, v + height)).reshape(-1, 2).long()
+    assert grid.amin(dim=0).tolist() == [u, v]
+    assert grid[:, 0].max() < u + width
+    assert grid[:, 1].max() < v + height

@@ -2,7 +2,7 @@
 
 import { element } from "report/dom";
 import { mapsOf, thumbnailsOf } from "report/data";
-import { carName, change, costChange, iouChange, number, percent, signed, tone } from "report/format";
+import { carName, change, costChange, iouChange, number, percent, signed, tone, trackName } from "report/format";
 import { curves } from "report/charts";
 import { factTable } from "report/summary";
 import { showCarInFrame } from "report/frame_view";
@@ -80,7 +80,7 @@ function figures(car, maps) {
     ["Standard deviation of x, y, z", `${sigmas.slice(0, 3).map((sigma) => number(sigma)).join(", ")} m`],
     ["Standard deviation of the heading", sigmas[3] === null ? "–" : `${number(sigmas[3] * 180 / Math.PI, 1)}°`],
     ["Least seen", car.unseen || "–"],
-    ...(car.track ? [["Track", car.track]] : []),
+    ...(car.track ? [["Track", trackName(car)]] : []),
     ["Score of the detector", number(car.score)],
     ["Iterations", String(car.iterations)],
     ["Cost", `${change(car.cost_before, car.cost_after)} (${percent(costChange(car))})`],

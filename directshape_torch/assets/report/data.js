@@ -27,10 +27,12 @@ export const cars = table.rows.map((values, index) => {
 });
 
 export const hasLabels = cars.some((car) => car.iou_after !== null);
-export const hasTracks = cars.some((car) => car.track !== "");
+export const tracks = [...new Set(cars.map((car) => car.track).filter(Boolean))];
 export const hasErrorsBefore = cars.some((car) => car.iou_before !== null);
 
 export const carsOfFrame = (frame) => cars.filter((car) => car.frame === frame);
+// Where a car of a track is in each of its frames, as the camera sees it.
+export const pathOf = (car) => cars.filter((other) => car.track && other.track === car.track).map((view) => [view.x_m, view.y_m, view.distance_m]);
 export const thumbnailsOf = (car) => read(`thumbnails-${car.frame}`)?.[car.place] ?? {};
 export const mapsOf = (car) => read(`maps-${car.frame}`)?.[car.place] ?? null;
 export const sceneOf = (frame) => read(`scene-${frame}`);

@@ -32,6 +32,9 @@ export const iouChange = (car) => (car.iou_before === null || car.iou_after === 
 
 export const carName = (car) => `${car.frameId}, line ${car.line}`;
 
+// Who shares the shape of a track: the parts of one that was split are other cars.
+export const trackName = (car) => car.track && `${car.track}${car.track_part > 0 ? `, part ${car.track_part}` : car.track_part < 0 ? ", alone" : ""}`;
+
 export const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 
 // Relative change of the cost, or null.

@@ -1,7 +1,7 @@
 // One frame at a time: its picture, and its cars in 3D.
 
 import { element, byId } from "report/dom";
-import { carsOfFrame, frames, sceneOf } from "report/data";
+import { carsOfFrame, frames, pathOf, sceneOf, tracks } from "report/data";
 import { carName, counted } from "report/format";
 import { framePicture } from "report/frame_picture";
 
@@ -67,7 +67,11 @@ async function start() {
   }
 }
 
-const drawScene = () => viewer?.show(sceneOf(current), shown, `Frame ${frames.ids[current]} in 3D`);
+function drawScene() {
+  const inFrame = carsOfFrame(current);
+  const paints = inFrame.map((car, place) => car.track ? tracks.indexOf(car.track) : place);
+  return viewer?.show(sceneOf(current), shown, `Frame ${frames.ids[current]} in 3D`, paints, inFrame.map(pathOf));
+}
 
 async function showFrame(number) {
   current = number;

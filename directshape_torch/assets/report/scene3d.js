@@ -48,7 +48,8 @@ export class Viewer {
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { this.paintGround(); this.draw(); });
   }
 
-  async show(data, shown, label) {
+  // `paints` are numbers of colours, `paths` places [x, y, z] of each car in all frames of its track.
+  async show(data, shown, label, paints, paths) {
     const generation = ++this.generation;
     const meshes = await Promise.all(data.cars.map((car) => surfaceOf(car)));
     if (generation !== this.generation) return;  // another frame was chosen meanwhile
@@ -59,7 +60,8 @@ export class Viewer {
     this.cars = new THREE.Group();
     // The camera's y points down and its z forward; here up is +y.
     this.cars.rotation.x = Math.PI;
-    data.cars.forEach((car, place) => this.addCar(car, place, meshes[place], shown));
+    data.cars.forEach((car, place) => this.addCar(car, place, meshes[place], shown, PAINTS[paints[place] % PAINTS.length]));
+    if (shown.after) paths.forEach((path, place) => this.cars.add(pathLine(path, PAINTS[paints[place] % PAINTS.length])));
     if (shown.truth) data.truth.forEach((box) => this.cars.add(boxLines(box, COLOURS.truth)));
     this.cars.add(this.groundGrid(data));
     this.scene.add(this.cars);
@@ -70,9 +72,9 @@ export class Viewer {
     this.draw();
   }
 
-  addCar(car, place, mesh, shown) {
+  addCar(car, place, mesh, shown, color) {
     if (mesh !== null && shown.after) {
-      const material = new THREE.MeshStandardMaterial({ color: PAINTS[place % PAINTS.length], roughness: 0.55, metalness: 0.1, side: THREE.DoubleSide });
+      const material = new THREE.MeshStandardMaterial({ color, roughness: 0.55, metalness: 0.1, side: THREE.DoubleSide });
       const surface = new THREE.Mesh(geometryOf(mesh), material);
       surface.matrixAutoUpdate = false;
       surface.matrix.set(...car.T_cam_obj);
@@ -181,6 +183,13 @@ function boxLines(box, colour) {
   const front = [0, 1, 2].map((axis) => 0.5 * (box[axis] + box[3 + axis]));
   const middle = [0, 1, 2].map((axis) => 0.25 * [0, 1, 2, 3].reduce((sum, id) => sum + box[3 * id + axis], 0));
   return lines([...EDGES.flatMap(([a, b]) => [...corner(a), ...corner(b)]), ...middle, ...front], colour);
+}
+
+// From each place to the next, with a cross at each.
+function pathLine(path, colour) {
+  const ways = path.slice(1).flatMap((place, index) => [...path[index], ...place]);
+  const crosses = path.flatMap(([x, y, z]) => [x - 0.2, y, z, x + 0.2, y, z, x, y, z - 0.2, x, y, z + 0.2]);
+  return lines([...ways, ...crosses], colour);
 }
 
 function lines(points, colour) {

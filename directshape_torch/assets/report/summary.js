@@ -1,7 +1,7 @@
 // The top of the page: counts, mean errors, notes, failed frames, settings.
 
 import { element, byId } from "report/dom";
-import { run } from "report/data";
+import { cars, run, tracks } from "report/data";
 import { change, counted, percent, tone } from "report/format";
 
 export function showSummary() {
@@ -19,6 +19,10 @@ function tiles() {
     ["Cars", String(run.cars)],
     ["Refined", run.cars ? `${run.refined} (${percent(run.refined / run.cars)})` : "0"],
   ];
+  if (tracks.length) {
+    const split = new Set(cars.filter((car) => car.track_part > 0).map((car) => car.track)).size;
+    entries.push(["Tracks", split ? `${tracks.length}, ${split} of them split` : String(tracks.length), split ? "bad" : null]);
+  }
   const errors = run.errors;
   if (errors !== null) {
     entries.push(

@@ -1,21 +1,21 @@
 // All cars: filter, sort by any column, a hundred rows at a time.
 
 import { element, byId } from "report/dom";
-import { cars, run, hasLabels, hasErrorsBefore, hasTracks } from "report/data";
-import { MISSING, costChange, iouChange, number, percent, signed, tone } from "report/format";
+import { cars, run, hasLabels, hasErrorsBefore, tracks } from "report/data";
+import { MISSING, costChange, iouChange, number, percent, signed, tone, trackName } from "report/format";
 import { thumbnail } from "report/thumbnails";
 import { openCar } from "report/car_dialog";
 
 const ROWS_AT_ONCE = 100;
 
 const numeric = (title, value, text = (car) => number(value(car)), toneOf = () => null) => ({ title, value, text, toneOf, kind: "number" });
-const words = (title, value) => ({ title, value, text: value, kind: "words" });
+const words = (title, value, kind = "words") => ({ title, value, text: value, kind });
 
 const iouTone = (car) => tone(car.iou_before, car.iou_after, true);
 const columns = [
-  ...(hasTracks ? [words("Track", (car) => car.track)] : []),
+  ...(tracks.length ? [words("Track", trackName, "type")] : []),
   numeric("Distance [m]", (car) => car.distance_m, (car) => number(car.distance_m, 1)),
-  { title: "Status", value: (car) => car.status, text: (car) => car.status, kind: "status" },
+  words("Status", (car) => car.status, "status"),
   ...(hasErrorsBefore ? [numeric("IoU before", (car) => car.iou_before)] : []),
   ...(hasLabels ? [numeric("IoU after", (car) => car.iou_after, undefined, iouTone)] : []),
   ...(hasErrorsBefore ? [numeric("IoU change", iouChange, (car) => signed(iouChange(car)), iouTone)] : []),
@@ -27,7 +27,7 @@ const columns = [
   numeric("Image difference [grey]", (car) => car.photometric_error_grey, (car) => number(car.photometric_error_grey, 1)),
   numeric("Sigma of depth [m]", (car) => car.sigma_depth_m),
   numeric("Length [m]", (car) => car.length_m),
-  { title: "Type", value: (car) => car.type, text: (car) => car.type, kind: "type" },
+  words("Type", (car) => car.type, "type"),
   words("Least seen", (car) => car.unseen),
 ];
 const nameColumn = { title: "Car", value: (car) => `${car.frameId} ${String(car.line).padStart(4, "0")}` };
@@ -53,7 +53,7 @@ function controls() {
   const choose = element("select", { id: "status-filter", onchange: (event) => { state.status = event.target.value; restart(); } },
     element("option", { value: "" }, "all"), ...run.statuses.map((status) => element("option", { value: status.name }, status.name)));
   return element("div", { class: "controls" },
-    element("label", {}, hasTracks ? "Frame, track or type" : "Frame or type", search), element("label", {}, "Status", choose),
+    element("label", {}, tracks.length ? "Frame, track or type" : "Frame or type", search), element("label", {}, "Status", choose),
     element("label", { class: "narrow" }, "Sort by", sortChoice()));
 }
 
@@ -90,7 +90,7 @@ function sortBy(column) {
 
 function chosenCars() {
   const found = cars.filter((car) => (state.status === "" || car.status === state.status)
-    && (state.search === "" || `${car.frameId} ${car.type}${car.track && ` track ${car.track}`}`.toLowerCase().includes(state.search)));
+    && (state.search === "" || `${car.frameId} ${car.type}${car.track && ` track ${trackName(car)}`}`.toLowerCase().includes(state.search)));
   return state.column === null ? found : found.sort((a, b) => compare(state.column.value(a), state.column.value(b)) || a.index - b.index);
 }
 
