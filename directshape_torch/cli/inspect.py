@@ -1,4 +1,4 @@
-"""`directshape inspect`: figures of what happened to single cars, or of a shape prior."""
+"""`directshape inspect`: figures of what happened to single cars."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ if TYPE_CHECKING:
     from directshape_torch.io.stereo_files import FileStereoDataset
 
 _DESCRIPTION = """
-Refine the cars of a frame and draw the course of every one: sampled pixels, occlusion, residuals, contour and box of
-each iteration, costs, shape, point clouds, and how it would drift by silhouettes alone. With --prior and no frame: draw
-the shapes of a prior. docs/inspect.md shows the pictures.
+Refine the cars of a frame and draw the course of every one: sampled pixels, residuals, contour, box and costs of each
+iteration, and how it would drift by silhouettes alone. docs/inspect.md shows the pictures.
 """
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command and its options."""
-    parser = subparsers.add_parser("inspect", help="figures of single cars, or of a prior", description=_DESCRIPTION)
+    parser = subparsers.add_parser("inspect", help="figures of single cars", description=_DESCRIPTION)
     data = parser.add_argument_group("input")
     data.add_argument("--demo", action="store_true", help="the bundled frame, without data")
     data.add_argument("--frame", metavar="ID", type=frame_id_of, help="the frame; --frames for several")
@@ -32,12 +31,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     data.add_argument("--tracks", action="store_true", help="refine --frames together and let each car move")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a folder of figures a car")
     add_refiner_options(parser.add_argument_group("settings"))
-    meshes = parser.add_argument_group("of a prior alone")
-    meshes.add_argument("--meshes", type=Path, metavar="DIR", help="real cars for the prior to be fitted to")
-    meshes.add_argument(
-        "--forward-axis", default="+x", help="of the meshes, as --forward-axis=-x (default: %(default)s)"
-    )
-    meshes.add_argument("--up-axis", default="+z", help="of the meshes, as --up-axis=-y (default: %(default)s)")
     parser.set_defaults(run=run)
 
 
@@ -50,21 +43,6 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.io.figure_files import check_figures
 
     check_figures("directshape inspect")
-    if args.prior == "default":
-        args.prior = "pca"
-    if args.demo or args.data is not None:
-        return _inspect_frames(args)
-    if args.prior is None:
-        cure = "give --data with --frame, or --demo, or --prior alone"
-        raise InputError("inspect", "something to inspect", "neither a frame nor a prior", cure)
-    from directshape_torch.cli.inspect_prior import inspect_prior
-    from directshape_torch.shape.mesh_to_sdf import MeshOptions
-
-    options = MeshOptions(args.forward_axis, args.up_axis)
-    return inspect_prior(args.prior, args.meshes, options, args.out)
-
-
-def _inspect_frames(args: argparse.Namespace) -> int:
     from directshape_torch.cli.inspect_cars import inspect_frame
 
     dataset = _dataset(args)
@@ -79,8 +57,7 @@ def _inspect_frames(args: argparse.Namespace) -> int:
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
         rows = _rows(loaded, args.car)
-        root, must = args.data or DEMO_FOLDER, args.car is not None
-        inspect_frame(loaded, refiner, rows, root, dataset.layout, args.out, must_refine=must)
+        inspect_frame(loaded, refiner, rows, args.out, must_refine=args.car is not None)
     print(f"figures  {args.out}")
     return 0
 
@@ -94,6 +71,8 @@ def _dataset(args: argparse.Namespace) -> FileStereoDataset:
         frames = None if args.frame is None else [args.frame]
         folder = DEMO_FOLDER
         return KittiStereoDataset(folder, folder / "detections/noisy_stereo", folder / "training/masks", frames=frames)
+    if args.data is None:
+        raise InputError("inspect", "something to inspect", "no frame", "give --data with --frame, or --demo")
     if args.frame is not None:
         args.frames = [args.frame]
     if args.frames is None:

@@ -1,27 +1,23 @@
-"""`directshape inspect`: every figure of a car of the bundled frame and of the bundled prior, and clear refusals."""
+"""`directshape inspect`: every figure of a car of the bundled frame, and clear refusals."""
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
-from helpers.priors import first_components
 from PIL import Image
 
 from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.cli.inspect_cars import inspect_frame, points_of_car, silhouette_trace, true_points
+from directshape_torch.cli.inspect_cars import inspect_frame, silhouette_trace
 from directshape_torch.cli.main import main
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.shape.pca_prior import PCAShapePrior
 
-_PICTURES = ("sampling", "occlusion", "residuals", "iterations", "costs", "shape", "points", "drift")
+_PICTURES = ("sampling", "residuals", "drift")
 _FAST = ["--config", "fast"]
 
 
@@ -64,9 +60,8 @@ def test_without_both_of_the_papers_terms_there_is_no_drift(setting: str) -> Non
         (["--demo", "--car", "9"], "car of frame 000000: 1, 2, 3, 4, 5, 6, got 9"),
         (["--demo", "--data", "x"], "bundled frame alone"),
         (["--data", str(DEMO_FOLDER)], "give --frame ID"),
-        ([], "neither a frame nor a prior"),
-        (["--prior", "nowhere.npz"], "nowhere.npz"),
-        (["--prior", "default", "--meshes", "nowhere"], "nowhere"),
+        ([], "something to inspect"),
+        (["--demo", "--prior", "nowhere.npz"], "nowhere.npz"),
         (["--demo", "--car", "2", "--set", "sampling.min_usable_pixels=100000"], "too_few_pixels"),
     ],
 )
@@ -92,51 +87,7 @@ def test_the_only_car_of_a_frame_may_fail_unless_it_was_asked_for(
 ) -> None:
     data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
     refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", "sampling.min_usable_pixels=100000"]))
-    inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, data.layout, tmp_path)
+    inspect_frame(data.load("000000"), refiner, [1], tmp_path)
     assert "car 2: not refined, too_few_pixels" in capsys.readouterr().out
     with pytest.raises(InputError, match="too_few_pixels"):
-        inspect_frame(data.load("000000"), refiner, [1], DEMO_FOLDER, data.layout, tmp_path, must_refine=True)
-
-
-def test_prior(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    file, folder = tmp_path / "two.npz", tmp_path / "out"
-    first_components(PCAShapePrior.load_bundled(), 2).save(file)
-    monkeypatch.setattr("directshape_torch.cli.inspect_prior.BODY_TYPES", ("estate", "coupe"))
-    assert main(["inspect", "--prior", str(file), "--out", str(folder)]) == 0
-    out = capsys.readouterr().out
-    assert "estate: " in out
-    assert "mean of 2 cars" in out
-    assert {path.name for path in folder.iterdir()} == {"fits.png", "codes.png", "codes.gif"}
-
-
-@pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: true points needed")
-@pytest.mark.parametrize(
-    ("folder", "detections", "frame", "car", "name"),
-    [
-        ("kitti", "noisy_stereo", "000107", 0, "LiDAR"),
-        ("kitti", "noisy_stereo", "007322", 0, "true disparity"),
-        ("rendered", "stereo", "000003", 0, "true surface"),
-    ],
-)
-def test_true_points_lie_on_the_labelled_car(folder: str, detections: str, frame: str, car: int, name: str) -> None:
-    root = Path(os.environ["DIRECTSHAPE_DATA"]) / folder
-    data = KittiStereoDataset(root, root / "detections" / detections, root / "training/masks")
-    loaded = data.load(frame)
-    points = true_points(root, data.layout, loaded)
-    assert points is not None
-    assert points.name == name
-    found = points_of_car(points, loaded, car, loaded.detections.T_cam_obj[car, :3, 3])
-    assert found is not None
-    assert 50 < found.of_car.sum() < len(found.of_car)
-    on_car = found.points_cam[found.of_car]
-    assert np.ptp(on_car[:, 1]) < 2.2
-    depth = float(loaded.detections.T_cam_obj[car, 2, 3])
-    assert abs(np.median(on_car[:, 2]) - depth) < 3.0
-
-
-def test_meshes_that_are_no_cars_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "hole.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert main(["inspect", "--prior", "default", "--meshes", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert "skipped: hole" in said
-    assert "at least one mesh that can be made solid" in said
+        inspect_frame(data.load("000000"), refiner, [1], tmp_path, must_refine=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,14 +18,8 @@ from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.observation.packing import pack_pixels
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.drawing import Surface, View, silhouette_mask
-from directshape_torch.visualize.inspection.car_view import CarView, KnownPoints
+from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.course_figures import animation_frames, costs_of_car, distance_course
-from directshape_torch.visualize.inspection.point_figures import (
-    point_sets,
-    shape_points_cam,
-    stereo_points,
-    write_known_point_figure,
-)
 from directshape_torch.visualize.inspection.residual_figure import car_residuals
 from directshape_torch.visualize.inspection.sampling_figure import sampled_pixels_of
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
@@ -162,34 +155,6 @@ def test_distances_begin_at_the_input(view: CarView) -> None:
     assert distance_course(replace(view, truth_corners_cam=corners))[0] == pytest.approx(5.0, abs=0.1)
 
 
-def test_points_of_the_shape_lie_on_it_and_under_the_mask(view: CarView) -> None:
-    points = shape_points_cam(view)
-    assert len(points) > 500
-    (ours,) = [s for s in point_sets(view) if s.name == "refined shape"]
-    assert np.abs(ours.distance_m).max() < 0.01
-    K = view.loaded.frame.camera.K_left[0].double().numpy()
-    uv = points @ K.T
-    u, v = np.rint(uv[:, :2] / uv[:, 2:]).astype(int).T
-    assert view.loaded.detections.mask_left[_CAR].numpy()[v, u].mean() > 0.99
-
-
-def test_stereo_points_are_near_the_car(view: CarView) -> None:
-    clouds = stereo_points(view.loaded.frame, view.loaded.detections, view.trace.config.point_cloud)
-    assert len(clouds) == len(view.loaded.detections)
-    sets = point_sets(replace(view, stereo_points_cam=clouds[_CAR]))
-    assert [s.name for s in sets] == ["dense stereo", "refined shape"]
-    assert np.nanmedian(np.abs(sets[0].distance_m)) < 0.2
-
-
-def test_known_points_are_one_of_the_sets(view: CarView) -> None:
-    points = view.footprint(len(view.trace) - 1)
-    points_cam = np.stack([points[:, 0], np.full(4, 1.5), points[:, 1]], axis=1)
-    known = KnownPoints("a scan", points_cam, np.zeros((4, 2)), np.array([True, False, True, True]))
-    sets = point_sets(replace(view, known_points=known))
-    assert (sets[-1].name, len(sets[-1].points_obj)) == ("a scan", 3)
-    np.testing.assert_allclose(np.abs(sets[-1].points_obj[:, 0]), sets[-1].points_obj[:, 0].max(), atol=0.1)
-
-
 def test_animation_moves_the_contour_in_both_images(view: CarView) -> None:
     frames = animation_frames(view)
     assert len(frames) == len(view.steps)
@@ -200,11 +165,6 @@ def test_animation_moves_the_contour_in_both_images(view: CarView) -> None:
     width = frames[0].shape[1]
     assert moved[: width * 3 // 10].any()
     assert moved[width * 32 // 100 : width * 55 // 100].any()
-
-
-def test_scan_figure_needs_a_scan(view: CarView, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="scan"):
-        write_known_point_figure(tmp_path / "scan.png", view)
 
 
 def test_cars_that_did_not_take_part_are_refused(view: CarView) -> None:

@@ -36,23 +36,6 @@ _SURROUNDINGS = 0.12
 
 
 @dataclass(frozen=True)
-class KnownPoints:
-    """Points of a scene whose place is known, in the left camera frame.
-
-    Attributes:
-        name: where they come from, for titles.
-        points_cam: (P, 3) metres; all are seen in the left image.
-        uv: (P, 2) pixels there.
-        of_car: (P,) bool, those of the car in question.
-    """
-
-    name: str
-    points_cam: Array
-    uv: Array
-    of_car: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
 class CarView:
     """One car of a frame and the trace of its refinement.
 
@@ -61,16 +44,12 @@ class CarView:
         trace: of a refinement of its detections.
         car: row of the detections; it took part in the refinement.
         truth_corners_cam: (8, 3) of its labelled box, in the order of `box_corners`, or None.
-        known_points: a scan or the like, or None.
-        stereo_points_cam: (P, 3) of the car by dense stereo, or None.
     """
 
     loaded: LoadedFrame
     trace: RefinementTrace
     car: int
     truth_corners_cam: Array | None = None
-    known_points: KnownPoints | None = None
-    stereo_points_cam: Array | None = None
 
     def __post_init__(self) -> None:
         if self.trace.place_of(self.car) < 0:
@@ -163,12 +142,6 @@ class CarView:
     def centre_cam(self, number: int) -> Array:
         """Middle of the footprint (2,), x and z, metres."""
         return np.asarray(self.footprint(number).mean(axis=0))
-
-    def height_above_ground(self, points_cam: Array) -> Array:
-        """Height (P,) of points (P, 3) above the frame's ground plane, metres."""
-        ground = self.loaded.frame.ground
-        normal, offset = ground.normal[0].double().cpu().numpy(), float(ground.offset[0])
-        return np.asarray(points_cam @ normal + offset)
 
     def mask_lines(self, side: Side) -> list[Array]:
         """Outline of the instance mask, lines (n, 2) of pixels; none where there is no mask."""

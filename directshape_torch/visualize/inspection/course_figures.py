@@ -1,4 +1,4 @@
-"""The course of a refinement: contours and boxes of every state, costs, an animation, the drift without photometry."""
+"""The course of a refinement: contour, box and costs of every state as an animation, the drift without photometry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.visualize.drawing import Picture
 from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
 from directshape_torch.visualize.inspection.panels import (
-    DETECTOR_INK,
     MASK_INK,
     draw_footprint,
     draw_lines,
@@ -23,94 +22,12 @@ from directshape_torch.visualize.inspection.panels import (
     show_crop,
 )
 
-_CONTOUR_INCHES = (11.5, 4.6)
-
-
-def write_contour_figure(path: Path | str, view: CarView) -> None:
-    """Write the figure as PNG: the instance mask is the dotted line, the colour tells the iteration.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
-    figure = new_figure(*_CONTOUR_INCHES, "drawing iterations")
-    figure.suptitle(view.title)
-    image, above = figure.subplots(1, 2, width_ratios=[3, 2])
-    inks = iteration_inks(len(view.steps))
-    show_crop(image, view.image("left"), view.window("left"), f"projected contour of {len(view.steps)} states")
-    draw_lines(image, view.mask_lines("left"), MASK_INK, "mask", linewidth=1.3, linestyle=":")
-    show_birds_eye(above, view, [view.footprint(k) for k in view.steps])
-    detector = footprint_of_corners(view.detector_corners_cam)
-    draw_footprint(above, detector, DETECTOR_INK, "detection", linewidth=1.2, linestyle="--")
-    for place, number in enumerate(view.steps):
-        width = 1.8 if place in (0, len(view.steps) - 1) else 0.8
-        draw_lines(image, view.contours("left", number), inks[place], linewidth=width)
-        draw_footprint(above, view.footprint(number), inks[place], linewidth=width)
-    _add_iteration_bar(figure, above, view.steps)
-    image.legend(loc="lower left", fontsize=8, facecolor="0.3", labelcolor="white")
-    above.legend(loc="upper left", fontsize=8)
-    write_figure(path, figure)
-
-
-def _add_iteration_bar(figure: Any, axes: Any, steps: list[int]) -> None:
-    """A bar of the colours that the states have, with the iterations that they come from."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import BoundaryNorm, ListedColormap
-
-    edges = [k - 0.5 for k in range(len(steps) + 1)]
-    colours = ScalarMappable(BoundaryNorm(edges, len(steps)), ListedColormap(iteration_inks(len(steps))))
-    bar = figure.colorbar(colours, ax=axes, label="iteration", ticks=range(len(steps)))
-    bar.set_ticklabels([str(k) for k in steps], fontsize=7)
-
-
-_COST_INCHES = (8.5, 4.4)
-# Of the largest total: terms below are not worth their decades of the axis.
-_LEAST_SHARE = 1e-4
-
 
 def costs_of_car(view: CarView) -> dict[str, NDArray[np.float64]]:
     """Cost (N + 1,) of each term by its name, at the final stage's settings, and their "sum"."""
     costs = view.trace.costs[:, view.car].cpu().numpy()
     named = dict(zip(view.trace.result.term_names, costs.T, strict=True))
     return {**named, "sum": costs.sum(axis=1)}
-
-
-def stage_beginnings(stage: Sequence[int]) -> list[float]:
-    """Places between the states where a later stage than the first begins.
-
-    Examples:
-        >>> stage_beginnings([-1, 0, 0, 1, 1])
-        [2.5]
-    """
-    return [k - 0.5 for k in range(1, len(stage)) if stage[k] != stage[k - 1] and stage[k] > 0]
-
-
-def write_cost_figure(path: Path | str, view: CarView) -> None:
-    """Write the figure as PNG: all costs are those of the final stage, so a step of an earlier stage may raise them.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
-    figure = new_figure(*_COST_INCHES, "drawing costs")
-    axes = figure.subplots()
-    costs, iterations = costs_of_car(view), np.arange(len(view.trace))
-    for name, values in costs.items():
-        style = {"color": "black", "linewidth": 2.2} if name == "sum" else {"linewidth": 1.4}
-        axes.plot(iterations, values, label=name, **style)
-    accepted = view.trace.accepted[:, view.car].cpu().numpy()
-    refused = ~accepted
-    refused[0] = False
-    axes.plot(
-        iterations[refused], costs["sum"][refused], "x", color="0.5", markersize=5, label="step refused, or car done"
-    )
-    for number, place in enumerate(stage_beginnings(view.trace.stage)):
-        axes.axvline(place, color="0.6", linestyle=":", label=None if number else "next stage")
-    axes.set_yscale("log")
-    axes.set_ylim(bottom=_LEAST_SHARE * costs["sum"].max())
-    axes.set(xlabel="iteration", ylabel="cost at the final stage's settings", title=view.title)
-    axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.grid(alpha=0.3)
-    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8)
-    write_figure(path, figure)
 
 
 _ANIMATION_INCHES = (13.5, 3.3)

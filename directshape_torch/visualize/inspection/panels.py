@@ -14,10 +14,8 @@ from directshape_torch.visualize.inspection.car_view import CarView, Window, foo
 Array = NDArray[np.float64]
 Ink = Any  # whatever matplotlib takes for a colour
 
-DETECTOR_INK, TRUTH_INK, MASK_INK, BEFORE_INK, AFTER_INK = "darkorange", "limegreen", "white", "darkorange", "royalblue"
+TRUTH_INK, MASK_INK = "limegreen", "white"
 _BIRDS_EYE_MARGIN_M = 0.7
-# Points of the road would cover the cars.
-_LEAST_HEIGHT_M = 0.2
 
 
 def iteration_inks(count: int) -> list[Ink]:
@@ -54,7 +52,7 @@ def draw_footprint(axes: Any, corners: Array, ink: Ink, label: str | None = None
 
 
 def show_birds_eye(axes: Any, view: CarView, others: Sequence[Array] = ()) -> None:
-    """Axes over the ground around a car: scan points, the detection's box and the true one.
+    """Axes over the ground around a car, with the true box where it is known.
 
     Args:
         axes: of matplotlib.
@@ -68,10 +66,6 @@ def show_birds_eye(axes: Any, view: CarView, others: Sequence[Array] = ()) -> No
     corners = np.concatenate(footprints)
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     half = np.ptp(corners, axis=0).max() / 2 + _BIRDS_EYE_MARGIN_M
-    if view.known_points is not None:
-        points = view.known_points.points_cam
-        points = points[view.height_above_ground(points) > _LEAST_HEIGHT_M]
-        axes.plot(points[:, 0], points[:, 2], ".", color="0.6", markersize=2, label=view.known_points.name, zorder=0)
     if view.truth_corners_cam is not None:
         truth = footprint_of_corners(view.truth_corners_cam)
         draw_footprint(axes, truth, TRUTH_INK, "ground truth", linewidth=2.5)
