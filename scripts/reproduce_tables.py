@@ -150,7 +150,7 @@ def difference(default: Comparison, found: Comparison) -> str:
     cars = [{(car.frame_id, car.detection_line): car.after.bev_iou for car in side.cars} for side in (default, found)]
     common = sorted(set(cars[0]) & set(cars[1]))
     before, after = (np.array([side[key] for key in common]) for side in cars)
-    return with_interval("", CarBootstrap(np.arange(len(common))).change(before, after, weighted_mean), sign=True)
+    return with_interval("", CarBootstrap(len(common)).change(before, after, weighted_mean), sign=True)
 
 
 def ap_cells(args: argparse.Namespace, results: Path) -> list[str]:

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
 _DESCRIPTION = """
-Compare result files before and after a refinement with labels: centre, yaw, bird's-eye and 3D overlap, shares above
-0.7 and made worse by 0.05, for all detections, physical cars, distances and drives, with n and bootstrap intervals over
-cars. A detection takes the label of largest 2D overlap (at least 0.3, one to one). Counted are Car labels at least
-25 px high, occluded <= 1, truncated <= 0.5.
+Compare result files before and after a refinement with labels: centre, yaw, bird's-eye and 3D overlap, shares above 0.7
+and made worse by 0.05, for all detections and by distance, with n and bootstrap intervals over cars. A detection takes
+the label of largest 2D overlap (at least 0.3, one to one). Counted are Car labels at least 25 px high, occluded <= 1,
+truncated <= 0.5.
 """
 
 
@@ -54,7 +54,6 @@ def run(args: argparse.Namespace) -> int:
         args.after,
         split=args.split,
         frames=args.frames,
-        tracks=args.tracks,
         keep_line=None if args.shapes is None else lines_with_left_mask(args.shapes),
         bootstrap=bootstrap_settings(args),
     )

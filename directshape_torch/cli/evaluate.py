@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 _DESCRIPTION = """
 Score result files as KITTI's object devkit (2017) does: average precision of 2D boxes, in bird's-eye view and in 3D at
 IoU 0.7 and 0.5, easy / moderate / hard, over 11 and over 40 recall points, orientation similarity where the results
-carry alpha, and the precision of each distance.
+carry alpha.
 """
 
 
@@ -26,7 +26,6 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all of --labels")
     parser.add_argument("--type", default="Car", metavar="CLASS", help="Car (default), Pedestrian, Cyclist ..")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all scores and curves")
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="write curves of precision over recall as PNG")
     parser.set_defaults(run=run)
 
 
@@ -43,8 +42,4 @@ def run(args: argparse.Namespace) -> int:
     print(format_scores(scores), end="")
     if args.json is not None:
         write_scores_json(args.json, scores)
-    if args.plots is not None:
-        from directshape_torch.cli.evaluate_plots import write_recall_plots
-
-        write_recall_plots(args.plots, scores)
     return 0

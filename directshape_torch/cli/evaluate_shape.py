@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
 _DESCRIPTION = """
-Measure shapes before (mean shape at the pose of the detection) and after a refinement against true surfaces:
+Measure shapes before (mean shape at the pose of the detection) and after a refinement against true depths:
 completeness, accuracy, F1 and RMSE over the distance tau, 0.05 to 1.0 m, as the paper defines them, with n and
 bootstrap intervals over cars. Counted are Car labels at least 25 px high, occluded <= 1, truncated <= 0.5.
 """
@@ -29,16 +29,14 @@ def add_parser(subparsers: Subparsers) -> None:
 
 
 def _add_inputs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/calib ..")
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="ROOT", help="holds training, with calib, disp_occ_0 .."
+    )
     parser.add_argument("--detections", type=Path, required=True, metavar="DIR", help="what went into the refinement")
     parser.add_argument("--refined", type=Path, required=True, metavar="OUT", help="output folder of 'refine'")
     parser.add_argument(
-        "--truth",
-        choices=("disparity", "points"),
-        required=True,
-        help="training/disp_occ_0 inside masks (KITTI Stereo 2015), or training/points with depth_2 and instance_2",
+        "--masks", type=Path, required=True, metavar="DIR", help="which pixels belong to a car, as for 'refine'"
     )
-    parser.add_argument("--masks", type=Path, metavar="DIR", help="with disparity: which pixels belong to a car")
     parser.add_argument("--labels", type=Path, metavar="DIR", help="default: ROOT/training/label_2")
     add_frame_choice(parser, "all that have truth")
     parser.add_argument("--prior", metavar="FILE|NAME", help="the shape prior of the refinement (default: pca)")
@@ -47,8 +45,7 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all curves")
-    parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each label, surface and tau")
-    parser.add_argument("--plots", type=Path, metavar="DIR", help="write the curves over tau as PNG")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each label and tau")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -72,12 +69,10 @@ def run(args: argparse.Namespace) -> int:
         args.detections,
         args.refined,
         prior,
-        truth=args.truth,
         masks=args.masks,
         labels_dir=args.labels,
         frames=args.frames,
         split=args.split,
-        tracks=args.tracks,
         prior_sha256=hash_prior(prior),
         bootstrap=bootstrap_settings(args),
     )
@@ -86,8 +81,4 @@ def run(args: argparse.Namespace) -> int:
         write_shape_scores_json(args.json, scores)
     if args.csv is not None:
         write_shape_scores_csv(args.csv, scores.cars)
-    if args.plots is not None:
-        from directshape_torch.cli.evaluate_plots import write_tau_plots
-
-        write_tau_plots(args.plots, scores)
     return 0

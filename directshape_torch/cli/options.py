@@ -109,8 +109,7 @@ def add_frame_choice(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def add_interval_options(parser: argparse.ArgumentParser) -> None:
-    """`--tracks`, `--seed` and `--draws` of intervals over physical cars."""
-    parser.add_argument("--tracks", type=Path, metavar="FILE", help="JSON: which labels show the same physical car")
+    """`--seed` and `--draws` of intervals over cars."""
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap (default 0)")
     parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
 

@@ -1,4 +1,4 @@
-"""Confidence intervals by drawing whole cars again, because the frames of one car are no independent evidence."""
+"""Confidence intervals by drawing cars again."""
 
 from __future__ import annotations
 
@@ -83,39 +83,28 @@ def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -
 
 
 class CarBootstrap:
-    """Draws of whole cars with replacement, shared by every figure of one group, so that figures are comparable.
+    """Draws of cars with replacement, shared by every figure of one group, so that figures are comparable.
 
     Args:
-        car_index: (N,) the car of each row, 0 .. number of cars - 1.
-        base_weights: (N,) weight of each row, default one each (1 / rows of the car makes every car count the same).
+        num_cars: N, at least 1.
         settings: of the intervals.
 
     Raises:
-        InputError: no rows, or shapes that differ.
+        InputError: no cars.
 
     Examples:
-        >>> boot = CarBootstrap(np.array([0, 0, 1, 2]))
-        >>> boot.estimate(np.array([1.0, 1.0, 1.0, 1.0]), weighted_mean)
+        >>> CarBootstrap(4).estimate(np.ones(4), weighted_mean)
         Estimate(value=1.0, low=1.0, high=1.0)
     """
 
-    def __init__(
-        self,
-        car_index: NDArray[np.int64],
-        base_weights: NDArray[np.float64] | None = None,
-        settings: BootstrapSettings | None = None,
-    ) -> None:
-        if car_index.ndim != 1 or not len(car_index):
-            raise InputError("car_index", "shape (N,) with at least one row", str(car_index.shape))
-        base = np.ones(len(car_index)) if base_weights is None else np.asarray(base_weights, dtype=np.float64)
-        if base.shape != car_index.shape:
-            raise InputError("base_weights", f"shape {car_index.shape}", str(base.shape))
-        self.car_index, self.base_weights = car_index, base
-        self.num_cars = int(car_index.max()) + 1
+    def __init__(self, num_cars: int, settings: BootstrapSettings | None = None) -> None:
+        if num_cars < 1:
+            raise InputError("num_cars", "at least one", str(num_cars))
+        self.num_cars = num_cars
         settings = BootstrapSettings() if settings is None else settings
         self.tail = 50 * (1 - settings.confidence)
-        draws = np.random.default_rng(settings.seed).integers(self.num_cars, size=(settings.num_draws, self.num_cars))
-        self._copies = np.stack([np.bincount(draw, minlength=self.num_cars) for draw in draws]).astype(np.uint16)
+        draws = np.random.default_rng(settings.seed).integers(num_cars, size=(settings.num_draws, num_cars))
+        self._copies = np.stack([np.bincount(draw, minlength=num_cars) for draw in draws]).astype(np.uint16)
 
     def estimate(self, values: NDArray[np.float64], statistic: Statistic) -> Estimate:
         """The statistic of `values` (N,) with its percentile interval over the draws."""
@@ -132,12 +121,12 @@ class CarBootstrap:
         return MetricSummary(*both, self.change(before, after, statistic))
 
     def _value(self, values: NDArray[np.float64], statistic: Statistic) -> float:
-        return float(statistic(values, self.base_weights[None])[0])
+        return float(statistic(values, np.ones((1, len(values))))[0])
 
     def _drawn(self, values: NDArray[np.float64], statistic: Statistic) -> NDArray[np.float64]:
         chunk = max(1, _CHUNK_ELEMENTS // len(values))
         parts = np.split(self._copies, range(chunk, len(self._copies), chunk))
-        return np.concatenate([statistic(values, copies[:, self.car_index] * self.base_weights) for copies in parts])
+        return np.concatenate([statistic(values, copies.astype(np.float64)) for copies in parts])
 
     def _interval(self, value: float, drawn: NDArray[np.float64]) -> Estimate:
         if self.num_cars < 2:

@@ -1,4 +1,4 @@
-"""Result files before and after a refinement, judged against labels, with confidence intervals over physical cars."""
+"""Result files before and after a refinement, judged against labels, with confidence intervals over cars."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from directshape_torch.evaluation.bootstrap import (
     weighted_mean,
     weighted_median,
 )
-from directshape_torch.evaluation.car_identity import CarTracks, read_tracks
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
 from directshape_torch.evaluation.pose_error import CarErrors, boxes_of, car_errors, pose_errors
 from directshape_torch.io.instance_masks import file_of_frame
@@ -39,8 +38,6 @@ class ComparedCar:
         frame_id: the frame.
         detection_line: line of both result files, from 1.
         label_line: line of the label file, from 1.
-        car: name of the physical car, or of the label where the car is not known.
-        drive: name of the drive, or None.
         depth_m: of the label's box along the optical axis, metres.
         height_px: of the label's 2D box.
         score: the detector's, or None.
@@ -50,8 +47,6 @@ class ComparedCar:
     frame_id: str
     detection_line: int
     label_line: int
-    car: str
-    drive: str | None
     depth_m: float
     height_px: float
     score: float | None
@@ -90,45 +85,33 @@ class GroupSummary:
     Attributes:
         name: of the group.
         num_detections: n, detections compared.
-        num_cars: physical cars among them (labels, where cars are not known).
         metrics: by `Metric.key`; empty for an empty group.
         worse_share: share of detections whose BEV IoU fell by more than 0.05; None for an empty group.
     """
 
     name: str
     num_detections: int
-    num_cars: int
     metrics: dict[str, MetricSummary]
     worse_share: Estimate | None
 
 
-def summarise(
-    name: str, cars: Sequence[ComparedCar], settings: BootstrapSettings, *, cars_weigh_equally: bool = False
-) -> GroupSummary:
+def summarise(name: str, cars: Sequence[ComparedCar], settings: BootstrapSettings) -> GroupSummary:
     """Figures of a group of detections.
-
-    Args:
-        name: of the group.
-        cars: its detections.
-        settings: of the confidence intervals.
-        cars_weigh_equally: one vote for each physical car, instead of one for each detection.
 
     Examples:
         >>> summarise("nothing", [], BootstrapSettings()).num_detections
         0
     """
     if not cars:
-        return GroupSummary(name, 0, 0, {}, None)
-    _, index = np.unique([car.car for car in cars], return_inverse=True)
-    weights = 1.0 / np.bincount(index)[index] if cars_weigh_equally else None
-    bootstrap = CarBootstrap(index, weights, settings)
+        return GroupSummary(name, 0, {}, None)
+    bootstrap = CarBootstrap(len(cars), settings)
     metrics = {}
     for metric in METRICS:
         before = _values([metric.value(car.before) for car in cars])
         after = _values([metric.value(car.after) for car in cars])
         metrics[metric.key] = bootstrap.summary(before, after, metric.statistic)
     worse = _values([car.after.bev_iou < car.before.bev_iou - WORSE_BY_BEV_IOU for car in cars])
-    return GroupSummary(name, len(cars), bootstrap.num_cars, metrics, bootstrap.estimate(worse, weighted_mean))
+    return GroupSummary(name, len(cars), metrics, bootstrap.estimate(worse, weighted_mean))
 
 
 def _values(values: Sequence[float]) -> NDArray[np.float64]:
@@ -149,26 +132,18 @@ class Comparison:
     Attributes:
         cars: every counted label with a detection, in the order of frames and detection lines.
         overall: figures over detections.
-        per_car: the same with one vote for each physical car.
         by_depth: figures for each bin of `DEPTH_BINS_M`.
-        by_car: figures for each physical car that the tracks name.
-        by_drive: figures for each drive, only where drives are known.
         num_frames: frames compared.
         num_labels_counted: labels that count, found by a detection or not.
         num_filtered_out: found labels whose detection was left out by the line filter.
-        tracks_known: whether physical cars are known; else every label is taken for a car of its own.
     """
 
     cars: tuple[ComparedCar, ...]
     overall: GroupSummary
-    per_car: GroupSummary
     by_depth: tuple[GroupSummary, ...]
-    by_car: tuple[GroupSummary, ...]
-    by_drive: tuple[GroupSummary, ...]
     num_frames: int
     num_labels_counted: int
     num_filtered_out: int
-    tracks_known: bool
 
 
 def compare_results(
@@ -178,7 +153,6 @@ def compare_results(
     *,
     split: Path | str | None = None,
     frames: Iterable[str | int] | None = None,
-    tracks: CarTracks | Path | str | None = None,
     keep_line: LineFilter | None = None,
     counted: CountedLabels | None = None,
     bootstrap: BootstrapSettings | None = None,
@@ -191,7 +165,6 @@ def compare_results(
             frame have the same lines in the same order; a detection takes its label by the 2D box of `before`.
         split: file with one frame id a line; default every frame of `before_dir`.
         frames: ids of the frames to compare, instead of `split`.
-        tracks: which labels show the same physical car; default none known.
         keep_line: leaves detections out (see `lines_with_left_mask`); they still take their labels.
         counted: which labels count.
         bootstrap: settings of the confidence intervals.
@@ -201,7 +174,6 @@ def compare_results(
         InputError: no frames.
     """
     counted = CountedLabels() if counted is None else counted
-    known = read_tracks(tracks) if isinstance(tracks, (str, Path)) else tracks
     folders = Path(labels_dir), Path(before_dir), Path(after_dir)
     named = named_frames(frames, split)
     frame_ids = _frames_of(folders[1]) if named is None else named
@@ -214,8 +186,19 @@ def compare_results(
         pairs += found
         num_counted += count
     kept = [p for p in pairs if keep_line is None or keep_line(p.frame_id, p.before.line_number)]
-    cars = _compared_cars(kept, CarTracks({}) if known is None else known)
-    return _group(cars, len(frame_ids), num_counted, len(pairs) - len(kept), known, bootstrap)
+    cars = _compared_cars(kept)
+    settings = BootstrapSettings() if bootstrap is None else bootstrap
+    return Comparison(
+        cars=cars,
+        overall=summarise("all detections", cars, settings),
+        by_depth=tuple(
+            summarise(_bin_name(low, high), [c for c in cars if low <= c.depth_m < high], settings)
+            for low, high in pairwise(DEPTH_BINS_M)
+        ),
+        num_frames=len(frame_ids),
+        num_labels_counted=num_counted,
+        num_filtered_out=len(pairs) - len(kept),
+    )
 
 
 def lines_with_left_mask(shapes_dir: Path | str) -> LineFilter:
@@ -280,20 +263,17 @@ def _check_same_lines(
             raise DataFormatError(after_path, problem, line_number=new.line_number, line=new.raw_line, cure=cure)
 
 
-def _compared_cars(pairs: Sequence[_Pair], tracks: CarTracks) -> tuple[ComparedCar, ...]:
+def _compared_cars(pairs: Sequence[_Pair]) -> tuple[ComparedCar, ...]:
     true_boxes = boxes_of([p.label for p in pairs])
     before = car_errors(pose_errors(boxes_of([p.before for p in pairs]), true_boxes))
     after = car_errors(pose_errors(boxes_of([p.after for p in pairs]), true_boxes))
     cars = []
     for pair, errors_before, errors_after in zip(pairs, before, after, strict=True):
-        identity = tracks.identity(pair.frame_id, pair.label.line_number)
         cars.append(
             ComparedCar(
                 frame_id=pair.frame_id,
                 detection_line=pair.before.line_number,
                 label_line=pair.label.line_number,
-                car=identity.car,
-                drive=identity.drive,
                 depth_m=pair.label.location_ref[2],
                 height_px=pair.label.box_2d[3] - pair.label.box_2d[1],
                 score=pair.before.score,
@@ -302,35 +282,6 @@ def _compared_cars(pairs: Sequence[_Pair], tracks: CarTracks) -> tuple[ComparedC
             )
         )
     return tuple(cars)
-
-
-def _group(
-    cars: tuple[ComparedCar, ...],
-    num_frames: int,
-    num_counted: int,
-    num_filtered_out: int,
-    tracks: CarTracks | None,
-    bootstrap: BootstrapSettings | None,
-) -> Comparison:
-    settings = BootstrapSettings() if bootstrap is None else bootstrap
-    tracked = set() if tracks is None else {identity.car for identity in tracks.identities.values()}
-    names = sorted(tracked & {car.car for car in cars})
-    drives = sorted({car.drive for car in cars if car.drive is not None})
-    return Comparison(
-        cars=cars,
-        overall=summarise("all detections", cars, settings),
-        per_car=summarise("all cars, one vote each", cars, settings, cars_weigh_equally=True),
-        by_depth=tuple(
-            summarise(_bin_name(low, high), [c for c in cars if low <= c.depth_m < high], settings)
-            for low, high in pairwise(DEPTH_BINS_M)
-        ),
-        by_car=tuple(summarise(name, [c for c in cars if c.car == name], settings) for name in names),
-        by_drive=tuple(summarise(drive, [c for c in cars if c.drive == drive], settings) for drive in drives),
-        num_frames=num_frames,
-        num_labels_counted=num_counted,
-        num_filtered_out=num_filtered_out,
-        tracks_known=tracks is not None,
-    )
 
 
 def _bin_name(low: float, high: float) -> str:

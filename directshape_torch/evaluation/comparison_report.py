@@ -26,7 +26,7 @@ _GROUP_METRICS = ("bev_iou_mean", "iou_3d_mean", "bev_iou_good_share", "centre_m
 def format_comparison(comparison: Comparison) -> str:
     """Tables for reading: figures overall, and one line a group."""
     parts = [_heading(comparison), _overall_table(comparison.overall)]
-    groups = [comparison.overall, comparison.per_car, *comparison.by_depth, *comparison.by_drive, *comparison.by_car]
+    groups = [comparison.overall, *comparison.by_depth]
     parts.append(_group_table([group for group in groups if group.num_detections]))
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -50,20 +50,17 @@ def write_comparison_csv(path: Path | str, cars: Sequence[ComparedCar]) -> None:
 
 def _heading(comparison: Comparison) -> str:
     overall = comparison.overall
-    cars = (
-        f"{overall.num_cars} physical cars"
-        if comparison.tracks_known
-        else "physical cars not known, each label counts as a car of its own"
-    )
     lines = [
         f"{overall.num_detections} detections of {comparison.num_labels_counted} counted labels in "
-        f"{comparison.num_frames} frames; {cars}"
+        f"{comparison.num_frames} frames"
     ]
     if comparison.num_filtered_out:
         lines.append(f"{comparison.num_filtered_out} more detections have no left mask and are left out")
     if overall.num_detections:
         lines.append(
-            "in brackets: 95 % intervals, bootstrap over cars" if overall.num_cars > 1 else "one car: no intervals"
+            "in brackets: 95 % intervals, bootstrap over cars"
+            if overall.num_detections > 1
+            else "one car: no intervals"
         )
     return "\n".join(lines)
 
@@ -84,11 +81,11 @@ def _group_table(groups: Sequence[GroupSummary]) -> str:
     if not groups:
         return ""
     metrics = [metric for metric in METRICS if metric.key in _GROUP_METRICS]
-    rows = [["group", "n", "cars", *(metric.label for metric in metrics), "worse"]]
+    rows = [["group", "n", *(metric.label for metric in metrics), "worse"]]
     for group in groups:
         figures = [_before_after(metric, group) for metric in metrics]
         worse = "" if group.worse_share is None else number("%", group.worse_share.value)
-        rows.append([group.name, str(group.num_detections), str(group.num_cars), *figures, worse])
+        rows.append([group.name, str(group.num_detections), *figures, worse])
     return align(rows)
 
 

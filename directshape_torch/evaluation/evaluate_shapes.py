@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, get_args
 
+import numpy as np
 import torch
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.bootstrap import BootstrapSettings
-from directshape_torch.evaluation.car_identity import CarTracks, read_tracks
+from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, MetricSummary, weighted_mean
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
 from directshape_torch.evaluation.shape_error import ShapeError
-from directshape_torch.evaluation.shape_scores import (
-    EvaluatedCar,
-    ShapeScores,
-    SurfaceSummary,
-    TruthKind,
-    summarise_surface,
-)
-from directshape_torch.evaluation.shape_truth import FOLDER, EstimatedCar, SegmentSource, SurfaceSource
+from directshape_torch.evaluation.shape_truth import EstimatedCar, SegmentSource, SegmentTruth
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
@@ -32,27 +24,71 @@ from directshape_torch.io.run_folder import shapes_path
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
-class Truth(Protocol):
-    """What is known of the surface of one car."""
+@dataclass(frozen=True)
+class EvaluatedCar:
+    """One label with a detection and a true surface.
 
-    @property
-    def segment(self) -> str: ...
+    Attributes:
+        frame_id: the frame.
+        detection_line, label_line: lines of their files, from 1.
+        status: how the refinement of the car ended.
+        depth_m: of the label's box along the optical axis, metres.
+        segment: which pixels of the left image are the car's.
+        before: errors of the mean shape at the pose of the detection.
+        after: errors of the refined shape.
+    """
 
-    def errors(self, car: EstimatedCar) -> dict[str, ShapeError]:
-        """Errors of an estimate, by the name of the surface."""
-        ...
+    frame_id: str
+    detection_line: int
+    label_line: int
+    status: str
+    depth_m: float
+    segment: str
+    before: ShapeError
+    after: ShapeError
 
-    def sampling_limit(self, car: EstimatedCar) -> dict[str, ShapeError]:
-        """Errors that points alone would leave to a perfect estimate; no entry where they leave none."""
-        ...
+
+@dataclass(frozen=True)
+class ShapeCurve:
+    """One metric over tau: its mean over cars.
+
+    Attributes:
+        metric: "completeness", "accuracy", "f1" (shares) or "rmse_m" (metres).
+        taus_m: (T,) metres.
+        num_cars: (T,) cars in the mean: all, or for RMSE those with a matched point both before and after.
+        summaries: (T,) before, after and change; None where there is no such car.
+    """
+
+    metric: str
+    taus_m: tuple[float, ...]
+    num_cars: tuple[int, ...]
+    summaries: tuple[MetricSummary | None, ...]
 
 
-class TruthSource(Protocol):
-    """Where the true surfaces of a data set come from."""
+@dataclass(frozen=True)
+class ShapeScores:
+    """Everything `evaluate_shapes` finds.
 
-    def frame_ids(self) -> tuple[str, ...]: ...
+    Attributes:
+        cars: in the order of frames and detection lines.
+        curves: one for each of `METRICS`.
+        num_frames: frames evaluated.
+        num_labels_counted: labels that count in these frames.
+        num_without_truth: of these, labels without a true surface: no mask, or no known depth in it.
+        num_without_detection: of the others, labels that no detection was refined for.
+        mean_num_true: true points a car, mean.
+    """
 
-    def truths(self, frame_id: str, labels: Sequence[KittiObject], camera: StereoCamera) -> Mapping[int, Truth]: ...
+    cars: tuple[EvaluatedCar, ...]
+    curves: tuple[ShapeCurve, ...]
+    num_frames: int
+    num_labels_counted: int
+    num_without_truth: int
+    num_without_detection: int
+    mean_num_true: float
+
+
+METRICS = ("completeness", "accuracy", "f1", "rmse_m")
 
 
 def evaluate_shapes(
@@ -61,12 +97,10 @@ def evaluate_shapes(
     refined_dir: Path | str,
     prior: ShapePrior,
     *,
-    truth: TruthKind,
-    masks: Path | str | MaskSource | None = None,
+    masks: Path | str | MaskSource,
     labels_dir: Path | str | None = None,
     frames: Iterable[str | int] | None = None,
     split: Path | str | None = None,
-    tracks: CarTracks | Path | str | None = None,
     prior_sha256: str | None = None,
     counted: CountedLabels | None = None,
     bootstrap: BootstrapSettings | None = None,
@@ -78,29 +112,25 @@ def evaluate_shapes(
     are left out of its mean. Labels without a detection are counted and left out: a refinement cannot find them.
 
     Args:
-        data_dir: folder that holds `training` with calib and the truth: `disp_occ_0` (KITTI Stereo 2015), or `points`,
-            `depth_2` and `instance_2` (rendered scenes).
+        data_dir: folder that holds `training` with calib and the truth: `disp_occ_0` (KITTI Stereo 2015) or `depth_2`.
         detections_dir: result files that went into the refinement; "before" is the mean shape at their poses.
         refined_dir: output folder of `directshape refine`, with `shapes`.
         prior: the one that the refinement used.
-        truth: "disparity": one ray is cast for each pixel with a true disparity in the car's segment; "points": 4000
-            points of the estimate, uniform by area, against the true ones, whole and visible surface separately.
-        masks: the segments, for "disparity": a folder (see `mask_source`) or a source.
+        masks: the segments: a folder (see `mask_source`) or a source. One ray is cast for each pixel of a car's segment
+            whose true depth is known.
         labels_dir: default `training/label_2`.
         frames: ids of the frames, or their numbers; default all that have both shapes and truth.
         split: file with one frame id a line, instead of `frames`.
-        tracks: which labels show the same physical car.
         prior_sha256: of the prior; shapes of another one are refused. None does not check.
         counted: which labels count.
         bootstrap: settings of the confidence intervals, which are over cars.
 
     Raises:
         DataFormatError: a file is missing or damaged, or belongs to another prior.
-        InputError: nothing to evaluate, or no masks for "disparity".
+        InputError: nothing to evaluate.
     """
     training = _training(Path(data_dir))
-    source = _source(training, truth, masks)
-    known = read_tracks(tracks) if isinstance(tracks, (str, Path)) else tracks
+    source = SegmentSource(training, mask_source(masks) if isinstance(masks, (str, Path)) else masks)
     inputs = _Inputs(
         labels_dir=training / "label_2" if labels_dir is None else Path(labels_dir),
         detections_dir=Path(detections_dir),
@@ -110,7 +140,6 @@ def evaluate_shapes(
         prior=prior,
         prior_sha256=prior_sha256,
         counted=CountedLabels() if counted is None else counted,
-        tracks=CarTracks({}) if known is None else known,
     )
     frame_ids = _choose_frames(inputs, named_frames(frames, split))
     parts = [_evaluate_frame(inputs, frame_id) for frame_id in frame_ids]
@@ -120,16 +149,14 @@ def evaluate_shapes(
             "frames", "a counted label with a detection and a true surface", f"none in {len(parts)} frames"
         )
     settings = BootstrapSettings() if bootstrap is None else bootstrap
-    names = dict.fromkeys(name for car in cars for name in car.after)
     return ShapeScores(
-        truth=truth,
         cars=cars,
-        surfaces=tuple(_summarise(name, cars, settings) for name in names),
+        curves=tuple(_curve(metric, cars, settings) for metric in METRICS),
         num_frames=len(parts),
         num_labels_counted=sum(part.num_counted for part in parts),
         num_without_truth=sum(part.num_without_truth for part in parts),
         num_without_detection=sum(part.num_without_detection for part in parts),
-        tracks_known=known is not None,
+        mean_num_true=float(np.mean([car.after.num_true for car in cars])),
     )
 
 
@@ -139,11 +166,10 @@ class _Inputs:
     detections_dir: Path
     refined_dir: Path
     calib_dir: Path
-    source: TruthSource
+    source: SegmentSource
     prior: ShapePrior
     prior_sha256: str | None
     counted: CountedLabels
-    tracks: CarTracks
 
 
 @dataclass(frozen=True)
@@ -158,19 +184,6 @@ def _training(root: Path) -> Path:
     if not (root / "training").is_dir():
         raise DataFormatError(root, "holds no folder 'training'", cure="give the folder above it, in KITTI's layout")
     return root / "training"
-
-
-def _source(training: Path, truth: TruthKind, masks: Path | str | MaskSource | None) -> TruthSource:
-    if truth not in get_args(TruthKind):
-        raise InputError("truth", f"one of {', '.join(get_args(TruthKind))}", repr(truth))
-    folder = training / (FOLDER if truth == "disparity" else "points")
-    if not folder.is_dir():
-        raise DataFormatError(folder, "is no folder of ground truth", cure=f"choose one of {get_args(TruthKind)}")
-    if truth == "points":
-        return SurfaceSource(training)
-    if masks is None:
-        raise InputError("masks", "masks of the left images, which say which pixels belong to a car", "none")
-    return SegmentSource(folder, mask_source(masks) if isinstance(masks, (str, Path)) else masks)
 
 
 def _choose_frames(inputs: _Inputs, named: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -245,7 +258,7 @@ class _Estimate:
     camera: StereoCamera
 
 
-def _evaluate_car(inputs: _Inputs, label: KittiObject, truth: Truth, estimate: _Estimate) -> EvaluatedCar:
+def _evaluate_car(inputs: _Inputs, label: KittiObject, truth: SegmentTruth, estimate: _Estimate) -> EvaluatedCar:
     line = int(estimate.shapes.input_lines[estimate.row])
     (detection,) = (o for o in estimate.detections if o.line_number == line)
     prior = inputs.prior
@@ -259,18 +272,21 @@ def _evaluate_car(inputs: _Inputs, label: KittiObject, truth: Truth, estimate: _
         frame_id=estimate.frame_id,
         detection_line=line,
         label_line=label.line_number,
-        car=inputs.tracks.identity(estimate.frame_id, label.line_number).car,
         status=estimate.shapes.statuses[estimate.row],
         depth_m=label.location_ref[2],
         segment=truth.segment,
         before=truth.errors(before),
         after=truth.errors(after),
-        sampling_limit=truth.sampling_limit(after),
     )
 
 
-def _summarise(name: str, cars: Sequence[EvaluatedCar], settings: BootstrapSettings) -> SurfaceSummary:
-    chosen = [car for car in cars if name in car.after]
-    limits = [car.sampling_limit[name] for car in chosen if name in car.sampling_limit]
-    before, after = ([getattr(car, when)[name] for car in chosen] for when in ("before", "after"))
-    return summarise_surface(name, [car.car for car in chosen], before, after, limits, settings)
+def _curve(metric: str, cars: Sequence[EvaluatedCar], settings: BootstrapSettings) -> ShapeCurve:
+    sides = ([getattr(getattr(car, when), metric) for car in cars] for when in ("before", "after"))
+    before, after = (np.array(side, dtype=np.float64) for side in sides)  # (N, T)
+    known = np.isfinite(before) & np.isfinite(after)
+    summaries = [
+        CarBootstrap(int(kept.sum()), settings).summary(b[kept], a[kept], weighted_mean) if kept.any() else None
+        for b, a, kept in zip(before.T, after.T, known.T, strict=True)
+    ]
+    taus = tuple(cars[0].after.taus_m.tolist())
+    return ShapeCurve(metric, taus, tuple(known.sum(axis=0).tolist()), tuple(summaries))

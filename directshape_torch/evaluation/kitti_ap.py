@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.comparison import DEPTH_BINS_M
 from directshape_torch.evaluation.kitti_boxes import (
     COUNTED,
     DIFFICULTIES,
-    IGNORED,
     METRICS,
     BoxTable,
     Difficulty,
@@ -40,7 +36,6 @@ from directshape_torch.io.kitti_labels import KittiObject, read_objects
 MINIMUM_IOUS = (0.7, 0.5)
 # KITTI's mark of a result without an observation angle.
 _NO_ALPHA = -10.0
-_EVERYWHERE_M = (-np.inf, np.inf)
 
 
 @dataclass(frozen=True)
@@ -72,18 +67,6 @@ class ApScore:
 
 
 @dataclass(frozen=True)
-class DistanceScores:
-    """Scores of the labels whose depth along the optical axis lies within [`low_m`, `high_m`).
-
-    Labels beyond are ignored, and so are detections beyond that belong to no label.
-    """
-
-    low_m: float
-    high_m: float
-    scores: tuple[ApScore, ...]
-
-
-@dataclass(frozen=True)
 class KittiScores:
     """Everything `evaluate_kitti` finds.
 
@@ -94,7 +77,6 @@ class KittiScores:
         num_result_frames_unused: frames that have results and are not evaluated.
         num_detections: detections of the class in the evaluated frames.
         scores: for every metric, overlap and difficulty; bev and 3d are left out where no detection has a 3D box.
-        by_distance: the same for each bin of `DEPTH_BINS_M`; empty where no detection has a 3D box.
     """
 
     object_type: str
@@ -103,7 +85,6 @@ class KittiScores:
     num_result_frames_unused: int
     num_detections: int
     scores: tuple[ApScore, ...]
-    by_distance: tuple[DistanceScores, ...]
 
     def score(self, metric: str, minimum_iou: float, difficulty: str) -> ApScore:
         """The scores of one cell.
@@ -154,15 +135,13 @@ def evaluate_kitti(
     detection_table = make_box_table(frames.results)
     overlaps = find_overlaps(label_table, detection_table, object_type)
     scene = _Scene(label_table, detection_table, overlaps, object_type)
-    distances = pairwise(DEPTH_BINS_M) if "3d" in _metrics(scene) else ()
     return KittiScores(
         object_type=object_type,
         num_frames=len(frames.frame_ids),
         num_frames_without_results=frames.num_without_results,
         num_result_frames_unused=frames.num_results_unused,
         num_detections=int((detection_table.type == object_type.lower()).sum()),
-        scores=tuple(_all_scores(scene, *_EVERYWHERE_M)),
-        by_distance=tuple(DistanceScores(a, b, tuple(_all_scores(scene, a, b))) for a, b in distances),
+        scores=tuple(_all_scores(scene)),
     )
 
 
@@ -174,12 +153,12 @@ class _Scene:
     object_type: str
 
 
-def _all_scores(scene: _Scene, low_m: float, high_m: float) -> Iterator[ApScore]:
+def _all_scores(scene: _Scene) -> Iterator[ApScore]:
     similarity = _orientation_similarity(scene)
     for metric in _metrics(scene):
         for minimum_iou in MINIMUM_IOUS:
             for difficulty in DIFFICULTIES:
-                candidates = _candidates(scene, metric, minimum_iou, difficulty, similarity, (low_m, high_m))
+                candidates = _candidates(scene, metric, minimum_iou, difficulty, similarity)
                 yield _score(metric, minimum_iou, difficulty, candidates)
 
 
@@ -195,13 +174,10 @@ def _candidates(
     minimum_iou: float,
     difficulty: Difficulty,
     similarity: Floats | None,
-    depth_range_m: tuple[float, float],
 ) -> Candidates:
     label_role = label_roles(scene.labels, scene.object_type, difficulty)
     detection_role = detection_roles(scene.detections, scene.object_type, difficulty)
-    near, far = depth_range_m
-    label_role[(label_role == COUNTED) & ~_within(scene.labels, near, far)] = IGNORED
-    may_be_wrong = (detection_role == COUNTED) & _within(scene.detections, near, far)
+    may_be_wrong = detection_role == COUNTED
     if metric == "2d":
         # Seen from above and in space a DontCare region has no place, so that no detection lies in one.
         may_be_wrong &= scene.overlaps.dont_care_share <= minimum_iou
@@ -217,10 +193,6 @@ def _candidates(
         score=scene.detections.score,
         may_be_wrong=may_be_wrong,
     )
-
-
-def _within(table: BoxTable, low_m: float, high_m: float) -> NDArray[np.bool_]:
-    return np.asarray((table.depth_m >= low_m) & (table.depth_m < high_m))
 
 
 def _orientation_similarity(scene: _Scene) -> Floats | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,19 +13,18 @@ from directshape_torch.files import atomic_files
 
 KITTI_SCORES_SCHEMA_VERSION = 1
 _NAMES = {"2d": "2D box", "bev": "bird's-eye view", "3d": "3D box"}
-_DISTANCE_DIFFICULTY = "moderate"
 
 
 def format_scores(scores: KittiScores) -> str:
-    """Tables for reading: average precision, orientation similarity where it is known, and precision by distance."""
-    parts = [_heading(scores), _ap_table(scores), _aos_table(scores), _distance_table(scores)]
+    """Tables for reading: average precision, and orientation similarity where it is known."""
+    parts = [_heading(scores), _ap_table(scores), _aos_table(scores)]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def write_scores_json(path: Path | str, scores: KittiScores) -> None:
-    """Write every score and curve as JSON; an open end of a distance bin is null."""
+    """Write every score and curve as JSON."""
     content = plain(scores)
-    for score in (*content["scores"], *(score for part in content["by_distance"] for score in part["scores"])):
+    for score in content["scores"]:
         score |= score.pop("curve")
     atomic_files.write_json(path, {"schema_version": KITTI_SCORES_SCHEMA_VERSION} | content)
 
@@ -75,24 +73,3 @@ def _table(scores: Sequence[ApScore], prefix: str, figures: dict[str, str]) -> s
         values = [f"{getattr(cells[d.name], field):.2f}" for field in figures.values() for d in DIFFICULTIES]
         rows.append([_NAMES[metric], str(minimum_iou), *values])
     return align(rows)
-
-
-def _distance_table(scores: KittiScores) -> str:
-    if not scores.by_distance:
-        return ""
-    rows = [
-        [
-            f"{_DISTANCE_DIFFICULTY}, by depth",
-            "labels",
-            *(f"{s.metric} {s.minimum_iou}" for s in _moderate(scores.scores)),
-        ]
-    ]
-    for part in scores.by_distance:
-        name = f"{part.low_m:.0f}-{part.high_m:.0f} m" if math.isfinite(part.high_m) else f"over {part.low_m:.0f} m"
-        moderate = _moderate(part.scores)
-        rows.append([name, str(moderate[0].num_labels), *(f"{s.ap_r40:.2f} ({s.ap_area:.2f})" for s in moderate)])
-    return "AP_R40 (area under the curve), in percent\n" + align(rows)
-
-
-def _moderate(scores: Sequence[ApScore]) -> list[ApScore]:
-    return [score for score in scores if score.difficulty == _DISTANCE_DIFFICULTY]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
-import cv2
 import pytest
 
 from directshape_torch.cli.main import main
@@ -41,7 +39,6 @@ def test_tables(folders: tuple[str, str], capsys: pytest.CaptureFixture[str]) ->
     assert rows(text, "in percent") == [header.split()]
     assert rows(text, "3D box") == [["3D", "box", iou, *["90.91"] * 3, *["97.50"] * 3] for iou in ("0.7", "0.5")]
     assert "AOS_R40 moderate" in text
-    assert rows(text, "10-20 m")[0][2:5] == ["45", "97.50", "(97.78)"]
 
 
 def test_few_labels_are_said_and_the_area_is_given(
@@ -68,7 +65,6 @@ def test_json(folders: tuple[str, str], tmp_path: Path) -> None:
     assert first["aos_r40"] == pytest.approx(97.5)
     assert len(first["precision"]) == len(first["orientation"]) == 41
     assert len(first["thresholds"]) == len(first["recall"]) == 40
-    assert [(part["low_m"], part["high_m"]) for part in content["by_distance"]][-1] == (45, None)
 
 
 def test_the_documented_format_is_the_one_written(folders: tuple[str, str], tmp_path: Path) -> None:
@@ -77,26 +73,8 @@ def test_the_documented_format_is_the_one_written(folders: tuple[str, str], tmp_
     path = tmp_path / "scores.json"
     assert main(["evaluate", "--labels", folders[0], "--results", folders[1], "--json", str(path)]) == 0
     content = json.loads(path.read_text())
-    for name in (*content, *content["scores"][0], *content["by_distance"][0]):
+    for name in (*content, *content["scores"][0]):
         assert f'"{name}":' in documented
-
-
-def test_plots(folders: tuple[str, str], tmp_path: Path) -> None:
-    out = tmp_path / "plots"
-    assert main(["evaluate", "--labels", folders[0], "--results", folders[1], "--plots", str(out)]) == 0
-    names = ["orientation_recall.png", *(f"precision_recall_{metric}.png" for metric in ("2d", "3d", "bev"))]
-    assert sorted(path.name for path in out.iterdir()) == names
-    picture = cv2.imread(str(out / names[1]))
-    assert picture.shape[1] > 700
-    assert picture.std() > 5
-
-
-def test_plots_without_matplotlib_say_how_to_get_it(
-    folders: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert main(["evaluate", "--labels", folders[0], "--results", folders[1], "--plots", str(tmp_path / "p")]) == 2
-    assert "pip install 'directshape_torch[plot]'" in capsys.readouterr().err
 
 
 def test_wrong_input_is_one_line(folders: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
@@ -119,4 +97,3 @@ def test_detectors_of_image_boxes_alone(
     assert rows(text, "2D box")
     assert not rows(text, "3D box")
     assert "orientation" not in text
-    assert "by depth" not in text

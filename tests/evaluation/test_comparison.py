@@ -11,7 +11,6 @@ from helpers.shape_arrays import shape_arrays
 
 from directshape_torch.cli import compare
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, read_tracks, write_tracks
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
 from directshape_torch.evaluation.comparison_report import format_comparison
 from directshape_torch.io.result_files import ShapeArrays, write_shapes
@@ -83,7 +82,7 @@ def test_every_figure(folders: tuple[Path, Path, Path]):
         ("000002", 2, 1),
     ]
     overall = comparison.overall
-    assert (overall.num_detections, overall.num_cars) == (3, 3)
+    assert overall.num_detections == 3
     metrics = overall.metrics
     before = (3 / 5, 2 / 6, 3.6 / 4.4)
     after = (3 / 5, 1.0, 3 / 5)
@@ -104,27 +103,6 @@ def test_every_figure(folders: tuple[Path, Path, Path]):
 def test_depth_bins_partition_the_cars(folders: tuple[Path, Path, Path]):
     groups = {group.name: group.num_detections for group in compare_results(*folders).by_depth}
     assert groups == {"0-10 m": 1, "10-20 m": 0, "20-30 m": 1, "30-45 m": 1, "over 45 m": 0}
-
-
-def test_tracks_join_cars_and_drives(folders: tuple[Path, Path, Path], tmp_path: Path):
-    car, other = CarIdentity("0005/1", "0005"), CarIdentity("0007/3", "0007")
-    tracks = CarTracks({("000001", 1): car, ("000002", 1): car, ("000001", 2): other})
-    write_tracks(tmp_path / "tracks.json", tracks)
-    comparison = compare_results(*folders, tracks=tmp_path / "tracks.json")
-    assert comparison.tracks_known
-    assert comparison.overall.num_cars == 2
-    assert {g.name: g.num_detections for g in comparison.by_car} == {"0005/1": 2, "0007/3": 1}
-    assert {g.name: g.num_cars for g in comparison.by_drive} == {"0005": 1, "0007": 1}
-    # One vote a car: the mean of (2/6 + 3.6/4.4) / 2 and 3/5.
-    expected = np.mean([np.mean([2 / 6, 3.6 / 4.4]), 3 / 5])
-    assert comparison.per_car.metrics["bev_iou_mean"].before.value == pytest.approx(expected)
-    assert comparison.by_car[0].metrics["bev_iou_mean"].before.low is None
-
-
-def test_without_tracks_it_says_so(folders: tuple[Path, Path, Path]):
-    comparison = compare_results(*folders)
-    assert comparison.by_car == comparison.by_drive == ()
-    assert "physical cars not known" in format_comparison(comparison)
 
 
 def _shapes(frame_id: str, lines: list[int], statuses: list[str]) -> ShapeArrays:
@@ -177,24 +155,6 @@ def test_empty_files_and_no_files(tmp_path: Path):
     (tmp_path / "none").mkdir()
     with pytest.raises(InputError, match="frames: expected at least one frame"):
         compare_results(parts[0], tmp_path / "none", parts[2])
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("{", "is not valid JSON"),
-        ("[]", "is no tracks file of schema 1"),
-        ('{"schema_version": 2, "labels": {}}', "schema_version is 2"),
-        ('{"schema_version": 1, "labels": {"000001": {"0": {"car": "a"}}}}', "'0' is no label line number"),
-        ('{"schema_version": 1, "labels": {"000001": {"1": {"car": 3}}}}', "frame 000001, line 1: expected"),
-        ('{"schema_version": 1, "labels": {"000001": []}}', "frame 000001 holds no object"),
-    ],
-)
-def test_damaged_tracks_are_named(tmp_path: Path, content: str, message: str):
-    path = tmp_path / "tracks.json"
-    path.write_text(content)
-    with pytest.raises(DataFormatError, match=message):
-        read_tracks(path)
 
 
 def test_command_prints_and_writes(

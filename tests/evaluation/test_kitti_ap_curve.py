@@ -77,22 +77,3 @@ class TestOrientation:
     def test_one_result_without_alpha_leaves_it_out(self) -> None:
         scores = evaluate([line()], [line(score=1), line(1, kind="Cyclist", alpha=-10, score=0.1)])
         assert scores.score("2d", 0.7, "easy").aos_r40 is None
-
-
-class TestDistance:
-    def test_labels_and_wrong_detections_beyond_a_bin_are_left_out(self) -> None:
-        labels = [line(0, z=5), line(1, z=25)]
-        results = [line(0, z=5, score=0.5), line(1, z=25, score=0.5), line(2, z=25, score=0.9)]
-        by_distance = {part.low_m: part for part in evaluate(labels, results).by_distance}
-        expected = {0: (1, [1.0]), 10: (0, [0.0]), 20: (1, [0.5]), 30: (0, [0.0]), 45: (0, [0.0])}
-        assert by_distance.keys() == expected.keys()
-        for low, (num_labels, values) in expected.items():
-            (score,) = (
-                s for s in by_distance[low].scores if (s.metric, s.minimum_iou, s.difficulty) == ("3d", 0.7, "moderate")
-            )
-            assert (score.num_labels, precision(score, 1)) == (num_labels, values)
-
-    def test_a_detection_across_the_border_belongs_to_its_label(self) -> None:
-        scores = evaluate([line(z=20.05)], [line(z=19.95, score=1)])
-        areas = {part.low_m: part.scores[-1].ap_area for part in scores.by_distance}
-        assert areas == {0: 0, 10: 0, 20: 100, 30: 0, 45: 0}

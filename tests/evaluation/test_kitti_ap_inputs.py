@@ -29,7 +29,6 @@ class TestWhatIsEvaluated:
         scores = evaluate([line()], [result])
         assert {score.metric for score in scores.scores} == {"2d"}
         assert scores.score("2d", 0.7, "easy").ap_area == 100
-        assert scores.by_distance == ()
         with pytest.raises(InputError, match=r"expected 2d; .*got 3d"):
             scores.score("3d", 0.7, "easy")
 

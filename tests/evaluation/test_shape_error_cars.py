@@ -11,7 +11,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,9 +20,8 @@ from helpers.synthetic_scene import TWO_CARS, stereo_camera
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import BootstrapSettings
-from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
+from directshape_torch.evaluation.evaluate_shapes import ShapeScores, evaluate_shapes
 from directshape_torch.evaluation.matching import CountedLabels
-from directshape_torch.evaluation.shape_scores import ShapeScores
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.camera import disparity_of_depth, rays_from_pixels
@@ -33,7 +31,6 @@ from directshape_torch.io.mask_files import FrameJsonMasks
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 
 FRAMES = ("000000", "000001")
 # The second car is 18 px high.
@@ -57,36 +54,20 @@ def surface_depth(prior: PCAShapePrior, car: int, v: np.ndarray, u: np.ndarray) 
 
 
 def write_truth(root: Path, prior: PCAShapePrior) -> None:
-    """The ground truth of both kinds; the cars are the same in every frame."""
+    """True disparities and depths; the cars are the same in every frame."""
     masks = FrameJsonMasks(root / "masks").read(FRAMES[0], (120, 160))
-    left = [np.asarray(mask.probability) > 0.5 for mask in masks if mask.side == "left"]
-    depth, instance = np.full((120, 160), 100.0), np.zeros((120, 160), dtype=np.uint16)
-    for car, inside in enumerate(left):
-        v, u = np.nonzero(inside)
-        depth[v, u], instance[v, u] = surface_depth(prior, car, v, u), 1001 + car
+    depth = np.zeros((120, 160))
+    for car, mask in enumerate(mask for mask in masks if mask.side == "left"):
+        v, u = np.nonzero(np.asarray(mask.probability) > 0.5)
+        depth[v, u] = surface_depth(prior, car, v, u)
     camera = stereo_camera(160, 120, 150.0)
-    v, u = np.nonzero(instance)
+    v, u = np.nonzero(depth)
     uv, calibration = torch.from_numpy(np.stack([u, v], -1)).double(), (camera.K_left[0], camera.K_right[0])
     disparity = np.zeros((120, 160))
     disparity[v, u] = disparity_of_depth(uv, torch.from_numpy(depth[v, u]), *calibration, camera.T_right_cam[0])[:, 0]
-    values = prior.values(torch.tensor(CODE, dtype=torch.float64))
     for frame_id in FRAMES:
-        training = root / "training"
-        write_png(training / "disp_occ_0" / f"{frame_id}.png", np.rint(256 * disparity).astype(np.uint16))
-        write_png(training / "depth_2" / f"{frame_id}.png", np.rint(256 * depth).astype(np.uint16))
-        write_png(training / "instance_2" / f"{frame_id}.png", instance)
-        (training / "points").mkdir(exist_ok=True)
-        for car in range(2):
-            mesh = sdf_to_mesh(values[car], prior.origin, prior.spacing_m, T_CAM_OBJ[car])
-            # Area-uniform, in the frame of the labels.
-            corners = mesh.triangles
-            area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-            # Not the seeds of the estimate's points: equal streams would pick equal triangles.
-            rng = np.random.default_rng(100 + car)
-            chosen = corners[rng.choice(len(area), size=4000, p=area / area.sum())]
-            weights = rng.dirichlet([1.0, 1.0, 1.0], size=4000)
-            points = (weights[:, :, None] * chosen).sum(axis=1) - camera.t_cam_ref[0].numpy()
-            np.savez(training / "points" / f"{frame_id}_{car + 1}.npz", points=points.astype(np.float32))
+        for folder, values in (("disp_occ_0", disparity), ("depth_2", depth)):
+            write_png(root / "training" / folder / f"{frame_id}.png", np.rint(256 * values).astype(np.uint16))
 
 
 def write_perfect(source: Path, target: Path) -> None:
@@ -110,15 +91,16 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def evaluate(root: Path, refined: str = "perfect", truth: str = "disparity", **options: Any) -> ShapeScores:
-    settings: dict[str, Any] = {"counted": BOTH, "bootstrap": FEW, "masks": root / "masks", "truth": truth} | options
+def evaluate(root: Path, refined: str = "perfect", **options: Any) -> ShapeScores:
+    settings: dict[str, Any] = {"counted": BOTH, "bootstrap": FEW, "masks": root / "masks"} | options
     prior = load_prior(root / "prior.npz")
     return evaluate_shapes(root, root / "detections", root / refined, prior, **settings)
 
 
 def command(root: Path, refined: Path, *extra: str) -> list[str]:
     words = ["evaluate-shape", "--data", root, "--detections", root / "detections", "--refined", refined]
-    return [*map(str, words), "--prior", str(root / "prior.npz"), "--draws", "200", *extra]
+    words += ["--masks", root / "masks", "--prior", root / "prior.npz", "--draws", 200]
+    return [*map(str, words), *extra]
 
 
 def test_the_truth_itself_is_perfect_on_segments(root: Path) -> None:
@@ -128,31 +110,22 @@ def test_the_truth_itself_is_perfect_on_segments(root: Path) -> None:
     assert [(car.frame_id, car.detection_line, car.label_line) for car in scores.cars] == [
         (frame_id, line, label) for frame_id in FRAMES for line, label in ((1, 1), (3, 2))
     ]
-    (surface,) = scores.surfaces
-    assert (surface.surface, surface.num_rows, surface.num_cars) == ("segment", 4, 4)
     for car in scores.cars:
-        error = car.after["segment"]
+        error = car.after
         # Disparities are rounded to 1/256 px, up to 4 mm at 12.5 m.
         assert error.completeness[0] > 0.99
         assert error.accuracy[0] > 0.99
         assert error.rmse_m[0] < 0.01
-        assert car.before["segment"].completeness[0] < 0.9
-        assert car.sampling_limit == {}
+        assert car.before.completeness[0] < 0.9
 
 
-def test_the_truth_itself_is_perfect_on_surfaces_up_to_sampling(root: Path) -> None:
-    scores = evaluate(root, truth="points")
-    assert {surface.surface for surface in scores.surfaces} == {"whole", "visible"}
-    for car in scores.cars:
-        assert car.segment == f"instance {1000 + car.label_line}"
-        assert car.after["whole"].num_true == 4000
-        assert 800 < car.after["visible"].num_true < 2400
-        for name, error in car.after.items():
-            limit = car.sampling_limit[name]
-            assert error.completeness == pytest.approx(limit.completeness, abs=0.04)
-            assert error.accuracy == pytest.approx(limit.accuracy, abs=0.04)
-            assert error.f1[3] > 0.99
-            assert car.before[name].f1[1] < error.f1[1]
+def test_depths_say_the_same_as_disparities(root: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(root, tmp_path / "kitti"))
+    by_disparity = evaluate(copy, "refined")
+    shutil.rmtree(copy / "training" / "disp_occ_0")
+    for a, b in zip(by_disparity.cars, evaluate(copy, "refined").cars, strict=True):
+        assert a.after.num_true == b.after.num_true
+        np.testing.assert_allclose(a.after.f1, b.after.f1, atol=0.01)
 
 
 def test_a_car_moved_by_a_known_amount(root: Path, tmp_path: Path) -> None:
@@ -164,7 +137,7 @@ def test_a_car_moved_by_a_known_amount(root: Path, tmp_path: Path) -> None:
         moved[:, 2, 3] += 0.3
         write_shapes(tmp_path / "shapes" / f"{frame_id}.npz", dataclasses.replace(shapes, T_cam_obj=moved))
     for car in evaluate(root, refined=str(tmp_path)).cars:
-        error = car.after["segment"]
+        error = car.after
         assert error.completeness[5] > 0.9  # tau 0.3 m
         assert error.completeness[0] < 0.25  # tau 0.05 m
         assert 0.15 < error.rmse_m[9] < 0.3
@@ -172,47 +145,41 @@ def test_a_car_moved_by_a_known_amount(root: Path, tmp_path: Path) -> None:
 
 def test_without_detection_and_without_truth_are_counted(root: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(root, tmp_path / "kitti"))
-    (copy / "training" / "points" / "000001_1.npz").unlink()
+    masks = json.loads((copy / "masks" / "000001.json").read_text())
+    (copy / "masks" / "000001.json").write_text(json.dumps([m for m in masks if m["instance_id"] == 1]))
     lines = (copy / "detections" / "data" / "000000.txt").read_text().splitlines()
     elsewhere = re.sub(r"^(Car \S+ \S+ \S+) \S+ \S+ \S+ \S+", r"\1 0 0 5 5", lines[2])
     (copy / "detections" / "data" / "000000.txt").write_text("\n".join([*lines[:2], elsewhere]) + "\n")
-    scores = evaluate(copy, truth="points")
+    scores = evaluate(copy, masks=copy / "masks")
     assert (scores.num_labels_counted, scores.num_without_truth, scores.num_without_detection) == (4, 1, 1)
     assert [(car.frame_id, car.label_line) for car in scores.cars] == [("000000", 1), ("000001", 2)]
 
 
 def test_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = ["--json", str(tmp_path / "s.json"), "--csv", str(tmp_path / "s.csv"), "--plots", str(tmp_path / "plots")]
-    extra = ["--truth", "disparity", "--masks", str(root / "masks"), *files]
-    assert main(command(root, root / "perfect", *extra)) == 0
+    files = ["--json", str(tmp_path / "s.json"), "--csv", str(tmp_path / "s.csv")]
+    assert main(command(root, root / "perfect", *files)) == 0
     text = capsys.readouterr().out
-    assert text.startswith("2 of 2 counted labels in 2 frames, 2 cars (each label counts as a car of its own)")
-    assert "segments are the given masks, not an object map: 000000 left mask 0, 000001 left mask 0" in text
+    assert text.startswith("2 of 2 counted labels in 2 frames; 0 have no true surface, 0 no detection")
     assert "95 % intervals, bootstrap over cars" in text
     assert re.search(r"\ntau 0.05 m  2  .*  100.0 % \[100.0, 100.0\]", text)
     content = json.loads((tmp_path / "s.json").read_text())
-    assert (content["schema_version"], content["truth"]) == (1, "disparity")
-    (surface,) = content["surfaces"]
-    assert [curve["metric"] for curve in surface["curves"]] == ["completeness", "accuracy", "f1", "rmse_m"]
-    for curve in surface["curves"]:
-        assert len(curve["taus_m"]) == len(curve["summaries"]) == len(curve["num_rows"]) == 20
+    assert content["schema_version"] == 1
+    assert [curve["metric"] for curve in content["curves"]] == ["completeness", "accuracy", "f1", "rmse_m"]
+    for curve in content["curves"]:
+        assert len(curve["taus_m"]) == len(curve["summaries"]) == len(curve["num_cars"]) == 20
     with (tmp_path / "s.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 20
-    assert rows[0]["surface"] == "segment"
     assert float(rows[0]["completeness_after"]) > 0.99
-    picture = cv2.imread(str(tmp_path / "plots" / "shape_segment.png"))
-    assert picture.shape[1] > 1000
-    assert picture.std() > 5
 
 
 def test_the_documented_format_is_the_one_written(root: Path, tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "file_formats.md").read_text(encoding="utf-8")
     documented = text[text.index("## Shape scores (`evaluate-shape") :]
     files = ["--json", str(tmp_path / "s.json"), "--csv", str(tmp_path / "s.csv")]
-    assert main(command(root, root / "perfect", "--truth", "points", *files)) == 0
+    assert main(command(root, root / "perfect", *files)) == 0
     content = json.loads((tmp_path / "s.json").read_text())
-    for part in (content, content["surfaces"][0], content["surfaces"][0]["curves"][0]):
+    for part in (content, content["curves"][0]):
         for name in part:
             assert f'"{name}":' in documented
     for name in (tmp_path / "s.csv").read_text().splitlines()[0].split(","):
@@ -227,31 +194,21 @@ def test_errors_name_what_is_wrong(root: Path, tmp_path: Path, capsys: pytest.Ca
         assert captured.err.count("\n") == 1
         return captured.err
 
-    masks = ("--masks", str(root / "masks"))
-    assert "masks: expected masks of the left images" in fails(root / "perfect", "--truth", "disparity")
-    assert "has no shapes/NNNNNN.npz" in fails(tmp_path, "--truth", "points")
-    assert "frames: expected frames with ground truth, got 000009" in fails(
-        root / "perfect", "--truth", "points", "--frames", "9"
-    )
-    assert "000000.npz: cannot be read" in fails(tmp_path, "--truth", "points", "--frames", "000000")
+    assert "has no shapes/NNNNNN.npz" in fails(tmp_path)
+    assert "frames: expected frames with ground truth, got 000009" in fails(root / "perfect", "--frames", "9")
+    assert "000000.npz: cannot be read" in fails(tmp_path, "--frames", "000000")
     (tmp_path / "shapes").mkdir()
     (tmp_path / "shapes" / "000000.npz").write_bytes(b"no archive")
-    assert "000000.npz: is no readable npz file" in fails(tmp_path, "--truth", "disparity", *masks)
-    assert "holds codes of another shape prior" in fails(root / "perfect", "--truth", "points", "--prior", "pca")
-    assert "is not a folder of masks" in fails(
-        root / "perfect", "--truth", "disparity", "--masks", str(tmp_path / "no")
-    )
+    assert "000000.npz: is no readable npz file" in fails(tmp_path)
+    assert "holds codes of another shape prior" in fails(root / "perfect", "--prior", "pca")
+    assert "is not a folder of masks" in fails(root / "perfect", "--masks", str(tmp_path / "no"))
     empty = tmp_path / "empty"
     (empty / "training").mkdir(parents=True)
-    assert "training/points: is no folder of ground truth" in fails(
-        root / "perfect", "--truth", "points", "--data", str(empty)
-    )
-    assert "holds no folder 'training'" in fails(root / "perfect", "--truth", "points", "--data", str(tmp_path / "no"))
+    assert "holds neither disp_occ_0 nor depth_2" in fails(root / "perfect", "--data", str(empty))
+    assert "holds no folder 'training'" in fails(root / "perfect", "--data", str(tmp_path / "no"))
 
 
 def test_library_errors(root: Path) -> None:
-    with pytest.raises(InputError, match="truth: expected one of disparity, points, got 'lidar'"):
-        evaluate(root, truth="lidar")
     with pytest.raises(InputError, match="frames or split, got both"):
         evaluate(root, frames=["000000"], split="x")
     with pytest.raises(InputError, match="a counted label with a detection and a true surface, got none in 2 frames"):
@@ -264,7 +221,7 @@ def test_detections_of_another_run_are_named(root: Path, tmp_path: Path) -> None
         (tmp_path / f"{frame_id}.txt").write_text(first + "\n")
     prior = load_prior(root / "prior.npz")
     with pytest.raises(DataFormatError, match="names line 3 of a detection file that has 1 lines"):
-        evaluate_shapes(root, tmp_path, root / "perfect", prior, truth="points", counted=BOTH)
+        evaluate_shapes(root, tmp_path, root / "perfect", prior, masks=root / "masks", counted=BOTH)
 
 
 @pytest.mark.skipif("DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA is not set: frame 007322 needed")
@@ -282,8 +239,8 @@ def test_the_label_of_a_real_frame_beats_a_noisy_detection(tmp_path: Path) -> No
     T_label = poses_cam(labels, camera.t_cam_ref[0]).numpy()
     write_shapes(path, dataclasses.replace(shapes, T_cam_obj=T_label, codes=np.zeros_like(shapes.codes)))
     masks = data / "training" / "masks"
-    scores = evaluate_shapes(data, detections, tmp_path, load_prior("pca"), truth="disparity", masks=masks)
+    scores = evaluate_shapes(data, detections, tmp_path, load_prior("pca"), masks=masks)
     (car,) = scores.cars
-    assert car.after["segment"].num_true == 13563
-    assert car.after["segment"].f1[3] > 0.8
-    assert car.before["segment"].f1[3] < 0.3
+    assert car.after.num_true == 13563
+    assert car.after.f1[3] > 0.8
+    assert car.before.f1[3] < 0.3

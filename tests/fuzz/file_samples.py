@@ -24,7 +24,6 @@ from directshape_torch import load_config
 from directshape_torch.batch.run_status import format_status, read_status
 from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.errors import MeshError
-from directshape_torch.evaluation.car_identity import CarIdentity, CarTracks, read_tracks, write_tracks
 from directshape_torch.figures.trust_model import load_trust_model
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
 from directshape_torch.geometry.disparity_field import DisparityField
@@ -80,7 +79,6 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     (folder / "tracking.txt").write_text("".join(f"{n} 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0\n" for n in range(3)))
     (folder / "times.txt").write_text("2011-09-26 13:02:25.964389445\n" * 3)
     (folder / "split.txt").write_text("".join(f"{name}\n" for name in FRAMES))
-    write_tracks(folder / "tracks.json", CarTracks({(FRAME, 1): CarIdentity("a", "b")}))
     write_shapes(folder / "shapes.npz", shape_arrays(2))
     write_disparity(folder / "disparity.png", np.full((12, 16), 7.5))
     DisparityField.constant(-0.4, (160, 120), torch.eye(3), torch.eye(3), torch.eye(4)).save(folder / "field.json")
@@ -112,7 +110,6 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     return {
         "times": (folder / "times.txt", read_timestamps),
         "tracking": (folder / "tracking.txt", read_tracking_objects),
-        "tracks": (folder / "tracks.json", read_tracks),
         "shapes": (folder / "shapes.npz", read_shapes),
         "disparity": (folder / "disparity.png", read_disparity),
         "field": (folder / "field.json", DisparityField.load),
