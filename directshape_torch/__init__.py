@@ -1,5 +1,6 @@
 """Joint 3D pose and shape refinement of cars from stereo images (DirectShape), in PyTorch."""
 
+from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.config import RefinerConfig
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import (
@@ -14,7 +15,6 @@ from directshape_torch.errors import (
 from directshape_torch.figures.disparity_profile import DisparityProfile
 from directshape_torch.figures.observability import Observability
 from directshape_torch.figures.quality import FitQuality
-from directshape_torch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.refiner import DirectShapeRefiner

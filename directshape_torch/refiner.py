@@ -12,8 +12,6 @@ from torch import Tensor, nn
 
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
-from directshape_torch.diagnosis.box_alignment import align_boxes
-from directshape_torch.diagnosis.outcome import Outcome, outcome_of_boxes
 from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.figures.car_record import kept, placed
 from directshape_torch.geometry import se3
@@ -23,7 +21,10 @@ from directshape_torch.observation.car_points import PointSamples, car_points
 from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
-from directshape_torch.problem import CarProblem, TermFactory
+from directshape_torch.refinement.box_alignment import align_boxes
+from directshape_torch.refinement.outcome import Outcome, outcome_of_boxes
+from directshape_torch.refinement.problem import CarProblem, TermFactory
+from directshape_torch.refinement.tracks import refined
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.check_prior import check_prior
@@ -33,7 +34,6 @@ from directshape_torch.solver.gauss_newton import search_start
 from directshape_torch.status import Status, is_refined
 from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.tracks import refined
 
 
 class KnownRig(Protocol):

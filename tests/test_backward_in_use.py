@@ -15,9 +15,9 @@ from helpers.street_inputs import SETTLED, StreetInputs, gradient_by, summary, w
 from helpers.synthetic_scene import cached_street, disturbed
 from torch import Tensor
 
-from directshape_torch import tracks as tracks_module
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError, NoGradientWarning
+from directshape_torch.refinement import tracks as tracks_module
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch

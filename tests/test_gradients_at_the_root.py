@@ -14,7 +14,7 @@ from helpers.synthetic_scene import cached_street, disturbed
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
-from directshape_torch.problem import CarProblem, CarStage
+from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Iteration, Minimum, minimise

@@ -23,7 +23,7 @@ from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.problem import CarProblem, CarStage, method_stages
+from directshape_torch.refinement.problem import CarProblem, CarStage, method_stages
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior

@@ -23,11 +23,11 @@ from helpers.synthetic_scene import (
 )
 from torch import Tensor
 
-from directshape_torch import tracks
 from directshape_torch.config import RefinerConfig
-from directshape_torch.diagnosis import outcome as outcomes
-from directshape_torch.diagnosis.outcome import Outcome
 from directshape_torch.errors import InputError
+from directshape_torch.refinement import outcome as outcomes
+from directshape_torch.refinement import tracks
+from directshape_torch.refinement.outcome import Outcome
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.errors import InputError
 from directshape_torch.files import atomic_files
-from directshape_torch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from directshape_torch.fit_shape import ShapeFit
+    from directshape_torch.batch.fit_shape import ShapeFit
 
     Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
 
@@ -107,8 +107,8 @@ def _fit_cloud(args: argparse.Namespace) -> int:
     import torch
     from trimesh.exchange.ply import export_ply
 
+    from directshape_torch.batch.fit_shape import fit_shape
     from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
-    from directshape_torch.fit_shape import fit_shape
     from directshape_torch.io.velodyne import read_points
     from directshape_torch.shape.load_prior import load_prior
 

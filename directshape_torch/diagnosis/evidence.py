@@ -14,8 +14,7 @@ from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.numerics.tensors import constant_like
-from directshape_torch.problem import CarStage
-from directshape_torch.shape.shape_prior import DimensionsDerivative
+from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.term import Figures, Sight
 
@@ -30,6 +29,9 @@ class Course:
     """The course of a refinement of B cars, as far as the evidence needs it.
 
     Attributes:
+        prior: the shapes.
+        term_names: of the T columns of costs.
+        is_prior_column: (T) which of them say what is known beforehand.
         before, after: input and final state.
         detector_hwl: (B, 3) metres, of the input.
         cost_before, cost_after: (B, T) at the final stage.
@@ -39,9 +41,13 @@ class Course:
         covariance_xyz_yaw: (B, 4, 4), uncalibrated.
         unsettled: (B,) bool, the iterations ran out.
         profile: photometric cost over the disparity.
+        support: (B,) pixels of the photometric set, float64.
         detector_sigma: (B,) metres, of the input along the viewing ray; not finite where nobody knows it.
     """
 
+    prior: ShapePrior
+    term_names: tuple[str, ...]
+    is_prior_column: list[bool]
     before: CarState
     after: CarState
     detector_hwl: Tensor
@@ -53,6 +59,7 @@ class Course:
     covariance_xyz_yaw: Tensor
     unsettled: Tensor
     profile: DisparityProfile
+    support: Tensor
     detector_sigma: Tensor
 
 
@@ -65,23 +72,23 @@ class Agreement(NamedTuple):
     matched_share: Tensor
 
 
-def evidence_of(stage: CarStage, course: Course, agreement: Agreement) -> Tensor:
+def evidence_of(course: Course, agreement: Agreement) -> Tensor:
     """The evidence (B, E), float64, columns `EVIDENCE_NAMES`; NaN where a figure does not exist."""
     columns = {
-        **_motion(stage, course),
-        **_agreement(stage, course, agreement),
-        **_costs(stage, course),
+        **_motion(course),
+        **_agreement(course, agreement),
+        **_costs(course),
         **_profile(course.profile),
     }
     return torch.stack([columns[name].to(torch.float64) for name in EVIDENCE_NAMES], dim=1)
 
 
-def _motion(stage: CarStage, course: Course) -> dict[str, Tensor]:
+def _motion(course: Course) -> dict[str, Tensor]:
     """How far the box moved, in metres, in shares of itself and in standard deviations."""
     T_obj_cam = torch.stack([course.before.T_obj_cam, course.after.T_obj_cam]).to(torch.float64)
     T_cam_obj = se3.inverse(T_obj_cam)
     T_before, T_after = T_cam_obj
-    dimensions = stage.problem.prior.dimensions_and_derivative(course.after.code)
+    dimensions = course.prior.dimensions_and_derivative(course.after.code)
     hwl = dimensions.hwl.to(torch.float64)
     shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
     heading_before, heading_after = rotation_y_from_pose(T_cam_obj)
@@ -146,28 +153,27 @@ def _expected(motion: Tensor, sigma: Tensor, hwl: Tensor) -> tuple[Tensor, Tenso
     return (loss * at_output).sum(1), (loss * (at_input - at_output)).sum(1).clamp_min(0)
 
 
-def _agreement(stage: CarStage, course: Course, agreement: Agreement) -> dict[str, Tensor]:
+def _agreement(course: Course, agreement: Agreement) -> dict[str, Tensor]:
     """How well the images agree with the final state, and how many pixels say so."""
     return {
         "mask_misfit_left": 1 - agreement.mask_iou_left,
         "mask_misfit_right": 1 - agreement.mask_iou_right,
         "log_photometric_error": (agreement.photometric_error_grey.clamp_min(0.1) / 10).log(),
         "unmatched_share": 1 - agreement.matched_share,
-        "log_support": torch.log1p(_support(stage, course.unsettled)),
+        "log_support": torch.log1p(course.support),
         "unsettled": course.unsettled.to(torch.float64),
     }
 
 
-def _costs(stage: CarStage, course: Course) -> dict[str, Tensor]:
+def _costs(course: Course) -> dict[str, Tensor]:
     """What the terms paid before and after, and whether photometry pulls against the others at the end."""
-    names = stage.problem.term_names
-    silhouettes = [name.startswith("silhouette") for name in names]
-    photometric = [name == "photometric" for name in names]
-    priors = stage.is_prior_column
+    silhouettes = [name.startswith("silhouette") for name in course.term_names]
+    photometric = [name == "photometric" for name in course.term_names]
     # (T, 2, B): before and after.
     costs = torch.stack([course.cost_before, course.cost_after]).permute(2, 0, 1)
     everything = costs.sum(dim=0)
-    paid = torch.stack([*(_total(costs, chosen) for chosen in (silhouettes, priors, photometric)), everything])
+    by_kind = (_total(costs, chosen) for chosen in (silhouettes, course.is_prior_column, photometric))
+    paid = torch.stack([*by_kind, everything])
     log_before, log_after = paid.clamp_min(_TINY).log().unbind(dim=1)
     decrease = log_before - log_after
     return {
@@ -209,12 +215,6 @@ def _conflict(at_end: Figures, photometric: list[bool], cost: Tensor) -> Tensor:
         return torch.zeros_like(cost)
     gain = 0.5 * _mahalanobis(at_end.gradient[:, photometric.index(True)], at_end.hessian.sum(dim=1)).square()
     return torch.log1p(100 * gain / cost.clamp_min(_TINY))
-
-
-def _support(stage: CarStage, like: Tensor) -> Tensor:
-    """Pixels (B,) of the photometric set."""
-    term = stage.photometric
-    return torch.zeros_like(like, dtype=torch.float64) if term is None else term.pixel_set.support
 
 
 def _view_jacobian(location: Tensor) -> Tensor:

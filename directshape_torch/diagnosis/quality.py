@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from directshape_torch.diagnosis.evidence import Agreement, Course, evidence_of
 from directshape_torch.figures.quality import FitQuality
 from directshape_torch.figures.trust_model import bundled_trust_model
-from directshape_torch.problem import CarStage
 from directshape_torch.rows import CarSums
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.silhouette import MaskRows
@@ -16,29 +17,31 @@ from directshape_torch.terms.term import Part, Sight
 
 
 @torch.no_grad()
-def fit_quality(stage: CarStage, course: Course) -> FitQuality:
-    """Figures of B cars at the end of a refinement, in its last stage."""
-    agreed = _agreement(stage, course)
-    evidence = evidence_of(stage, course, agreed)
-    better, not_worse = _probabilities(stage, evidence)
+def fit_quality(course: Course, masks: MaskRows, photometric: Photometric | None, at: Part | None) -> FitQuality:
+    """Figures of B cars at the end of a refinement.
+
+    Args:
+        course: of the refinement.
+        masks: the rays of both images.
+        photometric: the term of the last stage, and what it says of the end; None without photometry.
+        at: see there.
+    """
+    left, right = mask_ious(masks, course.seen)
+    nan = torch.full_like(left, torch.nan)
+    both = (nan, nan) if photometric is None or at is None else photometric_agreement(photometric, at)
+    agreed = Agreement(left, right, *both)
+    evidence = evidence_of(course, agreed)
+    better, not_worse = _probabilities(course.term_names, evidence)
     return FitQuality(*agreed, evidence, better, not_worse)
 
 
-def _probabilities(stage: CarStage, evidence: Tensor) -> tuple[Tensor, Tensor]:
+def _probabilities(term_names: Sequence[str], evidence: Tensor) -> tuple[Tensor, Tensor]:
     """Of a better and of a not worse box, (B,) each; the model knows the terms of the method "direct" alone."""
-    names = set(stage.problem.term_names)
-    if not {"silhouette_left", "photometric"} <= names or "point_cloud" in names:
+    if not {"silhouette_left", "photometric"} <= set(term_names) or "point_cloud" in term_names:
         unknown = torch.full_like(evidence[:, 0], torch.nan)
         return unknown, unknown
     model = bundled_trust_model()
     return model.better(evidence), model.not_worse(evidence)
-
-
-def _agreement(stage: CarStage, course: Course) -> Agreement:
-    left, right = mask_ious(stage.problem.masks, course.seen)
-    nan = torch.full_like(left, torch.nan)
-    term, at = stage.photometric, stage.photometric_part(course.figures)
-    return Agreement(left, right, *((nan, nan) if term is None or at is None else photometric_agreement(term, at)))
 
 
 def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:

@@ -16,7 +16,7 @@ from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
-from directshape_torch.problem import CarProblem, CarStage, TermFactory
+from directshape_torch.refinement.problem import CarProblem, CarStage, TermFactory
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior

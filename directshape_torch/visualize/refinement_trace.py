@@ -14,7 +14,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import without_empty_masks
-from directshape_torch.problem import CarStage
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch

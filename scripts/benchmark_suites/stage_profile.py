@@ -21,9 +21,9 @@ from benchmark_suites.times import make_refiner
 from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import demo_scene
 from directshape_torch import depth
-from directshape_torch.diagnosis.outcome import outcome_of
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.problem import CarIterations, CarProblem, CarStage
+from directshape_torch.refinement.outcome import outcome_of
+from directshape_torch.refinement.problem import CarIterations, CarProblem, CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.damped_solve import damped_step

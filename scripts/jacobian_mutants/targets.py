@@ -101,7 +101,7 @@ TARGETS: dict[str, Target] = {
         _SUMS,
     ),
     "stage_sums": Target(
-        "directshape_torch/problem.py",
+        "directshape_torch/refinement/problem.py",
         ("CarStage.figures", "CarIterations.evaluated", "_Layout.of"),
         _SUMS,
     ),

@@ -11,10 +11,10 @@ from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
 from helpers.problems import DEFAULT
 from helpers.synthetic_scene import TWO_CARS, Street, joined_detections, joined_frames, select, street
 
-from directshape_torch.diagnosis.box_alignment import box_hits
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.rays import ray_box_interval
+from directshape_torch.refinement.box_alignment import box_hits
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.rows import Rays

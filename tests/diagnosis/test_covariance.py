@@ -13,7 +13,7 @@ from directshape_torch.diagnosis.observability import covariance_of, covariance_
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.problem import CarStage
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.cars import CarState

@@ -19,12 +19,11 @@ from directshape_torch.diagnosis.observability import covariance_of, covariance_
 from directshape_torch.figures.disparity_profile import DisparityProfile, profile_offsets
 from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.geometry import se3
-from directshape_torch.problem import CarStage
 from directshape_torch.terms.cars import CarState
 
 
 @cache
-def course_at_truth() -> tuple[CarStage, Course]:
+def course_at_truth() -> Course:
     """Cars that begin and end at the same place, and cost half as much at the end."""
     prior, scene = cached_street()
     stage, state = begun_stage(prior, scene.frames, scene.detections)
@@ -32,7 +31,10 @@ def course_at_truth() -> tuple[CarStage, Course]:
     at_end = stage.figures(seen)
     costs, covariance = at_end.term_costs, covariance_of(at_end.information.sum(dim=1))
     surface = photometric_of(stage).where(seen)
-    course = Course(
+    return Course(
+        prior=prior,
+        term_names=stage.problem.term_names,
+        is_prior_column=stage.is_prior_column,
         before=state,
         after=state,
         detector_hwl=prior.dimensions_and_derivative(state.code).hwl,
@@ -44,9 +46,9 @@ def course_at_truth() -> tuple[CarStage, Course]:
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, state.T_obj_cam),
         unsettled=torch.tensor([False, True]),
         profile=disparity_profile(stage.photometric, surface, surface, 2, state.code),
+        support=photometric_of(stage).pixel_set.support,
         detector_sigma=torch.tensor([0.5, 0.25], dtype=torch.float64),
     )
-    return stage, course
 
 
 def agreement(**changes: float) -> Agreement:
@@ -55,13 +57,13 @@ def agreement(**changes: float) -> Agreement:
 
 
 def columns(course: Course, agreed: Agreement | None = None) -> dict[str, Tensor]:
-    rows = evidence_of(course_at_truth()[0], course, agreement() if agreed is None else agreed)
+    rows = evidence_of(course, agreement() if agreed is None else agreed)
     assert rows.shape == (2, len(EVIDENCE_NAMES))
     return dict(zip(EVIDENCE_NAMES, rows.unbind(1), strict=True))
 
 
 def test_a_car_that_did_not_move() -> None:
-    found = columns(course_at_truth()[1])
+    found = columns(course_at_truth())
     for name in ("moved_depth", "turned", "length_change", "log_moved_sigmas"):
         torch.testing.assert_close(found[name], torch.zeros(2).double(), atol=1e-9, rtol=0)
     for name in ("silhouette_decrease", "photometric_decrease", "relative_decrease"):
@@ -73,7 +75,7 @@ def test_a_car_that_did_not_move() -> None:
 
 
 def test_a_motion_along_the_ray_is_one_of_depth() -> None:
-    _, course = course_at_truth()
+    course = course_at_truth()
     T = se3.inverse(course.after.T_obj_cam)
     ray = T[:, :3, 3] * torch.tensor([1.0, 0.0, 1.0]).double()
     T[:, :3, 3] -= 0.4 * ray / ray.norm(dim=1, keepdim=True)
@@ -102,7 +104,7 @@ def test_expectations_agree_with_sampling() -> None:
 
 def test_sigmas_are_along_and_across_the_viewing_ray() -> None:
     """Half a metre along the ray, 2 cm across it and 0.1 rad, of cars to the left and right of the axis."""
-    _, course = course_at_truth()
+    course = course_at_truth()
     location = se3.inverse(course.after.T_obj_cam)[:, :3, 3]
     x, z = (location[:, [0, 2]] / location[:, [0, 2]].norm(dim=1, keepdim=True)).unbind(1)
     assert (x.abs() > 0.05).all()
@@ -117,8 +119,8 @@ def test_sigmas_are_along_and_across_the_viewing_ray() -> None:
 
 def test_conflict_is_what_photometry_alone_would_gain() -> None:
     """With a unit matrix and a pull of length 0.2 at a cost of 1: log(1 + 100 * 0.02)."""
-    stage, course = course_at_truth()
-    column = stage.problem.term_names.index("photometric")
+    course = course_at_truth()
+    column = course.term_names.index("photometric")
     pull, hessian = torch.ones_like(course.figures.gradient), torch.zeros_like(course.figures.hessian)
     pull[:, column] = 0
     pull[:, column, 3] = 0.2
@@ -130,7 +132,7 @@ def test_conflict_is_what_photometry_alone_would_gain() -> None:
 
 
 def test_what_does_not_exist_is_nan_and_touches_no_other_column() -> None:
-    _, course = course_at_truth()
+    course = course_at_truth()
     blank = columns(course, agreement(mask_iou_right=math.nan))
     assert blank["mask_misfit_right"].isnan().all()
     assert all(x.isfinite().all() for name, x in blank.items() if name != "mask_misfit_right")
@@ -145,7 +147,7 @@ def test_what_does_not_exist_is_nan_and_touches_no_other_column() -> None:
 
 def test_the_profile_by_hand() -> None:
     """At the input 2 + (x - 2)^2, at the end 3 + 6 (x - 0.25)^2 of 100 pixels; the second car has no curve."""
-    _, course = course_at_truth()
+    course = course_at_truth()
     x = profile_offsets()
     before, after = (torch.stack([c, c * math.nan]) for c in (2 + (x - 2) ** 2, 3 + 6 * (x - 0.25) ** 2))
     pixels = torch.full((2,), 100.0, dtype=torch.float64)
@@ -164,7 +166,7 @@ def test_the_profile_by_hand() -> None:
 
 
 def test_a_flat_profile_is_as_wide_as_its_range() -> None:
-    _, course = course_at_truth()
+    course = course_at_truth()
     flat = torch.full((2, 25), 4.0, dtype=torch.float64)
     found = columns(replace(course, profile=replace(course.profile, cost_before=flat, cost_after=flat)))
     assert float(found["log_profile_sigma"][0]) == pytest.approx(math.log(3))

@@ -10,10 +10,10 @@ from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.diagnosis.outcome import outcome_of
 from directshape_torch.diagnosis.quality import _probabilities, mask_ious, photometric_agreement
 from directshape_torch.figures.quality import EVIDENCE_NAMES
-from directshape_torch.problem import CarStage
+from directshape_torch.refinement.outcome import outcome_of
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.status import Status
 from directshape_torch.terms.cars import CarBatch, CarState
@@ -141,8 +141,8 @@ def test_a_car_with_its_input_back_costs_after_what_it_cost_before() -> None:
 
 def test_probabilities_exist_for_the_method_they_were_fitted_to_alone() -> None:
     evidence = torch.zeros(2, len(EVIDENCE_NAMES), dtype=torch.float64)
-    for probability in _probabilities(begun()[0], evidence):
+    for probability in _probabilities(begun()[0].problem.term_names, evidence):
         assert ((probability > 0) & (probability < 1)).all()
     blind = replace(DEFAULT, photometric=replace(DEFAULT.photometric, weight=0.0))
-    for probability in _probabilities(begun(blind)[0], evidence):
+    for probability in _probabilities(begun(blind)[0].problem.term_names, evidence):
         assert probability.isnan().all()

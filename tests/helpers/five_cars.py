@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.problem import CarStage
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior

@@ -9,7 +9,7 @@ import torch
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.geometry import se3
-from directshape_torch.problem import CarStage
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.terms.cars import CarState
 from helpers.derivatives import moved, tangent_of
 from helpers.ellipsoids import ellipsoid_prior

@@ -11,7 +11,7 @@ from helpers.term_cases import ALL_CONFIGS, REGIMES, case
 from reference import residuals as reference
 from torch import Tensor
 
-from directshape_torch.problem import CarStage
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.photometric_rows import CONTRAST_FLOOR, DSO_PATTERN, patch_residual

@@ -15,7 +15,7 @@ from reference import residuals as reference
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.problem import CarStage
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.terms import photometric_rows
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import is_grazing

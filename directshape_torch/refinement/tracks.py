@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from directshape_torch.diagnosis.outcome import Outcome, judged, outcome_of
-from directshape_torch.problem import CarProblem
+from directshape_torch.refinement.outcome import Outcome, judged, outcome_of
+from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.solver.backward import attached_state
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum, minimise

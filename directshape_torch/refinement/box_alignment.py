@@ -21,7 +21,7 @@ from directshape_torch.diagnosis.disparity_profile import (
 from directshape_torch.figures.disparity_profile import DisparityProfile, profile_figures, profile_offsets
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.tensors import constant_like
-from directshape_torch.problem import CarProblem
+from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
-from directshape_torch.diagnosis.box_alignment import ROUNDS_PX, BoxAlignment
 from directshape_torch.diagnosis.disparity_profile import disparity_profile
 from directshape_torch.diagnosis.evidence import Course
 from directshape_torch.diagnosis.observability import (
@@ -24,7 +23,8 @@ from directshape_torch.figures.observability import Observability
 from directshape_torch.figures.quality import FitQuality
 from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
-from directshape_torch.problem import CarProblem, CarStage
+from directshape_torch.refinement.box_alignment import ROUNDS_PX, BoxAlignment
+from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
@@ -105,7 +105,11 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     information = problem.sharing.with_others(after.information.sum(dim=1), refined)
     covariance = covariance_of(information)[:, :num_kept, :num_kept] + _of_field(end, cars)
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
+    term = stage.photometric
     course = Course(
+        prior=problem.prior,
+        term_names=problem.term_names,
+        is_prior_column=stage.is_prior_column,
         before=initial,
         after=end,
         detector_hwl=cars.detector_hwl,
@@ -116,7 +120,8 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
-        profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
+        profile=disparity_profile(term, at_input, at_end, len(cars), end.code),
+        support=torch.zeros_like(after.cost) if term is None else term.pixel_set.support,
         detector_sigma=detector_pose_sigma(problem.config.priors, cars)[:, 0].detach(),
     )
     seen = stage.information_of_measurements(after)
@@ -133,7 +138,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         cost_after=course.cost_after,
         covariance=covariance,
         covariance_xyz_yaw=course.covariance_xyz_yaw,
-        quality=fit_quality(stage, course),
+        quality=fit_quality(course, problem.masks, term, stage.photometric_part(after)),
         # The directions are mostly those of the depth, so its factor brings them to size.
         observability=unseen.scaled(bundled_trust_model().sigma_factors[0]),
         profile=course.profile,
