@@ -28,6 +28,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.refinement import outcome as outcomes
 from directshape_torch.refinement import tracks
 from directshape_torch.refinement.outcome import Outcome
+from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -122,7 +123,7 @@ def test_the_order_of_the_detections_does_not_matter() -> None:
 
 def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
     # The few pixels of a toy know its shape less well than those of a street.
-    monkeypatch.setattr(tracks, "_MOST_DIFFERENCE", 1.5)
+    monkeypatch.setattr(tracks, "_MOST_SAVED", 3.0)
     _, detections, _ = drive(contrast=2.5)
     right, swapped = (refined(detections, ids, contrast=2.5) for ids in ([0, 1] * 3, [0, 1, 0, 1, 1, 0]))
     assert right.track_part.tolist() == [0] * 6
@@ -135,11 +136,34 @@ def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytes
 def test_the_cut_is_where_the_shape_changes(cut: int) -> None:
     generator = torch.Generator().manual_seed(2)
     A = 3 * torch.randn(7, 20, 3, generator=generator, dtype=torch.float64)
+    A, known = A.mT @ A / 20, 0.15 * torch.eye(3, dtype=torch.float64).expand(7, 3, 3)
     code = 0.1 * torch.randn(7, 3, generator=generator, dtype=torch.float64)
     views = [6, 0, 3, 1, 5, 2, 4]
-    assert tracks._of_one_car(views, A.mT @ A, code) == [views]
+
+    def parts(code: Tensor) -> list[list[int]]:
+        return tracks._of_one_car(views, tracks._Quadratics(A, A @ code[:, :, None], known))
+
+    assert parts(code) == [views]
     code[views[cut:]] += torch.tensor([1.5, -1.0, 0.8])
-    assert tracks._of_one_car(views, A.mT @ A, code) == [views[:cut], views[cut:]]
+    assert parts(code) == [views[:cut], views[cut:]]
+
+
+def test_what_two_shapes_save_is_what_the_least_costs_say() -> None:
+    generator = torch.Generator().manual_seed(3)
+    roots = torch.randn(5, 4, 2, generator=generator, dtype=torch.float64)
+    A, code = roots.mT @ roots, torch.randn(5, 2, 1, generator=generator, dtype=torch.float64)
+    known = 0.15 * torch.eye(2, dtype=torch.float64)
+
+    def least(views: list[int]) -> float:
+        both = known + A[views].sum(dim=0)
+        c = torch.linalg.solve(both, (A[views] @ code[views]).sum(dim=0))
+        off = c - code[views]
+        return float((off.mT @ A[views] @ off).sum() + c.mT @ known @ c)
+
+    says = tracks._Quadratics(A, A @ code, known.expand(5, 2, 2))
+    for cut, saved in enumerate(says.saved([3, 0, 4, 1]), start=1):
+        views = [3, 0, 4, 1]
+        assert saved == pytest.approx(least(views) - least(views[:cut]) - least(views[cut:]))
 
 
 def test_a_view_without_a_mask_touches_nothing_else() -> None:
@@ -194,6 +218,29 @@ def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: 
             assert torch.equal(values[2], alone.state_dict()[name][2]), name
             assert torch.equal(values[others], trusted.state_dict()[name][others]), name
     assert result.status == [Status.converged] * 6
+
+
+def test_a_view_that_leaves_midway_leaves_the_track_as_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, detections, _ = drive()
+    without = refined(detections, [0, 1, -1, 1, 0, 1])
+    minimise = tracks.minimise
+
+    def failing(problem: CarProblem, *others: Any) -> Minimum[CarState]:
+        minimum = minimise(problem, *others)
+        if not isinstance(problem.sharing, Groups) or len(minimum.status) < 6:
+            return minimum
+        return replace(minimum, status=minimum.status.index_fill(0, torch.tensor([2]), Status.singular.code))
+
+    monkeypatch.setattr(tracks, "minimise", failing)
+    assert_same(refined(detections, [0, 1] * 3), without)
+
+
+def test_a_view_whose_track_has_no_other_that_is_trusted_has_a_shape_of_its_own(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, detections, _ = drive()
+    doubt_in_track(monkeypatch, 1)
+    assert refined(detections, [0, -1, 0, 1, -1, 1]).track_part.tolist() == [-1, -1, -1, 0, -1, 0]
 
 
 @pytest.mark.parametrize("doubted", [False, True])

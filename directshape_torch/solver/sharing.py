@@ -171,7 +171,7 @@ class Groups:
         return self._unless_alone(newton_step(J, gradient), together)
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
-        of_each, solvable = said_of_shared(information, self.own, self.shared)
+        of_each, _, solvable = said_of_shared(information, torch.zeros_like(information[:, 0]), self.own, self.shared)
         members = members & solvable
         of_each = torch.where(members[:, None, None], of_each, 0.0)
         widened = information.clone()
@@ -198,17 +198,23 @@ class Groups:
         return torch.where(solvable[:, None], step, 0.0), solvable
 
 
-def said_of_shared(information: Tensor, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
-    """Information (B, K, K) of the shared unknowns whatever the own ones are, of (B, D, D) of all; where (B,) there is.
+def said_of_shared(
+    matrix: Tensor,  # (B, D, D)
+    gradient: Tensor,  # (B, D)
+    own: Tensor,
+    shared: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What quadratics say of the shared unknowns alone, the own ones following: `x^T A x / 2 - r^T x`.
+
+    Returns:
+        A (B, K, K), r (B, K), and where (B,) there is one.
 
     Examples:
-        >>> of_all = torch.tensor([[[2.0, 1.0], [1.0, 1.0]]])
-        >>> said_of_shared(of_all, own=torch.tensor([0]), shared=torch.tensor([1]))[0]
-        tensor([[[0.5000]]])
+        >>> matrix, gradient = torch.tensor([[[2.0, 1.0], [1.0, 1.0]]]), torch.tensor([[2.0, 0.0]])
+        >>> said_of_shared(matrix, gradient, own=torch.tensor([0]), shared=torch.tensor([1]))
+        (tensor([[[0.5000]]]), tensor([[1.]]), tensor([True]))
     """
-    nothing = torch.zeros_like(information[:, 0])
-    _, of_each, _, solvable = _reduced(information, nothing, own, shared, _undamped_solution)
-    return of_each, solvable
+    return _reduced(matrix, gradient, own, shared, _undamped_solution)[1:]
 
 
 def _reduced(
