@@ -201,11 +201,13 @@ class _Quadratics:
         known = self.known.index_select(0, index).mean(dim=0)
 
         def twice_least(A: Tensor, b: Tensor) -> Tensor:
-            return -(b.mT @ torch.linalg.solve_ex(A + known, b)[0])[:, 0, 0]
+            solution: Tensor = torch.linalg.solve_ex(A + known, b)[0]
+            return -(b * solution).sum(dim=(1, 2))
 
         together = twice_least(A[-1:], b[-1:])
         halves = twice_least(A[:-1], b[:-1]) + twice_least(A[-1] - A[:-1], b[-1] - b[:-1])
-        return (together - halves).tolist()
+        saved: list[float] = (together - halves).tolist()
+        return saved
 
 
 def _of_one_car(views: list[int], says: _Quadratics) -> list[list[int]]:
