@@ -22,7 +22,7 @@ from directshape_torch.errors import (
     ResumeError,
 )
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.camera import project
+from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.scene import GroundPlane, Occluders

@@ -1,7 +1,7 @@
-"""Pixels, rays and depths of a rectified stereo pair: pinhole cameras, the crossing to the right one, disparity.
+"""From pixels of a rectified stereo pair to rays and points.
 
 Pixel centres lie at integer (u, v). Where a rig has a residual disparity field an image point lies at `u_right =
-pinhole - bias`, `v_right = pinhole + vertical`. The rows of the two cameras need only nearly be aligned.
+pinhole - bias`, `v_right = pinhole + vertical`.
 """
 
 from __future__ import annotations
@@ -30,67 +30,6 @@ def rays_from_pixels(
     return torch.stack([u, v, torch.ones_like(u)], dim=-1)
 
 
-def project(
-    points_cam: Tensor,  # (*, 3) metres
-    K: Tensor,  # (*, 3, 3)
-) -> Tensor:  # (*, 2)
-    """Pixels of points in the camera frame; meaningless for points with z <= 0, which the caller must exclude.
-
-    Examples:
-        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
-        >>> project(torch.tensor([1.0, 0.0, 10.0]), K)
-        tensor([670., 180.])
-    """
-    homogeneous = (K @ points_cam[..., None])[..., 0]
-    return homogeneous[..., :2] / homogeneous[..., 2:]
-
-
-class RightPixels(NamedTuple):
-    """Where left pixels of known depth appear in the right image."""
-
-    uv_right: Tensor  # (*, 2) pixels
-    J_pixel_depth: Tensor  # (*, 2) d uv_right / d depth, pixels per metre
-    in_front: Tensor  # (*,) bool, false where the point is behind the right camera
-
-
-def warp_to_right(
-    ray_left: Tensor,  # (*, 3) K_left^-1 [u, v, 1]
-    depth: Tensor,  # (*,) depth along the optical axis of the left camera, metres
-    K_right: Tensor,  # (*, 3, 3)
-    T_right_cam: Tensor,  # (*, 4, 4)
-    bias_px: Tensor | None = None,  # (*,) residual disparity at the left pixel
-    vertical_px: Tensor | None = None,  # (*,) residual row offset at the left pixel
-) -> RightPixels:
-    """Warp left pixels into the right image (paper, supplement, `warp(p, d)` and its derivative by d).
-
-    Examples:
-        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
-        >>> T_right_cam = torch.eye(4)
-        >>> T_right_cam[0, 3] = -0.5
-        >>> warp_to_right(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(10.0), K, T_right_cam).uv_right
-        tensor([565., 180.])
-    """
-    v = (T_right_cam[..., :3, :3] @ ray_left[..., None])[..., 0]
-    point_right = depth[..., None] * v + T_right_cam[..., :3, 3]
-    homogeneous = (K_right @ point_right[..., None])[..., 0]
-    J_homogeneous_depth = (K_right @ v[..., None])[..., 0]
-    in_front = homogeneous[..., 2] > 1e-6
-    z = torch.where(in_front, homogeneous[..., 2], torch.ones_like(depth))[..., None]
-    uv = homogeneous[..., :2] / z
-    J_pixel_depth = (J_homogeneous_depth[..., :2] - uv * J_homogeneous_depth[..., 2:]) / z
-    return RightPixels(_shifted(uv, bias_px, vertical_px, 1.0), J_pixel_depth, in_front)
-
-
-def _shifted(uv: Tensor, bias_px: Tensor | None, vertical_px: Tensor | None, sign: float) -> Tensor:
-    """Pinhole pixels to measured ones (sign 1), or back (sign -1)."""
-    if bias_px is None and vertical_px is None:
-        return uv
-    u, v = uv.unbind(-1)
-    u = u if bias_px is None else u - sign * bias_px
-    v = v if vertical_px is None else v + sign * vertical_px
-    return torch.stack([u, v], dim=-1)
-
-
 class RightRays(NamedTuple):
     """Rays of the right camera in the left camera frame: `point_cam = origin_cam + depth_right * direction_cam`."""
 
@@ -114,7 +53,10 @@ def right_rays(
         >>> right_rays(torch.tensor([565.0, 180.0]), K, T_right_cam).origin_cam
         tensor([0.5000, 0.0000, 0.0000])
     """
-    uv_right = _shifted(uv_right, bias_px, vertical_px, -1.0)
+    if bias_px is not None:
+        uv_right = torch.stack([uv_right[..., 0] + bias_px, uv_right[..., 1]], dim=-1)
+    if vertical_px is not None:
+        uv_right = torch.stack([uv_right[..., 0], uv_right[..., 1] - vertical_px], dim=-1)
     R_cam_right = T_right_cam[..., :3, :3].transpose(-1, -2)
     ray_right = rays_from_pixels(uv_right, K_right)
     direction = (R_cam_right @ ray_right[..., None])[..., 0]
@@ -173,24 +115,3 @@ def points_from_disparity(
     """
     depth = depth_from_disparity(uv_left, disparity, K_left, K_right, T_right_cam, field)
     return depth[..., None] * rays_from_pixels(uv_left, K_left)
-
-
-def disparity_of_depth(
-    uv_left: Tensor,  # (*, 2) pixels
-    depth: Tensor,  # (*,) metres
-    K_left: Tensor,  # (*, 3, 3)
-    K_right: Tensor,  # (*, 3, 3)
-    T_right_cam: Tensor,  # (*, 4, 4)
-) -> Tensor:  # (*, 2)
-    """True displacement `uv_left - uv_right` of left pixels of known depth: disparity and row shift, pixels.
-
-    Examples:
-        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
-        >>> T_right_cam = torch.eye(4)
-        >>> T_right_cam[0, 3] = -0.5
-        >>> disparity_of_depth(torch.tensor([670.0, 180.0]), torch.tensor(10.0), K, K, T_right_cam)
-        tensor([35.,  0.])
-    """
-    direction = T_right_cam[..., :3, :3] @ rays_from_pixels(uv_left, K_left)[..., None]
-    homogeneous = depth[..., None] * (K_right @ direction)[..., 0] + (K_right @ T_right_cam[..., :3, 3:])[..., 0]
-    return uv_left - homogeneous[..., :2] / homogeneous[..., 2:]

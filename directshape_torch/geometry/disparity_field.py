@@ -8,23 +8,15 @@ and Segvic, "Improving the Egomotion Estimation by Correcting the Calibration Bi
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, InputError, shown
-from directshape_torch.files.atomic_files import write_json
-from directshape_torch.files.read_files import read_json
+from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape, check_size_wh, check_stored
 from directshape_torch.numerics.gradient_mode import is_plain
-
-SCHEMA = "directshape disparity field"
-SCHEMA_VERSION = 1
 
 # Exponents of the normalised (u, v) in each basis function: 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, u^4.
 EXPONENTS: tuple[tuple[int, int], ...] = (
@@ -126,12 +118,12 @@ class DisparityField:
 
     def __post_init__(self) -> None:
         check_size_wh("size_wh", self.size_wh)
-        for name, shape in _TENSOR_SHAPES.items():
+        for name, shape in TENSOR_SHAPES.items():
             check_shape(name, getattr(self, name), ["M" if n is None else n for n in shape], kind="floating")
             check_stored(name, getattr(self, name))
         if len(self.hull_uv) < 3:
             raise InputError("hull_uv", "shape (M, 2) with at least 3 vertices", f"{tuple(self.hull_uv.shape)}")
-        for name in _TENSOR_SHAPES:
+        for name in TENSOR_SHAPES:
             if not bool(getattr(self, name).isfinite().all()):
                 raise InputError(name, "finite numbers", str(getattr(self, name).tolist()))
 
@@ -161,7 +153,7 @@ class DisparityField:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> DisparityField:
         """A copy on another device and of another floating-point type."""
-        return replace(self, **{name: getattr(self, name).to(device=device, dtype=dtype) for name in _TENSOR_SHAPES})
+        return replace(self, **{name: getattr(self, name).to(device=device, dtype=dtype) for name in TENSOR_SHAPES})
 
     def bias(
         self,
@@ -267,66 +259,8 @@ class DisparityField:
         """`size_wh`, `K_left`, `K_right`, `T_right_cam`: the arguments of `check_rig`."""
         return self.size_wh, self.K_left, self.K_right, self.T_right_cam
 
-    def save(self, path: Path | str) -> None:
-        """Write the field as JSON; a reader sees the old file or the new one, never half of it.
 
-        Raises:
-            OSError: the folder cannot be made or written.
-        """
-        content = {
-            "schema": SCHEMA,
-            "schema_version": SCHEMA_VERSION,
-            "size_wh": list(self.size_wh),
-            "provenance": dict(self.provenance),
-            **{name: getattr(self, name).double().cpu().tolist() for name in _TENSOR_SHAPES},
-        }
-        write_json(path, content)
-
-    @classmethod
-    def load(cls, path: Path | str, dtype: torch.dtype = torch.float64) -> DisparityField:
-        """Read a field written by `save`.
-
-        Raises:
-            DataFormatError: the file is missing, is not valid JSON, or does not hold what a field needs.
-        """
-        content = _NOT_KNOWN | _read_json(path)
-        tensors = {name: _read_tensor(path, content, name, shape, dtype) for name, shape in _TENSOR_SHAPES.items()}
-        size = content.get("size_wh")
-        if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)):
-            raise DataFormatError(path, f"'size_wh' must be [width, height], got {shown(size)}", cure=_CURE)
-        provenance = content.get("provenance", {})
-        if not isinstance(provenance, dict):
-            raise DataFormatError(path, f"'provenance' must be an object, got {shown(provenance)}", cure=_CURE)
-        return cls(size_wh=(size[0], size[1]), provenance=provenance, **tensors)
-
-
-def field_of_rig(
-    fields: Sequence[DisparityField],
-    size_wh: tuple[int, int],
-    K_left: Tensor,  # (3, 3)
-    K_right: Tensor,  # (3, 3)
-    T_right_cam: Tensor,  # (4, 4)
-) -> DisparityField | None:
-    """The first of some fields that is of this rig; None where there are none.
-
-    Raises:
-        InputError: there are fields, and all are of other rigs.
-    """
-    refusal: InputError | None = None
-    for one in fields:
-        try:
-            one.check_rig(size_wh, K_left, K_right, T_right_cam)
-        except InputError as error:
-            refusal = refusal or error
-        else:
-            return one
-    if refusal is not None:
-        raise refusal
-    return None
-
-
-_CURE = "write it again with 'directshape calibrate-rig'"
-_TENSOR_SHAPES: dict[str, tuple[int | None, ...]] = {
+TENSOR_SHAPES: dict[str, tuple[int | None, ...]] = {
     "coefficients": (NUM_COEFFICIENTS,),
     "vertical_coefficients": (NUM_COEFFICIENTS,),
     "hull_uv": (None, 2),
@@ -335,35 +269,7 @@ _TENSOR_SHAPES: dict[str, tuple[int | None, ...]] = {
     "T_right_cam": (4, 4),
     "covariance": (NUM_COEFFICIENTS, NUM_COEFFICIENTS),
 }
-_NOT_KNOWN = {"covariance": [[0.0] * NUM_COEFFICIENTS] * NUM_COEFFICIENTS}
-"""What files of earlier versions lack."""
 
 
 def _largest_difference(a: Tensor, b: Tensor) -> float:
     return float((a.detach().double().cpu() - b.detach().double().cpu()).abs().max())
-
-
-def _read_json(path: Path | str) -> dict[str, Any]:
-    content = read_json(path, _CURE)
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise DataFormatError(path, f"is no disparity field (its 'schema' is not {SCHEMA!r})", cure=_CURE)
-    if content.get("schema_version") != SCHEMA_VERSION:
-        version = content.get("schema_version")
-        raise DataFormatError(path, f"has schema version {shown(version)}, known is {SCHEMA_VERSION}", cure=_CURE)
-    return content
-
-
-def _read_tensor(
-    path: Path | str, content: Mapping[str, Any], name: str, shape: tuple[int | None, ...], dtype: torch.dtype
-) -> Tensor:
-    wanted = "(" + ", ".join("M" if n is None else str(n) for n in shape) + ")"
-    try:
-        tensor = torch.tensor(content[name], dtype=torch.float64)
-    except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise DataFormatError(path, f"{name!r} must be numbers of shape {wanted}", cure=_CURE) from error
-    fits = tensor.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, tensor.shape, strict=False))
-    if not fits or (name == "hull_uv" and len(tensor) < 3) or not all(map(math.isfinite, tensor.flatten().tolist())):
-        raise DataFormatError(
-            path, f"{name!r} must be finite numbers of shape {wanted}, got {tuple(tensor.shape)}", cure=_CURE
-        )
-    return tensor.to(dtype)

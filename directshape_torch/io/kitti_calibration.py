@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.text_files import read_lines
-from directshape_torch.geometry.disparity_field import DisparityField, field_of_rig
+from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 
 # The name of each matrix in the object, the tracking and the raw layout, and its shape.
@@ -149,8 +149,25 @@ def camera_of_rig(
         InputError: all fields are of other rigs.
     """
     rig = to_stereo_camera([calibration], dtype=torch.float64)
-    field = field_of_rig(fields, size_wh, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
+    field = _field_of_rig(fields, size_wh, rig)
     return replace(rig, disparity_field=field).to(dtype=dtype)
+
+
+def _field_of_rig(
+    fields: Sequence[DisparityField], size_wh: tuple[int, int], rig: StereoCamera
+) -> DisparityField | None:
+    """The first of some fields that is of this rig; None where there are none."""
+    refusal: InputError | None = None
+    for one in fields:
+        try:
+            one.check_rig(size_wh, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
+        except InputError as error:
+            refusal = refusal or error
+        else:
+            return one
+    if refusal is not None:
+        raise refusal
+    return None
 
 
 def _check_baseline(calibration: KittiCalibration) -> None:

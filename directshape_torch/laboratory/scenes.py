@@ -12,7 +12,8 @@ from directshape_torch.depth import march
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
-from directshape_torch.geometry.camera import project, rays_from_pixels, right_rays
+from directshape_torch.geometry.camera import rays_from_pixels, right_rays
+from directshape_torch.geometry.projection import project
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.camera import rays_from_pixels, warp_to_right
+from directshape_torch.geometry.camera import rays_from_pixels
+from directshape_torch.geometry.projection import warp_to_right
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.image.interpolate import bilinear_with_gradient

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import box_corners
-from directshape_torch.geometry.camera import disparity_of_depth, project, rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
+from directshape_torch.geometry.projection import disparity_of_depth, project
 from directshape_torch.geometry.rays import ray_box_interval
 from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.image.grey_levels import grey_levels

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.geometry.camera import disparity_of_depth
+from directshape_torch.geometry.projection import disparity_of_depth
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.stereo_matching.disparity import match_disparity

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.geometry.camera import project
+from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.rig.detections import near_side_depth

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.geometry.camera import disparity_of_depth, project
+from directshape_torch.geometry.projection import disparity_of_depth, project
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.velodyne import read_scan

@@ -22,6 +22,7 @@ from directshape_torch.files.read_files import read_json
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField
 from directshape_torch.rig.detections import COLUMNS
 from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.field_file import load_field
 from directshape_torch.rig.pixels import PixelEvidence
 
 # In the folder of a run.
@@ -65,7 +66,7 @@ def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
     Raises:
         DataFormatError: it is missing, damaged or neither of the two.
     """
-    return tuple(rig.field for rig in load_rigs(path)) if holds_rigs(path) else (DisparityField.load(path),)
+    return tuple(rig.field for rig in load_rigs(path)) if holds_rigs(path) else (load_field(path),)
 
 
 def holds_rigs(path: Path | str) -> bool:

@@ -115,13 +115,15 @@ TARGETS: dict[str, Target] = {
     ),
     "retract": Target("directshape_torch/terms/cars.py", ("retract",), _JACOBIANS),
     "offset": Target("directshape_torch/terms/cars.py", ("CarBatch.inverse_depth_of_offset",), _OFFSET),
-    "pinhole": Target(
-        "directshape_torch/geometry/camera.py", ("rays_from_pixels", "project"), ("tests/geometry/test_pinhole.py",)
-    ),
-    "stereo_warp": Target(
+    "rays": Target(
         "directshape_torch/geometry/camera.py",
-        ("warp_to_right", "_shifted", "right_rays"),
-        ("tests/geometry/test_stereo.py",),
+        ("rays_from_pixels", "right_rays"),
+        ("tests/geometry/test_pinhole.py", "tests/geometry/test_stereo.py"),
+    ),
+    "projection": Target(
+        "directshape_torch/geometry/projection.py",
+        ("project", "warp_to_right"),
+        ("tests/geometry/test_pinhole.py", "tests/geometry/test_stereo.py"),
     ),
     "bilinear": Target(
         "directshape_torch/image/interpolate.py",

@@ -15,6 +15,7 @@ from directshape_torch.cli.options import find_device
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.rig.field_file import save_field
 
 QUICK = ("--set", "stages=[{max_iterations: 2}]")
 
@@ -139,7 +140,8 @@ def test_stereo_bias_is_used_and_hashed(source: Path, tmp_path: Path, capsys: py
     coefficients[0] = -0.8
     hull = torch.tensor([[0.0, 0.0], [159.0, 0.0], [159.0, 119.0], [0.0, 119.0]], dtype=torch.float64)
     rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
-    DisparityField(coefficients=coefficients, hull_uv=hull, size_wh=(160, 120), **rig).save(tmp_path / "bias.json")
+    field = DisparityField(coefficients=coefficients, hull_uv=hull, size_wh=(160, 120), **rig)
+    save_field(field, tmp_path / "bias.json")
     assert main(command(source, tmp_path / "without")) == 0
     assert main(command(source, tmp_path / "with", "--rig", str(tmp_path / "bias.json"))) == 0
     name = "data/000000.txt"

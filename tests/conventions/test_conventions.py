@@ -22,7 +22,8 @@ from torch import Tensor
 
 from directshape_torch.depth import march
 from directshape_torch.geometry import box3d, se3
-from directshape_torch.geometry.camera import project, rays_from_pixels, right_rays, warp_to_right
+from directshape_torch.geometry.camera import rays_from_pixels, right_rays
+from directshape_torch.geometry.projection import project, warp_to_right
 from directshape_torch.image.grey_levels import grey_levels, halve
 from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.io.ground_plane_files import plane_ref_to_cam, read_plane

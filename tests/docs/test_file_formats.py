@@ -13,6 +13,7 @@ from helpers.ellipsoids import ellipsoid_prior
 from helpers.kitti_folder import write_data_set
 
 from directshape_torch.cli.main import main
+from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.result_files import SHAPES_SCHEMA_VERSION
 from directshape_torch.io.run_manifest import MANIFEST_SCHEMA_VERSION
 from directshape_torch.shape.pca_prior import PriorProvenance
@@ -87,9 +88,9 @@ def test_prior(tmp_path: Path) -> None:
 
 
 def test_disparity_field() -> None:
-    from directshape_torch.geometry import disparity_field
+    from directshape_torch.rig import field_file
 
     text = section("Residual disparity field")
-    assert f'"{disparity_field.SCHEMA}", "schema_version": {disparity_field.SCHEMA_VERSION}' in text
-    for field in fields(disparity_field.DisparityField):
+    assert f'"{field_file.SCHEMA}", "schema_version": {field_file.SCHEMA_VERSION}' in text
+    for field in fields(DisparityField):
         assert f'"{field.name}"' in text

@@ -24,7 +24,8 @@ from directshape_torch.evaluation.evaluate_shapes import ShapeScores, evaluate_s
 from directshape_torch.evaluation.matching import CountedLabels
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.geometry.camera import disparity_of_depth, rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
+from directshape_torch.geometry.projection import disparity_of_depth
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
 from directshape_torch.io.mask_files import FrameJsonMasks

@@ -39,6 +39,7 @@ from directshape_torch.io.tracking_files import read_tracking_objects
 from directshape_torch.io.velodyne import read_points, read_scan
 from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.field_file import load_field, save_field
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
@@ -81,7 +82,8 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
     (folder / "split.txt").write_text("".join(f"{name}\n" for name in FRAMES))
     write_shapes(folder / "shapes.npz", shape_arrays(2))
     write_disparity(folder / "disparity.png", np.full((12, 16), 7.5))
-    DisparityField.constant(-0.4, (160, 120), torch.eye(3), torch.eye(3), torch.eye(4)).save(folder / "field.json")
+    field = DisparityField.constant(-0.4, (160, 120), torch.eye(3), torch.eye(3), torch.eye(4))
+    save_field(field, folder / "field.json")
     street = cached_street()[1]
     rig = RigEstimate.of_frames(street.frames)
     rig.update(street.frames, street.detections)
@@ -112,7 +114,7 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "tracking": (folder / "tracking.txt", read_tracking_objects),
         "shapes": (folder / "shapes.npz", read_shapes),
         "disparity": (folder / "disparity.png", read_disparity),
-        "field": (folder / "field.json", DisparityField.load),
+        "field": (folder / "field.json", load_field),
         "rigs": (folder / "rigs.json", lambda path: [(each.field, str(each)) for each in load_rigs(path)]),
         "split": (folder / "split.txt", lambda path: dataset(root, split=path).frame_ids),
         "scan": (folder / "scan.bin", scan),

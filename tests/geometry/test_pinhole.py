@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from directshape_torch.geometry.camera import project, rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
+from directshape_torch.geometry.projection import project
 
 K = torch.tensor([[700.0, 0.4, 600.0], [0.0, 690.0, 180.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 

@@ -10,7 +10,8 @@ from reference.rays import RaysObj, first_entry
 from torch import Tensor
 
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.camera import disparity_of_depth, rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
+from directshape_torch.geometry.projection import disparity_of_depth
 from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.synthetic_scene import Street, cached_street

@@ -9,7 +9,7 @@ import torch
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.camera import project
+from directshape_torch.geometry.projection import project
 from directshape_torch.laboratory.bench import TERM_NAMES, Bench, near_border
 from directshape_torch.laboratory.regimes import REGIMES, checked_name, regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene

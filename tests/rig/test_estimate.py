@@ -16,6 +16,7 @@ from directshape_torch import DirectShapeRefiner, RigEstimate
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
 from directshape_torch.rig.disparity_observations import DisparityObservations
+from directshape_torch.rig.field_file import save_field
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.posterior import BIAS
 from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
@@ -104,7 +105,7 @@ def test_files_and_states_give_it_back(tmp_path: pytest.TempPathFactory) -> None
     assert torch.equal(first.mean, rig.mean)
     assert len(second.rows) == 0
     assert [field.size_wh for field in load_fields(path)] == [SIZE_WH, SIZE_WH]
-    rig.field.save(path)
+    save_field(rig.field, path)
     assert torch.equal(load_fields(path)[0].coefficients, rig.field.coefficients)
     saved = io.BytesIO()
     torch.save(DirectShapeRefiner(rig=rig).state_dict(), saved)

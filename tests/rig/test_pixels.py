@@ -20,6 +20,7 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.rig.disparity_observations import DisparityObservations, concatenate
 from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.field_file import save_field
 from directshape_torch.rig.labels import known_depth_from_labels
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs
@@ -129,8 +130,8 @@ def test_fields_of_other_rigs_are_named_and_the_others_compared(
     write_frame(tmp_path, "000001", bias_px=-0.6)
     assert calibrate(tmp_path) == 0
     (field,) = load_fields(tmp_path / "bias.json")
-    replace(field, size_wh=(99, 99)).save(tmp_path / "other.json")
-    field.save(tmp_path / "same.json")
+    save_field(replace(field, size_wh=(99, 99)), tmp_path / "other.json")
+    save_field(field, tmp_path / "same.json")
     against = ("--against", str(tmp_path / "other.json"), str(tmp_path / "same.json"))
     assert calibrate(tmp_path, *against) == 1
     captured = capsys.readouterr()

@@ -1,0 +1,90 @@
+"""From points, and from left pixels of known depth, to the pixels of a rectified stereo pair.
+
+Pixel centres lie at integer (u, v). Where a rig has a residual disparity field an image point lies at `u_right =
+pinhole - bias`, `v_right = pinhole + vertical`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.geometry.camera import rays_from_pixels
+
+
+def project(
+    points_cam: Tensor,  # (*, 3) metres
+    K: Tensor,  # (*, 3, 3)
+) -> Tensor:  # (*, 2)
+    """Pixels of points in the camera frame; meaningless for points with z <= 0, which the caller must exclude.
+
+    Examples:
+        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+        >>> project(torch.tensor([1.0, 0.0, 10.0]), K)
+        tensor([670., 180.])
+    """
+    homogeneous = (K @ points_cam[..., None])[..., 0]
+    return homogeneous[..., :2] / homogeneous[..., 2:]
+
+
+class RightPixels(NamedTuple):
+    """Where left pixels of known depth appear in the right image."""
+
+    uv_right: Tensor  # (*, 2) pixels
+    J_pixel_depth: Tensor  # (*, 2) d uv_right / d depth, pixels per metre
+    in_front: Tensor  # (*,) bool, false where the point is behind the right camera
+
+
+def warp_to_right(
+    ray_left: Tensor,  # (*, 3) K_left^-1 [u, v, 1]
+    depth: Tensor,  # (*,) depth along the optical axis of the left camera, metres
+    K_right: Tensor,  # (*, 3, 3)
+    T_right_cam: Tensor,  # (*, 4, 4)
+    bias_px: Tensor | None = None,  # (*,) residual disparity at the left pixel
+    vertical_px: Tensor | None = None,  # (*,) residual row offset at the left pixel
+) -> RightPixels:
+    """Warp left pixels into the right image (paper, supplement, `warp(p, d)` and its derivative by d).
+
+    Examples:
+        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+        >>> T_right_cam = torch.eye(4)
+        >>> T_right_cam[0, 3] = -0.5
+        >>> warp_to_right(torch.tensor([0.0, 0.0, 1.0]), torch.tensor(10.0), K, T_right_cam).uv_right
+        tensor([565., 180.])
+    """
+    v = (T_right_cam[..., :3, :3] @ ray_left[..., None])[..., 0]
+    point_right = depth[..., None] * v + T_right_cam[..., :3, 3]
+    homogeneous = (K_right @ point_right[..., None])[..., 0]
+    J_homogeneous_depth = (K_right @ v[..., None])[..., 0]
+    in_front = homogeneous[..., 2] > 1e-6
+    z = torch.where(in_front, homogeneous[..., 2], torch.ones_like(depth))[..., None]
+    uv = homogeneous[..., :2] / z
+    J_pixel_depth = (J_homogeneous_depth[..., :2] - uv * J_homogeneous_depth[..., 2:]) / z
+    if bias_px is not None:
+        uv = torch.stack([uv[..., 0] - bias_px, uv[..., 1]], dim=-1)
+    if vertical_px is not None:
+        uv = torch.stack([uv[..., 0], uv[..., 1] + vertical_px], dim=-1)
+    return RightPixels(uv, J_pixel_depth, in_front)
+
+
+def disparity_of_depth(
+    uv_left: Tensor,  # (*, 2) pixels
+    depth: Tensor,  # (*,) metres
+    K_left: Tensor,  # (*, 3, 3)
+    K_right: Tensor,  # (*, 3, 3)
+    T_right_cam: Tensor,  # (*, 4, 4)
+) -> Tensor:  # (*, 2)
+    """True displacement `uv_left - uv_right` of left pixels of known depth: disparity and row shift, pixels.
+
+    Examples:
+        >>> K = torch.tensor([[700.0, 0.0, 600.0], [0.0, 700.0, 180.0], [0.0, 0.0, 1.0]])
+        >>> T_right_cam = torch.eye(4)
+        >>> T_right_cam[0, 3] = -0.5
+        >>> disparity_of_depth(torch.tensor([670.0, 180.0]), torch.tensor(10.0), K, K, T_right_cam)
+        tensor([35.,  0.])
+    """
+    direction = T_right_cam[..., :3, :3] @ rays_from_pixels(uv_left, K_left)[..., None]
+    homogeneous = depth[..., None] * (K_right @ direction)[..., 0] + (K_right @ T_right_cam[..., :3, 3:])[..., 0]
+    return uv_left - homogeneous[..., :2] / homogeneous[..., 2:]
