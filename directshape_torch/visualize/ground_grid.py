@@ -38,7 +38,9 @@ def ground_grid(
     xz = np.array([[(x0, z0), (x1, z0), (x1, z1), (x0, z1)] for x0, x1, z0, z1 in strips]).reshape(-1, 2)
     y = -(n[0] * xz[:, 0] + n[2] * xz[:, 1] + offset) / n[1]
     vertices = np.stack([xz[:, 0], y, xz[:, 1]], axis=1)
-    return trimesh.Trimesh(vertices, _faces(len(strips)), process=False)
+    # Of faces that are seen from both sides the normals would cancel.
+    up = np.tile(n / np.linalg.norm(n), (len(vertices), 1))
+    return trimesh.Trimesh(vertices, _faces(len(strips)), vertex_normals=up, process=False)
 
 
 def _faces(num_strips: int) -> npt.NDArray[np.integer[Any]]:

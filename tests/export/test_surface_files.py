@@ -133,6 +133,9 @@ def test_glb_stands_upright_and_looks_along_minus_z(exported: Path) -> None:
     for name in ("car_1", "car_3", "ground"):
         np.testing.assert_array_equal(file.matrix(name), np.diag([1.0, -1.0, -1.0, 1.0]))
     points = file.attribute("car_1", "POSITION") @ file.matrix("car_1")[:3, :3].T
+    normals = file.attribute("ground", "NORMAL").astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    assert normals[:, 1].max() < -0.9
     ground = file.attribute("ground", "POSITION") @ file.matrix("ground")[:3, :3].T
     assert points[:, 1].min() > ground[:, 1].max() - 0.3
     assert points[:, 2].max() < 0
