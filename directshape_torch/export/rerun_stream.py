@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from directshape_torch.errors import MissingDependencyError
 
@@ -63,6 +67,49 @@ class RerunStream:
             ValueError: Rerun does not take the data; its own default is a line on stderr.
         """
         self._stream.log(entity, *archetypes, static=static, strict=True)
+
+    def log_mesh(
+        self,
+        entity: str,
+        vertices_cam: NDArray[Any],
+        faces: NDArray[Any],
+        normals: NDArray[Any] | None = None,
+        colours: NDArray[np.uint8] | None = None,
+        colour: tuple[int, int, int] | None = None,
+    ) -> None:
+        """Triangles with a colour for each vertex, or one for all."""
+        mesh = self.rr.Mesh3D(
+            vertex_positions=np.asarray(vertices_cam, dtype=np.float32),
+            triangle_indices=np.asarray(faces, dtype=np.uint32),
+            vertex_normals=None if normals is None else np.asarray(normals, dtype=np.float32),
+            vertex_colors=colours,
+            albedo_factor=None if colour is None else [*colour, 255],
+        )
+        self.log(entity, mesh)
+
+    def log_boxes(
+        self,
+        entity: str,
+        T_cam_box: NDArray[np.float64],  # (B, 4, 4) at the middle of the bottom, y down
+        hwl: NDArray[np.float64],  # (B, 3)
+        colours: Sequence[tuple[int, int, int]],
+        labels: Sequence[str],
+    ) -> None:
+        """Boxes with length, height, width along the axes of their objects."""
+        from scipy.spatial.transform import Rotation
+
+        hwl, T_cam_box = hwl.reshape(-1, 3), T_cam_box.reshape(-1, 4, 4)
+        quaternions = Rotation.from_matrix(T_cam_box[:, :3, :3]).as_quat() if len(hwl) else np.zeros((0, 4))
+        boxes = self.rr.Boxes3D(
+            centers=T_cam_box[:, :3, 3] - 0.5 * hwl[:, :1] * T_cam_box[:, :3, 1],
+            half_sizes=0.5 * hwl[:, [2, 0, 1]],
+            quaternions=[self.rr.Quaternion(xyzw=q) for q in quaternions],
+            colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
+            labels=list(labels),
+            show_labels=False,
+            fill_mode=self.rr.components.FillMode.MajorWireframe,
+        )
+        self.log(entity, boxes)
 
     def close(self) -> None:
         """Write the end and move the file to its place."""
