@@ -16,7 +16,7 @@ from directshape_torch.batch.frame_groups import FrameGroup, frame_groups, track
 from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import FrameEnd, GroupRefiner, GroupReport, RunJob, limited_threads
 from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver, WorkerOptions
-from directshape_torch.batch.resumption import EarlierResults, remove_results, remove_unfinished_files
+from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
 from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, find_warnings
 from directshape_torch.batch.timing import RunTimings, write_timings
@@ -63,7 +63,7 @@ def refine_dataset(
     Raises:
         ResumeError: the folder holds results of another configuration, prior or input.
         RunInProgressError: another run is writing there.
-        InputError: the folder would overwrite the detections.
+        InputError: the folder would overwrite the detections, or a folder in it is a link.
         DirectShapeError: the run cannot go on: the disk is full, workers die before they finish anything.
     """
     out_dir, options, workers = Path(out_dir), options or RefineOptions(), workers or WorkerOptions()
@@ -295,6 +295,9 @@ def package_version() -> str:
 
 
 def _check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
+    for link in (out_dir / name for name in OUTPUT_FOLDERS if (out_dir / name).is_symlink()):
+        cure = "remove the link; the output folder itself may be one"
+        raise InputError("out", "folders of its own in it, where results are written and removed", f"link {link}", cure)
     written = (out_dir / "data").resolve()
     for read in (dataset.detections_dir, dataset.detections_dir / "data"):
         if written == read.resolve():

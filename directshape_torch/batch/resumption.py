@@ -38,7 +38,7 @@ from directshape_torch.io.stereo_dataset import StereoDataset
 _READING_THREADS = 8
 _MESH = re.compile(r"(.+)_[0-9]{1,9}\.(ply|glb)")
 _TRACK = re.compile(r"(.+_)?[0-9]{6,}\.npz")
-_OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks")
+OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks")
 
 
 class EarlierResults:
@@ -153,7 +153,7 @@ class EarlierResults:
 
 def remove_unfinished_files(out_dir: Path) -> None:
     """Remove temporary files of processes that were killed while they wrote; only for who holds the folder."""
-    for folder in (out_dir, *(out_dir / name for name in _OUTPUT_FOLDERS)):
+    for folder in (out_dir, *(out_dir / name for name in OUTPUT_FOLDERS)):
         for path in folder.glob(".*.tmp"):
             path.unlink(missing_ok=True)
 
@@ -186,7 +186,7 @@ def remove_results(out_dir: Path, others: Iterable[str]) -> bool:
             track.unlink()
     for name in (*others, summary_path(out_dir).name):
         (out_dir / name).unlink(missing_ok=True)
-    for name in _OUTPUT_FOLDERS:
+    for name in OUTPUT_FOLDERS:
         with suppress(OSError):  # files of somebody else stay, and their folder with them
             (out_dir / name).rmdir()
     return True

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.quick_runs import dataset, refine
+from helpers.quick_runs import dataset, refine, refiner
 
+from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_log import RunLog, log_path
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.instance_masks import check_count
@@ -52,6 +53,26 @@ def test_the_lock_follows_no_link(tmp_path: Path) -> None:
     with pytest.raises(DirectShapeError, match=r"run\.jsonl"), RunLog(tmp_path):
         pass
     assert foreign.read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["data", "shapes", "overlays", "meshes", "tracks"])
+def test_a_folder_of_results_that_is_a_link(shared_kitti: Path, tmp_path: Path, name: str) -> None:
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "000000.txt").write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).symlink_to(foreign)
+    for fresh in (False, True):
+        with pytest.raises(InputError, match=rf"out: expected folders of its own .*, got link .*{name}; remove the li"):
+            refine_dataset(dataset(shared_kitti), refiner(shared_kitti), tmp_path / "out", fresh=fresh)
+    assert [path.read_text() for path in foreign.iterdir()] == ["mine"]
+
+
+def test_an_output_folder_that_is_a_link_is_the_user_s_own(shared_kitti: Path, tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "disk")
+    assert refine(shared_kitti, tmp_path / "out").exit_code == 0
+    assert (tmp_path / "disk" / "summary.json").is_file()
 
 
 def test_instances_of_an_image_fit_into_memory() -> None:
