@@ -1,12 +1,15 @@
 """Gradients through whole refinements against finite differences: every backward mode with every option.
 
-Cars of the bundled frame, float64, their pixels thinned. Each input of a refinement is moved along one direction, and
-the sum of a car's outputs with fixed weights is differentiated twice: by the backward mode, and by central differences
-of the refinement itself, at two steps. Where the two steps disagree by more than 5 % the refinement is at a kink there,
-and the pair is left out and counted. The error of a row is that of all inputs and cars, relative to the differences.
+Each input of a refinement is moved along one direction, and the sum of a car's outputs with fixed weights is
+differentiated twice: by the backward mode, and by central differences of the refinement itself, at two steps. Where the
+two steps disagree by more than 5 % the refinement is at a jump there, and the pair is left out and counted. An error is
+relative to the differences; a car to which a mode gives no gradient, with a warning, is left out and counted too.
+
+Cars are those of the bundled frame, as shipped but for their pixels, or two of a small drawn street whose iterations go
+on to the root of the gradient, as the implicit modes need it. All is float64.
 
     python scripts/check_backward.py --out backward
-    python scripts/check_backward.py --option default "silhouette.form=product" --mode unroll --cars 2
+    python scripts/check_backward.py --scene street --option default "silhouette.form=product" --mode implicit
 
 Written: `backward.csv`, a line for each option, mode, input and car, and the table of docs/backward.md, `backward.md`.
 """
@@ -14,8 +17,10 @@ Written: `backward.csv`, a line for each option, mode, input and car, and the ta
 from __future__ import annotations
 
 import argparse
+import copy
 import csv
 import io
+import itertools
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +31,12 @@ import torch
 from command_line import run_command
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
+from helpers.synthetic_scene import cached_street, disturbed
+
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, PCAShapePrior, RefinerConfig, load_config
+from directshape_torch.errors import ConfigError
 from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.laboratory.scenes import load_scene, select_detections
@@ -58,38 +68,67 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     ),
     "search": ("search.disparity_offsets_px=[-2, 2]",),
     "geometric": ("method=geometric", "point_cloud.min_points=20"),
+    "geometric joint": ("method=geometric", "point_cloud.order=joint", "point_cloud.min_points=20"),
     "combined": ("method=combined", "point_cloud.min_points=20"),
 }
+# Undamped steps to the root of the gradient, on masks of few pixels.
+SETTLED = (
+    "stages=[{contour_width_px: 2.0, image_level: 1, max_iterations: 10}, {contour_width_px: 1.0, image_level: 0, "
+    "max_iterations: 40}]",
+    "solver.cost_tolerance=0",
+    "solver.step_tolerance=1e-9",
+    "solver.accept_every_step=true",
+    "solver.initial_damping=0",
+    "silhouette.samples_per_ray=32",
+    "priors.dimensions_weight=1",
+    "sampling.mode_right=adaptive",
+    "acceptance.min_probability_better=0",
+    "acceptance.min_probability_not_worse=0",
+    "backward.unroll_iterations=1000",
+)
 _STEP, _SMALLER_STEP = 1e-6, 2.5e-7
 _KINK = 0.05
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The cars, and the directions in which the inputs are moved."""
+    """The cars, their settings but for the options, and the directions in which the inputs are moved."""
 
     frames: FrameBatch
     detections: Detections
     prior: PCAShapePrior
+    settings: Sequence[str]
     directions: Mapping[str, Tensor]
 
     @classmethod
     def of_demo(cls, num_cars: int) -> Scene:
-        """The first cars of the bundled frame, with standard deviations of the detector."""
+        """The first cars of the bundled frame."""
         loaded = load_scene(None, None, None, None)
-        frames, found = loaded.frame.to(dtype=torch.float64), loaded.detections.to(dtype=torch.float64)
+        found = loaded.detections.to(dtype=torch.float64)
         detections = select_detections(found, torch.arange(num_cars))
-        sigma = detections.score.new_tensor([0.6, 0.2, 0.1, 0.1]).expand(num_cars, 4)
-        # Clamped probabilities have no gradient.
-        soft = (x.clamp(0.1, 0.9) for x in (detections.mask_left, detections.mask_right))
-        left, right = soft
+        frames = loaded.frame.to(dtype=torch.float64)
+        return cls._of(frames, detections, PCAShapePrior.load_bundled().double(), THINNED)
+
+    @classmethod
+    def of_street(cls, num_cars: int) -> Scene:
+        """The cars of the street that the tests draw."""
+        prior, street = cached_street()
+        detections = select_detections(disturbed(street.detections), torch.arange(min(num_cars, 2)))
+        return cls._of(street.frames, detections, prior, SETTLED)
+
+    @classmethod
+    def _of(cls, frames: FrameBatch, detections: Detections, prior: PCAShapePrior, settings: Sequence[str]) -> Scene:
+        """With standard deviations of the detector, and masks that are not clamped, which have no gradient."""
+        sigma = detections.score.new_tensor([0.6, 0.2, 0.1, 0.1]).expand(len(detections), 4)
+        left, right = (x.clamp(0.1, 0.9) for x in (detections.mask_left, detections.mask_right))
         detections = replace(detections, pose_sigma=sigma, mask_left=left, mask_right=right)
         generator = torch.Generator().manual_seed(5)
         inputs = {"left image": frames.images_left, "right image": frames.images_right, "masks": left}
         noise = {name: 0.05 * torch.randn(x.shape, generator=generator, dtype=x.dtype) for name, x in inputs.items()}
-        return cls(frames, detections, PCAShapePrior.load_bundled().double(), noise)
+        return cls(frames, detections, prior, settings, noise)
 
 
+SCENES: dict[str, Callable[[int], Scene]] = {"bundled": Scene.of_demo, "street": Scene.of_street}
 BOX = ("x", "y", "z", "heading", "height", "width", "length")
 INPUTS = (*BOX, "pose_sigma", "left image", "right image", "masks", "prior mean", "prior basis", "term weight")
 
@@ -113,7 +152,7 @@ def refined(scene: Scene, config: RefinerConfig, by: Mapping[str, Tensor]) -> Re
         images_left=frames.images_left + at["left image"] * scene.directions["left image"],
         images_right=frames.images_right + at["right image"] * scene.directions["right image"],
     )
-    prior = PCAShapePrior.load_bundled().double()
+    prior = copy.deepcopy(scene.prior)
     prior.mean = prior.mean + at["prior mean"]
     prior.basis = prior.basis * (1 + at["prior basis"])
     refiner = DirectShapeRefiner(prior, config)
@@ -152,14 +191,12 @@ def gradients(scene: Scene, config: RefinerConfig, inputs: Sequence[str] = INPUT
 
 @dataclass(frozen=True)
 class Row:
-    """An option and a mode: gradients, differences at two steps, each (inputs, B)."""
+    """An option: differences at two steps, each (inputs, B), and what the modes say, None where one refuses."""
 
     option: str
-    mode: str
-    gradient: Tensor
     numeric: Tensor
     numeric_smaller: Tensor
-    num_skipped: int
+    gradients: Mapping[str, Tensor | None]
 
     @property
     def smooth(self) -> Tensor:
@@ -167,60 +204,55 @@ class Row:
         scale = self.numeric.abs().maximum(self.numeric_smaller.abs())
         return (self.numeric - self.numeric_smaller).abs() <= _KINK * scale + 1e-7
 
-    @property
-    def error(self) -> Tensor:
-        """Relative to the differences (inputs, B); absolute where they are below a thousandth."""
-        return (self.gradient - self.numeric_smaller).abs() / self.numeric_smaller.abs().clamp_min(1e-3)
+    def errors(self, mode: str) -> str:
+        """Of the box and of the other inputs, of cars that have a gradient."""
+        found = self.gradients[mode]
+        if found is None:
+            return "refused"
+        # Relative to the differences; absolute where they are below a thousandth.
+        error = (found - self.numeric_smaller).abs() / self.numeric_smaller.abs().clamp_min(1e-3)
+        has_gradient = (found != 0).any(dim=0)
+        counted = self.smooth & has_gradient
+        parts = (slice(None, len(BOX)), slice(len(BOX), None))
+        numbers = [
+            f"{float(x.median()):.0e} / {float(x.max()):.0e}" for x in (error[p][counted[p]] for p in parts) if len(x)
+        ]
+        lost = int((~has_gradient).sum())
+        return ", ".join([*numbers, *([f"{lost} without"] if lost else [])])
 
     def cells(self) -> list[str]:
-        """Of the table: what, how many, and the errors."""
-        smooth, error = self.smooth, self.error
-        box = error[: len(BOX)][smooth[: len(BOX)]]
-        rest = error[len(BOX) :][smooth[len(BOX) :]]
-        numbers = [f"{float(x.median()):.0e} / {float(x.max()):.0e}" if len(x) else "" for x in (box, rest)]
-        return [
-            self.option,
-            self.mode,
-            str(int(smooth.sum())),
-            str(int((~smooth).sum())),
-            str(self.num_skipped),
-            *numbers,
-        ]
-
-
-HEADER = (
-    "option",
-    "mode",
-    "pairs",
-    "kinks left out",
-    "cars without gradient",
-    "box: median / max",
-    "others: median / max",
-)
+        """Of the table."""
+        counts = (str(int(part.sum())) for part in (self.smooth, ~self.smooth))
+        return [self.option, *counts, *(self.errors(mode) for mode in self.gradients)]
 
 
 def study(scene: Scene, options: Sequence[str], modes: Sequence[str], report: Callable[[str], None]) -> list[Row]:
     """All of them."""
     rows = []
     for option in options:
-        changes = OPTIONS.get(option, (option,) if "=" in option else ())
+        settings = [*scene.settings, *OPTIONS.get(option, (option,) if "=" in option else ())]
         # With a mode, because those march their rays under `no_grad` too.
-        base = [*THINNED, *changes]
-        config = load_config(None, [*base, "backward.mode=unroll"])
+        config = load_config(None, [*settings, "backward.mode=unroll"])
         numeric, smaller = (differences(scene, config, step) for step in (_STEP, _SMALLER_STEP))
-        for mode in modes:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", NotStationaryWarning)
-                found = gradients(scene, load_config(None, [*base, f"backward.mode={mode}"]))
-            skipped = int((found == 0).all(dim=0).sum()) if caught else 0
-            rows.append(Row(option, mode, found, numeric, smaller, skipped))
-            report(" | ".join(rows[-1].cells()))
+        rows.append(Row(option, numeric, smaller, {mode: _by_mode(scene, settings, mode) for mode in modes}))
+        report(" | ".join(rows[-1].cells()))
     return rows
 
 
+def _by_mode(scene: Scene, settings: Sequence[str], mode: str) -> Tensor | None:
+    try:
+        config = load_config(None, [*settings, f"backward.mode={mode}"])
+    except ConfigError:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotStationaryWarning)
+        return gradients(scene, config)
+
+
 def as_markdown(rows: Sequence[Row]) -> str:
-    """The table of docs/backward.md."""
-    lines = [HEADER, ("---",) * len(HEADER), *(row.cells() for row in rows)]
+    """The table of docs/backward.md: median / largest error of the box, and of the other inputs."""
+    header = ("option", "pairs", "at jumps", *rows[0].gradients)
+    lines = [header, ("---",) * len(header), *(row.cells() for row in rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
@@ -229,17 +261,18 @@ def as_csv(rows: Sequence[Row]) -> str:
     file = io.StringIO()
     writer = csv.writer(file)
     writer.writerow(("option", "mode", "input", "car", "gradient", "difference", "smaller_difference", "smooth"))
-    for row in rows:
-        for number, name in enumerate(INPUTS):
-            for car in range(row.gradient.shape[1]):
-                values = (float(x[number, car]) for x in (row.gradient, row.numeric, row.numeric_smaller))
-                writer.writerow((row.option, row.mode, name, car, *values, bool(row.smooth[number, car])))
+    for row, (mode, found) in ((row, each) for row in rows for each in row.gradients.items()):
+        if found is not None:
+            for number, car in itertools.product(range(len(found)), range(found.shape[1])):
+                values = (float(x[number, car]) for x in (found, row.numeric, row.numeric_smaller))
+                writer.writerow((row.option, mode, INPUTS[number], car, *values, bool(row.smooth[number, car])))
     return file.getvalue()
 
 
 def run(args: argparse.Namespace) -> None:
     """Study, print, write."""
-    rows = study(Scene.of_demo(args.cars), args.option, args.mode, lambda line: print(line, file=sys.stderr))
+    scene = SCENES[args.scene](args.cars)
+    rows = study(scene, args.option, args.mode, lambda line: print(line, file=sys.stderr))
     print(as_markdown(rows), end="")
     if args.out is not None:
         write_text(args.out / "backward.csv", as_csv(rows))
@@ -251,7 +284,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--option", nargs="+", default=list(OPTIONS), metavar="NAME", help="default all; or KEY=VALUE")
     parser.add_argument("--mode", nargs="+", default=list(MODES), choices=MODES, help="default all")
-    parser.add_argument("--cars", type=int, default=3, metavar="N", help="of the bundled frame (default 3)")
+    parser.add_argument("--scene", choices=tuple(SCENES), default="bundled", help="default bundled")
+    parser.add_argument("--cars", type=int, default=2, metavar="N", help="of the scene (default 2)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="for backward.csv and backward.md")
     torch.set_num_threads(1)
     return run_command(parser, run, arguments)

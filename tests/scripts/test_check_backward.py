@@ -35,9 +35,11 @@ def test_a_start_that_is_not_reached_is_named(scene: script.Scene) -> None:
         DirectShapeRefiner(scene.prior, config)(scene.frames, detections)
 
 
-def test_a_row_tells_kinks_from_errors() -> None:
+def test_a_row_tells_jumps_from_errors_and_cars_without_a_gradient() -> None:
     numeric = torch.tensor([[1.0], [2.0], [3.0]]).expand(3, 2)
-    row = script.Row("default", "unroll", numeric * 1.01, numeric, numeric * torch.tensor([1.0, 2.0]), 0)
+    said = {"unroll": numeric * 1.01, "implicit": numeric * torch.tensor([1.01, 0.0]), "implicit_gauss_newton": None}
+    row = script.Row("default", numeric, numeric * torch.tensor([1.0, 2.0]), said)
     assert row.smooth.tolist() == [[True, False]] * 3
     table = script.as_markdown([row])
-    assert "| default | unroll | 3 | 3 | 0 | 1e-02 / 1e-02 |" in table
+    assert "| default | 3 | 3 | 1e-02 / 1e-02 | 1e-02 / 1e-02, 1 without | refused |" in table
+    assert script.as_csv([row]).count("default") == 2 * 3 * 2  # no line of what refuses
