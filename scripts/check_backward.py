@@ -261,7 +261,7 @@ def as_csv(rows: Sequence[Row]) -> str:
     file = io.StringIO()
     writer = csv.writer(file)
     writer.writerow(("option", "mode", "input", "car", "gradient", "difference", "smaller_difference", "smooth"))
-    for row, (mode, found) in ((row, each) for row in rows for each in row.gradients.items()):
+    for row, (mode, found) in ((one, each) for one in rows for each in one.gradients.items()):
         if found is not None:
             for number, car in itertools.product(range(len(found)), range(found.shape[1])):
                 values = (float(x[number, car]) for x in (found, row.numeric, row.numeric_smaller))
