@@ -49,11 +49,8 @@ class WorkerOptions:
     """Who does the work of `refine_dataset`.
 
     Attributes:
-        workers: processes that refine side by side. None: this process alone, or with `ray` as many as the cluster has
-            cores for.
+        workers: processes that refine side by side. None: this process alone.
         threads: of each of them. None: this process keeps what it has, a worker gets 1.
-        ray: address of a Ray cluster ("auto", "10.0.0.7:6379", "ray://..") or "local" for a cluster of this machine
-            alone; None: processes of this machine without Ray.
         retries: how often frames whose worker died are tried again before they count as failed.
 
     Raises:
@@ -68,7 +65,6 @@ class WorkerOptions:
 
     workers: int | None = None
     threads: int | None = None
-    ray: str | None = None
     retries: int = 1
 
     def __post_init__(self) -> None:
@@ -80,7 +76,7 @@ class WorkerOptions:
     @property
     def in_this_process(self) -> bool:
         """Whether no other process takes part."""
-        return self.workers is None and self.ray is None
+        return self.workers is None
 
     @property
     def threads_per_worker(self) -> int | None:

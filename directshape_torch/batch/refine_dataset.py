@@ -57,7 +57,7 @@ def refine_dataset(
         out_dir: gets `data`, `shapes`, `summary.json`, `run.jsonl`, `timings.json` and what the options ask for.
         options: kinds of outputs and frames in a call.
         observer: is told of each frame.
-        workers: other processes, or a cluster; default this process.
+        workers: other processes; default this process.
         fresh: remove what earlier runs have written there and start again.
 
     Raises:
@@ -130,9 +130,7 @@ class _Run:
             return
         start = time.perf_counter()
         workers = self._workers()
-        # Ray has tried as often as that before it says that a worker died.
-        retries = self.who.retries if self.who.ray is None else 0
-        dispatch = GroupDispatch(groups, workers, retries, self._finished)
+        dispatch = GroupDispatch(groups, workers, self.who.retries, self._finished)
         try:
             for report in dispatch.reports():
                 self._take_in(report)
@@ -146,16 +144,9 @@ class _Run:
         who, threads = self.who, self.who.threads_per_worker
         if who.in_this_process:
             return ThisProcess(GroupRefiner(self.job))
-        self.timings.threads = threads or 1
-        if who.ray is not None:
-            from directshape_torch.batch.ray_workers import RayWorkers
-
-            ray_workers = RayWorkers(self.job, who)
-            self.timings.workers = ray_workers.num_workers
-            return ray_workers
         from directshape_torch.batch.local_workers import LocalWorkers
 
-        self.timings.workers = who.workers or 1
+        self.timings.threads, self.timings.workers = threads or 1, who.workers or 1
         return LocalWorkers(self.job, self.timings.workers, threads)
 
     def _take_in(self, report: GroupReport) -> None:
@@ -228,7 +219,7 @@ class _Run:
     def _work(self) -> dict[str, Any]:
         who = self.who
         return {
-            "where": "this process" if who.in_this_process else who.ray or "processes",
+            "where": "this process" if who.in_this_process else "processes",
             "workers": 1 if who.in_this_process else who.workers,
             "threads": who.threads_per_worker or torch.get_num_threads(),
             "device": self.timings.device.type,

@@ -64,7 +64,7 @@ class RunBeginning:
     """The first line.
 
     Attributes:
-        work: who works: "where" ("this process", "processes" or the address of a Ray cluster), "workers", "threads" of
+        work: who works: "where" ("this process" or "processes"), "workers", "threads" of
             each, "device", "batch_frames", "outputs".
         num_frames: of the data set.
         host, pid: the process that was started by the user.

@@ -19,12 +19,7 @@ class WorkerDiedError(Exception):
 
     Args:
         reason: what is known of it.
-        num_tries: how often somebody else has tried already.
     """
-
-    def __init__(self, reason: str, num_tries: int = 1) -> None:
-        super().__init__(reason)
-        self.num_tries = num_tries
 
 
 class Workers(Protocol):
@@ -129,5 +124,5 @@ class GroupDispatch:
         elif len(group.frame_ids) > 1:
             self._waiting.extendleft(reversed(group.halves()))
         else:
-            times = self._deaths[group.frame_ids] * death.num_tries
+            times = self._deaths[group.frame_ids]
             self.lost[group.frame_ids[0]] = f"its worker died each of {times} times ({death})"

@@ -85,11 +85,6 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
         help="of the CPU, for each worker (default: 1; without workers PyTorch's); 1 is best on a busy machine",
     )
     group.add_argument(
-        "--ray",
-        metavar="ADDRESS|local",
-        help="workers on a Ray cluster: auto, HOST:PORT, ray://HOST:PORT, or one of this machine alone (extra ray)",
-    )
-    group.add_argument(
         "--retries", type=int, default=1, metavar="N", help="for frames whose worker died (default: %(default)s)"
     )
 
@@ -107,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     from directshape_torch.rig.estimate import RigEstimates
     from directshape_torch.terms.lidar import LidarPoints
 
-    workers = WorkerOptions(args.workers, args.threads, args.ray, args.retries)
+    workers = WorkerOptions(args.workers, args.threads, args.retries)
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
     options = RefineOptions(args.meshes, args.overlays, batch_frames)
