@@ -10,19 +10,18 @@ from typing import TYPE_CHECKING
 from directshape_torch.cli.options import add_data_options, dataset_of
 
 if TYPE_CHECKING:
-    from directshape_torch.geometry.disparity_field import DisparityField
     from directshape_torch.rig.estimate import RigEstimate
     from directshape_torch.rig.frames_with_truth import TruthSource
 
 _DESCRIPTION = """
 Estimate by how much disparities are off over the images of a stereo rig, and the depths of a detector, for 'directshape
 refine --rig FILE'. 'refine' does this by itself from detections (docs/your_rig.md); here other evidence joins them:
-LiDAR scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), labels (training/label_2), or
-consecutive frames of a car that drives past still things ('motion': ROOT is one sequence with image_02, image_03 and
+LiDAR scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), or consecutive
+frames of a car that drives past still things ('motion': ROOT is one sequence with image_02, image_03 and
 calib.txt, as in KITTI's tracking benchmark). All kinds add up, those in the file of --rig too.
 """
 
-_SOURCES = ("detections", "lidar", "disparity", "labels", "motion")
+_SOURCES = ("detections", "lidar", "disparity", "motion")
 
 
 # argparse's own type for this argument is private, hence the generic `_SubParsersAction` in quotes.
@@ -45,25 +44,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE.json", help="file to write, and a picture .png"
     )
-    parser.add_argument(
-        "--against", nargs="+", type=Path, default=[], metavar="FILE.json", help="print the difference to other files"
-    )
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate, write file and picture, report; 0, or 1 where there is no evidence or not all could be compared.
+    """Estimate, write file and picture, report; 0, or 1 where there is no evidence.
 
     Raises:
         DirectShapeError: a missing or damaged file, or too few observations.
     """
     # Imported here so that `directshape --help` does not wait for torch.
     from directshape_torch.files.atomic_files import write_png
-    from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
+    from directshape_torch.rig.rig_file import load_rigs, save_rigs
     from directshape_torch.visualize.rig_picture import draw_rigs
 
-    # Before the work, which may take minutes.
-    others = {path: load_fields(path) for path in args.against}
     rigs = [] if args.rig == "none" else load_rigs(args.rig)
     for source in dict.fromkeys(args.sources):
         _add(source, args, rigs)
@@ -77,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     save_rigs(args.out, rigs)
     write_png(picture, draw_rigs(rigs))
     print(f"wrote {args.out} and {picture}")
-    return _print_differences(rigs, others)
+    return 0
 
 
 def _add(source: str, args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
@@ -137,19 +131,3 @@ def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
     rig_among(rigs, size_wh, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]).add_pixels(
         "motion", found.evidence
     )
-
-
-def _print_differences(rigs: list[RigEstimate], others: dict[Path, tuple[DisparityField, ...]]) -> int:
-    """To the fields of other files; 1 where one of them belongs to another rig or another part of the image."""
-    from directshape_torch.errors import InputError
-    from directshape_torch.rig.compare_fields import compare_fields
-
-    exit_code = 0
-    for path, fields in others.items():
-        for rig in rigs:
-            try:
-                print(f"less {path}, where both have data: {compare_fields(rig.field, fields[0])}")
-            except InputError as error:
-                print(f"not compared with {path}: {error}", file=sys.stderr)
-                exit_code = 1
-    return exit_code

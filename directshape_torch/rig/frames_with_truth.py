@@ -1,4 +1,4 @@
-"""Observations of a rig's disparity from frames in KITTI's folder layout, from any of the three kinds of truth."""
+"""Observations of a rig's disparity from frames in KITTI's folder layout, from scans or disparity maps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import find_image, read_rgb
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, to_stereo_camera
-from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.rig.disparity_maps import FOLDERS, known_depth_from_disparity_map
 from directshape_torch.rig.disparity_observations import (
     DisparityObservations,
@@ -22,11 +21,10 @@ from directshape_torch.rig.disparity_observations import (
     observe_disparity,
 )
 from directshape_torch.rig.estimate import RigEstimate, rig_among
-from directshape_torch.rig.labels import known_depth_from_labels
 from directshape_torch.rig.lidar import known_depth_from_lidar
 from directshape_torch.rig.pixels import pixel_evidence
 
-TruthSource = Literal["disparity", "lidar", "labels"]
+TruthSource = Literal["disparity", "lidar"]
 
 
 @dataclass(frozen=True)
@@ -55,11 +53,7 @@ def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
     training = root / "training"
     if not training.is_dir():
         raise DataFormatError(root, "holds no folder 'training'", cure="give the folder above it, in KITTI's layout")
-    folders, ending = {
-        "disparity": (FOLDERS, "png"),
-        "lidar": (("velodyne",), "bin"),
-        "labels": (("label_2",), "txt"),
-    }[source]
+    folders, ending = (FOLDERS, "png") if source == "disparity" else (("velodyne",), "bin")
     files = {path.stem: path for folder in folders for path in sorted((training / folder).glob(f"*.{ending}"))}
     if not files:
         wanted = " or ".join(f"training/{folder}/*.{ending}" for folder in folders)
@@ -128,6 +122,4 @@ def _known_depth(
 ) -> KnownDepth:
     if source == "disparity":
         return known_depth_from_disparity_map(truth, size_wh, camera)
-    if source == "lidar":
-        return known_depth_from_lidar(truth, calibration, size_wh, camera)
-    return known_depth_from_labels(read_objects(truth, with_score=False), size_wh, camera)
+    return known_depth_from_lidar(truth, calibration, size_wh, camera)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +16,8 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.rig.disparity_observations import DisparityObservations, concatenate
 from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.field_file import save_field
-from directshape_torch.rig.labels import known_depth_from_labels
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs
 
@@ -124,21 +120,6 @@ def test_command_finds_a_constant_bias_in_images(tmp_path: Path, capsys: pytest.
     assert "px in the middle, from disparity (1 frames)" in capsys.readouterr().out
 
 
-def test_fields_of_other_rigs_are_named_and_the_others_compared(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_frame(tmp_path, "000001", bias_px=-0.6)
-    assert calibrate(tmp_path) == 0
-    (field,) = load_fields(tmp_path / "bias.json")
-    save_field(replace(field, size_wh=(99, 99)), tmp_path / "other.json")
-    save_field(field, tmp_path / "same.json")
-    against = ("--against", str(tmp_path / "other.json"), str(tmp_path / "same.json"))
-    assert calibrate(tmp_path, *against) == 1
-    captured = capsys.readouterr()
-    assert "other.json: disparity_field: expected images of" in captured.err
-    assert "RMS 0.000" in captured.out.split("same.json")[1]
-
-
 def test_command_reports_a_damaged_frame_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for frame_id in ("000001", "000002"):
         write_frame(tmp_path, frame_id, bias_px=-0.6)
@@ -168,21 +149,6 @@ def test_each_of_two_rigs_has_its_estimate_and_unknown_frames_are_refused(tmp_pa
     assert offsets == pytest.approx([0.0, 0.5], abs=0.05)
     with pytest.raises(InputError, match=r"among 000001, 000002 .*, got 9"):
         calibrate(tmp_path, "--frames", "000009")
-
-
-def test_labels_give_the_near_sides_of_visible_cars(tmp_path: Path) -> None:
-    # Seen from behind at 20 m: half of 4 m nearer, 10 cm within the box.
-    lines = [
-        "Car 0.00 0 0.0 180 70 220 100 1.5 1.6 4.0 0.0 1.5 20.0 -1.5707963",
-        "Car 0.00 1 0.0 180 70 220 100 1.5 1.6 4.0 4.0 1.5 20.0 -1.5707963",
-        "Car 0.00 0 0.0 180 70 220 100 1.5 1.6 4.0 0.0 1.5 9.0 -1.5707963",
-    ]
-    path = tmp_path / "labels.txt"
-    path.write_text("\n".join(lines) + "\n")
-    known = known_depth_from_labels(read_objects(path), SIZE, camera())
-    assert len(known.depth_m) > 50
-    torch.testing.assert_close(known.depth_m, torch.full_like(known.depth_m, 18.1), atol=1e-6, rtol=0)
-    assert len(known_depth_from_labels([], SIZE, camera()).depth_m) == 0
 
 
 @pytest.mark.skipif(
