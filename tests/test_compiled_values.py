@@ -46,9 +46,10 @@ def _threads(threads: int) -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-# Where 40 cars hide each other, what hides a pixel is looked up in several words: another compilation.
+# Where 40 cars hide each other, what hides a pixel is looked up in several words: another compilation, as are another
+# number of threads and a rig whose disparity may be off.
 @needs_compiler
-@pytest.mark.parametrize(("threads", "num_cars", "sigma_px"), [(1, 5, 0), (2, 5, 0.5), (2, 40, 0)])
+@pytest.mark.parametrize(("threads", "num_cars", "sigma_px"), [(1, 5, 0.5), (2, 40, 0)])
 @pytest.mark.usefixtures("_threads")
 def test_compiled_functions_compute_what_they_compute_plainly(
     num_cars: int, sigma_px: float, monkeypatch: pytest.MonkeyPatch
