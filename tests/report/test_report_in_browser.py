@@ -213,7 +213,7 @@ def test_tracks_are_named(opened: Chrome) -> None:
     """The table says which views are of one car, the summary what was split, and each view knows the whole path."""
     tracks = dict(zip(texts(opened, ".open-car"), texts(opened, "td[data-title='Track']"), strict=True))
     assert sorted(tracks.values()) == [TRACK, TRACK, f"{TRACK}, part 1"] + ["\u2013"] * 3
-    assert "1, 1 of them split" in find(opened, "#summary").text
+    assert "1, 1 split" in find(opened, "#summary").text
     find(opened, "#search").send_keys(f"track {TRACK}, part")
     assert len(texts(opened, ".open-car")) == 1
     path = "const done = arguments[0]; import('report/data').then(({cars, pathOf}) => done(cars.map(pathOf)))"

@@ -21,7 +21,7 @@ function tiles() {
   ];
   if (tracks.length) {
     const split = new Set(cars.filter((car) => car.track_part > 0).map((car) => car.track)).size;
-    entries.push(["Tracks", split ? `${tracks.length}, ${split} of them split` : String(tracks.length), split ? "bad" : null]);
+    entries.push(["Tracks", split ? `${tracks.length}, ${split} split` : String(tracks.length), split ? "bad" : null]);
   }
   const errors = run.errors;
   if (errors !== null) {

@@ -12,8 +12,10 @@ const numeric = (title, value, text = (car) => number(value(car)), toneOf = () =
 const words = (title, value, kind = "words") => ({ title, value, text: value, kind });
 
 const iouTone = (car) => tone(car.iou_before, car.iou_after, true);
+// The frame's name says of which sequence.
+const trackNumber = (car) => trackName(car).replace(/^(.*_)?0*(?=\d)/, "");
 const columns = [
-  ...(tracks.length ? [words("Track", trackName, "type")] : []),
+  ...(tracks.length ? [{ title: "Track", value: (car) => car.track, text: trackNumber, kind: "type" }] : []),
   numeric("Distance [m]", (car) => car.distance_m, (car) => number(car.distance_m, 1)),
   words("Status", (car) => car.status, "status"),
   ...(hasErrorsBefore ? [numeric("IoU before", (car) => car.iou_before)] : []),
