@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.twists import twists
+from reference.rays import RaysObj
 from torch import Tensor
 
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.rays import ray_box_interval
-from directshape_torch.rows import Blocks, CarSums, Rays, Rows
+from directshape_torch.rows import Blocks, CarSums, ObjectRays, Rays, Rows
 from directshape_torch.terms.term import weighted_products
 
 COUNTS = [[0], [3], [64], [65, 0, 1], [130, 64, 0, 200], [0, 0, 5], []]
@@ -118,14 +118,27 @@ def test_where_rays_come_next_to_points_and_cross_bounds() -> None:
     bounds = torch.tensor([[-2.0, -1.5, -1.0], [2.0, 0.5, 1.0]], dtype=torch.float64)
     found = in_objects.interval(bounds)
     centre = in_objects.centre_obj.expand_as(points).movedim(0, -1)
-    expected = ray_box_interval(centre, in_objects.direction_obj.movedim(0, -1), bounds)
-    assert torch.equal(found.hit, expected.hit)
+    flat = (x.reshape(-1, 3) for x in (centre, in_objects.direction_obj.movedim(0, -1)))
+    near, far, hit = (x.view(found.near.shape) for x in RaysObj(torch.empty(0), *flat).interval(bounds))
+    assert torch.equal(found.hit, hit)
     assert 0 < float(found.hit.double().mean()) < 1
     assert found.near.isfinite().all()
-    for x, y, planes in ((found.near, expected.near, found.enters), (found.far, expected.far, found.leaves)):
+    for x, y, planes in ((found.near, near, found.enters), (found.far, far, found.leaves)):
         torch.testing.assert_close(x[found.hit], y[found.hit])
         # Where the point lies on a plane of the bounds, that is the one named.
         named = (planes == x) & found.hit
         assert (named.any(0) | (x == 0))[found.hit].all()
         distance = (in_objects.at(x)[:, None] - bounds.T[..., None, None]).abs().amin(dim=1)
         assert distance[named].max() < 1e-9
+
+
+def test_intervals_by_hand() -> None:
+    """Straight at the box, over it, at half speed, from inside, with the box behind, and nowhere."""
+    bounds = torch.tensor([[-2.0, -1.5, -0.9], [2.1, 0.2, 0.9]], dtype=torch.float64)
+    centres = torch.tensor([[-5.0, 0, 0], [-5.0, 0.3, 0], [0, 0, 5.0], [0, 0, 0], [5.0, 0, 0], [0, 0, 0]]).double()
+    directions = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [0, 0, -0.5], [1.0, 0, 0], [1.0, 0, 0], [torch.nan, 0, 0]])
+    found = ObjectRays(centres.T[..., None], directions.double().T[..., None]).interval(bounds)
+    assert found.hit[:, 0].tolist() == [True, False, True, True, False, False]
+    torch.testing.assert_close(found.near[[0, 2, 3], 0], torch.tensor([3.0, 8.2, 0.0]).double())
+    torch.testing.assert_close(found.far[[0, 2, 3], 0], torch.tensor([7.1, 11.8, 2.1]).double())
+    assert torch.isfinite(found.near).all()

@@ -8,9 +8,9 @@ from torch import Tensor
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.projection import disparity_of_depth, project
-from directshape_torch.geometry.rays import ray_box_interval
 from directshape_torch.geometry.se3 import inverse, transform
 from directshape_torch.image.grey_levels import grey_levels
+from directshape_torch.rows import ObjectRays
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.stereo_matching.disparity import match_disparity
 from directshape_torch.stereo_matching.patch_alignment import refine_disparity
@@ -38,10 +38,12 @@ def near_side_depth(
     height, width, length = dimensions_hwl
     half = torch.stack([length / 2 - _SETBACK_M, height, width / 2 - _SETBACK_M])
     bounds = torch.stack([-half, half * half.new_tensor([1.0, 0.0, 1.0])])
-    interval = ray_box_interval(T_obj_cam[:3, 3], rays_cam @ T_obj_cam[:3, :3].T, bounds)
-    level = -transform(T_obj_cam, interval.near[:, None] * rays_cam)[:, 1] / height
-    on_band = interval.hit & (level > _BAND[0]) & (level < _BAND[1])
-    return torch.where(on_band, interval.near, torch.nan)
+    # One block, of the rays of one camera.
+    rays_obj = ObjectRays(T_obj_cam[:3, 3, None, None], (rays_cam @ T_obj_cam[:3, :3].T).T[:, None])
+    near, _, hit = (x[0] for x in rays_obj.interval(bounds)[:3])
+    level = -transform(T_obj_cam, near[:, None] * rays_cam)[:, 1] / height
+    on_band = hit & (level > _BAND[0]) & (level < _BAND[1])
+    return torch.where(on_band, near, torch.nan)
 
 
 # Corners of roof, belt, bumpers and wheels in lengths, heights and widths of a box; either side, either end.

@@ -10,10 +10,10 @@ import torch
 from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
 from helpers.problems import DEFAULT
 from helpers.synthetic_scene import TWO_CARS, Street, joined_detections, joined_frames, select, street
+from reference.rays import RaysObj
 
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.rays import ray_box_interval
 from directshape_torch.refinement.box_alignment import box_hits
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
@@ -118,12 +118,13 @@ def test_hits_are_where_rays_enter_the_lower_half_of_the_box() -> None:
         corner = torch.tensor([length / 2, 0.0, width / 2]).double()
         bounds = torch.stack([-corner - torch.tensor([0, height, 0]), corner])
         T, rays = T_obj_cam[car], ray_cam[:, car].T
-        entered = ray_box_interval(T[:3, 3], rays @ T[:3, :3].T, bounds)
-        points = se3.transform(T, entered.near[:, None] * rays)
-        found = entered.hit & (points[:, 1] > -height / 2)
+        direction = rays @ T[:3, :3].T
+        near, _, hit = RaysObj(torch.empty(0), T[:3, 3].expand_as(direction), direction).interval(bounds)
+        points = se3.transform(T, near[:, None] * rays)
+        found = hit & (points[:, 1] > -height / 2)
         assert 5 < found.sum() < 60
         assert torch.equal(hits.found[car], found)
-        torch.testing.assert_close(hits.depth[car][found], entered.near[found])
+        torch.testing.assert_close(hits.depth[car][found], near[found])
         torch.testing.assert_close(hits.points_obj[:, car].T[found], points[found])
         # A face's normal is against the ray, and the point lies on that face.
         normal = hits.normal_obj[:, car].T[found]
