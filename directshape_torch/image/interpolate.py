@@ -1,4 +1,4 @@
-"""Bilinear lookup in a stack of images, with the exact derivative of that lookup."""
+"""Bilinear lookup in images, with the exact derivative of that lookup."""
 
 from __future__ import annotations
 
@@ -7,54 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
 from directshape_torch.numerics.tensors import take
-
-
-def bilinear_with_gradient(
-    images: Tensor,  # (F, H, W)
-    frame_index: Tensor,  # (...), broadcastable to uv's leading axes
-    uv: Tensor,  # (..., 2)
-    sizes: Tensor | None = None,  # (F, 2)
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Value of each image at (u, v) and the exact derivative of the bilinear patch there, in one pass.
-
-    The gradient belongs to the cell right and below of a point that lies on a grid line (left and above on the last
-    row and column). A coordinate outside the image is clamped to it, where the lookup is constant in that coordinate:
-    its derivative is 0. Differentiable by autograd in `images` and `uv`; autograd and the returned gradient agree.
-
-    Args:
-        images: (F, H, W), any unit.
-        frame_index: integer frame of each point; for neighbourhoods (P, N, 2) give (P, 1).
-        uv: (..., 2) pixels, (column, row), centre of the top-left pixel at (0, 0).
-        sizes: (F, 2) integer (height, width) of each frame without padding; None: every frame fills (H, W).
-
-    Returns:
-        value (...); gradient (..., 2), d value / d (u, v) per pixel; inside (...) bool: the point lies within the
-        frame, border pixels' centres included. NaN coordinates are not inside.
-
-    Raises:
-        InputError: wrong shapes.
-
-    Examples:
-        >>> image = torch.tensor([[[0.0, 2.0], [10.0, 12.0]]])
-        >>> value, gradient, inside = bilinear_with_gradient(image, torch.tensor([0]), torch.tensor([[0.5, 0.25]]))
-        >>> value, gradient, inside
-        (tensor([3.5000]), tensor([[ 2., 10.]]), tensor([True]))
-    """
-    _check(images, frame_index, uv)
-    last_row, last_column = (None, None) if sizes is None else (sizes - 1).unbind(-1)
-    height, width = images.shape[1:]
-    at = bilinear_patch(
-        images.reshape(-1),
-        frame_index * (height * width),
-        width,
-        uv[..., 0],
-        uv[..., 1],
-        width - 1 if last_column is None else last_column[frame_index],
-        height - 1 if last_row is None else last_row[frame_index],
-    )
-    return at.value, torch.stack([at.d_u, at.d_v], dim=-1), at.inside
 
 
 class BilinearPatch(NamedTuple):
@@ -63,7 +16,23 @@ class BilinearPatch(NamedTuple):
     value: Tensor  # (...)
     d_u: Tensor  # (...) per pixel
     d_v: Tensor  # (...) per pixel
-    inside: Tensor  # (...) bool
+    inside: Tensor  # (...) bool: within the image, border pixels' centres included; NaN coordinates are not
+
+
+def bilinear_at(
+    image: Tensor,  # (H, W)
+    uv: Tensor,  # (..., 2) pixels (column, row)
+) -> BilinearPatch:
+    """`bilinear_patch` in one image.
+
+    Examples:
+        >>> at = bilinear_at(torch.tensor([[0.0, 2.0], [10.0, 12.0]]), torch.tensor([[0.5, 0.25]]))
+        >>> at.value, at.d_u, at.d_v, at.inside
+        (tensor([3.5000]), tensor([2.]), tensor([10.]), tensor([True]))
+    """
+    height, width = image.shape
+    first = torch.zeros((), dtype=torch.long, device=image.device)
+    return bilinear_patch(image.reshape(-1), first, width, uv[..., 0], uv[..., 1], width - 1, height - 1)
 
 
 def bilinear_patch(
@@ -75,7 +44,12 @@ def bilinear_patch(
     last_column: Tensor | int,  # broadcastable to (...): of the image of each point
     last_row: Tensor | int,
 ) -> BilinearPatch:
-    """`bilinear_with_gradient` with the coordinates apart, the images in a row, and nothing checked."""
+    """Value at (u, v), (0, 0) being the centre of the top-left pixel, and the exact derivative of the bilinear patch.
+
+    The gradient belongs to the cell right and below of a point that lies on a grid line (left and above on the last
+    row and column). A coordinate outside the image is clamped to it, where the lookup is constant in that coordinate:
+    its derivative is 0. Differentiable by autograd in pixels and coordinates; autograd and the returned gradient agree.
+    """
     u, inside_u, column, right = _cell(u, last_column)
     v, inside_v, row, below = _cell(v, last_row)
     upper = first_pixel + row * row_step + column
@@ -101,19 +75,3 @@ def _cell(
     clamped = coordinate.nan_to_num(0.0).clamp_min(0).clamp_max(last)
     index = clamped.detach().int().minimum((last - 1).clamp_min(0))
     return clamped - index, clamped == coordinate, index, last.clamp(max=1)
-
-
-def _check(images: Tensor, frame_index: Tensor, uv: Tensor) -> None:
-    if images.ndim != 3:
-        raise InputError("images", "shape (F, H, W)", f"{tuple(images.shape)}", "call grey_levels first")
-    if uv.ndim < 1 or uv.shape[-1] != 2:
-        raise InputError("uv", "shape (..., 2)", f"{tuple(uv.shape)}", "stack (column, row) last")
-    try:
-        frame_index.expand(uv.shape[:-1])
-    except RuntimeError as error:
-        raise InputError(
-            "frame_index",
-            f"a shape that broadcasts to {tuple(uv.shape[:-1])}",
-            f"{tuple(frame_index.shape)}",
-            "for neighbourhoods (P, N, 2) give frame_index as (P, 1)",
-        ) from error

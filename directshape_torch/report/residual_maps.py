@@ -21,7 +21,7 @@ from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.projection import warp_to_right
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.image.grey_levels import grey_levels
-from directshape_torch.image.interpolate import bilinear_with_gradient
+from directshape_torch.image.interpolate import bilinear_at
 from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
@@ -137,10 +137,8 @@ def _photometric(
     rig = camera.disparity_field
     bias, vertical = (None, None) if rig is None else rig.offsets(uv)
     warped = warp_to_right(ray_cam, depth, camera.K_right[0], camera.T_right_cam[0], bias, vertical)
-    frame = torch.zeros(len(uv), dtype=torch.int64)
-    right, _, inside = bilinear_with_gradient(pair.right, frame, warped.uv_right)
-    left, _, _ = bilinear_with_gradient(pair.left, frame, uv)
-    seen = seen & inside & warped.in_front
+    at, left = bilinear_at(pair.right[0], warped.uv_right), bilinear_at(pair.left[0], uv).value
+    right, seen = at.value, seen & at.inside & warped.in_front
     gain = 1.0
     if settings.matches_brightness and bool(seen.any()):
         gain = float((right[seen].sum() / left[seen].sum().clamp_min(1)).clamp(*_GAIN_BOUNDS))

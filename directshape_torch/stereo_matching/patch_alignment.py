@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.image.interpolate import bilinear_with_gradient
+from directshape_torch.image.interpolate import bilinear_at
 
 _NUM_ITERATIONS = 10
 _HUBER_GREY = 10.0
@@ -61,14 +61,14 @@ def align_patches(
     """
     offsets = torch.arange(-limits.radius_px, limits.radius_px + 1, dtype=uv.dtype, device=uv.device)
     patch = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).reshape(-1, 2)
-    frame = torch.zeros(len(uv), 1, dtype=torch.long, device=uv.device)
-    observed, _, inside = bilinear_with_gradient(grey[None], frame, uv[:, None] + patch)
+    observed, _, _, inside = bilinear_at(grey, uv[:, None] + patch)
     centred = observed - observed.mean(dim=1, keepdim=True)
     zoomed = patch if zoom is None else zoom[:, None, None] * patch
     current, weight = uv_start, torch.ones_like(observed)
     for _ in range(_NUM_ITERATIONS):
-        predicted, gradient, inside_other = bilinear_with_gradient(grey_other[None], frame, current[:, None] + zoomed)
-        step, variance, residual = _solve_displacement(predicted - observed, gradient, centred, weight)
+        at = bilinear_at(grey_other, current[:, None] + zoomed)
+        gradient, inside_other = torch.stack([at.d_u, at.d_v], dim=-1), at.inside
+        step, variance, residual = _solve_displacement(at.value - observed, gradient, centred, weight)
         weight = _HUBER_GREY / residual.abs().clamp_min(_HUBER_GREY)
         step = step.clamp(-_LARGEST_STEP_PX, _LARGEST_STEP_PX)
         current = current + step

@@ -127,7 +127,7 @@ TARGETS: dict[str, Target] = {
     ),
     "bilinear": Target(
         "directshape_torch/image/interpolate.py",
-        ("bilinear_with_gradient", "_cell"),
+        ("bilinear_patch", "_cell"),
         ("tests/image/test_interpolate.py",),
     ),
     "sdf_grid": Target(

@@ -15,6 +15,7 @@ import pytest
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.ground import cars_on
+from helpers.lookup import bilinear_with_gradient
 from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 from kornia.geometry.liegroup import So3
@@ -25,7 +26,6 @@ from directshape_torch.geometry import box3d, se3
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.geometry.projection import project, warp_to_right
 from directshape_torch.image.grey_levels import grey_levels, halve
-from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.io.ground_plane_files import plane_ref_to_cam, read_plane
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.lookup import bilinear_with_gradient
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
-
-from directshape_torch.errors import InputError
-from directshape_torch.image.interpolate import bilinear_with_gradient
 
 
 def random_images(seed: int, shape: tuple[int, int, int], dtype: torch.dtype = torch.float64) -> Tensor:
@@ -137,13 +135,3 @@ def test_float32_is_close_to_float64() -> None:
     # A pixel coordinate below 64 has a float32 step of 4e-6; slopes are below 255 grey levels.
     torch.testing.assert_close(value.double(), exact, rtol=0, atol=5e-3)
     torch.testing.assert_close(gradient.double(), exact_gradient, rtol=0, atol=5e-3)
-
-
-def test_wrong_input_is_named() -> None:
-    index = torch.zeros(3, dtype=torch.long)
-    with pytest.raises(InputError, match=r"images: expected shape \(F, H, W\), got \(2, 3, 4, 5\)"):
-        bilinear_with_gradient(torch.zeros(2, 3, 4, 5), index, torch.zeros(3, 2))
-    with pytest.raises(InputError, match=r"uv: expected shape \(\.\.\., 2\), got \(3, 3\)"):
-        bilinear_with_gradient(torch.zeros(2, 4, 5), index, torch.zeros(3, 3))
-    with pytest.raises(InputError, match=r"frame_index: .*got \(3,\); for neighbourhoods"):
-        bilinear_with_gradient(torch.zeros(2, 4, 5), index, torch.zeros(3, 8, 2))

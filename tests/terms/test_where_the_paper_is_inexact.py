@@ -7,13 +7,13 @@ import torch
 from helpers.derivatives import central_differences, relative_error
 from helpers.ellipsoids import Ellipsoid, ellipsoid_prior
 from helpers.ground import cars_on
+from helpers.lookup import bilinear_with_gradient
 from kornia.geometry.liegroup import So3
 from reference.rays import RaysObj, first_entry, least
 from torch import Tensor
 
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
-from directshape_torch.image.interpolate import bilinear_with_gradient
 from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.shape.shape_prior import BoundShape
 from directshape_torch.terms import robust
