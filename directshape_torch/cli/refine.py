@@ -81,8 +81,9 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
         "--threads",
         "--threads-per-worker",
         type=int,
+        default=1,
         metavar="N",
-        help="of the CPU, for each worker (default: 1; without workers PyTorch's); 1 is best on a busy machine",
+        help="of the CPU, for each worker (default: 1; several stand still where other programs share the cores)",
     )
     group.add_argument(
         "--retries", type=int, default=1, metavar="N", help="for frames whose worker died (default: %(default)s)"

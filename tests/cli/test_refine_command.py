@@ -150,11 +150,15 @@ def test_stereo_bias_is_used_and_hashed(source: Path, tmp_path: Path, capsys: py
     assert "sha256 of 'stereo_bias'" in capsys.readouterr().err
 
 
-def test_threads_are_those_asked_for(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_threads_are_those_asked_for_one_by_default(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = torch.get_num_threads()
+    torch.set_num_threads(2)
     try:
-        assert main(command(source, tmp_path, "--threads", "1")) == 0
-        assert json.loads((tmp_path / "timings.json").read_text())["threads"] == 1
+        for words, threads in (((), 1), (("--threads", "2", "--fresh"), 2)):
+            assert main(command(source, tmp_path, *words)) == 0
+            assert json.loads((tmp_path / "timings.json").read_text())["threads"] == threads
     finally:
         torch.set_num_threads(before)
     assert main(command(source, tmp_path, "--threads", "0")) == 2
