@@ -168,7 +168,7 @@ class RefinementResult(CarRecord):
 
     @classmethod
     def from_state_dict(cls, state: Mapping[str, Tensor], prior: ShapePrior | None = None) -> Self:
-        """What `state_dict()` came from, read back by `torch.load(weights_only=True)` or safetensors.
+        """The result whose `state_dict()` this is, read back by `torch.load(weights_only=True)` or safetensors.
 
         Args:
             state: tensors by name.
@@ -328,7 +328,7 @@ class RefinementResult(CarRecord):
 
 
 def _check_state(result: RefinementResult) -> None:
-    """What the shapes of its tensors do not say."""
+    """Raise `InputError` for words, dtypes or statuses that do not fit: what shapes of tensors do not say."""
     for name in ("code", "input_dimensions_hwl", "t_cam_ref"):
         check_alike(f"state['{name}']", getattr(result, name), "state['T_cam_obj']", result.T_cam_obj)
     words = {"term_names": result.cost_after.shape[1], "ground_source": len(result)}

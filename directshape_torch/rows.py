@@ -99,7 +99,7 @@ class CarSums(NamedTuple):
 
     @classmethod
     def of(cls, owner: Tensor, num_cars: int) -> CarSums:
-        """Of blocks of cars (M,).
+        """The order of blocks whose cars (M,) these are.
 
         Examples:
             >>> CarSums.of(torch.tensor([0, 2, 0]), 3)
@@ -131,11 +131,11 @@ class Rays(NamedTuple):
 
     @classmethod
     def of_rows(cls, rows: Rows, centre_cam: Tensor, ray_cam: Tensor) -> Rays:
-        """From the camera centres and rays (P, 3) of packed rows."""
+        """The rays of blocks, from camera centres and rays (P, 3) of packed rows."""
         return cls(rows.blocks.owner, centre_cam[rows.row[:, 0]], ray_cam[rows.row].movedim(-1, 0).contiguous())
 
     def take(self, blocks: Tensor, owner: Tensor) -> Rays:
-        """Some of the blocks (Q,), of cars (Q,) that may be numbered anew."""
+        """The rays of the blocks (Q,), whose cars (Q,) may be numbered anew."""
         return Rays(owner, self.centre_cam[blocks], self.ray_cam.index_select(1, blocks))
 
     def in_objects(self, T_obj_cam: Tensor) -> ObjectRays:

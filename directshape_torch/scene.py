@@ -282,7 +282,7 @@ class Detections(TensorRecord):
         pose_sigma: Tensor | None = None,
         track_id: Tensor | None = None,
     ) -> Detections:
-        """From boxes as a detector writes them, and the masks that there are.
+        """Detections of boxes as a detector writes them, and of the masks that there are.
 
         Args:
             boxes: x, y, z, three sizes and heading, or corners, in metres and radians; what they mean, and in which

@@ -36,7 +36,7 @@ def fit_quality(course: Course, masks: MaskRows, photometric: Photometric | None
 
 
 def _probabilities(term_names: Sequence[str], evidence: Tensor) -> tuple[Tensor, Tensor]:
-    """Of a better and of a not worse box, (B,) each; the model knows the terms of the method "direct" alone."""
+    """Probabilities (B,) of a better and of a not worse box; the model knows the terms of the method "direct" alone."""
     if not {"silhouette_left", "photometric"} <= set(term_names) or "point_cloud" in term_names:
         unknown = torch.full_like(evidence[:, 0], torch.nan)
         return unknown, unknown

@@ -37,11 +37,11 @@ class CarRecord:
         return self._with(lambda value: placed(value, rows, count), per_car=True)
 
     def where(self, condition: Tensor) -> Self:
-        """What is known where the condition (B,) holds, NaN elsewhere."""
+        """A copy with NaN for the cars where the condition (B,) does not hold."""
         return self._with(lambda value: kept(value, condition), per_car=True)
 
     def put(self, rows: Tensor, others: Self) -> Self:
-        """With the cars `rows` (R,) replaced; figures of another width stay as they are."""
+        """A copy with the cars `rows` (R,) replaced; figures of another width stay as they are."""
         changed: dict[str, Any] = {}
         for (each, value), (_, other) in zip(self._fields(), others._fields(), strict=True):
             if isinstance(value, CarRecord):
@@ -80,7 +80,7 @@ class CarRecord:
     def _from_state(
         cls, state: Mapping[str, Tensor], prefix: str = "", sizes: dict[int | str, int] | None = None, **others: Any
     ) -> Self:
-        """What `state_dict` came from; `others` are the fields that are none of its values.
+        """The record whose `state_dict` this is; `others` are the fields that are none of its values.
 
         Raises:
             InputError: a value is missing or is not what its field declares.

@@ -71,7 +71,7 @@ class DisparityProfile(CarRecord):
 
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> DisparityProfile:
-        """Of `count` cars of which nothing is known."""
+        """Curves of `count` cars of which nothing is known: NaN."""
         offsets = default_offsets(like)
         nan = torch.full((count, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)
         return cls(offsets, nan, nan, nan[:, 0])

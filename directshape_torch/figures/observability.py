@@ -44,12 +44,12 @@ class Observability(CarRecord):
 
     @classmethod
     def nothing(cls, like: Tensor, count: int) -> Observability:
-        """Of `count` cars of which nothing is known."""
+        """Directions of `count` cars of which nothing is known: NaN."""
         nan = torch.full((count,), torch.nan, dtype=torch.float64, device=like.device)
         return cls(nan[:, None].expand(-1, 7), nan[:, None, None].expand(-1, 7, 7), nan)
 
     def scaled(self, factor: float) -> Observability:
-        """With all standard deviations multiplied."""
+        """The same directions with all standard deviations multiplied by a factor."""
         return Observability(factor * self.sigmas_m, self.directions, self.viewing_angle_rad)
 
     def words(self) -> list[str]:

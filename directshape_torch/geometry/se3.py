@@ -39,7 +39,7 @@ def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | 
 
 
 class _ExpConstants(NamedTuple):
-    """What `exp` is made of."""
+    """The tensors that `exp` combines a twist with."""
 
     part: Tensor  # (16,) of a twist that is, but for its sign, each entry of its matrix
     sign: Tensor  # (16,)

@@ -76,7 +76,7 @@ class StereoCamera(TensorRecord):
         K_right: Tensor | None = None,
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
-        """Of an ideal rectified pair: parallel cameras side by side, and labels in the frame of the left one.
+        """An ideal rectified pair: parallel cameras side by side, and labels in the frame of the left one.
 
         Args:
             K: intrinsics of the images, pixels; one matrix for one frame, or one for each of F frames.
@@ -118,7 +118,8 @@ class StereoCamera(TensorRecord):
         P_right: Tensor,  # (F, 3, 4)
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
-        """From KITTI's P2 and P3: `K = P[:, :3]`, `t_left = K^-1 P2[:, 3]`, `T_right_cam = [I, t_right - t_left]`.
+        """The pair of KITTI's P2 and P3: `K = P[:, :3]`, `t_left = K^-1 P2[:, 3]`,
+        `T_right_cam = [I, t_right - t_left]`.
 
         Raises:
             InputError: wrong shapes or types, a K that has no inverse, or a right camera that is not to the right of
@@ -151,7 +152,7 @@ class StereoCamera(TensorRecord):
         right: kornia_camera.PinholeCamera | None = None,
         disparity_field: DisparityField | None = None,
     ) -> StereoCamera:
-        """From a rectified pair of kornia's `PinholeCamera`, or from its `StereoCamera`, of F frames each.
+        """The rectified pair of kornia's `PinholeCamera`, or of its `StereoCamera`, of F frames each.
 
         Pixels and axes are the same there: centres at integers, x right, y down, z forward. Extrinsics (world to
         camera) and projections are taken to be in metres. Of a pair, `T_right_cam` is kept and the world is not: `ref`
@@ -204,7 +205,7 @@ class StereoCamera(TensorRecord):
 
 
 def _intrinsics(name: str, K: Tensor) -> Tensor:
-    """Of F frames, (F, 3, 3)."""
+    """Intrinsics (F, 3, 3) of one frame or of F, checked."""
     shape = (3, 3) if isinstance(K, Tensor) and K.ndim == 2 else ("F", 3, 3)
     check_shape(name, K, shape, kind="floating")
     check_stored(name, K)

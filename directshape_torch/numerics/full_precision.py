@@ -17,7 +17,7 @@ _BACKENDS = ("cuda", "mkldnn")
 
 
 class _Setting(NamedTuple):
-    """What the user has allowed."""
+    """Which precisions of matrix products the user has allowed."""
 
     by_old_name: str | None  # of `torch.set_float32_matmul_precision`; None where the newer names are in use
     asked: tuple[str, ...]  # of each backend
@@ -40,7 +40,7 @@ class _Setting(NamedTuple):
                 torch._C._set_fp32_precision_setter(backend, "matmul", "ieee")
 
     def restore(self) -> None:
-        """As it was."""
+        """Allow again what was allowed before `suspend`."""
         if self.by_old_name not in (None, "highest"):
             torch.set_float32_matmul_precision(self.by_old_name)
             return
@@ -58,7 +58,7 @@ def _asked(backend: str) -> str:
 
 @dataclass
 class _Regions:
-    """Those of all threads: the setting is the process's, so the first to come and the last to leave change it."""
+    """The regions of all threads: the setting is the process's; the first to come and the last to leave change it."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     inside: int = 0

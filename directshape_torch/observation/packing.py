@@ -47,7 +47,7 @@ class PixelSamples:
         return len(self.object_index)
 
     def select(self, index: Tensor) -> PixelSamples:
-        """Some of the pixels, by their numbers (Q,)."""
+        """The pixels of the numbers (Q,), in that order."""
         return replace(self, **{f.name: getattr(self, f.name).index_select(0, index) for f in fields(self)})
 
     def of_objects(self, keep: Tensor) -> PixelSamples:

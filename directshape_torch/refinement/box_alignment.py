@@ -108,5 +108,5 @@ def _near_sides(problem: CarProblem, state: CarState, cars: CarBatch) -> Hits:
 
 
 def _depth(state: CarState) -> Tensor:
-    """Of the origins (B,), metres."""
+    """Depth (B,) of the object origins in the left camera, metres."""
     return se3.inverse(state.T_obj_cam)[:, 2, 3]

@@ -44,7 +44,7 @@ _LARGEST_DEPTH_SHARE = 0.2
 
 @dataclass(frozen=True)
 class Outcome(CarRecord):
-    """What the minimisation says of the cars that could be refined."""
+    """What is said of the R cars that could be refined; fields as in `RefinementResult`."""
 
     state: CarState
     status: Tensor
@@ -85,7 +85,7 @@ class Outcome(CarRecord):
         )
 
     def going_on(self, rows: Tensor, later: Outcome) -> Outcome:
-        """With the figures of the cars `rows` (R,), ascending, when they were minimised again; the state stays."""
+        """The outcome with the figures of a later minimisation of the cars `rows` (R,), ascending; the state stays."""
         done = self.iterations.index_add(0, rows, later.iterations)
         history = torch.cat([self.cost_history, placed(later.cost_history, rows, len(self.status))], dim=1)
         return replace(self.put(rows, later), iterations=done, cost_history=history)

@@ -120,7 +120,7 @@ def _cells_along(
 
 
 def _derivatives_along(field: GridField, node: Tensor, place: Tensor, step: Tensor) -> _AlongRay:
-    """Of the polynomial that belongs to a cell with lower node (M, R), at a place (3, M, R) in it."""
+    """Coefficients of the polynomial along a ray in the cell with lower node (M, R), at a place (3, M, R) in it."""
     (ux, uy, uz), (dx, dy, dz) = place, step
     # Interpolated along z, then y, then x: each time a polynomial of the distance gains a degree.
     lower, rise = halves(corner_values(field, node))

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
-from directshape_torch.solver.iteration import RUNNING, Outcome, begin, has_failed, iterate, step_lengths
+from directshape_torch.solver.iteration import RUNNING, IterationOutcome, begin, has_failed, iterate, step_lengths
 from directshape_torch.solver.problem import (
     BegunStage,
     Problem,
@@ -90,7 +90,7 @@ class _Log(Generic[StateT]):
         self.costs: list[Tensor] = []
         self.running: list[Tensor] = []
 
-    def add(self, rows: Tensor, before: tuple[StateT, Tensor, Tensor], outcome: Outcome, cost: Tensor) -> None:
+    def add(self, rows: Tensor, before: tuple[StateT, Tensor, Tensor], outcome: IterationOutcome, cost: Tensor) -> None:
         """One iteration: state, damping and which steps were stretched, then what came of it, all for these rows."""
         self.costs.append(cost)
         self.running.append(outcome.running)

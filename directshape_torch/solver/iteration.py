@@ -49,7 +49,7 @@ _LEAST_DAMPING, _MOST_DAMPING = 1e-7, 1e5
 _FLAT = 10.0
 
 
-class Outcome(NamedTuple):
+class IterationOutcome(NamedTuple):
     """What an iteration did to each problem, (B,) bool."""
 
     running: Tensor  # it took part
@@ -121,7 +121,7 @@ def iterate(
     config: SolverConfig,
     limits: Tensor,
     over_relaxation: float = 1.0,
-) -> Outcome:
+) -> IterationOutcome:
     """One iteration of a batch, whose progress is written to.
 
     Args:
@@ -168,7 +168,7 @@ def iterate(
     astray = running if config.accept_every_step else left
     p.ended = torch.where(astray & solvable & ~finite, Status.non_finite.code, p.ended)
     improved = _move(problem, p, candidate, at_candidate, accepted, config)
-    return Outcome(running, accepted, improved)
+    return IterationOutcome(running, accepted, improved)
 
 
 def _move(

@@ -210,9 +210,9 @@ def said_of_shared(
         A (B, K, K), r (B, K), and where (B,) there is one.
 
     Examples:
-        >>> matrix, gradient = torch.tensor([[[2.0, 1.0], [1.0, 1.0]]]), torch.tensor([[2.0, 0.0]])
+        >>> matrix, gradient = torch.tensor([[[4.0, 2.0], [2.0, 2.0]]]), torch.tensor([[4.0, 0.0]])
         >>> said_of_shared(matrix, gradient, own=torch.tensor([0]), shared=torch.tensor([1]))
-        (tensor([[[0.5000]]]), tensor([[1.]]), tensor([True]))
+        (tensor([[[1.]]]), tensor([[2.]]), tensor([True]))
     """
     return _reduced(matrix, gradient, own, shared, _undamped_solution)[1:]
 
