@@ -76,7 +76,7 @@ def _dataset(args: argparse.Namespace) -> FileStereoDataset:
     if args.frame is not None:
         args.frames = [args.frame]
     if args.frames is None:
-        raise InputError("--frame", "the frame to inspect", "none", "give --frame ID")
+        raise InputError("--frame", "the frame to inspect", "none", "give --frame ID, or several with --frames")
     return dataset_of(args)
 
 
