@@ -1,1 +1,1 @@
-"""What is wrong with a stereo data set on disk: its files, their times, and the scenes in them."""
+"""What is wrong with a stereo data set on disk: its files, and the scenes in them."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from directshape_torch.data_check.check_rig import check_rig
-from directshape_torch.data_check.check_times import check_times
 from directshape_torch.data_check.frame_parts import gather_evidence, numbers_of, read_parts
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.stereo_files import FileStereoDataset
@@ -41,7 +40,7 @@ def check_dataset(
     if max_frames is not None and max_frames < 1:
         raise InputError("max_frames", "at least 1", str(max_frames))
     chosen = spread(dataset.frame_ids, max_frames)
-    findings = [*check_files(dataset), *check_times(dataset, dataset.frame_ids)]
+    findings = check_files(dataset)
     seen = _Seen()
     for frame_id in chosen:
         findings += _check_frame(dataset, frame_id, seen)

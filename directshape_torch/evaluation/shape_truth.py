@@ -23,7 +23,6 @@ from directshape_torch.io.image_files import read_single_channel
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.mask_matching import match_masks
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 
@@ -43,18 +42,6 @@ class EstimatedCar:
     prior: ShapePrior
     code: Tensor
     T_cam_obj: Tensor
-
-    def sampled_points(self, count: int, seed: int) -> Points:
-        """`count` points (count, 3) in camera coordinates, uniform by area over the whole closed surface.
-
-        Raises:
-            MeshError: the shape has no surface.
-        """
-        from trimesh.sample import sample_surface
-
-        values = self.prior.values(self._code())[0]
-        mesh = sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, self.T_cam_obj)
-        return np.asarray(sample_surface(mesh, count, seed=seed)[0], dtype=np.float64)
 
     def depth_at_pixels(
         self,

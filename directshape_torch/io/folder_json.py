@@ -81,14 +81,12 @@ class FolderFrame:
         objects: detections, and other instances that may hide them.
         labels: the ground truth, or None.
         ground_plane: (a, b, c, d), a x + b y + c z + d = 0 in the left camera frame, or None.
-        times_s: when the left and the right image were taken, seconds from any start, or None.
         comment: whatever its owner says.
     """
 
     objects: Sequence[FolderObject]
     labels: Sequence[FolderObject] | None = None
     ground_plane: tuple[float, float, float, float] | None = None
-    times_s: tuple[float, float] | None = None
     comment: Any = None
 
 

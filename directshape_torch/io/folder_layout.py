@@ -120,11 +120,6 @@ class FolderLayout(FrameLayout):
         """All frames are of one drive."""
         return ""
 
-    def times_s(self, frame_id: str) -> tuple[float, float] | None:
-        """Those of the frame's file, where it has them."""
-        times_s = self._frame(frame_id).times_s
-        return None if times_s is None else (times_s[0], times_s[1])
-
     def masks(self, directory: Path | None) -> MaskSource | None:
         """Those of the frames' files, unless a folder of others is given."""
         return FolderMasks(self.root, self.detections_dir) if directory is None else super().masks(directory)

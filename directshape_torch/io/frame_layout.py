@@ -74,10 +74,6 @@ class FrameLayout(ABC):
         """The disparity map of a frame in a folder of such maps."""
         return first_disparity(folder, frame_id)
 
-    def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
-        """The LiDAR scan of a frame and a calibration that places it in the camera, or None where there is no scan."""
-        return None
-
     def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
         """By role: the scan of a frame in a folder of scans ("lidar"), and a file of the scanner's place."""
         return {"lidar": folder / f"{frame_id}.bin"}
@@ -88,10 +84,6 @@ class FrameLayout(ABC):
 
     def sequence_of(self, frame_id: str) -> str | None:
         """The sequence of frames that follow each other, "" where there is but one; None: a frame by itself."""
-        return None
-
-    def times_s(self, frame_id: str) -> tuple[float, float] | None:
-        """When the left and the right image were taken, seconds from any start, or None where no file says so."""
         return None
 
     def masks(self, directory: Path | None) -> MaskSource | None:

@@ -23,7 +23,6 @@ from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_o
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_velo_to_cam
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.mask_files import mask_source
-from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
 
 
@@ -37,10 +36,9 @@ class KittiFiles:
     Attributes:
         left, right: images, without ending.
         calibration: file with P2 and P3, or P_rect_02 and P_rect_03.
-        plane, scan: ground plane and LiDAR scan.
+        plane: ground plane.
         labels: a file a frame, or without `{stem}` one of the tracking benchmark; "": there are none.
         velo_to_cam: file that places the LiDAR; "": the calibration does.
-        times: of the left and the right images, or ().
         digits: of a frame's number.
         first: what is added to a number alone; files may leave it out.
     """
@@ -49,23 +47,20 @@ class KittiFiles:
     right: str
     calibration: str
     plane: str = "planes/{stem}.txt"
-    scan: str = "velodyne/{stem}.bin"
     labels: str = ""
     velo_to_cam: str = ""
-    times: tuple[str, ...] = ()
     digits: int = 6
     first: str = ""
 
 
 OBJECT = KittiFiles("image_2/{stem}", "image_3/{stem}", "calib/{stem}.txt", labels="label_2/{stem}.txt")
-STEREO_2015 = KittiFiles("image_2/{stem}", "image_3/{stem}", "calib_cam_to_cam/{scene}.txt", scan="", first="_10")
+STEREO_2015 = KittiFiles("image_2/{stem}", "image_3/{stem}", "calib_cam_to_cam/{scene}.txt", first="_10")
 TRACKING_SEQUENCE = KittiFiles("image_02/{stem}", "image_03/{stem}", "calib.txt", labels="label_02.txt")
 TRACKING = KittiFiles(
     "image_02/{sequence}/{stem}",
     "image_03/{sequence}/{stem}",
     "calib/{sequence}.txt",
     "planes/{sequence}/{stem}.txt",
-    "velodyne/{sequence}/{stem}.bin",
     "label_02/{sequence}.txt",
 )
 # In the folder of the day, and with a calibration in the drive itself.
@@ -74,9 +69,7 @@ RAW_OF_DAY = KittiFiles(
     "{sequence}/image_03/data/{stem}",
     "calib_cam_to_cam.txt",
     "{sequence}/planes/{stem}.txt",
-    "{sequence}/velodyne_points/data/{stem}.bin",
     velo_to_cam="calib_velo_to_cam.txt",
-    times=("{sequence}/image_02/timestamps.txt", "{sequence}/image_03/timestamps.txt"),
     digits=10,
 )
 RAW = replace(
@@ -110,7 +103,6 @@ class KittiLayout(FrameLayout):
         if "" not in sequences:
             self.detection_file_name += " or SEQUENCE.txt"
         self._tracking: dict[Path, dict[int, list[KittiObject]]] = {}
-        self._times_s: dict[Path, list[float]] = {}
 
     def frame_ids(self) -> list[str]:
         """The frames with a detection file, or all of the sequences that have one of the tracking benchmark."""
@@ -141,13 +133,6 @@ class KittiLayout(FrameLayout):
 
     def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
         return read_plane(self._plane_file(frame_id))
-
-    def scan(self, frame_id: str) -> tuple[Path, KittiCalibration] | None:
-        """Raw recordings have a file of its own for the place of the LiDAR; without it a scan is of no use."""
-        path, place = self._path(frame_id, self._files.scan), self._velo_to_cam(frame_id)
-        if not self._files.scan or not path.is_file() or not (place is None or place.is_file()):
-            return None
-        return path, self.lidar_calibration(frame_id)
 
     def lidar_files(self, folder: Path, frame_id: str) -> dict[str, Path]:
         """`folder/NNNNNN.bin`, of several sequences `folder/SEQUENCE/NNNNNN.bin`; raw: the scanner's place too."""
@@ -187,13 +172,6 @@ class KittiLayout(FrameLayout):
     def disparity_path(self, folder: Path, frame_id: str) -> Path:
         """`folder/NNNNNN.png`, and of several sequences `folder/SEQUENCE/NNNNNN.png`."""
         return first_disparity(self._in_folder(folder, frame_id), self._split(frame_id)[3])
-
-    def times_s(self, frame_id: str) -> tuple[float, float] | None:
-        both = [self._path(frame_id, name) for name in self._files.times]
-        if not both or not all(path.is_file() for path in both):
-            return None
-        left_s, right_s = (self._time(path, int(self._split(frame_id)[3])) for path in both)
-        return left_s, right_s
 
     def masks(self, directory: Path | None) -> MaskSource | None:
         """See `KittiMasks`; no masks come with the layout itself."""
@@ -241,14 +219,6 @@ class KittiLayout(FrameLayout):
         if path not in self._tracking:
             self._tracking[path] = read_tracking_objects(path)
         return self._tracking[path].get(int(stem), [])
-
-    def _time(self, path: Path, number: int) -> float:
-        if path not in self._times_s:
-            self._times_s[path] = read_timestamps(path)
-        times_s = self._times_s[path]
-        if number >= len(times_s):
-            raise DataFormatError(path, f"has {len(times_s)} times, none for frame {number}", cure="one line a frame")
-        return times_s[number]
 
     def _path(self, frame_id: str, pattern: str, named: str | None = None) -> Path:
         """The file of a frame, or one that is called otherwise."""

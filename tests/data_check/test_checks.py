@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 from helpers.kitti_folder import write_data_set
-from helpers.layouts import put, write_folder, write_raw
+from helpers.layouts import write_folder
 
 from directshape_torch.cli.main import main
 from directshape_torch.data_check.check_dataset import check_dataset
-from directshape_torch.data_check.check_times import check_times
 from directshape_torch.data_check.frame_parts import numbers_of
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.stereo_camera import StereoCamera
@@ -166,42 +165,8 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize(
-    ("times", "expected"),
-    [
-        ((25.0, 25.001, 26.0, 26.001), []),
-        ((25.0, 25.010, 26.0, 26.001), [("pair_times", "warning")]),
-        ((25.0, 25.100, 26.0, 26.001), [("pair_times", "error")]),
-        ((25.0, 25.001, 24.0, 24.001), [("time_order", "error")]),
-        (None, [("time_file", "error")]),
-    ],
-)
-def test_times_of_a_raw_drive(
-    times: tuple[float, ...] | None, expected: list[tuple[str, str]], kitti: Path, tmp_path: Path
-) -> None:
-    drive = write_raw(kitti, tmp_path, ("000000", "000001"))
-    for index, folder in enumerate(("image_02", "image_03")):
-        lines = ["yesterday"] if times is None else [f"2011-09-26 13:02:{at:09.6f}" for at in times[index::2]]
-        (drive / folder / "timestamps.txt").write_text("\n".join(lines))
-    for number in range(2):
-        put(kitti / "detections" / "data" / "000000.txt", tmp_path / "detections" / f"{number:010d}.txt")
-    dataset = open_dataset("raw", drive, tmp_path / "detections")
-    found = check_times(dataset, dataset.frame_ids)
-    assert [(finding.check, finding.severity) for finding in found] == expected
-
-
-def test_layouts_without_times_have_none(kitti: Path, tmp_path: Path) -> None:
-    dataset = open_dataset("kitti", kitti, kitti / "detections")
-    assert check_times(dataset, dataset.frame_ids) == []
-    write_folder(kitti, tmp_path, ("000000",))
-    path = tmp_path / "frames" / "000000.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "times_s": [1.0, 1.5]}))
-    folder = open_dataset("folder", tmp_path)
-    assert check_times(folder, folder.frame_ids)[0].measured.startswith("left and right image are up to 500.0 ms apart")
-
-
 def test_a_damaged_frame_of_a_folder_is_one_finding_and_hides_no_other(kitti: Path, tmp_path: Path) -> None:
-    """Its file holds detections, masks, plane and times."""
+    """Its file holds detections, masks and plane."""
     write_folder(kitti, tmp_path, ("000000", "000001"))
     path = tmp_path / "frames" / "000001.json"
     path.write_text(path.read_text()[:300])

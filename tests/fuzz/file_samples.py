@@ -34,7 +34,6 @@ from directshape_torch.io.mask_files import CocoFileMasks, InstancePngMasks
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.io.timestamp_files import read_timestamps
 from directshape_torch.io.tracking_files import read_tracking_objects
 from directshape_torch.io.velodyne import read_points, read_scan
 from directshape_torch.report.make_report import make_report
@@ -78,7 +77,6 @@ def samples(kitti: Path, folder: Path) -> dict[str, Sample]:
 def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[Path], object]]]:
     """Files that one function reads."""
     (folder / "tracking.txt").write_text("".join(f"{n} 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0\n" for n in range(3)))
-    (folder / "times.txt").write_text("2011-09-26 13:02:25.964389445\n" * 3)
     (folder / "split.txt").write_text("".join(f"{name}\n" for name in FRAMES))
     write_shapes(folder / "shapes.npz", shape_arrays(2))
     write_disparity(folder / "disparity.png", np.full((12, 16), 7.5))
@@ -110,7 +108,6 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         return None
 
     return {
-        "times": (folder / "times.txt", read_timestamps),
         "tracking": (folder / "tracking.txt", read_tracking_objects),
         "shapes": (folder / "shapes.npz", read_shapes),
         "disparity": (folder / "disparity.png", read_disparity),

@@ -39,9 +39,6 @@ def write_raw(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> Path:
         for folder, source in (("image_02", "image_2"), ("image_03", "image_3")):
             put(kitti / "training" / source / f"{frame_id}.png", drive / folder / "data" / f"{number:010d}.png")
         put(kitti / "training" / "planes" / f"{frame_id}.txt", drive / "planes" / f"{number:010d}.txt")
-    for folder, nanoseconds in (("image_02", 964389445), ("image_03", 964400000)):
-        times = [f"2011-09-26 13:02:{25 + number:02d}.{nanoseconds}\n" for number in range(len(frame_ids))]
-        write(drive / folder / "timestamps.txt", "".join(times))
     return drive
 
 

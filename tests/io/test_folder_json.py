@@ -97,11 +97,10 @@ def test_masks_are_probabilities(root: Path) -> None:
         FolderMasks(root, root / "frames").read("a", (80, 60))
 
 
-def test_plane_labels_and_times(root: Path) -> None:
-    write(root, "frames/a.json", {**FRAME, "ground_plane": [0, 2, 0, -3], "labels": [CAR], "times_s": [1.0, 1.01]})
+def test_plane_and_labels(root: Path) -> None:
+    write(root, "frames/a.json", {**FRAME, "ground_plane": [0, 2, 0, -3], "labels": [CAR]})
     layout = FolderLayout(root)
     assert layout.plane_ref("a").tolist() == [0, -1, 0, 1.5]
-    assert layout.times_s("a") == (1.0, 1.01)
     labels = layout.labels("a")
     assert labels is not None
     assert labels[0].score is None
@@ -147,7 +146,6 @@ def test_damaged_rig(root: Path, path: str, value: object, message: str) -> None
         ("objects.0.dimensions_hwl_m", [1, 0, 4], "expected lengths above 0"),
         ("objects.0.score", None, "score: expected float, got None"),
         ("objects.1.yaw", 1.0, r"objects\[1\].'yaw' is unknown"),
-        ("times_s", [1.0], "times_s: expected a list of 2 or nothing"),
     ],
 )
 def test_damaged_frame(root: Path, path: str, value: object, message: str) -> None:

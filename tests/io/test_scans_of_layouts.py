@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.kitti_folder import write_data_set
-from helpers.layouts import DAY, DRIVE, SEQUENCE, put, write, write_folder, write_raw, write_sequence
+from helpers.layouts import DAY, DRIVE, SEQUENCE, put, write, write_raw, write_sequence
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.frame_layout import FrameLayout
@@ -42,17 +42,16 @@ def layout_of(name: LayoutName, root: Path, kitti: Path, stem: str, to: Path) ->
     return open_dataset(name, root, to / "found", kitti / "masks").layout
 
 
-def scanned(layout: FrameLayout, frame_id: str) -> Points:
+def scanned(layout: FrameLayout, frame_id: str, kitti: Path) -> Points:
     """Pixels and depths of the points that the left camera sees."""
-    found = layout.scan(frame_id)
-    assert found is not None
-    known = known_depth_from_lidar(*found, SIZE_WH, to_stereo_camera([found[1]], dtype=torch.float64))
+    calibration, scan = layout.lidar_calibration(frame_id), kitti / "training" / "velodyne" / f"{FRAME}.bin"
+    known = known_depth_from_lidar(scan, calibration, SIZE_WH, to_stereo_camera([calibration], dtype=torch.float64))
     return known.uv_left, known.depth_m
 
 
 @pytest.fixture
 def expected(kitti: Path, tmp_path: Path) -> Points:
-    known = scanned(layout_of("kitti", kitti, kitti, FRAME, tmp_path), FRAME)
+    known = scanned(layout_of("kitti", kitti, kitti, FRAME, tmp_path), FRAME, kitti)
     # Camera 0 is 0.3 m before the scanner, the left camera 3 mm behind camera 0.
     torch.testing.assert_close(known[1], torch.tensor([9.703, 19.703], dtype=torch.float64), atol=1e-6, rtol=0)
     return known
@@ -63,10 +62,7 @@ def test_tracking(kitti: Path, tmp_path: Path, expected: Points, single: bool) -
     write_sequence(kitti, tmp_path, (FRAME,), single)
     frame_id = FRAME if single else f"{SEQUENCE}_{FRAME}"
     layout = layout_of("tracking", tmp_path, kitti, frame_id, tmp_path)
-    assert layout.scan(frame_id) is None
-    folder = tmp_path / "velodyne" if single else tmp_path / "training" / "velodyne" / SEQUENCE
-    put(kitti / "training" / "velodyne" / f"{FRAME}.bin", folder / f"{FRAME}.bin")
-    torch.testing.assert_close(scanned(layout, frame_id), expected)
+    torch.testing.assert_close(scanned(layout, frame_id, kitti), expected)
     # `--lidar DIR` finds them in any folder.
     named = layout.lidar_files(Path("scans"), frame_id)
     assert named == {"lidar": Path("scans") / ("" if single else SEQUENCE) / f"{FRAME}.bin"}
@@ -81,21 +77,13 @@ def test_raw(kitti: Path, tmp_path: Path, expected: Points, single: bool) -> Non
     calibration.write_text("".join(lines))
     frame_id = "0000000000" if single else f"{DRIVE}_0000000000"
     layout = layout_of("raw", drive if single else tmp_path / DAY, kitti, frame_id, tmp_path)
-    assert layout.scan(frame_id) is None
-    put(kitti / "training" / "velodyne" / f"{FRAME}.bin", drive / "velodyne_points" / "data" / "0000000000.bin")
-    assert layout.scan(frame_id) is None
     write(
         drive.parent / "calib_velo_to_cam.txt", f"calib_time: 15-Mar-2012 11:37:16\nR: {ROTATION}\nT: {TRANSLATION}\n"
     )
-    torch.testing.assert_close(scanned(layout, frame_id), expected)
+    torch.testing.assert_close(scanned(layout, frame_id, kitti), expected)
     place = layout.lidar_files(Path("scans"), frame_id)["lidar_calibration"]
     assert place == drive.parent / "calib_velo_to_cam.txt"
     assert layout.lidar_calibration(frame_id).Tr_velo_to_cam is not None
-
-
-def test_a_plain_folder_has_none(kitti: Path, tmp_path: Path) -> None:
-    write_folder(kitti, tmp_path, (FRAME,))
-    assert open_dataset("folder", tmp_path).layout.scan(FRAME) is None
 
 
 def test_place_of_a_scanner(tmp_path: Path) -> None:
