@@ -227,17 +227,8 @@ class DirectShapeRefiner(nn.Module):
         term_weights: Mapping[str, Tensor] | None,
     ) -> CarProblem:
         """The problem of some of the detections, of which `cars` and `seen` are."""
-        return CarProblem.of_scene(
-            self.config,
-            self.prior,
-            frames,
-            detections,
-            cars,
-            seen.pixels,
-            seen.points,
-            self.extra_terms,
-            term_weights,
-        )
+        extra = self.extra_terms
+        return CarProblem.of_scene(self.config, self.prior, frames, detections, cars, *seen, extra, term_weights)
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
         if self.config.method == "box_alignment":

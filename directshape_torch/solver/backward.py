@@ -8,12 +8,12 @@ from torch import Tensor
 from directshape_torch.config import BackwardConfig
 from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum
-from directshape_torch.solver.problem import DifferentiableProblem, StateT, put_rows, take_rows
+from directshape_torch.solver.problem import Problem, StateT, put_rows, take_rows
 from directshape_torch.status import is_refined
 
 
 def attached_state(
-    problem: DifferentiableProblem[StateT],
+    problem: Problem[StateT],
     start: StateT,
     minimum: Minimum[StateT],
     backward: BackwardConfig,

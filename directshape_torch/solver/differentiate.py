@@ -15,9 +15,9 @@ from torch import Tensor
 from directshape_torch.solver.damped_solve import limit_step, step_size
 from directshape_torch.solver.gauss_newton import Iteration, Minimum
 from directshape_torch.solver.problem import (
-    DifferentiableProblem,
-    DifferentiableStage,
+    BegunStage,
     EnergyAt,
+    Problem,
     StateT,
     take_rows,
     where_rows,
@@ -33,7 +33,7 @@ class StartNotReachedWarning(UserWarning):
 
 
 def unrolled_state(
-    problem: DifferentiableProblem[StateT],
+    problem: Problem[StateT],
     start: StateT,
     minimum: Minimum[StateT],
     rows: Tensor,
@@ -101,7 +101,7 @@ def _first_states(trajectory: Sequence[Iteration[StateT]], repeated: Tensor) -> 
 
 
 def implicit_state(
-    problem: DifferentiableProblem[StateT],
+    problem: Problem[StateT],
     minimum: Minimum[StateT],
     rows: Tensor,
     *,
@@ -146,7 +146,7 @@ def implicit_state(
 
 
 def _gradient_and_its_jacobian(
-    stage: DifferentiableStage[StateT], state: StateT, delta: Tensor, exact: bool
+    stage: BegunStage[StateT], state: StateT, delta: Tensor, exact: bool
 ) -> tuple[EnergyAt, Tensor]:
     """g with its graph to the problem, and its Jacobian (R, D, D) by the tangent at the state, without one."""
     if not exact:
@@ -186,8 +186,8 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def _step(
-    problem: DifferentiableProblem[StateT],
-    stage: DifferentiableStage[StateT],
+    problem: Problem[StateT],
+    stage: BegunStage[StateT],
     state: StateT,
     iteration: Iteration[StateT],
 ) -> StateT:

@@ -77,6 +77,22 @@ class BegunStage(Protocol[StateT]):
         """What is said of a state that was looked at by itself; the solver compares nothing but its `cost` (B,)."""
         ...
 
+    def linearise_differentiably(self, state: StateT) -> Any:
+        """The `EnergyAt` a state, with an autograd graph to the state and to the problem's own inputs."""
+        ...
+
+    def free_unknowns(self, state: StateT) -> Tensor:
+        """Unknowns (B, D) that are not held by a bound, bool."""
+        ...
+
+    def retract(self, state: StateT, step: Tensor) -> StateT:
+        """The state moved by tangent vectors (B, D)."""
+        ...
+
+    def step_limits(self) -> Tensor:
+        """Largest trusted step of each unknown, (D,)."""
+        ...
+
 
 class Problem(Protocol[StateT]):
     """B problems, by themselves or in groups that share unknowns."""
@@ -96,34 +112,8 @@ class Problem(Protocol[StateT]):
         """A stage that begins at a state that was looked at."""
         ...
 
-
-class DifferentiableStage(BegunStage[StateT], Protocol):
-    """A stage whose linearisation can be differentiated, by the state and by whatever the problem is made of."""
-
-    def linearise_differentiably(self, state: StateT) -> Any:
-        """The `EnergyAt` a state, with an autograd graph to the state and to the problem's own inputs."""
-        ...
-
-    def free_unknowns(self, state: StateT) -> Tensor:
-        """Unknowns (B, D) that are not held by a bound, bool."""
-        ...
-
-    def retract(self, state: StateT, step: Tensor) -> StateT:
-        """The state moved by tangent vectors (B, D)."""
-        ...
-
-    def step_limits(self) -> Tensor:
-        """Largest trusted step of each unknown, (D,)."""
-        ...
-
-
-class DifferentiableProblem(Problem[StateT], Protocol):
-    """A problem whose stages can be differentiated."""
-
-    def begin(self, stage: StageConfig, seen: Any) -> DifferentiableStage[StateT]: ...
-
-    def of_problems(self, keep: Tensor) -> DifferentiableProblem[StateT]:
-        """The same without the problems where `keep` (B,) is false."""
+    def of_problems(self, keep: Tensor) -> Problem[StateT]:
+        """The problems where `keep` (B,) holds."""
         ...
 
 
