@@ -84,7 +84,9 @@ def occlusion_map(
     Args:
         detections: B objects and M further occluders.
         side: image whose masks are used.
-        order: see `instances_in_front`.
+        order: "depth": smaller depth of the object's origin; an instance of unknown depth (NaN, or not in front of the
+            camera) goes by the boxes. "box_bottom": lower bottom edge of the left 2D box, as in the paper. Equals, and
+            comparisons with NaN, hide nothing.
         extents: of the masks of these detections, where they are known already.
 
     Raises:
@@ -98,7 +100,9 @@ def occlusion_map(
         >>> hidden.at(torch.tensor([0, 1, 1]), torch.tensor([[25, 15], [25, 15], [35, 15]]))
         tensor([False,  True, False])
     """
-    frame, _, numbers, limits = _instances(detections, side, order)
+    if side not in ("left", "right"):
+        raise InputError("side", "'left' or 'right'", repr(side))
+    frame, numbers, limits = _instances(detections, order)
     extents = scene_extents(detections) if extents is None else extents
     boxes = (extents.boxes_left if side == "left" else extents.boxes_right).tolist()
     shown = [box for box in boxes if box[2] > box[0]] or [(0, 0, 0, 0)]
@@ -121,42 +125,17 @@ def occlusion_map(
     return OcclusionMap(crop, limits, covering)
 
 
-def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
-    """Which instance stands in front of which detection and has a mask that may hide it.
-
-    Args:
-        detections: B objects and M further occluders.
-        side: image whose masks are asked for.
-        order: "depth": smaller depth of the object's origin; an instance of unknown depth (NaN, or not in front of the
-            camera) goes by the boxes. "box_bottom": lower bottom edge of the left 2D box, as in the paper. Equals, and
-            comparisons with NaN, hide nothing.
-
-    Returns:
-        (B + M, B) bool: instance i (detections first, then occluders) is in front of detection j.
-
-    Raises:
-        InputError: unknown side or order.
-    """
-    frame, present, numbers, limits = _instances(detections, side, order)
-    in_front = (numbers[:, None] < limits).any(dim=-1)
-    return in_front & (frame[:, None] == detections.frame_index) & present[:, None]
-
-
-def _instances(detections: Detections, side: Side, order: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Frame, presence of a mask and numbers (., 2) of all instances; what is in front of the detections (B, 2)."""
-    if side not in ("left", "right"):
-        raise InputError("side", "'left' or 'right'", repr(side))
+def _instances(detections: Detections, order: str) -> tuple[Tensor, Tensor, Tensor]:
+    """Frame and numbers (B + M, 2) of all instances; below which (B, 2) they are in front of the detections."""
     if order not in ("depth", "box_bottom"):
         raise InputError("order", "'depth' or 'box_bottom'", repr(order))
     d, others = detections, detections.occluders
     frame, depth_m, bottom_v = d.frame_index, d.T_cam_obj[:, 2, 3], d.box_2d[:, 3]
-    present = d.has_mask_left if side == "left" else d.has_mask_right
     limits = torch.stack([torch.where(depth_m > 0, depth_m, -torch.inf), -bottom_v], dim=1)
     if others is not None:
         frame = torch.cat([frame, others.frame_index])
         depth_m = torch.cat([depth_m, others.depth_m.to(depth_m)])
         bottom_v = torch.cat([bottom_v, others.bottom_v.to(bottom_v)])
-        present = torch.cat([present, present.new_ones(len(others.frame_index))])
     # What stands in front of what has no derivative.
     limits, depth_m, bottom_v = limits.detach(), depth_m.detach(), bottom_v.detach()
     by_depth = (depth_m > 0) & (order == "depth")  # False for NaN
@@ -165,7 +144,7 @@ def _instances(detections: Detections, side: Side, order: str) -> tuple[Tensor, 
         torch.stack([depth_m, -bottom_v], dim=1),
         torch.inf,
     )
-    return frame, present, numbers, limits
+    return frame, numbers, limits
 
 
 def _masks(detections: Detections, side: Side) -> list[Tensor]:

@@ -79,7 +79,7 @@ class DetailSettings:
         prior: shapes, or None where those of the run are not at hand.
         mean: the mesh of its mean shape.
         maps: settings of residual maps.
-        occlusion_order: see `instances_in_front`.
+        occlusion_order: see `occlusion_map`.
     """
 
     classes: Sequence[str]

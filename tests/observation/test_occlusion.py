@@ -10,7 +10,7 @@ from reference.occlusion import hidden_pixels as one_by_one
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.observation.occlusion import Side, instances_in_front, occlusion_map
+from directshape_torch.observation.occlusion import OcclusionOrder, Side, occlusion_map
 from directshape_torch.scene import Detections, Occluders
 
 HEIGHT, WIDTH = 20, 30
@@ -61,6 +61,18 @@ def hidden_pixels(detections: Detections, side: Side, object_index: Tensor, uv: 
     hidden = occlusion_map(detections, side).at(object_index, uv)
     assert torch.equal(hidden, one_by_one(detections, side, object_index, uv))
     return hidden
+
+
+def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
+    """Which instance hides which detection (B + M, B), by a pixel that each of them covers alone."""
+    others, count = detections.occluders, len(detections)
+    num_instances = count + (0 if others is None else len(others.frame_index))
+    masks = squares(*((i, 0, i + 1, 1) for i in range(num_instances)))
+    if others is not None:
+        others = replace(others, mask_left=masks[count:], mask_right=masks[count:])
+    alone = replace(detections, mask_left=masks[:count], mask_right=masks[:count], occluders=others)
+    uv = torch.stack([torch.arange(num_instances), torch.zeros(num_instances, dtype=torch.long)], dim=1)
+    return occlusion_map(alone, side, order).at(torch.arange(count), uv[:, None].expand(-1, count, 2))
 
 
 def test_depth_and_box_order_disagree() -> None:

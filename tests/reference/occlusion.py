@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from directshape_torch.observation.extents import MASK_THRESHOLD
-from directshape_torch.observation.occlusion import OcclusionOrder, Side, instances_in_front
+from directshape_torch.observation.occlusion import OcclusionOrder, Side
 from directshape_torch.scene import Detections
+
+
+def instances_in_front(detections: Detections, side: Side, order: OcclusionOrder = "depth") -> Tensor:
+    """Whether instance i (detections first, then occluders) is in front of detection j and has a mask, (B + M, B)."""
+    d, others = detections, detections.occluders
+    frame, depth, bottom = d.frame_index.tolist(), d.T_cam_obj[:, 2, 3].tolist(), d.box_2d[:, 3].tolist()
+    present = getattr(d, f"has_mask_{side}").tolist()
+    if others is not None:
+        frame, depth = frame + others.frame_index.tolist(), depth + others.depth_m.tolist()
+        bottom += others.bottom_v.tolist()
+        present += [True] * len(others.frame_index)
+
+    def is_in_front(i: int, j: int) -> bool:
+        if not present[i] or frame[i] != frame[j]:
+            return False
+        if order == "depth" and depth[i] > 0:
+            return depth[i] < depth[j]
+        return math.isfinite(bottom[i]) and bottom[i] > bottom[j]
+
+    table = [[is_in_front(i, j) for j in range(len(d))] for i in range(len(frame))]
+    return torch.tensor(table, dtype=torch.bool).view(len(frame), len(d))
 
 
 def hidden_pixels(
