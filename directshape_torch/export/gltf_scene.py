@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableMapping
+from collections.abc import Callable, MutableMapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,8 @@ class GlbExporter(Exporter):
         self._moving: dict[tuple[str, int], _MovingCar] = {}
 
     def add(self, source: FrameSource) -> None:
+        # Frames come sequence by sequence; a car keeps the picture of its nearest view until its own is over.
+        self._write([key for key in self._moving if not source.frame_id.startswith(_sequence(key[0]))])
         painted = source.painted
         write_bytes(self.folder / f"{source.frame_id}.glb", frame_glb(painted, source.loaded))
         for index, one in enumerate(painted.objects):
@@ -46,11 +48,15 @@ class GlbExporter(Exporter):
                 self._moving.setdefault(key, _MovingCar()).add(painted, index)
 
     def finish(self) -> None:
-        for (track, part), car in self._moving.items():
+        self._write(list(self._moving))
+
+    def _write(self, over: Sequence[tuple[str, int]]) -> None:
+        for track, part in over:
+            car = self._moving.pop((track, part))
             if len(car.T_cam_obj) > 1:
                 # The later parts of a track that was split are other cars.
                 name = f"track_{track}_part{part}" if part else f"track_{track}"
-                write_bytes(self.folder / f"{name}.glb", car.glb(track.rpartition("_")[0]))
+                write_bytes(self.folder / f"{name}.glb", car.glb(_sequence(track)))
 
 
 def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
@@ -71,6 +77,11 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
         count = len(ground.vertices)
         _add(scene, "ground", ground, Paint(np.full((count, 3), _GREY_OF_GROUND, np.uint8), np.zeros(count, np.uint8)))
     return _glb(scene)
+
+
+def _sequence(track: str) -> str:
+    """What the names of the track and of its frames begin with, "" for a single sequence."""
+    return track.rpartition("_")[0]
 
 
 class _MovingCar:

@@ -231,10 +231,10 @@ def test_a_car_moves_through_the_poses_of_its_track(finished: FinishedRun, tmp_p
 
 def test_what_shares_no_shape_does_not_move(finished: FinishedRun, tmp_path: Path) -> None:
     """Of a track that was split each part is a car, if it has two views; its name says which."""
-    run = with_tracks(finished, tmp_path / "run", ("0005_000007", "0005_000008"), [(2, 0), (2, 1)])
+    run = with_tracks(finished, tmp_path / "run", ("000007", "000008"), [(2, 0), (2, 1)])
     export_run(run, tmp_path, ["glb"], finished.inputs())
     moving = [path.stem for path in (tmp_path / "glb").iterdir() if path.stem.startswith("track")]
-    assert moving == ["track_0005_000007_part2"]
+    assert moving == ["track_000007_part2"]
 
 
 @pytest.mark.parametrize("car", [0, 1])
