@@ -24,9 +24,17 @@ def add_parser(subparsers: Subparsers) -> None:
     parser = subparsers.add_parser(
         "compare", help="measure results before and after a refinement", description=_DESCRIPTION
     )
-    parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="KITTI labels, NNNNNN.txt")
+    parser.add_argument(
+        "--labels",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="KITTI labels, NNNNNN.txt, or of tracking: SEQUENCE.txt, or one file",
+    )
     for name, what in (("before", "result files that went in"), ("after", "result files that came out")):
-        parser.add_argument(f"--{name}", type=Path, required=True, metavar="DIR", help=f"{what} (or DIR/data)")
+        parser.add_argument(
+            f"--{name}", type=Path, required=True, metavar="DIR", help=f"{what} (or DIR/data), in the same forms"
+        )
     add_frame_choice(parser, "all of --before")
     parser.add_argument("--shapes", type=Path, metavar="DIR", help="OUT/shapes: count only cars that had a mask")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all groups")

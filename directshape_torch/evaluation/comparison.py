@@ -22,9 +22,9 @@ from directshape_torch.evaluation.bootstrap import (
 )
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
 from directshape_torch.evaluation.pose_error import CarErrors, boxes_of, car_errors, pose_errors
-from directshape_torch.io.instance_masks import file_of_frame
-from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.tracking_files import FrameObjects
 
 GOOD_BEV_IOU = 0.7
 WORSE_BY_BEV_IOU = 0.05
@@ -160,10 +160,12 @@ def compare_results(
     """Compare two sets of result files line by line against labels.
 
     Args:
-        labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`).
-        before_dir, after_dir: folders of result files `NNNNNN.txt`, or above a folder `data` with them. The files of a
-            frame have the same lines in the same order; a detection takes its label by the 2D box of `before`.
-        split: file with one frame id a line; default every frame of `before_dir`.
+        labels_dir: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`), or of the tracking benchmark: a
+            folder of `SEQUENCE.txt`, for frames called `SEQUENCE_NNNNNN`, or the file of a single sequence.
+        before_dir, after_dir: result files in the same forms, or a folder `data` of them below. The files of a frame
+            have the same lines in the same order; a detection takes its label by the 2D box of `before`.
+        split: file with one frame id a line; default every frame of `before_dir`; where that is of the tracking
+            benchmark, those of `after_dir`.
         frames: ids of the frames to compare, instead of `split`.
         keep_line: leaves detections out (see `lines_with_left_mask`); they still take their labels.
         counted: which labels count.
@@ -174,15 +176,16 @@ def compare_results(
         InputError: no frames.
     """
     counted = CountedLabels() if counted is None else counted
-    folders = Path(labels_dir), Path(before_dir), Path(after_dir)
+    sources = Path(labels_dir), Path(before_dir), Path(after_dir)
     named = named_frames(frames, split)
-    frame_ids = _frames_of(folders[1]) if named is None else named
+    frame_ids = _frames_of(*sources[1:]) if named is None else named
     if not frame_ids:
         raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
     pairs: list[_Pair] = []
     num_counted = 0
+    objects = FrameObjects()
     for frame_id in frame_ids:
-        found, count = _pairs_of_frame(folders, frame_id, counted)
+        found, count = _pairs_of_frame(objects, sources, frame_id, counted)
         pairs += found
         num_counted += count
     kept = [p for p in pairs if keep_line is None or keep_line(p.frame_id, p.before.line_number)]
@@ -227,19 +230,32 @@ class _Pair:
     after: KittiObject
 
 
-def _frames_of(results: Path) -> tuple[str, ...]:
+def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
+    """Of the files of `before`; of a sequence, and of a single file, those that `after` has."""
+    results = _stems(after)
+    if before.is_file():
+        return tuple(results)
+    of_sequence: dict[str, list[str]] = {}
+    for stem in results:
+        of_sequence.setdefault(stem.rpartition("_")[0], []).append(stem)
+    return tuple(frame for stem in _stems(before) for frame in of_sequence.get(stem, [stem]))
+
+
+def _stems(results: Path) -> list[str]:
     nested = results / "data"
-    return tuple(sorted(path.stem for path in (nested if nested.is_dir() else results).glob("*.txt")))
+    return sorted(path.stem for path in (nested if nested.is_dir() else results).glob("*.txt"))
 
 
-def _pairs_of_frame(folders: tuple[Path, Path, Path], frame_id: str, counted: CountedLabels) -> tuple[list[_Pair], int]:
+def _pairs_of_frame(
+    objects: FrameObjects, sources: tuple[Path, Path, Path], frame_id: str, counted: CountedLabels
+) -> tuple[list[_Pair], int]:
     """Counted labels of a frame that have a detection, and the number of those that count at all."""
-    label_path, before_path, after_path = (file_of_frame(folder, f"{frame_id}.txt") for folder in folders)
-    labels = read_objects(label_path)
+    label_path, before_path, after_path = (objects.path(source, frame_id) for source in sources)
+    labels = objects.read(label_path, frame_id)
     if not after_path.is_file():
         cure = "was it refined? name the frames that were with --frames or --split"
         raise DataFormatError(after_path, f"there is no result of frame {frame_id}", cure=cure)
-    before, after = read_objects(before_path), read_objects(after_path)
+    before, after = objects.read(before_path, frame_id), objects.read(after_path, frame_id)
     _check_same_lines(before_path, before, after_path, after)
     rows = [row for row, o in enumerate(before) if o.type in counted.types and o.has_box_3d]
     partners = match_to_labels([before[row] for row in rows], labels)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.text_files import Line, read_lines
-from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.instance_masks import file_of_frame
+from directshape_torch.io.kitti_labels import KittiObject, parse_object, read_objects
 
 _COLUMNS = "frame track type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
 _LEADING = 2
@@ -41,6 +42,40 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
         found = parse_object(path, Line(line.number, text, text))
         objects.append(replace(found, track_id=int(words[1]), line_number=len(objects) + 1))
     return frames
+
+
+class FrameObjects:
+    """Objects frame by frame, of files of frames or of the tracking benchmark, each of which is read once."""
+
+    def __init__(self) -> None:
+        self._sequences: dict[Path, dict[int, list[KittiObject]]] = {}
+
+    def path(self, source: Path, frame_id: str) -> Path:
+        """The file of a frame.
+
+        Args:
+            source: a folder of `FRAME.txt` or `SEQUENCE.txt`, or one with `data` of them, or the file of a sequence.
+            frame_id: `FRAME`, or `SEQUENCE_NNNNNN`.
+        """
+        of_frame, sequence = file_of_frame(source, f"{frame_id}.txt"), frame_id.rpartition("_")[0]
+        of_sequence = source if source.is_file() else file_of_frame(source, f"{sequence}.txt")
+        return of_sequence if not of_frame.is_file() and of_sequence.is_file() else of_frame
+
+    def read(self, path: Path, frame_id: str) -> list[KittiObject]:
+        """The objects of a frame in a file that `path` named.
+
+        Raises:
+            DataFormatError: the file is missing or damaged.
+            InputError: the name of a frame of a sequence does not end with its number.
+        """
+        if path.stem == frame_id:
+            return read_objects(path)
+        number = frame_id.rpartition("_")[2]
+        if not _is_number(number):
+            raise InputError("frames", f"numbers of frames of {path}", repr(frame_id))
+        if path not in self._sequences:
+            self._sequences[path] = read_tracking_objects(path)
+        return self._sequences[path].get(int(number), [])
 
 
 def _is_number(word: str) -> bool:

@@ -157,6 +157,26 @@ def test_empty_files_and_no_files(tmp_path: Path):
         compare_results(parts[0], tmp_path / "none", parts[2])
 
 
+def test_files_of_the_tracking_benchmark(folders: tuple[Path, Path, Path], tmp_path: Path):
+    """One file a sequence, or that file itself, with the figures of a file a frame."""
+    expected = [(car.before, car.after) for car in compare_results(*folders).cars]
+    sequences = []
+    for folder in (folders[0], folders[1] / "data"):
+        lines = [f"{int(p.stem)} 7 {line}\n" for p in sorted(folder.iterdir()) for line in p.read_text().splitlines()]
+        sequences.append(tmp_path / folder.parent.name / f"of_{folder.name}")
+        sequences[-1].mkdir(parents=True)
+        (sequences[-1] / "0005.txt").write_text("".join(lines))
+    one = compare_results(*(folder / "0005.txt" for folder in sequences), folders[2])
+    assert [(car.before, car.after) for car in one.cars] == expected
+    for path in list(folders[2].iterdir()):
+        path.rename(path.with_name(f"0005_{path.name}"))
+    several = compare_results(*sequences, folders[2])
+    assert [(car.before, car.after) for car in several.cars] == expected
+    assert [car.frame_id for car in several.cars] == ["0005_000001", "0005_000001", "0005_000002"]
+    with pytest.raises(InputError, match="numbers of frames"):
+        compare_results(*sequences, folders[2], frames=["0005_first"])
+
+
 def test_command_prints_and_writes(
     folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
