@@ -23,7 +23,8 @@ from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
 from directshape_torch.refinement.box_alignment import align_boxes
 from directshape_torch.refinement.outcome import Outcome, outcome_of_boxes
-from directshape_torch.refinement.problem import CarProblem, TermFactory
+from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.refinement.tracks import refined
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
@@ -228,7 +229,7 @@ class DirectShapeRefiner(nn.Module):
     ) -> CarProblem:
         """The problem of some of the detections, of which `cars` and `seen` are."""
         extra = self.extra_terms
-        return CarProblem.of_scene(self.config, self.prior, frames, detections, cars, *seen, extra, term_weights)
+        return problem_of_scene(self.config, self.prior, frames, detections, cars, *seen, extra, term_weights)
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
         if self.config.method == "box_alignment":

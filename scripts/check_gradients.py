@@ -32,7 +32,7 @@ from directshape_torch.laboratory.regimes import regimes_named
 from directshape_torch.laboratory.report import console_table, summary, write_report
 from directshape_torch.laboratory.scenes import load_scene
 from directshape_torch.laboratory.study import SUBJECT_NAMES, StudyPlan, run_study, subjects_named
-from directshape_torch.refinement.problem import TermFactory
+from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig, RefinerConfig
 from directshape_torch.errors import InputError
 from directshape_torch.observation.car_points import car_points
-from directshape_torch.refinement.problem import TermFactory
+from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.rows import Blocks

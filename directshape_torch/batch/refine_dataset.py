@@ -27,7 +27,7 @@ from directshape_torch.io.run_folder import done_frames, overlay_path, result_pa
 from directshape_torch.io.run_manifest import RunManifest, SharedHashes
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.track_files import write_tracks
-from directshape_torch.refinement.problem import TermFactory
+from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 
 # Detection files that tell how many cars are ahead.

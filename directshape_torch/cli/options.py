@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from directshape_torch.evaluation.bootstrap import BootstrapSettings
     from directshape_torch.io.instance_masks import MaskSource
     from directshape_torch.io.stereo_files import FileStereoDataset
-    from directshape_torch.refinement.problem import TermFactory
+    from directshape_torch.refinement.scene_problem import TermFactory
     from directshape_torch.refiner import DirectShapeRefiner
 
 # As in io/open_dataset.py, which is not imported for it loads PyTorch; a test holds the two together.

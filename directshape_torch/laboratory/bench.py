@@ -16,7 +16,8 @@ from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
-from directshape_torch.refinement.problem import CarProblem, CarStage, TermFactory
+from directshape_torch.refinement.problem import CarProblem, CarStage
+from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -106,7 +107,7 @@ class Bench:
         start = CarState.of(se3.inverse(detections.T_cam_obj), drawn.state.code, cars.num_offsets)
         stages = []
         for c in (config, other_forms):
-            problem = CarProblem.of_scene(c, prior, frame, detections, cars, observation, points, own_terms)
+            problem = problem_of_scene(c, prior, frame, detections, cars, observation, points, own_terms)
             stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
         terms = _named(*stages)
         sight = stages[0].problem.look(drawn.state)

@@ -12,7 +12,7 @@ from directshape_torch.laboratory.comparison import Comparison, compare
 from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, FACTORS, gradient_experiment, term_experiment
 from directshape_torch.laboratory.regimes import Regime, checked_name, regimes_named
 from directshape_torch.laboratory.scenes import LaboratoryScene
-from directshape_torch.refinement.problem import TermFactory
+from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 SUBJECT_NAMES = (*FACTORS, *TERM_NAMES)

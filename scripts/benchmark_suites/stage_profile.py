@@ -24,6 +24,7 @@ from directshape_torch import depth
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refinement.outcome import outcome_of
 from directshape_torch.refinement.problem import CarIterations, CarProblem, CarStage
+from directshape_torch.refinement.scene_problem import problem_of_scene
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.damped_solve import damped_step
@@ -37,7 +38,7 @@ _REST = "everything else"
 _OUTCOME = "outcome: covariance, quality, profile, trust"
 # Of the functions themselves, so that one that goes takes its line with it.
 PARTS: dict[str, tuple[Any, ...]] = {
-    "observation: regions, occlusion, pixels": (DirectShapeRefiner._observe, CarProblem.of_scene),
+    "observation: regions, occlusion, pixels": (DirectShapeRefiner._observe, problem_of_scene),
     "marched rays and first hits": (CarProblem.look,),
     "tracked rays": (depth.tracked_closest, depth.tracked_depth),
     "beginning of stages": (CarProblem.begin, CarStage.start),

@@ -1,0 +1,128 @@
+"""The problem of a call: the terms of its method, made of what its images show, and a user's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import RefinerConfig
+from directshape_torch.errors import ConfigError, InputError
+from directshape_torch.geometry import se3
+from directshape_torch.image.grey_levels import GreyPair, grey_levels
+from directshape_torch.numerics.checks import check_shape, check_stored
+from directshape_torch.observation.car_points import PointSamples
+from directshape_torch.observation.packing import Observation
+from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.rows import Rows
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.check_term import check_term
+from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric_rows import LeftPixels
+from directshape_torch.terms.point_cloud import PointCloud
+from directshape_torch.terms.priors import prior_terms
+from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
+from directshape_torch.terms.term import Term
+
+# Those of "point_cloud" hold for the methods with points, the first two for the others.
+_WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
+
+TermFactory: TypeAlias = Callable[[FrameBatch, Detections, CarBatch, ShapePrior], Term]
+"""Makes a user's term for some cars of a call: of these frames, all detections, the cars to refine, the shapes."""
+
+
+def problem_of_scene(
+    config: RefinerConfig,
+    prior: ShapePrior,
+    frames: FrameBatch,
+    detections: Detections,
+    cars: CarBatch,
+    observation: Observation,
+    points: PointSamples | None = None,
+    extra_terms: Sequence[TermFactory] = (),
+    term_weights: Mapping[str, Tensor] | None = None,
+) -> CarProblem:
+    """The problem of `config.method`; terms of weight zero are left out, so ablations cost nothing.
+
+    Args:
+        config: weights and forms.
+        prior: the shapes.
+        frames: F frames.
+        detections: all detections of the call, which `cars.detection_row` points into.
+        cars: the B cars to refine.
+        observation: packed pixels of these cars.
+        points: stereo points of these cars; None for the methods without.
+        extra_terms: make further terms.
+        term_weights: (detections,) factors of named terms.
+
+    Raises:
+        ConfigError: every term has weight zero, so there is nothing to minimise.
+        InputError: a factor of a term that does not exist (a misspelt name, or a term of weight zero), of a wrong
+            shape, or less than 0; an extra term that is not what `Term` says.
+    """
+    pixels = observation.left, observation.right
+    sides = [Rows.of_sorted(p.object_index, len(cars)) for p in pixels]
+    masks = MaskRows.of_pixels(pixels, sides, config.silhouette, len(cars))
+    terms: list[Term] = []
+    if points is not None:
+        cloud, weight = config.point_cloud, config.point_cloud.combined_weight
+        cloud = cloud if config.method == "geometric" else replace(cloud, weight=weight)
+        terms += [PointCloud.of_points(cloud, points)] if cloud.weight > 0 else []
+    if config.method in ("direct", "combined") and config.silhouette.weight > 0:
+        form = SilhouetteProducts if config.silhouette.form == "product" else Silhouettes
+        terms.append(form(config.silhouette, cars, masks, prior.bounds_obj, torch.ones_like(masks.filled[:, :1])))
+    if config.method != "geometric" and config.photometric.weight > 0:
+        pyramid = _pyramid(frames, max(stage.image_level for stage in config.stages))
+        left = LeftPixels.of(pixels[0], sides[0], pyramid, observation.hidden_right, detections.mask_left)
+        terms.append(Photometric(config.photometric, cars, left))
+    terms += [] if config.method == "box_alignment" else prior_terms(config.priors, prior, cars)
+    own, extra = len(terms), [make(frames, detections, cars, prior) for make in extra_terms]
+    terms += extra
+    if not terms:
+        raise ConfigError(f"method {config.method}: expected a term of weight above 0, got none: {_WEIGHTS}")
+    problem = CarProblem(prior, tuple(terms), masks, masks.of_sides(), config, None, len(extra), cars.num_offsets)
+    _check_extra(problem, own, cars)
+    factors = _factors(term_weights, problem.term_names, prior.initial_code(len(detections)).to(frames.images_left))
+    return problem if factors is None else replace(problem, factors=factors[cars.detection_row])
+
+
+def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
+    """Raise `InputError` unless the terms behind our `own` are what `Term` says, at the detector's poses."""
+    if own == len(problem.terms):
+        return
+    code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
+    sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
+    names = [name for term in problem.terms[:own] for name in term.names]
+    for term in problem.terms[own:]:
+        check_term(term, problem.stages()[0], sight, names)
+        names += term.names
+
+
+def _pyramid(frames: FrameBatch, num_halvings: int) -> list[GreyPair]:
+    pyramid = [GreyPair(grey_levels(frames.images_left), grey_levels(frames.images_right), frames.sizes, 1.0)]
+    for _ in range(num_halvings):
+        pyramid.append(pyramid[-1].halved())
+    return pyramid
+
+
+def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: Tensor) -> Tensor | None:
+    """Factors (detections, T) of the columns from those given by name, 1 for the others."""
+    if weights is None:
+        return None
+    for name, weight in weights.items():
+        if name not in names:
+            raise InputError("term_weights", f"names among {', '.join(names)}", repr(name))
+        check_shape(f"term_weights[{name!r}]", weight, (len(code),), "one factor for each car")
+        check_stored(f"term_weights[{name!r}]", weight)
+        negative = (weight < 0).nonzero()[:, 0].tolist()
+        if negative:
+            got = f"{float(weight[negative[0]]):.3g} for car {negative[0]}"
+            cure = "let a network predict their logarithm"
+            raise InputError(f"term_weights[{name!r}]", "factors of at least 0", got, cure)
+    ones = code.new_ones(len(code))
+    return torch.stack([weights[name].to(code) if name in weights else ones for name in names], dim=1)
