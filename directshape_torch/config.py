@@ -307,6 +307,22 @@ class PriorConfig(Settings):
 
 
 @dataclass(frozen=True)
+class TracksConfig(Settings):
+    """How cars with numbers move, where the times of the frames are known (docs/tracks.md)."""
+
+    path_sigma_m: float = setting(
+        0.05,
+        "standard deviation of a car's place on the ground about a smooth path; 0: each frame by itself",
+        at_least=0,
+    )
+    path_sigma_yaw_deg: float = setting(1.0, "that of its heading", above=0)
+    acceleration_sigma_mps2: float = setting(
+        1.0, "standard deviation of the acceleration of the path, along each axis, m/s^2", above=0
+    )
+    turn_acceleration_sigma_dps2: float = setting(20.0, "that of its turn rate's change, deg/s^2", above=0)
+
+
+@dataclass(frozen=True)
 class SamplingConfig(Settings):
     """How many pixels a car gets, and which."""
 
@@ -389,6 +405,7 @@ class RefinerConfig(Settings):
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     rig: RigConfig = field(default_factory=RigConfig)
+    tracks: TracksConfig = field(default_factory=TracksConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
     backward: BackwardConfig = field(default_factory=BackwardConfig)
 

@@ -99,6 +99,10 @@ class FrameBatch(TensorRecord):
             a point cloud; None: they match the images themselves.
         points_cam: (F, P, 3) points of a LiDAR in the left camera frame, metres, NaN where a frame has fewer than P,
             for `terms.lidar`; None: nobody has measured any.
+        time_s: (F,) when each frame was taken, seconds from any beginning that keeps them small; with `track_id` a car
+            then moves along a smooth path (docs/tracks.md). None: not known, and each frame is by itself.
+        T_world_cam: (F, 4, 4) pose of the left camera in a world that is the same for all frames of a track; near its
+            origin, for float32 has seven digits. None: not known, and paths are those relative to the camera.
     """
 
     images_left: Annotated[Tensor, Dense("F", 3, "H", "W", kind="image", cure="stack images as (F, 3, H, W) in [0, 1]")]
@@ -109,6 +113,8 @@ class FrameBatch(TensorRecord):
     frame_ids: tuple[str, ...]
     disparity: Annotated[Tensor | None, Dense("F", "H", "W")] = None
     points_cam: Annotated[Tensor | None, Dense("F", "P", 3)] = None
+    time_s: Annotated[Tensor | None, Dense("F")] = None
+    T_world_cam: Annotated[Tensor | None, Dense("F", 4, 4)] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,6 +129,7 @@ class FrameBatch(TensorRecord):
                 raise InputError(name, f"{num_frames} frames", f"{count}")
         if num_frames and bool(((self.sizes > self.sizes.new_tensor([height, width])) | (self.sizes < 1)).any()):
             raise InputError("sizes", f"(height, width) within (1..{height}, 1..{width})", str(self.sizes.tolist()))
+        _check_motion(self.time_s, self.T_world_cam)
         field = self.camera.disparity_field
         if field is not None:
             for k in range(num_frames):
@@ -137,6 +144,8 @@ class FrameBatch(TensorRecord):
         camera: StereoCamera,
         ground: GroundPlane | float = 1.65,
         frame_ids: Sequence[str] | None = None,
+        time_s: Tensor | None = None,
+        T_world_cam: Tensor | None = None,
     ) -> FrameBatch:
         """Frames without padding, of RGB images in floating point in [0, 1] or uint8.
 
@@ -145,6 +154,7 @@ class FrameBatch(TensorRecord):
             camera: of F frames, or of one for all of them.
             ground: planes, or the height of the camera above a level road, metres.
             frame_ids: names; default "000000" and on.
+            time_s, T_world_cam: as in the class.
 
         Raises:
             InputError: what the class raises.
@@ -173,7 +183,7 @@ class FrameBatch(TensorRecord):
         sizes = torch.tensor([left.shape[2:]] * count, device=left.device).reshape(count, 2)
         names = tuple(f"{number:06d}" for number in range(count)) if frame_ids is None else frame_ids
         check_type("frame_ids", names, (tuple, list))
-        return cls(left, right, sizes, camera, ground, tuple(names))
+        return cls(left, right, sizes, camera, ground, tuple(names), time_s=time_s, T_world_cam=T_world_cam)
 
     def __len__(self) -> int:
         return len(self.images_left)
@@ -395,6 +405,16 @@ def _check_words(name: str, words: object, count: int, what: str) -> None:
         raise InputError(name, f"a tuple of {count} {what}", type(words).__name__)
     if len(words) != count:
         raise InputError(name, f"{count} {what}", f"{len(words)}")
+
+
+def _check_motion(time_s: Tensor | None, T_world_cam: Tensor | None) -> None:
+    if time_s is not None and not bool(time_s.isfinite().all()):
+        raise InputError("time_s", "finite seconds", str(time_s.tolist()), "leave it out where times are not known")
+    if T_world_cam is None:
+        return
+    if not bool(T_world_cam.isfinite().all()):
+        raise InputError("T_world_cam", "finite poses", "NaN or infinity", "leave it out where poses are not known")
+    check_rotation("T_world_cam", T_world_cam)
 
 
 def _check_tracks(

@@ -9,7 +9,9 @@
 
 Every sequence is cut into pieces of as many frames as `--views` says, each refined in one call; the first number is
 what the others are compared with. The same cars count in all: those that can be asked of an image (`CountedLabels`),
-with the box that is returned, refined or not. Prints tables in markdown: all cars, those that turn to the camera by
+with the box that is returned, refined or not. With `--interval` cars move smoothly (docs/tracks.md).
+
+Prints tables in markdown: all cars, those that turn to the camera by
 more than `--turn-deg` within their sequence, and median errors of near and far faces by distance. Writes one line a
 car, frame and number of frames to `OUT/cars.csv`. With `--swap` two cars of each sequence exchange their tracks half
 way: both must be split, and nothing may get worse.
@@ -91,6 +93,8 @@ def run(args: argparse.Namespace) -> None:
     found: list[CarOfFrame] = []
     for _, ids in groupby(dataset.frame_ids, dataset.sequence_of):
         loaded = [dataset.load(frame_id) for frame_id in ids]
+        if args.interval is not None:
+            loaded = [_timed(item, number * args.interval) for number, item in enumerate(loaded)]
         if args.swap:
             loaded = _swapped(loaded)
         for views in args.views:
@@ -162,6 +166,11 @@ def _reach(
     rays = true[:, [0, 2]] / true[:, [0, 2]].norm(dim=1, keepdim=True)
     along = (corners * rays[:, None]).sum(dim=-1)
     return torch.stack([along.amin(dim=1), along.amax(dim=1)], dim=1)
+
+
+def _timed(item: LoadedFrame, seconds: float) -> LoadedFrame:
+    frame = item.frame
+    return replace(item, frame=replace(frame, time_s=frame.images_left.new_tensor([seconds])))
 
 
 def _swapped(loaded: Sequence[LoadedFrame]) -> list[LoadedFrame]:
@@ -275,6 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", nargs="+", metavar="ID")
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8], help="frames in a call (default 1 2 4 8)")
     parser.add_argument("--turn-deg", type=float, default=20.0, help="(default 20)")
+    parser.add_argument("--interval", type=float, metavar="SECONDS", help="between frames; default: not known")
     parser.add_argument("--swap", action="store_true", help="exchange two tracks half way")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="of 'calibrate-rig' or a run; default: none")
     parser.add_argument("--threads", type=int, default=1)

@@ -139,7 +139,7 @@ def test_groups_made_in_python_are_checked_too(make: Callable[[], object], text:
 def test_every_setting_is_described_and_every_number_has_limits() -> None:
     config = RefinerConfig()
     groups = [x for x in vars(config).values() if isinstance(x, Settings)] + [config.stages[0]]
-    assert len(groups) == 11
+    assert len(groups) == 12
     settings = [(group, field) for group in groups for field in dataclasses.fields(group)]
     assert len(settings) > 60
     for group, field in settings:

@@ -244,7 +244,7 @@ def test_a_view_whose_track_has_no_other_that_is_trusted_has_a_shape_of_its_own(
 
 
 @pytest.mark.parametrize("doubted", [False, True])
-@pytest.mark.parametrize("mode", ["unroll", "implicit"])
+@pytest.mark.parametrize("mode", ["unroll", "implicit", "implicit_gauss_newton"])
 def test_gradients_of_a_track_are_those_of_differences(
     mode: str, doubted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -271,7 +271,9 @@ def test_gradients_of_a_track_are_those_of_differences(
     step = 1e-5
     numeric = float(summary_at(SETTLED, step) - summary_at(SETTLED, -step)) / (2 * step)
     assert abs(numeric) > 1e-3
-    assert abs(float(gradient) - numeric) < 1e-3 + 0.02 * abs(numeric)
+    # Gauss-Newton leaves second derivatives out.
+    share = 0.3 if mode == "implicit_gauss_newton" else 0.02
+    assert abs(float(gradient) - numeric) < 1e-3 + share * abs(numeric)
 
 
 def test_two_views_of_a_track_in_one_frame_are_refused() -> None:

@@ -40,6 +40,8 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
         frame_ids=tuple(frame_id for item in loaded for frame_id in item.frame.frame_ids),
         disparity=_disparities([item.frame.disparity for item in loaded], size_hw),
         points_cam=_points([item.frame.points_cam for item in loaded]),
+        time_s=_of_all([item.frame.time_s for item in loaded]),
+        T_world_cam=_of_all([item.frame.T_world_cam for item in loaded]),
     )
     return frame, _detections([item.detections for item in loaded], size_hw, _tracks(loaded))
 
@@ -78,6 +80,12 @@ def _points(clouds: Sequence[Tensor | None]) -> Tensor | None:
         raise InputError("loaded", "frames with LiDAR points, or frames without", f"{len(known)} of {len(clouds)} with")
     most = max(points.shape[1] for points in known)
     return torch.cat([pad(points, (0, 0, 0, most - points.shape[1]), value=torch.nan) for points in known])
+
+
+def _of_all(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """Of all frames; None where one is without."""
+    known = [part for part in parts if part is not None]
+    return torch.cat(known) if len(known) == len(parts) else None
 
 
 def _cameras(cameras: Sequence[StereoCamera]) -> StereoCamera:

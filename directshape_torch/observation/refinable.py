@@ -84,6 +84,7 @@ def check_fit(frames: FrameBatch, detections: Detections, prior: ShapePrior) -> 
                 "move them together with .to(device, dtype)",
             )
     _check_masks("detections", detections, frames)
+    _check_times(detections, frames)
     if detections.occluders is not None:
         _check_masks("detections.occluders", detections.occluders, frames)
 
@@ -101,6 +102,19 @@ def _check_masks(name: str, instances: Detections | Occluders, frames: FrameBatc
     lowest, highest = torch.stack(torch.aminmax(instances.frame_index)).tolist()
     if lowest < 0 or highest >= len(frames):
         raise InputError(f"{name}.frame_index", f"0..{len(frames) - 1}", f"{lowest}..{highest}")
+
+
+def _check_times(detections: Detections, frames: FrameBatch) -> None:
+    """Raise `InputError` where two views of a track were taken at one time."""
+    if detections.track_id is None or frames.time_s is None:
+        return
+    times = frames.time_s[detections.frame_index].tolist()
+    seen: set[tuple[int, float]] = set()
+    for view in zip(detections.track_id.tolist(), times, strict=True):
+        if view[0] >= 0 and view in seen:
+            cure = "take the time of the first frame off, before they become float32"
+            raise InputError("frames.time_s", "another time for each view of a track", f"{view[1]:g} s twice", cure)
+        seen.add(view)
 
 
 def without_empty_masks(detections: Detections, extents: SceneExtents | None = None) -> Detections:

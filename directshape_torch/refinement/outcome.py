@@ -84,6 +84,16 @@ class Outcome(CarRecord):
             track_part=none - 1,
         )
 
+    def with_columns(self, names: tuple[str, ...]) -> Outcome:
+        """With costs in the columns of these names, 0 in those that it has not."""
+        place = torch.tensor([names.index(name) for name in self.term_names], device=self.status.device)
+
+        def placed_in(costs: Tensor) -> Tensor:
+            return costs.new_zeros(len(costs), len(names)).index_copy(1, place, costs)
+
+        before, after = placed_in(self.cost_before), placed_in(self.cost_after)
+        return replace(self, term_names=names, cost_before=before, cost_after=after)
+
     def going_on(self, rows: Tensor, later: Outcome) -> Outcome:
         """The outcome with the figures of a later minimisation of the cars `rows` (R,), ascending; the state stays."""
         done = self.iterations.index_add(0, rows, later.iterations)

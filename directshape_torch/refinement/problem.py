@@ -60,6 +60,7 @@ class CarProblem:
         factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
         num_extra: how many of the terms, the last ones, are a user's own.
         num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
+        num_path: N, 9 where views of a track have a path in common.
         sharing: whose shapes are one (`tracks.py`).
     """
 
@@ -71,6 +72,7 @@ class CarProblem:
     factors: Tensor | None = None
     num_extra: int = 0
     num_offsets: int = 0
+    num_path: int = 0
     sharing: Sharing = INDEPENDENT
 
     @property
@@ -219,11 +221,12 @@ class CarStage:
         return self.without_held(summed(layout.sums(), layout.weight, parts))
 
     def moving_unknowns(self, like: Tensor) -> Tensor:
-        """Unknowns (D,) that the stage moves, offsets always, on the device of `like`."""
-        num_codes, num_offsets = self.problem.prior.num_codes, self.problem.num_offsets
-        number, unknowns = torch.arange(6 + num_codes + num_offsets, device=like.device), self.config.unknowns
-        is_pose, is_offset = number < 6, number >= 6 + num_codes
-        return is_offset | (is_pose & (unknowns != "shape")) | (~is_pose & (unknowns != "pose"))
+        """Unknowns (D,) that the stage moves, offsets and paths always, on the device of `like`."""
+        problem, unknowns = self.problem, self.config.unknowns
+        num_codes, num_others = problem.prior.num_codes, problem.num_offsets + problem.num_path
+        number = torch.arange(6 + num_codes + num_others, device=like.device)
+        is_pose, is_other = number < 6, number >= 6 + num_codes
+        return is_other | (is_pose & (unknowns != "shape")) | (~is_pose & (unknowns != "pose"))
 
     def without_held(self, at: Evaluation) -> Evaluation:
         """What the solver sees of it: an unknown that the stage holds has no slope and a curvature of its own."""
@@ -238,7 +241,8 @@ class CarStage:
         """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
         free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
         free_code = state.code.abs() < self.problem.config.solver.max_code
-        free = torch.cat([free_pose, free_code, torch.ones_like(state.offset_px, dtype=torch.bool)], dim=1)
+        others = (torch.ones_like(x, dtype=torch.bool) for x in (state.offset_px, state.path))
+        free = torch.cat([free_pose, free_code, *others], dim=1)
         return free & self.moving_unknowns(free)
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
@@ -249,7 +253,8 @@ class CarStage:
         """Largest trusted step of each unknown, (D,) float64; not to be written to."""
         prior, num_offsets = self.problem.prior, self.problem.num_offsets
         limits = [_MAX_STEP_M] * 3 + [_MAX_STEP_RAD] * 3 + [_MAX_STEP_CODE] * prior.num_codes
-        limits += [_MAX_STEP_OFFSET_PX] * num_offsets
+        # A path follows its views.
+        limits += [_MAX_STEP_OFFSET_PX] * num_offsets + [math.inf] * self.problem.num_path
         return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))
 
 

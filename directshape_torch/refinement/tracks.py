@@ -20,6 +20,7 @@ from directshape_torch.solver.problem import put_rows, take_rows
 from directshape_torch.solver.sharing import Groups, said_of_shared
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState, following, retract
+from directshape_torch.terms.motion import NUM_PATH, hold_of_path, motion_terms, timed, with_path
 
 # What the family of shapes says is known once, however many views there are; each detection's dimensions are a
 # measurement of their own.
@@ -48,7 +49,8 @@ def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarSt
             return replace(outcome, state=_attached(problem, cars, origin, minimum))
         views, rows = cars.of_cars(shared.keep), shared.keep.nonzero()[:, 0]
         agreed = shared.agreed(take_rows(minimum.state, rows))
-        in_track, of_track = _judged(shared.problem, views, take_rows(initial, rows), agreed, unroll)
+        before = shared.with_path(take_rows(initial, rows))
+        in_track, of_track = _judged(shared.problem, views, before, agreed, unroll)
         left = (in_track.status == Status.singular.code) | (in_track.status == Status.non_finite.code)
         if not bool(left.any()):
             break
@@ -62,7 +64,9 @@ def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarSt
     alone = _attached(problem, cars, origin, minimum)
     of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), _of_all_members(in_track))
     of_track = replace(of_track, track_part=shared.part_of(in_track.status))
-    outcome = outcome.going_on(rows[chosen], of_track.rows(chosen))
+    outcome = outcome.with_columns(of_track.term_names).going_on(rows[chosen], of_track.rows(chosen))
+    # The path has done its work.
+    of_views = of_views._replace(path=of_views.path[:, :0])
     return replace(outcome, state=put_rows(alone, rows[chosen], take_rows(of_views, chosen)))
 
 
@@ -92,12 +96,16 @@ class Together:
     Attributes:
         keep: (B,) bool, which of the cars of the call they are.
         problem: of these R views, its last stage alone.
+        agreement: whose codes are one.
+        cars: the views, with times and cameras of their track.
         gradient, hessian: (R, D) and (R, D, D) of what each adds to the cost of its track, where it ended by itself.
         part: (R,) of its track, 0 unless it was split.
     """
 
     keep: Tensor
     problem: CarProblem
+    agreement: Groups
+    cars: CarBatch
     gradient: Tensor
     hessian: Tensor
     part: Tensor
@@ -111,15 +119,19 @@ class Together:
         step = torch.zeros_like(self.hessian[:, 0]).index_copy(1, number, alone.code.to(self.hessian.dtype))
         slope = self.gradient - (self.hessian @ step[:, :, None])[:, :, 0]
         undamped, everybody = torch.zeros_like(slope[:, 0]), torch.ones_like(slope[:, 0], dtype=torch.bool)
-        to_agreement, _ = self.problem.sharing.damped_step(self.hessian, slope, undamped, everybody)
+        to_agreement, _ = self.agreement.damped_step(self.hessian, slope, undamped, everybody)
         max_code = self.problem.config.solver.max_code
         code = to_agreement[:, number].to(alone.code).clamp(-max_code, max_code)
-        return retract(alone, to_agreement - step)._replace(code=code)
+        return self.with_path(retract(alone, to_agreement - step)._replace(code=code))
+
+    def with_path(self, state: CarState) -> CarState:
+        """States (R) with the paths that fit their views best, where there is a motion prior."""
+        return with_path(self.problem.config.tracks, self.agreement, self.cars, state)
 
     def part_of(self, status: Tensor) -> Tensor:
         """The part of its track (R,), -1 for a view that ends with a shape of its own: no other was refined."""
-        sharing, is_in = self.problem.sharing, is_refined(status)
-        return torch.where(sharing.total(is_in.to(torch.float64), is_in) > 1, self.part, -1)
+        is_in = is_refined(status)
+        return torch.where(self.agreement.total(is_in.to(torch.float64), is_in) > 1, self.part, -1)
 
 
 def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], joins: Tensor) -> Together | None:
@@ -146,8 +158,10 @@ def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], jo
     # Each by itself ended where its slopes add up to nothing: what is left is that of what counts less from here on.
     slopes, curvatures = minimum.after.gradient[index], minimum.after.hessian[index]
     gradient = ((once - 1)[:, :, None] * slopes).sum(dim=1)
-    of_track = _sharing_a_shape(problem.of_problems(keep), sharing, once)
-    return Together(keep, of_track, gradient, (once[:, :, None, None] * curvatures).sum(dim=1), parts)
+    hessian = (once[:, :, None, None] * curvatures).sum(dim=1)
+    timed_views = timed(sharing, cars.of_cars(keep))
+    of_track = _in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index))
+    return Together(keep, of_track, sharing, timed_views, gradient, hessian, parts)
 
 
 def _unknowns(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -223,14 +237,35 @@ def _of_one_car(views: list[int], says: _Quadratics) -> list[list[int]]:
 
 def _once(problem: CarProblem, sharing: Groups) -> Tensor:
     """How much of each column of the cost (R, T) counts, so that a track knows once what is known of its shape."""
-    everybody = torch.ones_like(sharing.is_alone)
-    share = 1 / sharing.total(everybody.to(torch.float64), everybody)
+    share = _share(sharing)
     columns = [share if name == _KNOWN_ONCE else torch.ones_like(share) for name in problem.term_names]
     return torch.stack(columns, dim=1)
 
 
-def _sharing_a_shape(problem: CarProblem, sharing: Groups, once: Tensor) -> CarProblem:
-    """The last stage of a problem of R views, whose shapes are one in each group."""
-    config = replace(problem.config, stages=problem.config.stages[-1:])
+def _share(sharing: Groups) -> Tensor:
+    """One over the number of views in the group of each (R,), float64."""
+    everybody = torch.ones_like(sharing.is_alone)
+    return 1 / sharing.total(everybody.to(torch.float64), everybody)
+
+
+def _in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState) -> CarProblem:
+    """The last stage of a problem of R views, with one shape in each group, and one path where times are known."""
+    once = _once(problem, sharing)
     factors = once if problem.factors is None else once * problem.factors
-    return replace(problem, config=config, sharing=sharing, factors=factors)
+    config = replace(problem.config, stages=problem.config.stages[-1:])
+    problem = replace(problem, config=config, sharing=sharing, factors=factors)
+    motion = motion_terms(config.tracks, views)
+    if not motion:
+        return problem
+    own = len(problem.terms) - problem.num_extra
+    before = sum(len(term.names) for term in problem.terms[:own])
+    of_motion = torch.stack([hold_of_path(config.tracks, sharing, views, alone), _share(sharing)], dim=1)
+    last = len(sharing.own) + len(sharing.shared)
+    of_path = torch.arange(last, last + NUM_PATH, device=sharing.shared.device)
+    return replace(
+        problem,
+        terms=(*problem.terms[:own], *motion, *problem.terms[own:]),
+        factors=torch.cat([factors[:, :before], of_motion, factors[:, before:]], dim=1),
+        sharing=replace(sharing, shared=torch.cat([sharing.shared, of_path])),
+        num_path=NUM_PATH,
+    )

@@ -22,6 +22,7 @@ class CarState(NamedTuple):
     T_obj_cam: Tensor  # (B, 4, 4) left camera to object
     code: Tensor  # (B, K) standard deviations
     offset_px: Tensor  # (B, S) measured minus true disparity, full-resolution pixels; S is 1, or 0 where it is known
+    path: Tensor  # (B, N) of its track on the ground, see `terms.motion`; N is 9, or 0 where there is none
 
     @classmethod
     def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
@@ -31,12 +32,12 @@ class CarState(NamedTuple):
             >>> CarState.of(torch.eye(4)[None], torch.zeros(1, 2), num_offsets=1).offset_px
             tensor([[0.]])
         """
-        return cls(T_obj_cam, code, code.new_zeros(len(code), num_offsets))
+        return cls(T_obj_cam, code, code.new_zeros(len(code), num_offsets), code[:, :0])
 
     @property
     def num_unknowns(self) -> int:
-        """D = 6 + K + S."""
-        return 6 + self.code.shape[1] + self.offset_px.shape[1]
+        """D = 6 + K + S + N."""
+        return 6 + self.code.shape[1] + self.offset_px.shape[1] + self.path.shape[1]
 
 
 @torch.no_grad()
@@ -51,11 +52,12 @@ def _field_sigma_px(frames: FrameBatch, detections: Detections, offset_sigma_px:
 
 
 def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_angle: float = torch.inf) -> CarState:
-    """`T_obj_cam <- exp(v, omega) T_obj_cam`, `code <- code + dcode`, bounded, `offset_px <- offset_px + doffset`.
+    """`T_obj_cam <- exp(v, omega) T_obj_cam`, `code <- code + dcode`, bounded, offset and path likewise.
 
     Args:
         state: B cars.
-        delta: (B, 6 + K + S), `(v, omega, dcode, doffset)` in metres, radians, standard deviations and pixels.
+        delta: (B, 6 + K + S + N), `(v, omega, dcode, doffset, dpath)` in metres, radians, standard deviations, pixels
+            and the units of the path.
         max_code: largest magnitude of a code component.
         max_angle: no rotation is larger, radians (see `se3.exp`).
 
@@ -64,10 +66,11 @@ def retract(state: CarState, delta: Tensor, max_code: float = torch.inf, max_ang
         >>> retract(state, torch.tensor([[1.0, 0, 0, 0, 0, 0, 0.5, 9.0]]), max_code=3.0).code
         tensor([[0.5000, 3.0000]])
     """
-    sizes = [6, state.code.shape[1], state.offset_px.shape[1]]
-    twist, code_step, offset_step = torch.split_with_sizes(delta.to(state.code.dtype), sizes, dim=1)
+    sizes = [6, state.code.shape[1], state.offset_px.shape[1], state.path.shape[1]]
+    twist, code_step, offset_step, path_step = torch.split_with_sizes(delta.to(state.code.dtype), sizes, dim=1)
     T_obj_cam = torch.bmm(se3.exp(twist, max_angle), state.T_obj_cam)
-    return CarState(T_obj_cam, (state.code + code_step).clamp(-max_code, max_code), state.offset_px + offset_step)
+    code = (state.code + code_step).clamp(-max_code, max_code)
+    return CarState(T_obj_cam, code, state.offset_px + offset_step, state.path + path_step)
 
 
 def move_by_disparity(state: CarState, focal_baseline: Tensor, offset_px: float | Tensor) -> CarState:
@@ -122,6 +125,7 @@ class CarBatch:
         offset_sigma_px: (B,) standard deviation of the unknown offset of the disparity; None where no car has one.
         field_sigma_px: (B,) that of the rig's disparity field at the car; 0 where the offset is an unknown.
         track_id: (B,) see `Detections`, or None.
+        time_s, T_world_cam: (B,) and (B, 4, 4) of each car's frame, see `FrameBatch`, or None.
     """
 
     detection_row: Tensor
@@ -138,6 +142,8 @@ class CarBatch:
     offset_sigma_px: Tensor | None
     field_sigma_px: Tensor
     track_id: Tensor | None
+    time_s: Tensor | None = None
+    T_world_cam: Tensor | None = None
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
@@ -164,6 +170,8 @@ class CarBatch:
             offset_sigma_px=offset_sigma_px,
             field_sigma_px=_field_sigma_px(frames, detections, offset_sigma_px),
             track_id=detections.track_id,
+            time_s=None if frames.time_s is None else frames.time_s[f],
+            T_world_cam=None if frames.T_world_cam is None else frames.T_world_cam[f],
         )
 
     def __len__(self) -> int:

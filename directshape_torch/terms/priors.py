@@ -247,15 +247,24 @@ def pose_prior(
     x_axis, x_detector = R_cam_obj[:, 0::2, 0], detector_T_cam_obj[:, 0::2, 0]
     sine = x_axis[:, 0] * x_detector[:, 1] - x_axis[:, 1] * x_detector[:, 0]
     turned = torch.atan2(sine, (x_axis * x_detector).sum(-1))
-    # The x axis h moves by R_cam_obj (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], its angle atan2(-h_z, h_x) by
-    # (h_z dh_x - h_x dh_z) / |h|^2.
-    dh_y, dh_z = R_cam_obj[:, 0::2, 2], -R_cam_obj[:, 0::2, 1]
-    by_y, by_z = (x_axis[:, 1] * dh[:, 0] - x_axis[:, 0] * dh[:, 1] for dh in (dh_y, dh_z))
-    J_yaw_omega = torch.stack([torch.zeros_like(by_y), by_y, by_z], dim=-1) / (x_axis * x_axis).sum(-1, keepdim=True)
     J = T_obj_cam.new_zeros(len(T_obj_cam), 4, 6 + num_codes)
     J[:, :3, :3] = -axes @ R_cam_obj
-    J[:, 3, 3:6] = J_yaw_omega
+    J[:, 3, 3:6] = J_heading_omega(R_cam_obj)
     return PriorResidual(torch.cat([moved, turned[:, None]], dim=-1) / sigma, J / sigma[..., None])
+
+
+def J_heading_omega(R_obj: Tensor) -> Tensor:
+    """Derivative (B, 3) of the heading `atan2(-h_z, h_x)` of cars of rotation (B, 3, 3) by omega; h is their x axis.
+
+    It moves by R (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], its angle by (h_z dh_x - h_x dh_z) / |h|^2.
+
+    Examples:
+        >>> J_heading_omega(torch.eye(3)[None])
+        tensor([[ 0., -1.,  0.]])
+    """
+    x_axis, dh_y, dh_z = R_obj[:, 0::2, 0], R_obj[:, 0::2, 2], -R_obj[:, 0::2, 1]
+    by_y, by_z = (x_axis[:, 1] * dh[:, 0] - x_axis[:, 0] * dh[:, 1] for dh in (dh_y, dh_z))
+    return torch.stack([torch.zeros_like(by_y), by_y, by_z], dim=-1) / (x_axis * x_axis).sum(-1, keepdim=True)
 
 
 def rig_prior(cars: CarBatch, state: CarState) -> PriorResidual:

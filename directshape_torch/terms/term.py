@@ -120,10 +120,9 @@ class Part(NamedTuple):
 
 def linear_of(term: Term, field: Field, state: CarState, where: Where) -> Linear:
     """`term.linear` with a column for each unknown of the state."""
-    at, num_offsets = term.linear(field, state, where), state.offset_px.shape[1]
-    if not num_offsets or at.J_inner_state.shape[-1] == state.num_unknowns:
-        return at
-    return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, num_offsets)))
+    at = term.linear(field, state, where)
+    missing = state.num_unknowns - at.J_inner_state.shape[-1]
+    return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, missing))) if missing else at
 
 
 def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:
@@ -162,6 +161,7 @@ _SIZES = {
     "T_obj_cam": 0,
     "code": 0,
     "offset_px": 0,
+    "path": 0,
     "values": 0,
     "points_obj": 1,
     "normal_obj": 1,

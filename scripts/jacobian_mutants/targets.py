@@ -76,8 +76,14 @@ TARGETS: dict[str, Target] = {
             "dimensions_prior",
             "pose_prior",
             "rig_prior",
+            "J_heading_omega",
         ),
         (*_OFFSET[:1], *_JACOBIANS),
+    ),
+    "motion": Target(
+        "directshape_torch/terms/motion.py",
+        ("path_prior", "acceleration_prior", "_on_the_ground", "_basis"),
+        ("tests/terms/test_motion.py",),
     ),
     "robust": Target(
         "directshape_torch/terms/robust.py",

@@ -13,9 +13,11 @@ from directshape_torch.terms.cars import CarState
 
 def moved(state: CarState, delta: Tensor) -> CarState:
     """The state at `delta` (B, D) of its own tangent, by the definition of CONVENTIONS.md; differentiable."""
-    num_codes = state.code.shape[1]
-    code, offset_px = state.code + delta[:, 6 : 6 + num_codes], state.offset_px + delta[:, 6 + num_codes :]
-    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, code, offset_px)
+    last, size = 6, []
+    for part in state[1:]:
+        size.append(delta[:, last : last + part.shape[1]])
+        last += part.shape[1]
+    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, *(x + dx for x, dx in zip(state[1:], size, strict=True)))
 
 
 def tangent_of(state: CarState) -> Tensor:

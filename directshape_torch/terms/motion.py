@@ -1,0 +1,154 @@
+"""A car's way through the frames of its track: a smooth path on the ground, from which each view may deviate.
+
+The path is `(x, z, heading)(t) = p + v t + a t^2 / 2`, nine unknowns that the views of a track share as they share the
+code; t is in seconds from the middle of the track, x and z are axes of the camera of its first view, or of the camera
+that moves where nobody has said how it does. Constant velocity and turn rate is what `a` is held to. So a row sees its
+own view and the path, never another view. Derivation: docs/derivations/tracks.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import TracksConfig
+from directshape_torch.geometry import se3
+from directshape_torch.solver.sharing import Groups
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.priors import J_heading_omega, PriorResidual, PriorTerm
+
+NUM_PATH = 9
+# Of squared standard deviations, as that of the detector's pose.
+MOTION_WEIGHT = 0.2
+# A track of which a view, refined by itself, is further from the path than so many standard deviations, its own taken
+# for this share of its distance, goes along none (or is not of one car), and is held by next to nothing.
+_FURTHEST, _OWN_SHARE, _NEXT_TO_NOTHING = 3.0, 0.01, 1e-4
+# An acceleration lasts about so long: what it changes by is what a view so far from the middle may deviate.
+_STEADY_S = 0.3
+
+
+def motion_terms(config: TracksConfig, cars: CarBatch) -> list[PriorTerm]:
+    """What holds views to their path, and the path to constant velocity; none without times or standard deviations."""
+    if cars.time_s is None or config.path_sigma_m == 0:
+        return []
+    of_acceleration = _of_acceleration(config)
+    return [
+        PriorTerm("path", MOTION_WEIGHT, cars, partial(path_prior, config=config), 3),
+        PriorTerm("acceleration", MOTION_WEIGHT, cars, lambda _, state: acceleration_prior(state, of_acceleration), 3),
+    ]
+
+
+def _of_acceleration(config: TracksConfig) -> tuple[float, float, float]:
+    along = config.acceleration_sigma_mps2
+    return along, along, math.radians(config.turn_acceleration_sigma_dps2)
+
+
+def deviation_sigma(config: TracksConfig, time_s: Tensor) -> Tensor:
+    """Standard deviations (B, 3) of x, z and heading about a path, a Taylor series, at times (B,) from its middle.
+
+    Examples:
+        >>> deviation_sigma(TracksConfig(path_sigma_m=0.1, acceleration_sigma_mps2=1.8), torch.tensor([0.0, 1.0]))[:, 0]
+        tensor([0.1000, 1.0050])
+    """
+    here = time_s.new_tensor([config.path_sigma_m, config.path_sigma_m, math.radians(config.path_sigma_yaw_deg)])
+    change = time_s.new_tensor(_of_acceleration(config)) / _STEADY_S
+    return torch.hypot(here.expand(len(time_s), 3), change * time_s.abs()[:, None] ** 3 / 6)
+
+
+def path_prior(cars: CarBatch, state: CarState, config: TracksConfig) -> PriorResidual:
+    """Place on the ground and heading against the path (B, 9), in standard deviations.
+
+    Of the heading the sine: a car that a detector took for one that drives backwards pulls at nobody.
+    """
+    place, heading, J_v, J_omega = _on_the_ground(cars, state.T_obj_cam)
+    basis = _basis(cars)
+    x, z, yaw = (state.path.view(-1, 3, 3) * basis[:, None]).sum(dim=2).unbind(1)
+    turned = heading - yaw
+    residual = torch.stack([place[:, 0] - x, place[:, 1] - z, torch.sin(turned)], dim=1)
+    slope = torch.cos(turned)[:, None]
+    J = residual.new_zeros(len(residual), 3, state.num_unknowns)
+    J[:, :2, :3] = J_v
+    J[:, 2, 3:6] = slope * J_omega
+    first = state.num_unknowns - NUM_PATH
+    for row in range(3):
+        J[:, row, first + 3 * row : first + 3 * row + 3] = -basis if row < 2 else -slope * basis
+    assert cars.time_s is not None
+    per_sigma = 1 / deviation_sigma(config, cars.time_s)
+    return PriorResidual(residual * per_sigma, J * per_sigma[:, :, None])
+
+
+def acceleration_prior(state: CarState, sigma: tuple[float, float, float]) -> PriorResidual:
+    """Acceleration of the path along x and z and of its heading, in standard deviations."""
+    per_sigma = 1 / state.path.new_tensor(sigma)
+    J = state.path.new_zeros(len(state.path), 3, state.num_unknowns)
+    for row in range(3):
+        J[:, row, state.num_unknowns - NUM_PATH + 3 * row + 2] = per_sigma[row]
+    return PriorResidual(state.path[:, 2::3] * per_sigma, J)
+
+
+def with_path(config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarState) -> CarState:
+    """States (R) with the path of each group that fits its views best; as they are where there is no motion prior."""
+    if not motion_terms(config, cars):
+        return state
+    place, heading, _, _ = _on_the_ground(cars, state.T_obj_cam)
+    first = sharing.rows[:, 0][sharing.of_problem]
+    # The nearest heading to that of the first view, or to its opposite.
+    half_turns = torch.atan2(torch.sin(2 * (heading - heading[first])), torch.cos(2 * (heading - heading[first]))) / 2
+    seen = torch.cat([place, (heading[first] + half_turns)[:, None]], dim=1)
+    assert cars.time_s is not None
+    everybody, basis = torch.ones_like(sharing.is_alone), _basis(cars).to(torch.float64)
+    weight = 1 / deviation_sigma(config, cars.time_s).to(basis).square()
+    columns = []
+    for column, sigma in enumerate(_of_acceleration(config)):
+        weighted = weight[:, column, None] * basis
+        normal = sharing.total(weighted[:, :, None] * basis[:, None], everybody)
+        right = sharing.total(weighted * seen[:, column, None], everybody)
+        held = torch.diag(normal.new_tensor([0.0, 0.0, 1 / sigma**2]))
+        columns.append(torch.linalg.solve(normal + held, right))
+    return state._replace(path=torch.cat(columns, dim=1).to(state.code))
+
+
+def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: CarState) -> Tensor:
+    """Factor (R,) of what deviations cost views that ended here by themselves: 1 where a path fits their track."""
+    fitted = with_path(config, sharing, cars, alone)
+    assert cars.time_s is not None
+    place = _on_the_ground(cars, fitted.T_obj_cam)[0]
+    off = (place - (fitted.path.view(-1, 3, 3)[:, :2] * _basis(cars)[:, None]).sum(dim=2)).norm(dim=1)
+    own = _OWN_SHARE * fitted.T_obj_cam[:, :3, 3].norm(dim=1)
+    too_far = off > _FURTHEST * torch.hypot(deviation_sigma(config, cars.time_s)[:, 0], own)
+    return torch.ones_like(off, dtype=torch.float64).masked_fill(sharing.any(too_far), _NEXT_TO_NOTHING)
+
+
+def timed(sharing: Groups, cars: CarBatch) -> CarBatch:
+    """Views with times from the middle of their track, and poses of the camera in that of its first view."""
+    if cars.time_s is None:
+        return cars
+    T_path_cam = cars.T_world_cam
+    if T_path_cam is not None:
+        T_path_cam = se3.inverse(T_path_cam[sharing.rows[:, 0]][sharing.of_problem]) @ T_path_cam
+    return replace(cars, time_s=cars.time_s - _mean(sharing, cars.time_s), T_world_cam=T_path_cam)
+
+
+def _mean(sharing: Groups, values: Tensor) -> Tensor:
+    everybody = torch.ones_like(sharing.is_alone)
+    return sharing.total(values, everybody) / sharing.total(torch.ones_like(values), everybody)
+
+
+def _basis(cars: CarBatch) -> Tensor:
+    assert cars.time_s is not None
+    t = cars.time_s
+    return torch.stack([torch.ones_like(t), t, 0.5 * t * t], dim=1)
+
+
+def _on_the_ground(cars: CarBatch, T_obj_cam: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Place (B, 2) and heading (B,) in the axes of the path, and their derivatives by v and by omega."""
+    T_path_obj = se3.inverse(T_obj_cam)
+    if cars.T_world_cam is not None:
+        T_path_obj = cars.T_world_cam @ T_path_obj
+    R = T_path_obj[:, :3, :3]
+    # The origin moves by -R_path_obj v.
+    return T_path_obj[:, 0:3:2, 3], torch.atan2(-R[:, 2, 0], R[:, 0, 0]), -R[:, 0::2], J_heading_omega(R)

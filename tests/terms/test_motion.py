@@ -1,0 +1,195 @@
+"""The motion prior: derivatives, the path that fits, and what it does to the views of a track."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.derivatives import moved, tangent_of
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.ground import cars_on
+from helpers.problems import DEFAULT
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detections, joined_frames, street
+from torch import Tensor
+
+from directshape_torch.config import TracksConfig
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.result import RefinementResult
+from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.solver.sharing import Groups
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.motion import deviation_sigma, hold_of_path, motion_terms, timed, with_path
+from directshape_torch.terms.priors import PriorTerm
+
+CONFIG = TracksConfig()
+TIMES = torch.tensor([0.0, 0.1, 0.3, 0.4, 1.0], dtype=torch.float64)
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def views(with_camera: bool, num_offsets: int = 0) -> tuple[CarBatch, CarState]:
+    """Five views at random."""
+    cars, T_obj_cam = cars_on(random(3), random(1), 5), se3.exp(random(5, 6))
+    T_world_cam = se3.exp(random(5, 6, seed=1)) if with_camera else None
+    state = CarState(T_obj_cam, random(5, 3, seed=2), random(5, num_offsets, seed=3), random(5, 9, seed=4))
+    return replace(cars, time_s=TIMES, T_world_cam=T_world_cam), state
+
+
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("num_offsets", [0, 1])
+@pytest.mark.parametrize("with_camera", [False, True])
+def test_derivatives_are_those_of_autograd_and_of_differences(with_camera: bool, num_offsets: int, number: int) -> None:
+    cars, state = views(with_camera, num_offsets)
+    term: PriorTerm = motion_terms(CONFIG, cars)[number]
+    J = term.residual_of(cars, state).J_residual_state
+
+    def residual(delta: Tensor) -> Tensor:
+        return term.residual_of(cars, moved(state, delta)).residual.sum(dim=0)
+
+    zero = tangent_of(state)
+    by_autograd = torch.autograd.functional.jacobian(residual, zero).movedim(1, 0)
+    torch.testing.assert_close(J, by_autograd, rtol=1e-9, atol=1e-9)
+    for column in range(state.num_unknowns):
+        step = torch.zeros_like(zero)
+        step[:, column] = 1e-6
+        both = [term.residual_of(cars, moved(state, sign * step)).residual for sign in (1, -1)]
+        torch.testing.assert_close(J[:, :, column], (both[0] - both[1]) / 2e-6, rtol=1e-6, atol=1e-6)
+
+
+def on_a_path(path: Tensor, T_world_cam: Tensor | None) -> CarState:
+    """States at `TIMES` on a path (9,) whose times count from their mean."""
+    t = TIMES - TIMES.mean()
+    x, z, yaw = (path.view(3, 3) @ torch.stack([torch.ones_like(t), t, t * t / 2])).unbind(0)
+    cosine, sine, nothing, one = torch.cos(yaw), torch.sin(yaw), torch.zeros_like(yaw), torch.ones_like(yaw)
+    R = torch.stack([cosine, nothing, sine, nothing, one, nothing, -sine, nothing, cosine], dim=1).view(5, 3, 3)
+    T_path_obj = se3.from_rotation_translation(R, torch.stack([x, 1.6 * one, z], dim=1))
+    if T_world_cam is not None:
+        T_path_obj = se3.inverse(T_world_cam) @ T_world_cam[:1] @ T_path_obj
+    return CarState.of(se3.inverse(T_path_obj), random(5, 3))
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("with_camera", [False, True])
+def test_the_path_of_cars_on_a_path_is_found_and_costs_nothing(with_camera: bool, backwards: bool) -> None:
+    cars, _ = views(with_camera)
+    path = torch.tensor([2.0, 5.0, 0.0, 14.0, -3.0, 0.0, 2.9, 0.8, 0.0], dtype=torch.float64)
+    state = on_a_path(path, cars.T_world_cam)
+    if backwards:
+        half_turn = se3.exp(torch.tensor([0, 0, 0, 0, math.pi, 0], dtype=torch.float64))
+        state.T_obj_cam[2] = half_turn @ state.T_obj_cam[2]
+    sharing = Groups.of([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
+    of_track = timed(sharing, cars)
+    found = with_path(CONFIG, sharing, of_track, state)
+    torch.testing.assert_close(found.path, path.expand(5, 9), rtol=0, atol=1e-8)
+    for term in motion_terms(CONFIG, of_track):
+        assert term.residual_of(of_track, found).residual.abs().max() < 1e-6
+
+
+def test_the_fitted_path_is_the_cheapest_for_views_where_they_are() -> None:
+    cars, state = views(with_camera=False)
+    sharing = Groups.of([1, 2, 1, 1, 2], own=torch.arange(6), shared=torch.arange(6, 9))
+    of_track = timed(sharing, cars)
+    upright = state._replace(T_obj_cam=on_a_path(0.3 * random(9), None).T_obj_cam)
+    fitted = with_path(CONFIG, sharing, of_track, upright)
+    assert torch.equal(fitted.path[0], fitted.path[2])
+    place, acceleration = motion_terms(CONFIG, of_track)
+
+    def cost(path: Tensor) -> Tensor:
+        at = fitted._replace(path=path)
+        share = 1 / sharing.total(torch.ones(5, dtype=torch.float64), torch.ones(5, dtype=torch.bool))
+        once = share * acceleration.residual_of(of_track, at).residual.square().sum(dim=1)
+        # The heading as it is fitted, not its sine.
+        of_place = place.residual_of(of_track, at).residual[:, :2].square().sum(dim=1)
+        return (of_place + once).sum()
+
+    path = fitted.path.clone().requires_grad_()
+    (slope,) = torch.autograd.grad(cost(path), path)
+    summed = sharing.total(slope[:, :6].sum(dim=1), torch.ones(5, dtype=torch.bool))
+    assert summed.abs().max() < 1e-6 * float(cost(path).detach() + 1)
+
+
+def test_deviations_grow_with_the_time_from_the_middle() -> None:
+    sigma = deviation_sigma(CONFIG, torch.tensor([0.0, -0.5, 0.5, 2.0], dtype=torch.float64))
+    assert sigma[0].tolist() == pytest.approx([0.05, 0.05, math.radians(1.0)])
+    assert torch.equal(sigma[1], sigma[2])
+    assert (sigma[3] > 40 * sigma[0]).all()
+
+
+def drive(time_s: Tensor | None, T_world_cam: Tensor | None = None) -> tuple[FrameBatch, Detections]:
+    """Three frames of a car that goes straight on, from boxes that are off."""
+    prior, code = ellipsoid_prior(), torch.tensor([[0.5, -0.4, 0.3]], dtype=torch.float64)
+    seen = [street(prior, [(-1.0, CAMERA_HEIGHT_M, 9.0 + n)], [1.3], code) for n in range(3)]
+    detections = joined_detections([view.detections for view in seen], (120, 160))
+    frames = replace(joined_frames([view.frames for view in seen]), time_s=time_s, T_world_cam=T_world_cam)
+    return frames, replace(disturbed(detections), track_id=torch.zeros(3, dtype=torch.long))
+
+
+def refined(
+    time_s: Tensor | None, config: TracksConfig = CONFIG, T_world_cam: Tensor | None = None
+) -> RefinementResult:
+    settings = replace(DEFAULT, tracks=config)
+    result: RefinementResult = DirectShapeRefiner(ellipsoid_prior(), settings)(*drive(time_s, T_world_cam))
+    return result
+
+
+STIFF = TracksConfig(path_sigma_m=1e-3, path_sigma_yaw_deg=0.05, acceleration_sigma_mps2=1e-2)
+AT = torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)
+
+
+def bend(result: RefinementResult) -> float:
+    """Second difference of the places, metres."""
+    x = result.T_cam_obj[:, :3, 3]
+    return float((x[0] - 2 * x[1] + x[2])[[0, 2]].norm())
+
+
+def test_times_make_the_path_smooth_and_without_them_nothing_changes() -> None:
+    plain, held = refined(None), refined(AT, STIFF)
+    assert plain.term_names == tuple(n for n in held.term_names if n not in ("path", "acceleration"))
+    assert bend(held) < 0.3 * bend(plain)
+    assert held.status == plain.status
+    off = refined(AT, replace(STIFF, path_sigma_m=0.0))
+    assert off.term_names == plain.term_names
+    assert torch.equal(off.T_cam_obj, plain.T_cam_obj)
+    assert torch.equal(off.code, plain.code)
+
+
+def test_where_the_world_is_does_not_matter_and_where_the_camera_goes_does() -> None:
+    still = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    elsewhere = se3.exp(torch.tensor([3.0, 0.0, -7.0, 0.0, 0.0, 0.0], dtype=torch.float64)) @ still
+    jerky = still.clone()
+    jerky[1, 2, 3] = 0.5
+    at_rest, by_itself, shifted, pushed = (refined(AT, STIFF, T) for T in (still, None, elsewhere, jerky))
+    torch.testing.assert_close(at_rest.T_cam_obj, by_itself.T_cam_obj, rtol=0, atol=1e-9)
+    torch.testing.assert_close(at_rest.T_cam_obj, shifted.T_cam_obj, rtol=0, atol=1e-9)
+    assert (pushed.T_cam_obj - at_rest.T_cam_obj)[1, 2, 3] < -0.05
+
+
+def test_what_cannot_be_a_time_or_a_pose_is_refused() -> None:
+    with pytest.raises(InputError, match=r"frames\.time_s: expected another time for each view of a track, got 0\.1 s"):
+        refined(torch.tensor([0.0, 0.1, 0.1], dtype=torch.float64))
+    with pytest.raises(InputError, match="time_s: expected finite seconds"):
+        drive(torch.tensor([0.0, torch.nan, 0.1], dtype=torch.float64))
+    with pytest.raises(InputError, match="time_s"):
+        drive(AT[:2])
+    with pytest.raises(InputError, match="T_world_cam: expected finite poses"):
+        drive(AT, torch.full((3, 4, 4), torch.inf, dtype=torch.float64))
+    with pytest.raises(InputError, match="T_world_cam"):
+        drive(AT, 2 * torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+
+
+@pytest.mark.parametrize(("jump_m", "hold"), [(0.0, 1.0), (0.3, 1.0), (4.0, 1e-4)])
+def test_a_track_that_jumps_is_held_by_next_to_nothing(jump_m: float, hold: float) -> None:
+    cars, _ = views(with_camera=False)
+    sharing = Groups.of([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
+    of_track = timed(sharing, cars)
+    path = torch.tensor([0.0, 0.0, 0.0, 20.0, 9.0, 0.0, 1.6, 0.0, 0.0], dtype=torch.float64)
+    T_cam_obj = se3.inverse(on_a_path(path, None).T_obj_cam)
+    T_cam_obj[2:, 0, 3] += jump_m
+    state = CarState.of(se3.inverse(T_cam_obj), random(5, 3))
+    assert hold_of_path(CONFIG, sharing, of_track, state).tolist() == [hold] * 5
