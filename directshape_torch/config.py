@@ -218,9 +218,6 @@ class PointCloudConfig(Settings):
         30.0, 'factor of the same for "combined": beside the images less is better', at_least=0
     )
     huber_m: float = setting(0.1, "corner of the Huber norm", above=0)
-    matcher: Literal["sgbm", "elas"] = setting(
-        "sgbm", 'disparity where the frames bring none: "sgbm" (OpenCV) or "elas" (optional package)'
-    )
     pixels: Literal["mask", "box"] = setting(
         "mask", 'points of the left instance "mask" where there is one, else of the 2D box; or always of the "box"'
     )

@@ -74,9 +74,8 @@ class CompilationError(DirectShapeError, RuntimeError):
 class MissingDependencyError(DirectShapeError, ImportError):
     """An optional package is needed for what was asked; one that is in no extra of ours comes without `extra`."""
 
-    def __init__(self, package: str, extra: str, purpose: str, *, environment: str = "") -> None:
-        command = f"{environment} pip install" if environment else "pip install"
-        cure = f"install it with: {command} 'directshape_torch[{extra}]'" if extra else "install it as its pages say"
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        cure = f"install it with: pip install 'directshape_torch[{extra}]'" if extra else "install it as its pages say"
         super().__init__(f"{purpose} needs the package {package!r}; {cure}")
 
 

@@ -216,7 +216,7 @@ class DirectShapeRefiner(nn.Module):
         if self.config.method in ("direct", "box_alignment"):
             return _Seen(pixels, None)
         cloud = self.config.point_cloud
-        matched = with_disparity(frames, cloud.matcher, needed=detections.frame_index)
+        matched = with_disparity(frames, needed=detections.frame_index)
         return _Seen(pixels, car_points(matched, detections, cloud))
 
     def _problem(

@@ -36,7 +36,7 @@ def stereo_points(loaded: LoadedFrame, view: FrameView) -> Mapping[int, StereoPo
     A car's pixels are those of its left mask, of its 2D box where it has none; kept are those above the ground and near
     the car, as the point cloud methods of the refinement take them. The rig's bias is taken off where it is known.
     """
-    frames = with_disparity(loaded.frame, "sgbm")
+    frames = with_disparity(loaded.frame)
     samples = car_points(frames, loaded.detections, replace(PointCloudConfig(), max_points=_ALL_POINTS))
     rows, points_cam = samples.object_index.numpy(), samples.points_cam.double().numpy()
     found = {}

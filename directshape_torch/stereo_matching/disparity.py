@@ -1,20 +1,15 @@
-"""Dense disparity of a rectified pair: by OpenCV's semi-global matching, or by ELAS where that is installed.
-
-ELAS (Geiger, Roser, Urtasun, ACCV 2010) is the matcher of Engelmann et al.; its package is GPL-3.0.
-"""
+"""Dense disparity of a rectified pair by OpenCV's semi-global matching."""
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import replace
-from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import InputError, MissingDependencyError
+from directshape_torch.errors import InputError
 from directshape_torch.scene import FrameBatch
 
 _BLOCK_SIZE_PX = 5
@@ -91,55 +86,12 @@ def check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8]) ->
         raise InputError("image_right", f"the size of the left image {image_left.shape}", f"{image_right.shape}")
 
 
-def match_disparity_elas(
-    image_left: NDArray[np.uint8],  # (H, W, 3) RGB
-    image_right: NDArray[np.uint8],  # (H, W, 3)
-) -> NDArray[np.float32]:  # (H, W)
-    """Disparity of each left pixel, `u_left - u_right`, with libelas' own settings for robots.
-
-    Returns:
-        pixels, NaN where unknown.
-
-    Raises:
-        MissingDependencyError: the package pyelas (GPL-3.0, hence never installed by default) is not there.
-        InputError: the images are not a pair of RGB uint8 images.
-    """
-    import cv2
-
-    check_pair(image_left, image_right)
-    matcher = _elas_module().Elas()
-    left, right = (
-        np.ascontiguousarray(cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2GRAY))
-        for image in (image_left, image_right)
-    )
-    disparity = np.array(matcher.process(left, right)[0], dtype=np.float32)
-    disparity[disparity <= 0] = np.nan
-    return disparity
-
-
-def _elas_module() -> Any:
-    try:
-        return importlib.import_module("elas")
-    except ImportError as error:
-        raise MissingDependencyError(
-            "pyelas",
-            "elas",
-            "point_cloud.matcher elas (GPL-3.0, built from source)",
-            # Its source does not find numpy's headers by itself.
-            environment=f"CPLUS_INCLUDE_PATH={np.get_include()}",
-        ) from error
-
-
-def with_disparity(frames: FrameBatch, matcher: Literal["sgbm", "elas"], needed: Tensor | None = None) -> FrameBatch:
-    """The frames with the disparity that they bring, or else with that of the matcher.
+def with_disparity(frames: FrameBatch, needed: Tensor | None = None) -> FrameBatch:
+    """The frames with the disparity that they bring, or else with that of `match_disparity`.
 
     Args:
         frames: F frames; the images pass through the CPU as 8-bit images.
-        matcher: "sgbm" (OpenCV's semi-global matching) or "elas" (libelas, an optional package).
         needed: numbers of the frames to match, in any order and number; the others get NaN. None: all.
-
-    Raises:
-        MissingDependencyError: "elas" without its package.
 
     Examples:
         >>> from directshape_torch.geometry.stereo_camera import StereoCamera
@@ -152,18 +104,17 @@ def with_disparity(frames: FrameBatch, matcher: Literal["sgbm", "elas"], needed:
         >>> right = left.roll(-4, dims=3)
         >>> ground = GroundPlane.from_camera_height(1.65)
         >>> frames = FrameBatch(left, right, torch.tensor([[40, 80]]), camera, ground, ("0",))
-        >>> with_disparity(frames, "sgbm").disparity[0, 20, 40]
+        >>> with_disparity(frames).disparity[0, 20, 40]
         tensor(4.)
     """
     if frames.disparity is not None:
         return frames
-    match = match_disparity if matcher == "sgbm" else match_disparity_elas
     maps = torch.full_like(frames.images_left[:, 0], torch.nan)
     sizes = frames.sizes.tolist()
     for k in range(len(sizes)) if needed is None else sorted(set(needed.tolist())):
         height, width = sizes[k]
-        pair = (_rgb8(images[k, :, :height, :width]) for images in (frames.images_left, frames.images_right))
-        maps[k, :height, :width] = torch.from_numpy(match(*pair)).to(maps)
+        left, right = (_rgb8(images[k, :, :height, :width]) for images in (frames.images_left, frames.images_right))
+        maps[k, :height, :width] = torch.from_numpy(match_disparity(left, right)).to(maps)
     return replace(frames, disparity=maps)
 
 
