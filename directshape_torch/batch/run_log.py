@@ -11,6 +11,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import stat
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -255,7 +256,11 @@ class RunLog:
 
 
 def _opened(path: str, flags: int) -> int:
-    return os.open(path, flags | _LOCK_FLAGS, 0o666)
+    number = os.open(path, flags | _LOCK_FLAGS, 0o666)
+    if not stat.S_ISREG(os.fstat(number).st_mode):
+        os.close(number)
+        raise OSError(errno.EINVAL, "it is no regular file")
+    return number
 
 
 def log_path(out_dir: Path) -> Path:

@@ -55,6 +55,15 @@ def test_the_lock_follows_no_link(tmp_path: Path) -> None:
     assert foreign.read_text() == "mine"
 
 
+def test_the_lock_is_a_regular_file(tmp_path: Path) -> None:
+    os.mkfifo(log_path(tmp_path))
+    with (
+        pytest.raises(DataFormatError, match=r"run\.jsonl: cannot be written \(it is no regular file\)"),
+        RunLog(tmp_path),
+    ):
+        pass
+
+
 @pytest.mark.parametrize("name", ["data", "shapes", "overlays", "meshes", "tracks"])
 def test_a_folder_of_results_that_is_a_link(shared_kitti: Path, tmp_path: Path, name: str) -> None:
     foreign = tmp_path / "foreign"

@@ -123,6 +123,16 @@ def test_two_steps_in_a_row_that_change_next_to_nothing_are_the_end() -> None:
     assert (result.status.tolist(), result.iterations.tolist()) == ([0], [2])
 
 
+@pytest.mark.parametrize(("promised", "is_the_end"), [(7.0, True), (14.0, False)])
+def test_a_step_that_promises_ten_times_what_counts_as_little_is_not_the_end(promised: float, is_the_end: bool) -> None:
+    """A plain step from d beside the minimum promises 0.5 2.5 d^2 and rises by half of that."""
+    problem = Bent(2.5, [StageConfig(1.0, 0, 20, over_relaxation=FACTOR)])
+    d = (promised * DAMPED.cost_tolerance * 40.5 / 1.25) ** 0.5
+    start = Vector(torch.full((1, 1), 1 + d, dtype=torch.float64))
+    result = minimise(problem, start, replace(DAMPED, step_tolerance=0.0, initial_damping=1e-7))
+    assert (result.iterations.tolist() == [2]) is is_the_end
+
+
 def test_two_steps_in_a_row_that_overshoot_are_not() -> None:
     problem = ResidualProblem(
         lambda x, _: torch.atan(x), torch.arange(1), 1, [StageConfig(1.0, 0, 30, over_relaxation=FACTOR)], 20.0
