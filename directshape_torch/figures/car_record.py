@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, replace
-from typing import Any, ClassVar, Self, get_type_hints
+from typing import Any, Self, get_type_hints
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError, shown
-from directshape_torch.numerics.checks import check_declared, check_shape, check_stored
+from directshape_torch.numerics.checks import Record, check_declared, check_shape, check_stored
 
 
-class CarRecord:
-    """Base of frozen dataclasses of tensors (B, ...), of such records, and of words and other values.
+class CarRecord(Record):
+    """Base of records of tensors (B, ...), one row a car, of such records, and of words and other values.
 
     Examples:
         >>> from dataclasses import dataclass
@@ -25,20 +25,17 @@ class CarRecord:
         Depths(depth_m=tensor([20.]))
     """
 
-    # Fields that are one for all cars: kept as they are where cars are chosen.
-    shared: ClassVar[frozenset[str]] = frozenset()
-
     def rows(self, index: Tensor) -> Self:
         """The cars `index` (M,), in that order."""
-        return self._with(lambda value: value[index.to(value.device)], per_car=True)
+        return self._with(lambda value: value[index.to(value.device)], by_row=True)
 
     def spread(self, rows: Tensor, count: int) -> Self:
         """The cars `rows` (B,), ascending, placed among `count` cars; NaN for the others."""
-        return self._with(lambda value: placed(value, rows, count), per_car=True)
+        return self._with(lambda value: placed(value, rows, count), by_row=True)
 
     def where(self, condition: Tensor) -> Self:
         """A copy with NaN for the cars where the condition (B,) does not hold."""
-        return self._with(lambda value: kept(value, condition), per_car=True)
+        return self._with(lambda value: kept(value, condition), by_row=True)
 
     def put(self, rows: Tensor, others: Self) -> Self:
         """A copy with the cars `rows` (R,) replaced; figures of another width stay as they are."""
@@ -49,18 +46,6 @@ class CarRecord:
             elif isinstance(value, Tensor) and each.name not in self.shared and value.shape[1:] == other.shape[1:]:
                 changed[each.name] = value.index_copy(0, rows, other)
         return replace(self, **changed)  # type: ignore[type-var]
-
-    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """On another device and, for floating-point tensors, of another dtype."""
-        return self._with(lambda value: value.to(device=device, dtype=dtype if value.is_floating_point() else None))
-
-    def cpu(self) -> Self:
-        """In the memory of the host."""
-        return self.to("cpu")
-
-    def detach(self) -> Self:
-        """Without gradients."""
-        return self._with(lambda value: value.detach())
 
     def state_dict(self, prefix: str = "") -> dict[str, Tensor]:
         """All tensors and words by flat names, as `torch.save` and safetensors take them; words are UTF-8 bytes."""
@@ -109,17 +94,6 @@ class CarRecord:
 
     def _fields(self) -> Iterator[tuple[Field[Any], Any]]:
         return ((each, getattr(self, each.name)) for each in fields(self))  # type: ignore[arg-type]
-
-    def _with(self, change: Callable[[Tensor], Tensor], per_car: bool = False) -> Self:
-        changed: dict[str, Any] = {}
-        for each, value in self._fields():
-            if per_car and each.name in self.shared:
-                continue
-            if isinstance(value, CarRecord):
-                changed[each.name] = value._with(change, per_car)
-            elif isinstance(value, Tensor):
-                changed[each.name] = change(value)
-        return replace(self, **changed)  # type: ignore[type-var]
 
 
 def _words(name: str, letters: Tensor) -> tuple[str, ...]:

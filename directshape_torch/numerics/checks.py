@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import cache
 from numbers import Integral, Real
-from typing import Any, Literal, NamedTuple, Self, get_type_hints
+from typing import Any, ClassVar, Literal, NamedTuple, Self, get_type_hints
 
 import torch
 from torch import Tensor
@@ -192,8 +192,40 @@ class DeclaredTensor(NamedTuple):
     kind: Kind
 
 
-class TensorRecord:
-    """Base of frozen dataclasses of tensors (`Dense`; optional ones have None as default), such records, other values.
+class Record:
+    """Base of frozen dataclasses of tensors, of further such records, and of other values."""
+
+    # Fields that are one for all rows: kept where rows are chosen.
+    shared: ClassVar[frozenset[str]] = frozenset()
+
+    def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """A copy on another device and, for floating-point tensors, of another dtype, which may come alone."""
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
+        return self._with(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
+
+    def cpu(self) -> Self:
+        """A copy in the memory of the host."""
+        return self.to("cpu")
+
+    def detach(self) -> Self:
+        """A copy without gradients."""
+        return self._with(Tensor.detach)
+
+    def _with(self, change: Callable[[Tensor], Tensor], by_row: bool = False) -> Self:
+        """A copy with all tensors changed; `by_row`, but those that are shared."""
+        changed: dict[str, Any] = {}
+        for each in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, each.name)
+            if isinstance(value, Record):
+                changed[each.name] = value._with(change, by_row)
+            elif isinstance(value, Tensor) and not (by_row and each.name in self.shared):
+                changed[each.name] = change(value)
+        return replace(self, **changed)  # type: ignore[type-var]
+
+
+class TensorRecord(Record):
+    """Base of records whose tensors are declared (`Dense`; optional ones have None as default) and checked.
 
     Raises:
         InputError: a tensor is none, not dense, or of another shape or kind; floating-point ones differ in dtype or
@@ -231,25 +263,6 @@ class TensorRecord:
             for spec in getattr(hints[each.name], "__metadata__", ())
             if isinstance(spec, Dense)
         }
-
-    def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """A copy on another device and, for floating-point fields, of another dtype, which may come alone."""
-        if isinstance(device, torch.dtype):
-            device, dtype = None, device
-        return self._with(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
-
-    def detach(self) -> Self:
-        """A copy without gradients."""
-        return self._with(Tensor.detach)
-
-    def _with(self, change: Callable[[Tensor], Tensor]) -> Self:
-        def changed(value: Any) -> Any:
-            if isinstance(value, Tensor):
-                return change(value)
-            return value._with(change) if isinstance(value, TensorRecord) else value
-
-        values = {each.name: changed(getattr(self, each.name)) for each in fields(self)}  # type: ignore[arg-type]
-        return replace(self, **values)  # type: ignore[type-var]
 
     def tensors(self, name: str) -> Iterator[DeclaredTensor]:
         """All tensors of the record, named `name`, and of those in it."""
