@@ -19,8 +19,8 @@ from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
 
-# Residuals of several offsets at once: 4 MB in single precision, for what does not stay in the caches takes longer.
-_RESIDUALS_AT_ONCE = 1_000_000
+# Residuals of several offsets at once: 1 MB in single precision, for what does not stay in the caches takes longer.
+_RESIDUALS_AT_ONCE = 250_000
 
 
 @torch.no_grad()

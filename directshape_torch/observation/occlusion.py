@@ -9,6 +9,7 @@ number of the instances that cover each pixel, tells of every car what hides it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -115,10 +116,13 @@ def occlusion_map(
     # One entry at least, for whoever looks up nothing.
     covering = numbers.new_full((max(1, num_frames * height * width), 2), torch.inf)
     images = covering[: num_frames * height * width].view(num_frames, height, width, 2)
-    for number, (at, (u0, v0, u1, v1), mask) in enumerate(zip(frames, boxes, _masks(detections, side), strict=True)):
-        part = images[at, v0 - top : v1 - top, u0 - left : u1 - left]
-        covers = mask[v0:v1, u0:u1, None] > MASK_THRESHOLD
-        torch.minimum(part, torch.where(covers, numbers[number], torch.inf), out=part)
+    instances = zip(numbers.tolist(), frames, boxes, _masks(detections, side), strict=True)
+    # Painted from behind, so that the foremost stays; an instance has a number of one kind, or none.
+    for of_kinds, at, (u0, v0, u1, v1), mask in sorted(instances, key=lambda instance: instance[0], reverse=True):
+        covers = mask[v0:v1, u0:u1] > MASK_THRESHOLD
+        for kind, number in enumerate(of_kinds):
+            if number < math.inf:
+                images[at, v0 - top : v1 - top, u0 - left : u1 - left, kind].masked_fill_(covers, number)
     first = detections.frame_index * (height * width) - top * width - left
     crop = first.new_tensor([left, top, right, bottom, 0, width]).repeat(len(detections), 1)
     crop[:, 4] = first
