@@ -23,11 +23,8 @@ pytestmark = pytest.mark.skipif(
 _TESTS = Path(__file__).parent
 _COMPARED = [
     "default",
-    "product form",
-    "marched rays",
-    "every step",
-    "other residuals",
-    "other priors",
+    "product form, marched rays",
+    "other residuals and priors, every step",
     "search",
     "point cloud",
     "point cloud and images",

@@ -61,6 +61,12 @@ def refined(detections: Detections, track_id: list[int] | None = None, contrast:
     return DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(drive(contrast)[0], replace(detections, track_id=ids))
 
 
+@cache
+def by_themselves() -> RefinementResult:
+    """All six detections without tracks; nobody changes it."""
+    return refined(drive()[1])
+
+
 def assert_same(one: RefinementResult, other: RefinementResult) -> None:
     first, second = one.state_dict(), other.state_dict()
     for name, values in first.items():
@@ -70,12 +76,12 @@ def assert_same(one: RefinementResult, other: RefinementResult) -> None:
 @pytest.mark.parametrize("track_id", [[4, -1, 9, -1, 2, -7], [-1] * 6])
 def test_tracks_of_one_view_are_cars_by_themselves_to_the_bit(track_id: list[int]) -> None:
     _, detections, _ = drive()
-    assert_same(refined(detections, track_id), refined(detections))
+    assert_same(refined(detections, track_id), by_themselves())
 
 
 def test_cars_beside_a_track_are_refined_as_by_themselves_to_the_bit() -> None:
     _, detections, _ = drive()
-    alone, mixed = refined(detections), refined(detections, [4, -1, 4, -1, 4, 3])
+    alone, mixed = by_themselves(), refined(detections, [4, -1, 4, -1, 4, 3])
     for row in (1, 3, 5):
         assert torch.equal(mixed.T_cam_obj[row], alone.T_cam_obj[row])
         assert torch.equal(mixed.code[row], alone.code[row])
@@ -83,7 +89,7 @@ def test_cars_beside_a_track_are_refined_as_by_themselves_to_the_bit() -> None:
 
 def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
     _, detections, code = drive()
-    alone, together = refined(detections), refined(detections, [0, 1] * 3)
+    alone, together = by_themselves(), refined(detections, [0, 1] * 3)
     assert together.status == [Status.converged] * 6
     for track in (0, 1):
         views = together.code[track::2]
@@ -209,7 +215,7 @@ def doubt_in_track(monkeypatch: pytest.MonkeyPatch, row: int) -> None:
 
 def test_a_view_that_is_not_trusted_in_its_track_keeps_what_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     _, detections, _ = drive()
-    alone, trusted = refined(detections), refined(detections, [0, 1] * 3)
+    alone, trusted = by_themselves(), refined(detections, [0, 1] * 3)
     doubt_in_track(monkeypatch, 2)
     result = refined(detections, [0, 1] * 3)
     others = [0, 1, 3, 4, 5]

@@ -39,17 +39,21 @@ _SIGMAS = {"pose_sigma_along_m": 0.5, "pose_sigma_across_m": 0.3, "pose_sigma_ve
 
 SETTINGS: dict[str, RefinerConfig] = {
     "default": _SHIPPED,
-    "product form": replace(DEFAULT, silhouette=replace(DEFAULT.silhouette, form="product")),
-    "marched rays": with_solver(DEFAULT, rays="marched"),
-    "every step": with_solver(DEFAULT, initial_damping=0.0, accept_every_step=True),
-    "other residuals": replace(
-        DEFAULT,
-        photometric=replace(
-            DEFAULT.photometric, patch="normalised", brightness="affine", truncated=True, pixel_set="hit"
-        ),
-        sampling=replace(DEFAULT.sampling, mode="uniform"),
+    "product form, marched rays": with_solver(
+        replace(DEFAULT, silhouette=replace(DEFAULT.silhouette, form="product")), rays="marched"
     ),
-    "other priors": replace(DEFAULT, priors=replace(DEFAULT.priors, tilt_form="cosine", **_SIGMAS)),
+    "other residuals and priors, every step": with_solver(
+        replace(
+            DEFAULT,
+            photometric=replace(
+                DEFAULT.photometric, patch="normalised", brightness="affine", truncated=True, pixel_set="hit"
+            ),
+            sampling=replace(DEFAULT.sampling, mode="uniform"),
+            priors=replace(DEFAULT.priors, tilt_form="cosine", **_SIGMAS),
+        ),
+        initial_damping=0.0,
+        accept_every_step=True,
+    ),
     "search": replace(DEFAULT, search=replace(DEFAULT.search, disparity_offsets_px=(-1.0, 1.0))),
     "point cloud": replace(DEFAULT, method="geometric"),
     "point cloud and images": replace(DEFAULT, method="combined"),
