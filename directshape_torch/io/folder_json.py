@@ -17,6 +17,7 @@ from directshape_torch.files.schema import record_of
 FOLDER_SCHEMA_VERSION = 1
 _CURE = "see docs/inputs.md"
 _Triple = tuple[float, float, float]
+_Row = tuple[float, float, float, float]
 _BOX_KEYS = ("dimensions_hwl_m", "bottom_center_m", "rotation_y_rad")
 
 
@@ -81,12 +82,16 @@ class FolderFrame:
         objects: detections, and other instances that may hide them.
         labels: the ground truth, or None.
         ground_plane: (a, b, c, d), a x + b y + c z + d = 0 in the left camera frame, or None.
+        time_s: when it was taken, seconds from any beginning that keeps them small, or None.
+        T_world_cam: pose of the left camera in a world that all frames share, or None.
         comment: whatever its owner says.
     """
 
     objects: Sequence[FolderObject]
     labels: Sequence[FolderObject] | None = None
-    ground_plane: tuple[float, float, float, float] | None = None
+    ground_plane: _Row | None = None
+    time_s: float | None = None
+    T_world_cam: tuple[_Row, _Row, _Row, _Row] | None = None
     comment: Any = None
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.text_files import Line
 from directshape_torch.io.coco_segmentation import decode_segmentation
 from directshape_torch.io.folder_json import FolderFrame, FolderObject, FolderRig, read_frame, read_rig
@@ -33,6 +33,7 @@ from directshape_torch.io.instance_masks import (
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
 from directshape_torch.io.mask_files import COCO_CAR_IDS
+from directshape_torch.numerics.checks import is_no_rotation
 from directshape_torch.scene_check.image_boxes import project_boxes
 
 _CAR = "Car"
@@ -119,6 +120,17 @@ class FolderLayout(FrameLayout):
     def sequence_of(self, frame_id: str) -> str:
         """All frames are of one drive."""
         return ""
+
+    def motion(self, frame_id: str) -> tuple[float | None, NDArray[np.float64] | None]:
+        """What its file says."""
+        frame = self._frame(frame_id)
+        if frame.T_world_cam is None:
+            return frame.time_s, None
+        T_world_cam = np.array(frame.T_world_cam, np.float64)
+        if is_no_rotation(torch.from_numpy(T_world_cam)[None]).any() or list(T_world_cam[3]) != [0, 0, 0, 1]:
+            problem = f"'T_world_cam' is no rigid motion: {shown(frame.T_world_cam)}"
+            raise DataFormatError(self.detection_path(frame_id), problem, cure="see docs/inputs.md")
+        return frame.time_s, T_world_cam
 
     def masks(self, directory: Path | None) -> MaskSource | None:
         """Those of the frames' files, unless a folder of others is given."""

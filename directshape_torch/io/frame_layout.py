@@ -86,6 +86,14 @@ class FrameLayout(ABC):
         """The sequence of frames that follow each other, "" where there is but one; None: a frame by itself."""
         return None
 
+    def motion_files(self, frame_id: str) -> dict[str, Path]:
+        """The files of times and camera poses that there are for a frame, by role."""
+        return {}
+
+    def motion(self, frame_id: str) -> tuple[float | None, NDArray[np.float64] | None]:
+        """When a frame of a sequence was taken, seconds, and T_world_ref (4, 4); None where that is not known."""
+        return None, None
+
     def masks(self, directory: Path | None) -> MaskSource | None:
         """The reader of a folder of masks; None: of those that come with the layout itself, if there are any."""
         return None if directory is None else mask_source(directory)

@@ -61,7 +61,7 @@ def read_calibration(path: Path | str) -> KittiCalibration:
         words = line.text.split()
         name, shape = _LAYOUTS.get(words[0].rstrip(":"), (None, (0, 0)))
         if name is not None:
-            matrices[name] = _parse_matrix(path, line.number, line.text, words[1:], shape)
+            matrices[name] = parse_matrix(path, line.number, line.text, words[1:], shape)
     for name in ("P2", "P3"):
         if name not in matrices:
             raise DataFormatError(path, f"has no line {name}:", cure="a stereo pair needs the projections P2 and P3")
@@ -79,7 +79,7 @@ def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
         words = line.text.split()
         shape = {"R:": (3, 3), "T:": (3, 1)}.get(words[0])
         if shape is not None:
-            found[words[0]] = _parse_matrix(path, line.number, line.text, words[1:], shape)
+            found[words[0]] = parse_matrix(path, line.number, line.text, words[1:], shape)
     for name in ("R:", "T:"):
         if name not in found:
             raise DataFormatError(
@@ -88,9 +88,14 @@ def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
     return np.concatenate([found["R:"], found["T:"]], axis=1)
 
 
-def _parse_matrix(
+def parse_matrix(
     path: Path | str, number: int, text: str, words: Sequence[str], shape: tuple[int, int]
 ) -> NDArray[np.float64]:
+    """The finite numbers of a line, row by row.
+
+    Raises:
+        DataFormatError: it does not hold as many.
+    """
     wanted = shape[0] * shape[1]
     try:
         values = np.array([float(word) for word in words])

@@ -23,6 +23,7 @@ from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_o
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_velo_to_cam
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.mask_files import mask_source
+from directshape_torch.io.motion_files import of_line, read_poses, read_times
 from directshape_torch.io.tracking_files import read_tracking_objects
 
 
@@ -39,6 +40,7 @@ class KittiFiles:
         plane: ground plane.
         labels: a file a frame, or without `{stem}` one of the tracking benchmark; "": there are none.
         velo_to_cam: file that places the LiDAR; "": the calibration does.
+        times, poses: of the frames of a sequence, a line each from frame 0 on; "": there are none.
         digits: of a frame's number.
         first: what is added to a number alone; files may leave it out.
     """
@@ -49,19 +51,30 @@ class KittiFiles:
     plane: str = "planes/{stem}.txt"
     labels: str = ""
     velo_to_cam: str = ""
+    times: str = ""
+    poses: str = ""
     digits: int = 6
     first: str = ""
 
 
 OBJECT = KittiFiles("image_2/{stem}", "image_3/{stem}", "calib/{stem}.txt", labels="label_2/{stem}.txt")
 STEREO_2015 = KittiFiles("image_2/{stem}", "image_3/{stem}", "calib_cam_to_cam/{scene}.txt", first="_10")
-TRACKING_SEQUENCE = KittiFiles("image_02/{stem}", "image_03/{stem}", "calib.txt", labels="label_02.txt")
+TRACKING_SEQUENCE = KittiFiles(
+    "image_02/{stem}",
+    "image_03/{stem}",
+    "calib.txt",
+    labels="label_02.txt",
+    times="times.txt",
+    poses="poses.txt",
+)
 TRACKING = KittiFiles(
     "image_02/{sequence}/{stem}",
     "image_03/{sequence}/{stem}",
     "calib/{sequence}.txt",
     "planes/{sequence}/{stem}.txt",
     "label_02/{sequence}.txt",
+    times="times/{sequence}.txt",
+    poses="poses/{sequence}.txt",
 )
 # In the folder of the day, and with a calibration in the drive itself.
 RAW_OF_DAY = KittiFiles(
@@ -70,6 +83,8 @@ RAW_OF_DAY = KittiFiles(
     "calib_cam_to_cam.txt",
     "{sequence}/planes/{stem}.txt",
     velo_to_cam="calib_velo_to_cam.txt",
+    times="{sequence}/image_02/timestamps.txt",
+    poses="{sequence}/poses.txt",
     digits=10,
 )
 RAW = replace(
@@ -103,6 +118,7 @@ class KittiLayout(FrameLayout):
         if "" not in sequences:
             self.detection_file_name += " or SEQUENCE.txt"
         self._tracking: dict[Path, dict[int, list[KittiObject]]] = {}
+        self._motion: dict[Path, NDArray[np.float64]] = {}
 
     def frame_ids(self) -> list[str]:
         """The frames with a detection file, or all of the sequences that have one of the tracking benchmark."""
@@ -168,6 +184,21 @@ class KittiLayout(FrameLayout):
     def sequence_of(self, frame_id: str) -> str | None:
         """The prefix of the frame, where there are several sequences."""
         return None if "" in self._sequences else "" if self._single else self._split(frame_id)[0]
+
+    def motion_files(self, frame_id: str) -> dict[str, Path]:
+        """The sequence's."""
+        names = {"times": self._files.times, "poses": self._files.poses}
+        paths = {role: self._path(frame_id, pattern) for role, pattern in names.items() if pattern}
+        return {role: path for role, path in paths.items() if path.is_file()}
+
+    def motion(self, frame_id: str) -> tuple[float | None, NDArray[np.float64] | None]:
+        """Of the line of its number in the files of its sequence, which are read once."""
+        files, number = self.motion_files(frame_id), int(self._split(frame_id)[3])
+        for role, path in files.items():
+            if path not in self._motion:
+                self._motion[path] = read_times(path) if role == "times" else read_poses(path)
+        said = {role: of_line(path, self._motion[path], number) for role, path in files.items()}
+        return float(said["times"]) if "times" in said else None, said.get("poses")
 
     def disparity_path(self, folder: Path, frame_id: str) -> Path:
         """`folder/NNNNNN.png`, and of several sequences `folder/SEQUENCE/NNNNNN.png`."""

@@ -68,7 +68,7 @@ class FileStereoDataset:
         lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, which the calibration of the frames places; None: frames
             come without points.
         tracks: number the cars over the frames of a sequence (`Detections.track_id`): by the detection files, else by
-            the masks of KITTI MOTS, else by `associate`.
+            the masks of KITTI MOTS, else by `associate`; with times and camera poses of the frames where there are any.
         dtype: of the tensors.
 
     Raises:
@@ -136,6 +136,7 @@ class FileStereoDataset:
         camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, size_wh, self.dtype)
         ground = self._ground(frame_id, left, right, camera)
         height, width = left.shape[:2]
+        time_s, T_world_cam = self._motion(frame_id, camera)
         frame = FrameBatch(
             images_left=_to_tensor(left, self.dtype),
             images_right=_to_tensor(right, self.dtype),
@@ -145,6 +146,8 @@ class FileStereoDataset:
             frame_ids=(frame_id,),
             disparity=self._disparity(frame_id, (height, width)),
             points_cam=self._points(frame_id, (height, width)),
+            time_s=time_s,
+            T_world_cam=T_world_cam,
         )
         objects = self.objects(frame_id)
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
@@ -188,6 +191,8 @@ class FileStereoDataset:
             files["disparity"] = self.layout.disparity_path(self.disparity_dir, frame_id)
         if self.lidar_dir is not None:
             files |= self.layout.lidar_files(self.lidar_dir, frame_id)
+        if self.tracks:
+            files |= self.layout.motion_files(frame_id)
         plane = self.layout.plane_path(frame_id)
         if self.ground in ("auto", "file") and plane is not None:
             files["ground_plane"] = plane
@@ -265,6 +270,16 @@ class FileStereoDataset:
         camera = to_stereo_camera([calibration], dtype=torch.float64)
         points = read_scan(self.layout.lidar_files(self.lidar_dir, frame_id)["lidar"], calibration, camera)
         return in_image(points, size_hw, camera)[None].to(self.dtype)
+
+    def _motion(self, frame_id: str, camera: StereoCamera) -> tuple[Tensor | None, Tensor | None]:
+        """Time (1,) and pose (1, 4, 4) of the left camera, where cars have numbers and that is known."""
+        time_s, T_world_ref = self.layout.motion(frame_id) if self.tracks else (None, None)
+        T_world_cam = None
+        if T_world_ref is not None:
+            T_world_cam = torch.from_numpy(T_world_ref)[None].clone()
+            T_world_cam[:, :3, 3] -= (T_world_cam[:, :3, :3] @ camera.t_cam_ref[0].double()[:, None])[:, :, 0]
+            T_world_cam = T_world_cam.to(self.dtype)
+        return None if time_s is None else torch.tensor([time_s], dtype=self.dtype), T_world_cam
 
     def _ground(
         self, frame_id: str, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera

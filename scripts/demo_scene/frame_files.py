@@ -55,7 +55,7 @@ def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: f
     """Write frames of one scene in the layout of KITTI's tracking benchmark; a car's number is its track.
 
     Beside what a frame has: `poses/NAME.txt` (camera 0 of each frame in that of the first, rows of 12 as in KITTI's
-    odometry benchmark) and the times in the descriptions.
+    odometry benchmark) and `times/NAME.txt` (seconds).
     """
     training = root / "training"
     for number, frame in enumerate(frames):
@@ -70,6 +70,8 @@ def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: f
     lines = [(f"{n} {k}", frame.labels[k], frame.detections[k]) for n, frame in enumerate(frames) for k in frame.labels]
     _write_text(training / "calib" / f"{name}.txt", calibration_text())
     _write_text(training / "poses" / f"{name}.txt", "".join(pose_lines([f.layout.camera for f in frames])))
+    times = "".join(f"{number * interval_s:.3f}\n" for number in range(len(frames)))
+    _write_text(training / "times" / f"{name}.txt", times)
     _write_text(training / "label_02" / f"{name}.txt", "".join(f"{n} {label_line(x)}\n" for n, x, _ in lines))
     found = "".join(f"{n} {result_line(x, 0.9)}\n" for n, _, x in lines)
     _write_text(root / "detections" / "noisy_stereo" / f"{name}.txt", found)

@@ -31,6 +31,7 @@ from directshape_torch.io.disparity_files import read_disparity, write_disparity
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import read_calibration
 from directshape_torch.io.mask_files import CocoFileMasks, InstancePngMasks
+from directshape_torch.io.motion_files import read_poses, read_times
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
@@ -77,6 +78,8 @@ def samples(kitti: Path, folder: Path) -> dict[str, Sample]:
 def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[Path], object]]]:
     """Files that one function reads."""
     (folder / "tracking.txt").write_text("".join(f"{n} 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 1 1.6 20 0\n" for n in range(3)))
+    (folder / "times.txt").write_text("2011-09-26 13:02:44.94\n2011-09-26 13:02:45.05\n2011-09-26 13:02:45.15\n")
+    (folder / "poses.txt").write_text("0.8 0 0.6 1 0 1 0 2 -0.6 0 0.8 3\n" * 3)
     (folder / "split.txt").write_text("".join(f"{name}\n" for name in FRAMES))
     write_shapes(folder / "shapes.npz", shape_arrays(2))
     write_disparity(folder / "disparity.png", np.full((12, 16), 7.5))
@@ -119,6 +122,8 @@ def _by_themselves(root: Path, folder: Path) -> dict[str, tuple[Path, Callable[[
         "network": (folder / "neural_prior.safetensors", load_prior),
         "prior": (root / "prior.npz", load_prior),
         "boxes": (folder / "boxes.txt", read_boxes),
+        "times": (folder / "times.txt", read_times),
+        "poses": (folder / "poses.txt", read_poses),
         **{f"mesh {suffix[1:]}": (folder / f"mesh{suffix}", solid) for suffix in MESH_SUFFIXES},
         "trust": (folder / "trust_model.json", load_trust_model),
         "settings": (folder / "fast.yaml", load_config),

@@ -1,0 +1,91 @@
+"""When the frames of a sequence were taken, and where the camera was: text files of a line a frame."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError
+from directshape_torch.files.text_files import Line, read_lines
+from directshape_torch.io.kitti_calibration import parse_matrix
+from directshape_torch.numerics.checks import is_no_rotation
+
+
+def read_times(path: Path | str) -> NDArray[np.float64]:
+    """Seconds (N,) from the first line on.
+
+    Args:
+        path: of `times.txt` of KITTI's odometry benchmark (seconds), or `timestamps.txt` of its raw recordings (dates
+            with times of day).
+
+    Raises:
+        DataFormatError: a line is neither, or time does not go on.
+    """
+    lines = read_lines(path)
+    seconds: NDArray[np.float64] = np.array([_seconds(path, line) for line in lines], dtype=np.float64)
+    for line, (before, here) in zip(lines[1:], pairwise(seconds), strict=True):
+        if not before < here:
+            cure = "write one time a frame, in their order"
+            raise DataFormatError(path, "time does not go on", line_number=line.number, line=line.text, cure=cure)
+    return seconds - seconds[:1]
+
+
+def read_poses(path: Path | str) -> NDArray[np.float64]:
+    """Poses (N, 4, 4) of camera 0, the frame `ref` of boxes, in that of a world.
+
+    Args:
+        path: of a file as of KITTI's odometry benchmark: rows of a matrix (3, 4), a line a frame.
+
+    Raises:
+        DataFormatError: a line does not hold 12 finite numbers, or no rotation.
+    """
+    lines = read_lines(path)
+    poses = np.tile(np.eye(4), (len(lines), 1, 1))
+    for pose, line in zip(poses, lines, strict=True):
+        pose[:3] = _matrix(path, line)
+    return poses
+
+
+def of_line(path: Path, values: NDArray[np.float64], number: int) -> NDArray[np.float64]:
+    """What a file says of the frame of a number, from 0.
+
+    Raises:
+        DataFormatError: it has no line for it.
+    """
+    if number >= len(values):
+        problem = f"has {len(values)} lines and none for frame {number}"
+        raise DataFormatError(path, problem, cure="write a line for each frame of the sequence, from frame 0 on")
+    return values[number]  # type: ignore[no-any-return]
+
+
+def _seconds(path: Path | str, line: Line) -> float:
+    try:
+        # Python knows microseconds, the recordings write nanoseconds.
+        seconds = (
+            datetime.fromisoformat(line.text[:26]).replace(tzinfo=UTC).timestamp()
+            if ":" in line.text
+            else float(line.text)
+        )
+    except (ValueError, OverflowError) as error:
+        problem = f"expected seconds or a date and time ({error})"
+        raise DataFormatError(path, problem, line_number=line.number, line=line.text) from error
+    if not np.isfinite(seconds):
+        raise DataFormatError(path, "expected finite seconds", line_number=line.number, line=line.text)
+    return seconds
+
+
+def _of_date(text: str) -> float:
+    """Python knows microseconds, the recordings write nanoseconds."""
+    return datetime.fromisoformat(text[:26]).replace(tzinfo=UTC).timestamp()
+
+
+def _matrix(path: Path | str, line: Line) -> NDArray[np.float64]:
+    matrix = parse_matrix(path, line.number, line.text, line.text.split(), (3, 4))
+    if is_no_rotation(torch.from_numpy(matrix)[None]).any():
+        raise DataFormatError(path, "its first three columns are no rotation", line_number=line.number, line=line.text)
+    return matrix
