@@ -104,6 +104,8 @@ def summarise(name: str, cars: Sequence[ComparedCar], settings: BootstrapSetting
     """
     if not cars:
         return GroupSummary(name, 0, {}, None)
+    # By label, so that the draws do not depend on the order of the detections.
+    cars = sorted(cars, key=lambda car: f"{car.frame_id}:{car.label_line}")
     bootstrap = CarBootstrap(len(cars), settings)
     metrics = {}
     for metric in METRICS:
