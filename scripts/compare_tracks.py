@@ -115,21 +115,21 @@ def _refine(refiner: DirectShapeRefiner, loaded: Sequence[LoadedFrame], views: i
     with torch.no_grad():
         result = refiner(frames, detections)
     seconds = (time.perf_counter() - start) / max(1, len(detections))
-    first_row = 0
+    boxes, first_row = result.to_boxes("kitti", "ref").double(), 0
     for item in loaded:
-        yield from _cars(item, result, first_row, views, seconds)
+        yield from _cars(item, result, boxes, first_row, views, seconds)
         first_row += len(item.detections)
 
 
 def _cars(
-    item: LoadedFrame, result: RefinementResult, first_row: int, views: int, seconds: float
+    item: LoadedFrame, result: RefinementResult, boxes: Tensor, first_row: int, views: int, seconds: float
 ) -> Iterator[CarOfFrame]:
     labels, counted = item.labels or [], CountedLabels()
     objects = item.detected_objects
     partners = match_to_labels(objects, labels)
     rows = [k for k, partner in enumerate(partners) if partner >= 0 and counted.counts(labels[partner])]
     true = boxes_of([labels[partners[k]] for k in rows])
-    boxes = result.to_boxes("kitti", "ref").double()[[first_row + k for k in rows]]
+    boxes = boxes[[first_row + k for k in rows]]
     errors, before = pose_errors(boxes, true), pose_errors(boxes_of([objects[k] for k in rows]), true)
     reach, true_reach = _reach(boxes, true), _reach(true, true)
     status = result.status
