@@ -28,6 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     data.add_argument("--frame", metavar="ID", type=frame_id_of, help="the frame; --frames for several")
     data.add_argument("--car", metavar="N", type=int, help="number of its line in the detection file; default: all")
     add_data_options(data, required=False)
+    data.add_argument("--tracks", action="store_true", help="refine --frames together and let each car move")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a folder of figures a car")
     add_refiner_options(parser.add_argument_group("settings"))
     parser.set_defaults(run=run)
@@ -47,6 +48,12 @@ def run(args: argparse.Namespace) -> int:
     dataset = _dataset(args)
     # One frame is not worth a compilation, and pictures need no graphics card.
     refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")
+    if args.tracks:
+        from directshape_torch.cli.inspect_tracks import inspect_tracks
+
+        inspect_tracks([dataset.load(frame_id) for frame_id in dataset.frame_ids], refiner, args.out)
+        print(f"figures  {args.out}")
+        return 0
     for frame_id in dataset.frame_ids:
         loaded = dataset.load(frame_id)
         rows = _rows(loaded, args.car)

@@ -6,16 +6,24 @@ from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
 
+from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.numerics.checks import check_type
+from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.neural_prior import NeuralShapePrior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.shape.tensor_file import read_description
 
 BUNDLED_PRIORS: Mapping[str, Callable[[], ShapePrior]] = {
     "pca": PCAShapePrior.load_bundled,
     "neural": NeuralShapePrior.load_bundled,
 }
 """The priors that come with the package, by the name that `load_prior` knows them by."""
+
+_READERS: Mapping[str, Callable[[Path], ShapePrior]] = {
+    NeuralShapePrior.SCHEMA: NeuralShapePrior.load,
+    KernelPCAShapePrior.SCHEMA: KernelPCAShapePrior.load,
+}
 
 
 def load_prior(source: Path | str) -> ShapePrior:
@@ -36,4 +44,10 @@ def load_prior(source: Path | str) -> ShapePrior:
     if bundled is not None:
         return bundled()
     path = Path(source)
-    return NeuralShapePrior.load(path) if path.suffix == ".safetensors" else PCAShapePrior.load(path)
+    if path.suffix != ".safetensors":
+        return PCAShapePrior.load(path)
+    schema = read_description(path).get("schema", "none")
+    reader = _READERS.get(schema) if isinstance(schema, str) else None
+    if reader is None:
+        raise DataFormatError(path, f"schema {shown(schema)} is none of {', '.join(_READERS)}")
+    return reader(path)

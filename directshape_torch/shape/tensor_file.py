@@ -29,6 +29,15 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], description: Mappin
     write_bytes(path, content)
 
 
+def read_description(path: Path, cure: str = "") -> dict[str, Any]:
+    """The description in a safetensors file; empty where it has none.
+
+    Raises:
+        DataFormatError: no such file, or no safetensors file, or a truncated one.
+    """
+    return _description(path, _read(path, cure), cure)
+
+
 def read_tensors(path: Path, schema: str, cure: str = "") -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors as float32 on the CPU, and the description, of a file of `write_tensors`.
 

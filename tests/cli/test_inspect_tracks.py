@@ -1,0 +1,33 @@
+"""`directshape inspect --tracks`: a moving picture of each car that several frames show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.kitti_folder import FRAMES
+from helpers.layouts import write_sequence
+from PIL import Image
+
+from directshape_torch.cli.main import main
+
+
+def test_each_car_of_several_frames_moves(shared_kitti: Path, tmp_path: Path) -> None:
+    write_sequence(shared_kitti, tmp_path, FRAMES, single=True)
+    words = ["inspect", "--layout", "tracking", "--data", tmp_path, "--detections", shared_kitti / "detections"]
+    words += ["--masks", shared_kitti / "masks", "--prior", shared_kitti / "prior.npz", "--config", "fast"]
+    assert main([str(word) for word in (*words, "--tracks", "--frames", 0, 1, "--out", tmp_path / "figures")]) == 0
+    found = sorted((tmp_path / "figures").iterdir())
+    # By association, in which the pedestrian's line is counted too.
+    assert [path.name for path in found] == ["track_000000.gif", "track_000002.gif"]
+    with Image.open(found[0]) as animation:
+        assert (animation.n_frames, animation.size) == (2, (480, 360))
+
+
+def test_frames_by_themselves_have_no_tracks(
+    shared_kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["inspect", "--data", shared_kitti, "--detections", shared_kitti / "detections"]
+    words += ["--masks", shared_kitti / "masks", "--tracks", "--frames", 0, 1, "--out", tmp_path / "figures"]
+    assert main([str(word) for word in words]) == 2
+    assert "tracks: expected a layout of sequences" in capsys.readouterr().err
