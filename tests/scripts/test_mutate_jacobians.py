@@ -148,6 +148,6 @@ def test_a_survivor_ends_the_command_with_1(
 
 def test_a_sample_of_the_real_mutants_is_caught(capsys: pytest.CaptureFixture[str]) -> None:
     """Of targets whose tests are quick: each collects them in a process of its own."""
-    words = ["--target", "pinhole", "--target", "robust", "--sample", "3", "--seed", "7", "--processes", "1"]
+    words = ["--target", "projection", "--target", "robust", "--sample", "3", "--seed", "7", "--processes", "1"]
     assert mutate_jacobians.main(words) == 0
     assert "3 mutants: 3 caught" in capsys.readouterr().out
