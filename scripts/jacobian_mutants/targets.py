@@ -78,7 +78,7 @@ TARGETS: dict[str, Target] = {
             "rig_prior",
             "J_heading_omega",
         ),
-        (*_OFFSET[:1], *_JACOBIANS),
+        (*_OFFSET[:1], "tests/terms/test_priors.py", *_JACOBIANS),
     ),
     "motion": Target(
         "directshape_torch/terms/motion.py",
