@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.compiled_lookup import needs_compiler
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT
 from helpers.street_inputs import SETTLED, summary, with_mode
@@ -23,6 +24,7 @@ from helpers.synthetic_scene import (
 )
 from torch import Tensor
 
+from directshape_torch.compile import num_forms
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
 from directshape_torch.refinement import outcome as outcomes
@@ -286,3 +288,19 @@ def test_two_views_of_a_track_in_one_frame_are_refused() -> None:
     _, detections, _ = drive()
     with pytest.raises(InputError, match="track 5 in rows 0 and 1 of frame 0"):
         replace(detections, track_id=torch.tensor([5, 5, 1, 1, 2, 3]))
+
+
+@needs_compiler
+def test_a_compiled_track_ends_where_a_plain_one_does() -> None:
+    frames, detections, _ = drive()
+    frames = replace(frames, time_s=torch.tensor([0.0, 0.1, 0.2], dtype=torch.float64)).to(dtype=torch.float32)
+    track = replace(detections, track_id=torch.tensor([0, 1] * 3)).to(dtype=torch.float32)
+    prior, before = ellipsoid_prior().to(torch.float32), num_forms()
+    plain, compiled = (
+        DirectShapeRefiner(prior, replace(DEFAULT, compile=compile))(frames, track) for compile in ("off", "on")
+    )
+    assert num_forms() > before
+    assert "path" in compiled.term_names
+    assert compiled.track_part.tolist() == [0] * 6
+    torch.testing.assert_close(compiled.T_cam_obj, plain.T_cam_obj, rtol=0, atol=0.02)
+    torch.testing.assert_close(compiled.code, plain.code, rtol=0, atol=0.1)
