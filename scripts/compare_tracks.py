@@ -93,8 +93,7 @@ def run(args: argparse.Namespace) -> None:
     found: list[CarOfFrame] = []
     for _, ids in groupby(dataset.frame_ids, dataset.sequence_of):
         loaded = [dataset.load(frame_id) for frame_id in ids]
-        if args.interval is not None:
-            loaded = [_timed(item, number * args.interval) for number, item in enumerate(loaded)]
+        loaded = [_timed(item, number, args.interval) for number, item in enumerate(loaded)]
         if args.swap:
             loaded = _swapped(loaded)
         for views in args.views:
@@ -168,9 +167,11 @@ def _reach(
     return torch.stack([along.amin(dim=1), along.amax(dim=1)], dim=1)
 
 
-def _timed(item: LoadedFrame, seconds: float) -> LoadedFrame:
+def _timed(item: LoadedFrame, number: int, interval_s: float | None) -> LoadedFrame:
+    """The frame at a time of its own, or at none, whatever its files say."""
     frame = item.frame
-    return replace(item, frame=replace(frame, time_s=frame.images_left.new_tensor([seconds])))
+    time_s = None if interval_s is None else frame.images_left.new_tensor([number * interval_s])
+    return replace(item, frame=replace(frame, time_s=time_s))
 
 
 def _swapped(loaded: Sequence[LoadedFrame]) -> list[LoadedFrame]:

@@ -32,7 +32,9 @@ class CarState(NamedTuple):
             >>> CarState.of(torch.eye(4)[None], torch.zeros(1, 2), num_offsets=1).offset_px
             tensor([[0.]])
         """
-        return cls(T_obj_cam, code, code.new_zeros(len(code), num_offsets), code[:, :0])
+        # No view of the code: compiled functions take other strides for another form.
+        offset_px, path = code.new_zeros(len(code), num_offsets), code.new_zeros(len(code), 0)
+        return cls(T_obj_cam, code, offset_px, path)
 
     @property
     def num_unknowns(self) -> int:
