@@ -51,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
     if args.tracks:
         from directshape_torch.cli.inspect_tracks import inspect_tracks
 
-        inspect_tracks([dataset.load(frame_id) for frame_id in dataset.frame_ids], refiner, args.out)
+        if not inspect_tracks([dataset.load(frame_id) for frame_id in dataset.frame_ids], refiner, args.out):
+            raise InputError("--tracks", "a car in several of these frames", "none", "give more --frames")
         print(f"figures  {args.out}")
         return 0
     for frame_id in dataset.frame_ids:
@@ -65,7 +66,11 @@ def run(args: argparse.Namespace) -> int:
 def _dataset(args: argparse.Namespace) -> FileStereoDataset:
     from directshape_torch.io.kitti_dataset import KittiStereoDataset
 
+    if args.tracks and args.car is not None:
+        raise InputError("--tracks", "all cars of several frames", f"--car {args.car} too", "leave one of them out")
     if args.demo:
+        if args.tracks:
+            raise InputError("--tracks", "frames of a sequence", "--demo, one frame", "give --data with --frames")
         if args.data is not None:
             raise InputError("--demo", "the bundled frame alone", f"--data {args.data} too", "leave one of them out")
         frames = None if args.frame is None else [args.frame]

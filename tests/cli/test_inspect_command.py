@@ -61,6 +61,8 @@ def test_without_both_of_the_papers_terms_there_is_no_drift(setting: str) -> Non
         (["--demo", "--data", "x"], "bundled frame alone"),
         (["--data", str(DEMO_FOLDER)], "give --frame ID"),
         ([], "something to inspect"),
+        (["--demo", "--tracks"], "expected frames of a sequence, got --demo, one frame; give --data with --frames"),
+        (["--data", "x", "--tracks", "--car", "1"], "all cars of several frames, got --car 1 too"),
         (["--demo", "--prior", "nowhere.npz"], "nowhere.npz"),
         (["--demo", "--car", "2", "--set", "sampling.min_usable_pixels=100000"], "too_few_pixels"),
     ],

@@ -24,6 +24,19 @@ def test_each_car_of_several_frames_moves(shared_kitti: Path, tmp_path: Path) ->
         assert (animation.n_frames, animation.size) == (2, (480, 360))
 
 
+def test_a_car_of_one_frame_alone_has_nothing_to_move(
+    shared_kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_sequence(shared_kitti, tmp_path, FRAMES, single=True)
+    words = ["inspect", "--layout", "tracking", "--data", tmp_path, "--detections", shared_kitti / "detections"]
+    words += ["--masks", shared_kitti / "masks", "--prior", shared_kitti / "prior.npz", "--config", "fast"]
+    assert main([str(word) for word in (*words, "--tracks", "--frame", 1, "--out", tmp_path / "figures")]) == 2
+    shown = capsys.readouterr()
+    assert "--tracks: expected a car in several of these frames, got none; give more --frames" in shown.err
+    assert "figures" not in shown.out
+    assert not (tmp_path / "figures").exists()
+
+
 def test_frames_by_themselves_have_no_tracks(
     shared_kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
