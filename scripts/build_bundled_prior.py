@@ -4,7 +4,7 @@
     python scripts/build_bundled_prior.py --kernel 32 --out kernel_prior.safetensors
 
 No mesh goes in: every car comes from `directshape_torch.shape.parametric_cars`. The ranges of its measures were
-adjusted by hand while looking at how the prior fits real car meshes (`directshape inspect --prior FILE --meshes DIR`).
+adjusted by hand while looking at how the prior fits real car meshes.
 A kernel PCA of the same cars is not bundled: 32 components of grids weigh 3 MB, its results are no better.
 """
 

@@ -49,7 +49,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "build-prior",
         help="make a shape prior from a folder of car meshes",
         description="Make meshes solid, sample their signed distance and keep the principal components. Writes the "
-        "prior and a report (.json) beside it; 'inspect --prior FILE' draws its shapes.",
+        "prior and a report (.json) beside it.",
     )
     parser.add_argument(
         "--meshes", type=Path, required=True, help="folder of obj, ply, glb, off or stl files, searched deep"

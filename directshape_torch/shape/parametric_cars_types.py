@@ -106,9 +106,9 @@ class BodyTypeStatistics:
     tumblehome: tuple[float, float]
 
 
-# Typical measures of passenger cars of each class, adjusted by hand to how the resulting prior fits real cars
-# (`directshape inspect --prior FILE --meshes DIR`); no single model. The shares make the
-# mixture's length, width and height those of KITTI's labelled cars (3.88, 1.63, 1.53 m).
+# Typical measures of passenger cars of each class, adjusted by hand to how the resulting prior fits real cars; no
+# single model. The shares make the mixture's length, width and height those of KITTI's labelled cars (3.88, 1.63,
+# 1.53 m).
 _STATISTICS: Mapping[str, BodyTypeStatistics] = {
     "city": BodyTypeStatistics(
         0.16, (3.28, 0.14), (1.49, 0.09), (1.47, 0.05), 0.19,
