@@ -107,7 +107,7 @@ class RigEstimate(nn.Module):
         self.rows, self._solved = rows[key.argsort()[:_MOST_ROWS]], None
 
     def add_pixels(self, kind: str, evidence: PixelEvidence) -> None:
-        """Take in pixels of known depth: `kind` is "lidar", "disparity", "labels" or "motion"."""
+        """Take in pixels of known depth: `kind` is "lidar", "disparity" or "motion"."""
         before = self.pixels.get(kind)
         self.pixels[kind], self._solved = evidence if before is None else before + evidence, None
 

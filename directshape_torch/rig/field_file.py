@@ -17,7 +17,7 @@ from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, TENSOR_
 
 SCHEMA = "directshape disparity field"
 SCHEMA_VERSION = 1
-_CURE = "write it again with 'directshape calibrate-rig'"
+_CURE = "make a rig file with 'directshape calibrate-rig', or write it again with `save_field`"
 _NOT_KNOWN = {"covariance": [[0.0] * NUM_COEFFICIENTS] * NUM_COEFFICIENTS}
 """What files of earlier versions lack."""
 

@@ -1,4 +1,4 @@
-"""Pixels of known depth as evidence on a rig's field: LiDAR, disparity maps, labels, and points of a moving rig."""
+"""Pixels of known depth as evidence on a rig's field: LiDAR, disparity maps, and points of a moving rig."""
 
 from __future__ import annotations
 
