@@ -39,6 +39,7 @@ from quality_calibration.report import (
     probability_table,
 )
 
+from directshape_torch.cli.options import frame_id_of
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.config_files import load_config
 from directshape_torch.figures.quality import EVIDENCE_NAMES
@@ -188,7 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, required=True, metavar="ROOT", help="folder that holds training/")
     parser.add_argument("--exact", type=Path, required=True, metavar="DIR", help="labels as result files")
     parser.add_argument("--masks", type=Path, nargs="+", required=True, metavar="DIR")
-    parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
+    parser.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="default all")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument(
         "--other",

@@ -20,6 +20,7 @@ from command_line import run_command
 from torch import Tensor
 
 from directshape_torch import DirectShapeRefiner, load_config
+from directshape_torch.cli.options import frame_id_of
 from directshape_torch.evaluation.tables import align
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -104,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in ("data", "detections", "masks"):
         parser.add_argument(f"--{name}", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--frames", nargs="+", metavar="ID", help="default all")
+    parser.add_argument("--frames", nargs="+", metavar="ID", type=frame_id_of, help="default all")
     parser.add_argument("--most", type=int, metavar="N", help="frames at most")
     parser.add_argument("--long", action="store_true", help="with 80 iterations too")
     parser.add_argument("--marched", action="store_true", help="against marched rays too, and these from moved boxes")
