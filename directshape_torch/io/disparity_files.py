@@ -41,15 +41,3 @@ def read_disparity(
     disparity = stored.astype(np.float32) / np.float32(_UNITS_PER_PIXEL)
     disparity[stored == 0] = np.nan
     return disparity
-
-
-def write_disparity(
-    path: Path | str,
-    disparity: NDArray[np.floating],  # (H, W)
-) -> None:
-    """Write such a file: NaN and what is not positive as unknown, values rounded to 1/256 pixel, at most 255.996."""
-    from directshape_torch.files.atomic_files import write_png
-
-    known = np.isfinite(disparity) & (disparity > 0)
-    units = np.round(np.where(known, disparity, 0) * _UNITS_PER_PIXEL).clip(0, np.iinfo(np.uint16).max)
-    write_png(Path(path), units.astype(np.uint16))

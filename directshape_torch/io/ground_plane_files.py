@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files import atomic_files
 from directshape_torch.files.text_files import Line, read_lines
 
 _CURE = "write four lines: '# Plane', 'Width 4', 'Height 1', then a b c d with a x + b y + c z + d = 0"
@@ -61,12 +59,6 @@ def _four_numbers(path: Path | str, line: Line) -> NDArray[np.float64]:
     if len(values) != 4 or not np.isfinite(values).all():
         raise DataFormatError(path, "expected four finite numbers", line_number=line.number, line=line.text, cure=_CURE)
     return values
-
-
-def write_plane(path: Path | str, plane_ref: Sequence[float] | NDArray[np.float64]) -> None:
-    """Write a plane `(a, b, c, d)` of the `ref` frame in AVOD's four lines."""
-    numbers = " ".join(f"{value:.6e}" for value in plane_ref)
-    atomic_files.write_text(path, f"# Plane\nWidth 4\nHeight 1\n{numbers}\n")
 
 
 def plane_ref_to_cam(

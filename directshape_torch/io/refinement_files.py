@@ -13,19 +13,11 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.box3d import alpha_from_kitti
-from directshape_torch.io.result_files import RefinedBox, ShapeArrays, write_result_text, write_shapes
-from directshape_torch.io.run_folder import result_path, shapes_path
+from directshape_torch.io.result_files import RefinedBox, ShapeArrays, write_result_text
+from directshape_torch.io.run_folder import result_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.io.track_files import track_name
 from directshape_torch.result import RefinementResult
-
-
-def write_refinement(
-    out_dir: Path | str, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, first_row: int = 0
-) -> None:
-    """Write both files of a frame, outside of a run; arguments and errors as of `write_result`."""
-    shapes = write_result(out_dir, loaded, result, prior_sha256, first_row)
-    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
 
 
 def write_result(

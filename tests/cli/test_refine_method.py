@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.disparity_maps import write_disparity
 from helpers.exact_disparity import exact_disparity
 from helpers.kitti_folder import CODE, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main
-from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.disparity_maps import write_disparity
 from helpers.finished_run import FinishedRun
 from numpy.typing import NDArray
 from plyfile import PlyData
@@ -19,7 +20,6 @@ from scipy.spatial.transform import Rotation
 
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
-from directshape_torch.io.disparity_files import write_disparity
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder

@@ -17,8 +17,8 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import MatchingSummary
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
-from directshape_torch.io.refinement_files import write_refinement
-from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.refinement_files import write_result
+from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
@@ -105,6 +105,14 @@ def result(statuses: list[Status]) -> RefinementResult:
         track_part=torch.full((B,), -1),
         prior=box_prior(),
     )
+
+
+def write_refinement(
+    out_dir: Path, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, first_row: int = 0
+) -> None:
+    """Both files of a frame, outside of a run."""
+    shapes = write_result(out_dir, loaded, result, prior_sha256, first_row)
+    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
 
 
 @pytest.fixture
