@@ -37,6 +37,8 @@ Masks = Tensor | Sequence[Tensor | None]
 # Resampling by cubic kernels overshoots by a quarter at an edge; normalised images and 0..255 go far beyond.
 _BRIGHTEST = 1.5
 _DARKEST = -0.5
+# What times and places of a path must be told apart by.
+_FINE_S, _FINE_M = 1e-3, 0.01
 
 
 @dataclass(frozen=True)
@@ -410,11 +412,24 @@ def _check_words(name: str, words: object, count: int, what: str) -> None:
 def _check_motion(time_s: Tensor | None, T_world_cam: Tensor | None) -> None:
     if time_s is not None and not bool(time_s.isfinite().all()):
         raise InputError("time_s", "finite seconds", str(time_s.tolist()), "leave it out where times are not known")
+    if time_s is not None:
+        _check_fine("time_s", time_s, _FINE_S, "s")
     if T_world_cam is None:
         return
     if not bool(T_world_cam.isfinite().all()):
         raise InputError("T_world_cam", "finite poses", "NaN or infinity", "leave it out where poses are not known")
     check_rotation("T_world_cam", T_world_cam)
+    if bool((T_world_cam[:, 3] != T_world_cam.new_tensor([0.0, 0.0, 0.0, 1.0])).any()):
+        raise InputError("T_world_cam", "0, 0, 0, 1 as last rows", str(T_world_cam[:, 3].tolist()))
+    _check_fine("T_world_cam", T_world_cam[:, :3, 3], _FINE_M, "m")
+
+
+def _check_fine(name: str, values: Tensor, fine: float, unit: str) -> None:
+    """Raise `InputError` where the numbers of a dtype are too far apart for what they are to tell."""
+    spacing = torch.finfo(values.dtype).eps * float(values.detach().abs().max()) if values.numel() else 0.0
+    if spacing > fine:
+        came = f"{values.dtype} {float(values.detach().abs().max()):g} {unit}, which is known to {spacing:.2g} {unit}"
+        raise InputError(name, f"numbers near 0, exact to {fine:g} {unit}", came, "take those of the first frame off")
 
 
 def _check_tracks(

@@ -252,14 +252,25 @@ def test_a_view_whose_track_has_no_other_that_is_trusted_has_a_shape_of_its_own(
 
 
 @pytest.mark.parametrize("doubted", [False, True])
-@pytest.mark.parametrize("mode", ["unroll", "implicit", "implicit_gauss_newton"])
+@pytest.mark.parametrize(
+    ("mode", "time_s"),
+    [
+        ("unroll", None),
+        ("unroll", (0, 0.1)),
+        ("implicit", None),
+        ("implicit", (0, 0.1)),
+        ("implicit_gauss_newton", None),
+    ],
+)
 def test_gradients_of_a_track_are_those_of_differences(
-    mode: str, doubted: bool, monkeypatch: pytest.MonkeyPatch
+    mode: str, time_s: tuple[float, float] | None, doubted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if doubted:
         doubt_in_track(monkeypatch, 1)
     prior, scene = cached_street()
     frames = joined_frames([scene.frames] * 2)
+    if time_s is not None:
+        frames = replace(frames, time_s=torch.tensor(time_s, dtype=torch.float64))
     # The same picture twice: a minimum without a kink.
     first = replace(disturbed(scene.detections), mask_left=scene.detections.mask_left.clamp(0.2, 0.8))
     first = select(first, torch.tensor([0]))

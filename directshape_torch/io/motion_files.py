@@ -36,7 +36,7 @@ def read_times(path: Path | str) -> NDArray[np.float64]:
 
 
 def read_poses(path: Path | str) -> NDArray[np.float64]:
-    """Poses (N, 4, 4) of camera 0, the frame `ref` of boxes, in that of a world.
+    """Poses (N, 4, 4) of camera 0, the frame `ref` of boxes, in that of the first line: small numbers, for float32.
 
     Args:
         path: of a file as of KITTI's odometry benchmark: rows of a matrix (3, 4), a line a frame.
@@ -48,7 +48,7 @@ def read_poses(path: Path | str) -> NDArray[np.float64]:
     poses = np.tile(np.eye(4), (len(lines), 1, 1))
     for pose, line in zip(poses, lines, strict=True):
         pose[:3] = _matrix(path, line)
-    return poses
+    return np.linalg.inv(poses[:1]) @ poses
 
 
 def of_line(path: Path, values: NDArray[np.float64], number: int) -> NDArray[np.float64]:
@@ -77,11 +77,6 @@ def _seconds(path: Path | str, line: Line) -> float:
     if not np.isfinite(seconds):
         raise DataFormatError(path, "expected finite seconds", line_number=line.number, line=line.text)
     return seconds
-
-
-def _of_date(text: str) -> float:
-    """Python knows microseconds, the recordings write nanoseconds."""
-    return datetime.fromisoformat(text[:26]).replace(tzinfo=UTC).timestamp()
 
 
 def _matrix(path: Path | str, line: Line) -> NDArray[np.float64]:

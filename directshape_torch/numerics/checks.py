@@ -16,6 +16,7 @@ from directshape_torch.errors import InputError, shown
 
 # Calibration files have six digits or more, and float32 seven.
 _ROTATION_TOLERANCE = 1e-3
+_WIDEST_PX = 2**31
 
 Kind = Literal["number", "floating", "image", "index", "flags", "mask"]
 # Kinds that share one dtype in a call.
@@ -99,9 +100,9 @@ def check_size_wh(name: str, size: object) -> None:
     Examples:
         >>> check_size_wh("size_wh", (1242, 375))
     """
-    fits = isinstance(size, Sequence) and len(size) == 2 and all(isinstance(n, Integral) and int(n) > 0 for n in size)
-    if not fits:
-        raise InputError(name, "(width, height) in pixels, whole and above 0", shown(size))
+    fits = isinstance(size, Sequence) and len(size) == 2
+    if not fits or not all(isinstance(n, Integral) and 0 < int(n) <= _WIDEST_PX for n in size):
+        raise InputError(name, f"(width, height) in pixels, whole, from 1 to {_WIDEST_PX}", shown(size))
 
 
 def check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:

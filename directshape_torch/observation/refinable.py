@@ -112,7 +112,7 @@ def _check_times(detections: Detections, frames: FrameBatch) -> None:
     seen: set[tuple[int, float]] = set()
     for view in zip(detections.track_id.tolist(), times, strict=True):
         if view[0] >= 0 and view in seen:
-            cure = "take the time of the first frame off, before they become float32"
+            cure = "take the time of the first frame off before they become float32, or leave times out"
             raise InputError("frames.time_s", "another time for each view of a track", f"{view[1]:g} s twice", cure)
         seen.add(view)
 

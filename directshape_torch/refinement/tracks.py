@@ -172,10 +172,10 @@ def _unknowns(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor
 
 
 def _tracks(cars: CarBatch, usable: Tensor) -> list[list[int]]:
-    """Rows of the usable views of each track, in the order of the frames."""
+    """Rows of the usable views of each track, in the order of their times, or of the frames."""
     assert cars.track_id is not None
     views: dict[int, list[int]] = {}
-    order = cars.frame_index.argsort(stable=True).tolist()
+    order = (cars.frame_index if cars.time_s is None else cars.time_s).argsort(stable=True).tolist()
     track_id, is_usable = cars.track_id.tolist(), usable.tolist()
     for row in order:
         if track_id[row] >= 0 and is_usable[row]:

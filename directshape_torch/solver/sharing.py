@@ -163,12 +163,12 @@ class Groups:
     def damped_step(self, hessian: Tensor, gradient: Tensor, damping: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
         damped = hessian + torch.diag_embed(damping[:, None] * floored_diagonal(hessian))
         together = self._step(damped, gradient, _undamped_solution, members)
-        return self._unless_alone(damped_step(hessian, gradient, damping), together)
+        return self._unless_alone(damped_step(self._of_the_alone(hessian), gradient, damping), together)
 
     def newton_step(self, J: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         everybody = torch.ones_like(self.is_alone)
         together = self._step(J.detach(), gradient, general_solution, everybody)
-        return self._unless_alone(newton_step(J, gradient), together)
+        return self._unless_alone(newton_step(self._of_the_alone(J), gradient), together)
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
         of_each, _, solvable = said_of_shared(information, torch.zeros_like(information[:, 0]), self.own, self.shared)
@@ -182,6 +182,12 @@ class Groups:
         """Values (B, ...) in their places (G, F, ...), 0 in those without a member."""
         is_member = self.filled & members[self.rows]
         return torch.where(is_member.view(*is_member.shape, *(1,) * (values.ndim - 1)), values[self.rows], 0)
+
+    def _of_the_alone(self, matrix: Tensor) -> Tensor:
+        """Matrices (B, D, D) of those by themselves; another's own says nothing of some unknowns, and what cannot be
+        solved has NaN as its gradient even where nobody takes the solution."""
+        identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+        return torch.where(self.is_alone[:, None, None], matrix, identity)
 
     def _unless_alone(self, alone: tuple[Tensor, Tensor], together: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
         """To the bit what problems that share nothing get."""

@@ -22,11 +22,12 @@ from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.priors import J_heading_omega, PriorResidual, PriorTerm
 
 NUM_PATH = 9
+MOTION_NAMES = ("path", "acceleration")
 # Of squared standard deviations, as that of the detector's pose.
 MOTION_WEIGHT = 0.2
 # A track of which a view, refined by itself, is further from the path than so many standard deviations, its own taken
-# for this share of its distance, goes along none (or is not of one car), and is held by next to nothing.
-_FURTHEST, _OWN_SHARE, _NEXT_TO_NOTHING = 3.0, 0.01, 1e-4
+# for this share of its distance and these radians, goes along none or is not of one car: next to nothing holds it.
+_FURTHEST, _OWN_SHARE, _OWN_HEADING, _NEXT_TO_NOTHING = 3.0, 0.01, 0.05, 1e-4
 # An acceleration lasts about so long: what it changes by is what a view so far from the middle may deviate.
 _STEADY_S = 0.3
 
@@ -37,8 +38,8 @@ def motion_terms(config: TracksConfig, cars: CarBatch) -> list[PriorTerm]:
         return []
     of_acceleration = _of_acceleration(config)
     return [
-        PriorTerm("path", MOTION_WEIGHT, cars, partial(path_prior, config=config), 3),
-        PriorTerm("acceleration", MOTION_WEIGHT, cars, lambda _, state: acceleration_prior(state, of_acceleration), 3),
+        PriorTerm(MOTION_NAMES[0], MOTION_WEIGHT, cars, partial(path_prior, config=config), 3),
+        PriorTerm(MOTION_NAMES[1], MOTION_WEIGHT, cars, lambda _, state: acceleration_prior(state, of_acceleration), 3),
     ]
 
 
@@ -95,11 +96,8 @@ def with_path(config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarS
     if not motion_terms(config, cars):
         return state
     place, heading, _, _ = _on_the_ground(cars, state.T_obj_cam)
-    first = sharing.rows[:, 0][sharing.of_problem]
-    # The nearest heading to that of the first view, or to its opposite.
-    half_turns = torch.atan2(torch.sin(2 * (heading - heading[first])), torch.cos(2 * (heading - heading[first]))) / 2
-    seen = torch.cat([place, (heading[first] + half_turns)[:, None]], dim=1)
     assert cars.time_s is not None
+    seen = torch.cat([place, _continuous(sharing, cars.time_s, heading)[:, None]], dim=1)
     everybody, basis = torch.ones_like(sharing.is_alone), _basis(cars).to(torch.float64)
     weight = 1 / deviation_sigma(config, cars.time_s).to(basis).square()
     columns = []
@@ -112,14 +110,28 @@ def with_path(config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarS
     return state._replace(path=torch.cat(columns, dim=1).to(state.code))
 
 
+def _continuous(sharing: Groups, time_s: Tensor, heading: Tensor) -> Tensor:
+    """Headings (R,) of which each is the nearest to that of the view before it in time, or to its opposite."""
+    order = time_s[sharing.rows].masked_fill(~sharing.filled, torch.inf).argsort(dim=1, stable=True)
+    rows, filled = sharing.rows.gather(1, order), sharing.filled.gather(1, order)
+    in_order = heading[rows]
+    twice = 2 * in_order.diff(dim=1)
+    turned = torch.atan2(torch.sin(twice), torch.cos(twice)) / 2
+    unwound = torch.cat([in_order[:, :1], in_order[:, :1] + turned.cumsum(dim=1)], dim=1)
+    return heading.index_put((rows[filled],), unwound[filled])
+
+
 def hold_of_path(config: TracksConfig, sharing: Groups, cars: CarBatch, alone: CarState) -> Tensor:
     """Factor (R,) of what deviations cost views that ended here by themselves: 1 where a path fits their track."""
     fitted = with_path(config, sharing, cars, alone)
     assert cars.time_s is not None
-    place = _on_the_ground(cars, fitted.T_obj_cam)[0]
-    off = (place - (fitted.path.view(-1, 3, 3)[:, :2] * _basis(cars)[:, None]).sum(dim=2)).norm(dim=1)
+    place, heading, _, _ = _on_the_ground(cars, fitted.T_obj_cam)
+    on_path = (fitted.path.view(-1, 3, 3) * _basis(cars)[:, None]).sum(dim=2)
+    off, sigma = (place - on_path[:, :2]).norm(dim=1), deviation_sigma(config, cars.time_s)
     own = _OWN_SHARE * fitted.T_obj_cam[:, :3, 3].norm(dim=1)
-    too_far = off > _FURTHEST * torch.hypot(deviation_sigma(config, cars.time_s)[:, 0], own)
+    turned = torch.sin(heading - on_path[:, 2]).abs()
+    too_far = off > _FURTHEST * torch.hypot(sigma[:, 0], own)
+    too_far |= turned > _FURTHEST * torch.hypot(sigma[:, 2], torch.full_like(own, _OWN_HEADING))
     return torch.ones_like(off, dtype=torch.float64).masked_fill(sharing.any(too_far), _NEXT_TO_NOTHING)
 
 

@@ -92,6 +92,13 @@ def test_a_folder_says_it_in_its_frames(kitti: Path, tmp_path: Path) -> None:
         dataset.load(dataset.frame_ids[1])
 
 
+def test_poses_count_from_the_first(tmp_path: Path) -> None:
+    """However far away their world begins: float32 knows seven digits."""
+    far = "1 0 0 5400000.0 0 1 0 0 0 0 1 0\n1 0 0 5400000.1 0 1 0 0 0 0 1 0\n"
+    write(tmp_path / "poses.txt", far)
+    assert read_poses(tmp_path / "poses.txt")[:, 0, 3].tolist() == pytest.approx([0, 0.1], abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("read", "text", "said"),
     [

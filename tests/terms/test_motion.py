@@ -20,6 +20,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.solver.problem import take_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.motion import deviation_sigma, hold_of_path, motion_terms, timed, with_path
@@ -72,6 +73,21 @@ def on_a_path(path: Tensor, T_world_cam: Tensor | None) -> CarState:
     if T_world_cam is not None:
         T_path_obj = se3.inverse(T_world_cam) @ T_world_cam[:1] @ T_path_obj
     return CarState.of(se3.inverse(T_path_obj), random(5, 3))
+
+
+def test_a_car_may_turn_back() -> None:
+    """By more than a quarter turn from its first view, in the frames of any order."""
+    cars, _ = views(with_camera=False)
+    mixed = torch.tensor([3, 0, 4, 1, 2])
+    turning = torch.tensor([1.0, 2.0, 0.3, 9.0, -3.0, 0.0, 0.4, 2.0, 0.0], dtype=torch.float64)
+    cars, state = replace(cars, time_s=TIMES[mixed]), take_rows(on_a_path(turning, None), mixed)
+    sharing = Groups.of([7] * 5, torch.arange(6), torch.arange(6, 9))
+    cars = timed(sharing, cars)
+    path = with_path(CONFIG, sharing, cars, state).path
+    modulo = (path[:, 6] - turning[6] + math.pi / 2) % math.pi - math.pi / 2
+    torch.testing.assert_close(modulo, torch.zeros(5, dtype=torch.float64))
+    torch.testing.assert_close(path[:, 7], turning[7].expand(5))
+    assert hold_of_path(CONFIG, sharing, cars, state).tolist() == [1.0] * 5
 
 
 @pytest.mark.parametrize("backwards", [False, True])
