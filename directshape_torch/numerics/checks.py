@@ -100,8 +100,8 @@ def check_size_wh(name: str, size: object) -> None:
     Examples:
         >>> check_size_wh("size_wh", (1242, 375))
     """
-    fits = isinstance(size, Sequence) and len(size) == 2
-    if not fits or not all(isinstance(n, Integral) and 0 < int(n) <= _WIDEST_PX for n in size):
+    sides = size if isinstance(size, Sequence) and len(size) == 2 else ()
+    if not sides or not all(isinstance(n, Integral) and 0 < int(n) <= _WIDEST_PX for n in sides):
         raise InputError(name, f"(width, height) in pixels, whole, from 1 to {_WIDEST_PX}", shown(size))
 
 
