@@ -104,8 +104,6 @@ def _make_refiner(args: argparse.Namespace, folder: RunFolder, prior: ShapePrior
     """The refiner of the run, on the processor and not compiled: a few frames are not worth it."""
     from dataclasses import replace
 
-    from directshape_torch.config import RefinerConfig
-    from directshape_torch.config_files import config_from_mapping
     from directshape_torch.refiner import DirectShapeRefiner
 
     if "rerun" not in args.format:
@@ -116,5 +114,5 @@ def _make_refiner(args: argparse.Namespace, folder: RunFolder, prior: ShapePrior
             raise InputError(f"--{name}", "that of the run, for --iterations", "nothing")
     if prior is None:
         raise InputError("--prior", "the shape prior of the run", "nothing")
-    config = config_from_mapping(RefinerConfig, folder.setting("refiner"))
+    config = folder.refiner_config()
     return DirectShapeRefiner(prior, replace(config, compile="off"))

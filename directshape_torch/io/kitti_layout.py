@@ -40,7 +40,7 @@ class KittiFiles:
         plane: ground plane.
         labels: a file a frame, or without `{stem}` one of the tracking benchmark; "": there are none.
         velo_to_cam: file that places the LiDAR; "": the calibration does.
-        times, poses: of the frames of a sequence, a line each from frame 0 on; "": there are none.
+        times, trajectory: times and camera poses of a sequence, a line each from frame 0 on; "": there are none.
         digits: of a frame's number.
         first: what is added to a number alone; files may leave it out.
     """
@@ -52,7 +52,7 @@ class KittiFiles:
     labels: str = ""
     velo_to_cam: str = ""
     times: str = ""
-    poses: str = ""
+    trajectory: str = ""
     digits: int = 6
     first: str = ""
 
@@ -65,7 +65,7 @@ TRACKING_SEQUENCE = KittiFiles(
     "calib.txt",
     labels="label_02.txt",
     times="times.txt",
-    poses="poses.txt",
+    trajectory="poses.txt",
 )
 TRACKING = KittiFiles(
     "image_02/{sequence}/{stem}",
@@ -74,7 +74,7 @@ TRACKING = KittiFiles(
     "planes/{sequence}/{stem}.txt",
     "label_02/{sequence}.txt",
     times="times/{sequence}.txt",
-    poses="poses/{sequence}.txt",
+    trajectory="poses/{sequence}.txt",
 )
 # In the folder of the day, and with a calibration in the drive itself.
 RAW_OF_DAY = KittiFiles(
@@ -84,7 +84,7 @@ RAW_OF_DAY = KittiFiles(
     "{sequence}/planes/{stem}.txt",
     velo_to_cam="calib_velo_to_cam.txt",
     times="{sequence}/image_02/timestamps.txt",
-    poses="{sequence}/poses.txt",
+    trajectory="{sequence}/poses.txt",
     digits=10,
 )
 RAW = replace(
@@ -187,7 +187,7 @@ class KittiLayout(FrameLayout):
 
     def motion_files(self, frame_id: str) -> dict[str, Path]:
         """The sequence's."""
-        names = {"times": self._files.times, "poses": self._files.poses}
+        names = {"times": self._files.times, "poses": self._files.trajectory}
         paths = {role: self._path(frame_id, pattern) for role, pattern in names.items() if pattern}
         return {role: path for role, path in paths.items() if path.is_file()}
 

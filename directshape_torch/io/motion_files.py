@@ -45,10 +45,10 @@ def read_poses(path: Path | str) -> NDArray[np.float64]:
         DataFormatError: a line does not hold 12 finite numbers, or no rotation.
     """
     lines = read_lines(path)
-    poses = np.tile(np.eye(4), (len(lines), 1, 1))
-    for pose, line in zip(poses, lines, strict=True):
-        pose[:3] = _matrix(path, line)
-    return np.linalg.inv(poses[:1]) @ poses
+    T_world_ref = np.tile(np.eye(4), (len(lines), 1, 1))
+    for number, line in enumerate(lines):
+        T_world_ref[number, :3] = _matrix(path, line)
+    return np.linalg.inv(T_world_ref[:1]) @ T_world_ref
 
 
 def of_line(path: Path, values: NDArray[np.float64], number: int) -> NDArray[np.float64]:

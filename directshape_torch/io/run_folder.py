@@ -18,7 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.config import RefinerConfig
+from directshape_torch.config_files import config_from_mapping
+from directshape_torch.errors import ConfigError, DataFormatError, InputError
 from directshape_torch.files.names import is_frame_id
 from directshape_torch.files.read_files import parse_json, read_bytes
 from directshape_torch.files.schema import record_of
@@ -231,6 +233,17 @@ class RunFolder:
         if name not in self.manifest.config:
             raise DataFormatError(summary_path(self.path), f"has no setting {name!r}")
         return self.manifest.config[name]
+
+    def refiner_config(self) -> RefinerConfig:
+        """The settings of the refinement.
+
+        Raises:
+            DataFormatError: the summary does not have them, or one of them cannot be.
+        """
+        try:
+            return config_from_mapping(RefinerConfig, self.setting("refiner"))
+        except ConfigError as error:
+            raise DataFormatError(summary_path(self.path), f"config.refiner: {error}") from error
 
     def read(self, frame_id: str) -> FrameResult:
         """The results of a frame that is done.

@@ -14,7 +14,6 @@ from directshape_torch.batch.options import RunObserver, SilentObserver
 from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.config import RefinerConfig
-from directshape_torch.config_files import config_from_mapping
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.run_folder import RunFolder, shapes_path
@@ -92,7 +91,7 @@ class _PageOfRun:
         prior_was_given: bool,
     ) -> None:
         self._run, self._dataset = run, dataset
-        self._config = config_from_mapping(RefinerConfig, run.setting("refiner"))
+        self._config = run.refiner_config()
         # One for all frames and one for those with details: each counts what it could not use.
         self._reader, self._detail_reader = (InputReader(dataset, has_detections) for _ in range(2))
         self._grounds: Counter[str] = Counter()

@@ -11,7 +11,7 @@ from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.rows import Blocks
-from directshape_torch.terms.term import Linear, Sight, Term, Where
+from directshape_torch.terms.term import Linear, Sight, Term, Where, linear_of
 
 _MEMBERS = (
     *("names", "is_prior", "blocks", "column", "block_weight", "information", "row_weight"),
@@ -95,10 +95,9 @@ def _check_linear(called: str, term: Term, where: Where, sight: Sight) -> None:
     of_rows = tuple(term.row_weight.shape)
     check_shape(f"{called}.residual", at.residual, of_rows, "one for each block, row and residual")
     check_shape(f"{called}.J_residual_inner", at.J_residual_inner, of_rows, "by the row's inner scalar")
+    J = linear_of(term, sight.field, sight.state, where).J_inner_state
     by_state = (*of_rows[:2], sight.state.num_unknowns)
-    check_shape(
-        f"{called}.J_inner_state", at.J_inner_state, by_state, "by (v, omega, dcode), without the residual's axis"
-    )
+    check_shape(f"{called}.J_inner_state", J, by_state, "by (v, omega, dcode), without the residual's axis")
     again = term.residual(sight.field, sight.state, at.where)
     check_shape(f"{called.replace('linear', 'residual')}", again, of_rows, "those of linear(...)")
     for name, values in term.norm(at.residual)._asdict().items():

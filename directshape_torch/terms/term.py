@@ -119,10 +119,12 @@ class Part(NamedTuple):
 
 
 def linear_of(term: Term, field: Field, state: CarState, where: Where) -> Linear:
-    """`term.linear` with a column for each unknown of the state; most terms know nothing of the last, a path."""
+    """`term.linear` with a column for each unknown of the state; few terms know of the last, offset and path."""
     at = term.linear(field, state, where)
     missing = state.num_unknowns - at.J_inner_state.shape[-1]
-    return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, missing))) if missing else at
+    if not 0 < missing <= state.offset_px.shape[1] + state.path.shape[1]:
+        return at
+    return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, missing)))
 
 
 def part_of(term: Term, at: Linear, fisher: bool = True) -> Part:

@@ -129,11 +129,12 @@ def test_another_rigs_field_is_refused(
     import torch
 
     from directshape_torch.geometry.disparity_field import DisparityField
+    from directshape_torch.rig.field_file import save_field
 
     camera = finished.inputs().dataset.load("000000").frame.camera
     rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
     hull = torch.tensor([[0.0, 0.0], [159.0, 0.0], [159.0, 119.0]])
-    DisparityField(torch.zeros(10), hull_uv=hull, size_wh=(160, 120), **rig).save(tmp_path / "bias.json")
+    save_field(DisparityField(torch.zeros(10), hull_uv=hull, size_wh=(160, 120), **rig), tmp_path / "bias.json")
     words = ("--format", "points", "--data", finished.root, "--rig", tmp_path / "bias.json")
     assert main(command(finished, tmp_path / "out", *words)) == 2
     assert "--rig: expected the disparity fields that the run was made with, got others in" in capsys.readouterr().err
