@@ -24,7 +24,7 @@ from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibr
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.mask_files import mask_source
 from directshape_torch.io.motion_files import of_line, read_poses, read_times
-from directshape_torch.io.tracking_files import read_tracking_objects
+from directshape_torch.io.tracking_files import FrameObjects, frame_number
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class KittiLayout(FrameLayout):
         self.detection_file_name = f"{'N' * self._files.digits}{self._files.first}.txt"
         if "" not in sequences:
             self.detection_file_name += " or SEQUENCE.txt"
-        self._tracking: dict[Path, dict[int, list[KittiObject]]] = {}
+        self._objects = FrameObjects()
         self._motion: dict[Path, NDArray[np.float64]] = {}
 
     def frame_ids(self) -> list[str]:
@@ -171,7 +171,7 @@ class KittiLayout(FrameLayout):
     def objects(self, frame_id: str) -> list[KittiObject]:
         path = self.detection_path(frame_id)
         name, _, _, stem = self._split(frame_id)
-        return self._tracked(path, stem) if path.stem == name else read_objects(path)
+        return self._objects.of_sequence(path, stem) if path.stem == name else read_objects(path)
 
     def labels(self, frame_id: str) -> list[KittiObject] | None:
         path, pattern = self._path(frame_id, self._files.labels), self._files.labels
@@ -179,7 +179,7 @@ class KittiLayout(FrameLayout):
             return None
         if "{stem}" in pattern:
             return read_objects(path, with_score=False)
-        return self._tracked(path, self._split(frame_id)[3])
+        return self._objects.of_sequence(path, self._split(frame_id)[3])
 
     def sequence_of(self, frame_id: str) -> str | None:
         """The prefix of the frame, where there are several sequences."""
@@ -193,11 +193,11 @@ class KittiLayout(FrameLayout):
 
     def motion(self, frame_id: str) -> tuple[float | None, NDArray[np.float64] | None]:
         """Of the line of its number in the files of its sequence, which are read once."""
-        files, number = self.motion_files(frame_id), int(self._split(frame_id)[3])
-        for role, path in files.items():
+        said: dict[str, NDArray[np.float64]] = {}
+        for role, path in self.motion_files(frame_id).items():
             if path not in self._motion:
                 self._motion[path] = read_times(path) if role == "times" else read_poses(path)
-        said = {role: of_line(path, self._motion[path], number) for role, path in files.items()}
+            said[role] = of_line(path, self._motion[path], frame_number(self._split(frame_id)[3]))
         return float(said["times"]) if "times" in said else None, said.get("poses")
 
     def disparity_path(self, folder: Path, frame_id: str) -> Path:
@@ -244,12 +244,6 @@ class KittiLayout(FrameLayout):
         found = set(_text_stems(self.detections_dir / name))
         found |= {stem.removeprefix(prefix) for stem in all_stems if stem.startswith(prefix)}
         return sorted(found)
-
-    def _tracked(self, path: Path, stem: str) -> list[KittiObject]:
-        """The lines of one frame; such files hold a whole sequence, so each is read once."""
-        if path not in self._tracking:
-            self._tracking[path] = read_tracking_objects(path)
-        return self._tracking[path].get(int(stem), [])
 
     def _path(self, frame_id: str, pattern: str, named: str | None = None) -> Path:
         """The file of a frame, or one that is called otherwise."""

@@ -70,12 +70,35 @@ class FrameObjects:
         """
         if path.stem == frame_id:
             return read_objects(path)
-        number = frame_id.rpartition("_")[2]
-        if not _is_number(number):
-            raise InputError("frames", f"numbers of frames of {path}", repr(frame_id))
+        return self.of_sequence(path, frame_id)
+
+    def of_sequence(self, path: Path, frame_id: str) -> list[KittiObject]:
+        """The objects of a frame in a file of the tracking benchmark.
+
+        Raises:
+            DataFormatError: the file is missing or damaged.
+            InputError: the name of the frame does not end with its number.
+        """
+        number = frame_number(frame_id)
         if path not in self._sequences:
             self._sequences[path] = read_tracking_objects(path)
-        return self._sequences[path].get(int(number), [])
+        return self._sequences[path].get(number, [])
+
+
+def frame_number(frame_id: str) -> int:
+    """The number of a frame in its sequence, of `NNNNNN` or `SEQUENCE_NNNNNN`.
+
+    Raises:
+        InputError: the name does not end with one.
+
+    Examples:
+        >>> frame_number("0005_000012")
+        12
+    """
+    number = frame_id.rpartition("_")[2]
+    if not _is_number(number.lstrip("0") or number[-1:]):
+        raise InputError("frames", "names that end with numbers, for a file of their sequence", repr(frame_id))
+    return int(number)
 
 
 def _is_number(word: str) -> bool:

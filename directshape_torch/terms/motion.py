@@ -32,9 +32,14 @@ _FURTHEST, _OWN_SHARE, _OWN_HEADING, _NEXT_TO_NOTHING = 3.0, 0.01, 0.05, 1e-4
 _STEADY_S = 0.3
 
 
+def follow_paths(config: TracksConfig, cars: CarBatch) -> bool:
+    """Whether times are known, and paths wanted."""
+    return cars.time_s is not None and config.path_sigma_m > 0
+
+
 def motion_terms(config: TracksConfig, cars: CarBatch) -> list[PriorTerm]:
-    """What holds views to their path, and the path to constant velocity; none without times or standard deviations."""
-    if cars.time_s is None or config.path_sigma_m == 0:
+    """What holds views to their path, and the path to constant velocity; none where cars follow no path."""
+    if not follow_paths(config, cars):
         return []
     of_acceleration = _of_acceleration(config)
     return [
@@ -93,7 +98,7 @@ def acceleration_prior(state: CarState, sigma: tuple[float, float, float]) -> Pr
 
 def with_path(config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarState) -> CarState:
     """States (R) with the path of each group that fits its views best; as they are where there is no motion prior."""
-    if not motion_terms(config, cars):
+    if not follow_paths(config, cars):
         return state
     place, heading, _, _ = _on_the_ground(cars, state.T_obj_cam)
     assert cars.time_s is not None

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.kitti_folder import write_data_set
-from helpers.layouts import DRIVE, SEQUENCE, write, write_folder, write_raw, write_sequence
+from helpers.layouts import DRIVE, SEQUENCE, put, write, write_folder, write_raw, write_sequence
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.motion_files import of_line, read_poses, read_times
 from directshape_torch.io.open_dataset import open_dataset
@@ -19,13 +18,6 @@ from directshape_torch.io.open_dataset import open_dataset
 FRAMES = ("000000", "000001")
 TURNED = "0.8 0 0.6 1 0 1 0 2 -0.6 0 0.8 3"
 POSES = "1 0 0 0 0 1 0 0 0 0 1 0\n" + TURNED + "\n"
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root, FRAMES)
-    return root
 
 
 def sequence_detections(kitti: Path, folder: Path, name: str) -> Path:
@@ -122,3 +114,14 @@ def test_a_frame_without_a_line_is_named(tmp_path: Path) -> None:
     write(tmp_path / "times.txt", "0\n1\n")
     with pytest.raises(DataFormatError, match="has 2 lines and none for frame 2"):
         of_line(tmp_path / "times.txt", read_times(tmp_path / "times.txt"), 2)
+
+
+def test_a_frame_without_a_number_is_named(kitti: Path, tmp_path: Path) -> None:
+    write_sequence(kitti, tmp_path, FRAMES, single=True)
+    write(tmp_path / "times.txt", "0\n1\n")
+    for folder in ("image_02", "image_03"):
+        put(tmp_path / folder / "000000.png", tmp_path / folder / "first.png")
+    write(tmp_path / "found" / "first.txt", "")
+    dataset = open_dataset("tracking", tmp_path, tmp_path / "found", tracks=True)
+    with pytest.raises(InputError, match="names that end with numbers, for a file of their sequence, got 'first'"):
+        dataset.load("first")

@@ -10,7 +10,6 @@ from typing import get_args
 
 import pytest
 import torch
-from helpers.kitti_folder import write_data_set
 from helpers.layouts import (
     DAY,
     DRIVE,
@@ -30,13 +29,6 @@ from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 
 FRAMES = ("000000", "000001")
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root, FRAMES)
-    return root
 
 
 @pytest.fixture(scope="module")

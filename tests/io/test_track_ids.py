@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.kitti_folder import write_data_set
 from helpers.layouts import SEQUENCE, write, write_folder, write_sequence
 
 from directshape_torch.errors import DataFormatError, InputError
@@ -21,13 +20,6 @@ from directshape_torch.io.track_association import associate
 from directshape_torch.io.tracking_files import read_tracking_objects
 
 FRAMES = ("000000", "000001")
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root, FRAMES)
-    return root
 
 
 def tracked_lines(kitti: Path, tracks: Sequence[int]) -> str:
