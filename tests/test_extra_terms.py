@@ -211,6 +211,8 @@ def test_a_member_that_is_missing_is_named() -> None:
 def test_two_terms_of_one_name_are_named() -> None:
     with pytest.raises(InputError, match=r"extra term 'user': names: expected names that no other column has"):
         refine(made(), made())
+    with pytest.raises(InputError, match=r"extra term 'path': names: expected names that no other column has"):
+        refine(lambda *scene: PriorTerm("path", 1.0, scene[2], lower_by(0.1), 1))
 
 
 def _poisoned(name: str, when: Callable[[CarState], Tensor]) -> Callable[[CarBatch, CarState], PriorResidual]:

@@ -11,7 +11,7 @@ from helpers.derivatives import moved, tangent_of
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.ground import cars_on
 from helpers.problems import DEFAULT
-from helpers.synthetic_scene import CAMERA_HEIGHT_M, disturbed, joined_detections, joined_frames, street
+from helpers.synthetic_scene import CAMERA_HEIGHT_M, cached_street, disturbed, joined_detections, joined_frames, street
 from torch import Tensor
 
 from directshape_torch.config import TracksConfig
@@ -197,6 +197,20 @@ def test_what_cannot_be_a_time_or_a_pose_is_refused() -> None:
         drive(AT, torch.full((3, 4, 4), torch.inf, dtype=torch.float64))
     with pytest.raises(InputError, match="T_world_cam"):
         drive(AT, 2 * torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+    with pytest.raises(InputError, match="T_world_cam: expected 0, 0, 0, 1 as last rows"):
+        drive(AT, torch.block_diag(torch.eye(3), torch.tensor([[2.0]])).double().repeat(3, 1, 1))
+
+
+@pytest.mark.parametrize("name", ["time_s", "T_world_cam"])
+def test_numbers_too_large_for_their_dtype_are_refused(name: str) -> None:
+    frames = cached_street()[1].frames.to(dtype=torch.float32)
+    T_world_cam = torch.eye(4)[None]
+    T_world_cam[:, 0, 3] = 5.4e6
+    far = {"time_s": torch.tensor([1.3e9]), "T_world_cam": T_world_cam}[name]
+    with pytest.raises(
+        InputError, match=f"{name}: expected numbers near 0, exact to .*take those of the first frame off"
+    ):
+        replace(frames, **{name: far})
 
 
 @pytest.mark.parametrize(("jump_m", "hold"), [(0.0, 1.0), (0.3, 1.0), (4.0, 1e-4)])
@@ -209,3 +223,14 @@ def test_a_track_that_jumps_is_held_by_next_to_nothing(jump_m: float, hold: floa
     T_cam_obj[2:, 0, 3] += jump_m
     state = CarState.of(se3.inverse(T_cam_obj), random(5, 3))
     assert hold_of_path(CONFIG, sharing, of_track, state).tolist() == [hold] * 5
+
+
+@pytest.mark.parametrize(("turned_deg", "hold"), [(4.0, 1.0), (60.0, 1e-4), (180.0, 1.0)])
+def test_a_heading_off_the_path_of_the_others_is_one_too(turned_deg: float, hold: float) -> None:
+    cars, _ = views(with_camera=False)
+    sharing = Groups.of([4] * 5, own=torch.arange(6), shared=torch.arange(6, 9))
+    path = torch.tensor([0.0, 0.0, 0.0, 20.0, 9.0, 0.0, 1.6, 0.0, 0.0], dtype=torch.float64)
+    state = on_a_path(path, None)
+    turn = torch.tensor([0, 0, 0, 0, math.radians(turned_deg), 0], dtype=torch.float64)
+    state.T_obj_cam[2] = se3.exp(turn) @ state.T_obj_cam[2]
+    assert hold_of_path(CONFIG, sharing, timed(sharing, cars), state).tolist() == [hold] * 5
