@@ -12,9 +12,13 @@ import numpy as np
 import pytest
 from helpers.browser import chromium, console_problems, requested_urls, screenshot_of, set_viewport
 from helpers.report_runs import finished_run
+from helpers.synthetic_scene import cached_street
 
+from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.report.make_report import make_report
+from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, save_rigs
 
 if TYPE_CHECKING:
     from selenium.webdriver import Chrome
@@ -34,6 +38,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # The first car goes through all frames, in the last one as somebody else.
     for path, part in zip(sorted((run.out / "shapes").iterdir()), (0, 0, 1), strict=True):
         write_shapes(path, replace(read_shapes(path), tracks=(TRACK, ""), track_parts=np.array([part, -1])))
+    _, scene = cached_street()
+    save_rigs(run.out / RIG_FILE, [RigEstimate.of_frames(scene.frames)])
+    write_png(run.out / RIG_PICTURE, np.zeros((40, 3000, 3), np.uint8))
     return make_report(run.folder(), run.out.parent / "a page#1.html", run.dataset, run.prior).path
 
 
@@ -93,6 +100,12 @@ def test_hostile_names_are_text(opened: Chrome) -> None:
     assert set(texts(opened, "#frame-choice option")) == set(FRAMES)
     assert CAR_TYPE in texts(opened, "#car-rows td")
     assert opened.execute_script("return document.querySelectorAll('main img[src=x], main script, h1 svg').length") == 0
+
+
+def test_the_picture_of_the_rig_fits(opened: Chrome) -> None:
+    opened.execute_script("document.querySelector('#rig details').open = true")
+    until(lambda: opened.execute_script("return document.querySelector('#rig img').complete"))
+    assert 0 < find(opened, "#rig img").size["width"] <= 1280
 
 
 def test_sort_by_click_and_by_key(opened: Chrome) -> None:

@@ -52,9 +52,9 @@ function rig() {
   if (run.rig === null) return null;
   const words = run.rig.words.map((line) => element("p", {}, line));
   if (run.rig.picture === null) return element("div", { id: "rig" }, ...words);
-  const title = element("summary", {}, "Disparity field of the rig, and the detections behind it");
-  const picture = element("img", { src: run.rig.picture, alt: "", style: "max-width: 100%" });
-  return element("div", { id: "rig" }, ...words, element("details", {}, title, picture));
+  const title = "Disparity field of the rig, and the detections behind it";
+  const picture = element("img", { src: run.rig.picture, alt: title });
+  return element("div", { id: "rig" }, ...words, element("details", {}, element("summary", {}, title), picture));
 }
 
 function failures() {

@@ -89,7 +89,7 @@ def _draw_cost_curves(axes: Any, view: CarView) -> None:
     axes.set(xlabel="iteration", title="cost")
     axes.grid(alpha=0.3)
     # Costs may stay high or fall to nothing, but hardly stay half-way.
-    axes.legend(fontsize=7, loc="center right")
+    axes.legend(fontsize=7, loc="upper right")
 
 
 _DRIFT_INCHES = (14.5, 5.6)
