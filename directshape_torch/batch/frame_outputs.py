@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from directshape_torch.batch.options import RefineOptions
+import numpy as np
+
+from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.atomic_files import write_png
+from directshape_torch.files.atomic_files import write_bytes, write_png
 from directshape_torch.io.refinement_files import write_result
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import (
     FrameRecord,
     frame_entry,
+    mesh_path,
     overlay_path,
     read_record,
     result_path,
@@ -23,6 +27,12 @@ from directshape_torch.io.run_folder import (
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
+
+if TYPE_CHECKING:
+    import trimesh
+
+# glTF demands y up and the viewer in front of +z; the camera has y down and looks along +z.
+T_GLTF_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_frame_outputs(
@@ -52,9 +62,7 @@ def write_frame_outputs(
     earlier = _earlier_record(path, run, inputs)
     files = [result_path(out_dir, loaded.frame_id)]
     if options.meshes is not None:
-        from directshape_torch.batch.mesh_files import write_car_meshes
-
-        files += write_car_meshes(out_dir, loaded, result, first_row, options.meshes)
+        files += _write_meshes(out_dir, loaded, result, first_row, options.meshes)
     if options.overlays:
         from directshape_torch.visualize.overlay import overlay_of_frame
 
@@ -77,6 +85,34 @@ def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRec
         record = read_record(path, read_shapes(path))
         return record if (record.run, record.inputs) == (run, inputs) else None
     return None
+
+
+def _write_meshes(
+    out_dir: Path, loaded: LoadedFrame, result: RefinementResult, first_row: int, mesh_format: MeshFormat
+) -> list[Path]:
+    """The surface of each refined car of a frame in the left camera frame, metres.
+
+    GLB files hold the same vertices as PLY files below a node that turns them into glTF's axes (y up).
+    """
+    paths, refined = [], result.refined.tolist()
+    for car, line in enumerate(loaded.detected_objects, first_row):
+        if refined[car]:
+            paths.append(mesh_path(out_dir, loaded.frame_id, line.line_number, mesh_format))
+            write_bytes(paths[-1], _mesh_bytes(result.mesh(car), mesh_format))
+    return paths
+
+
+def _mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
+    import trimesh
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.exchange.ply import export_ply
+
+    export: Callable[..., bytes] = export_ply if mesh_format == "ply" else export_glb
+    if mesh_format == "ply":
+        return export(mesh)
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, node_name="car", geom_name="car", transform=T_GLTF_CAM)
+    return export(scene, include_normals=True)
 
 
 def failed_entry(reason: str) -> FrameEntry:

@@ -51,25 +51,12 @@ class RunJob:
     expected_cars: int
 
 
-@dataclass(frozen=True)
-class FrameEnd:
-    """How a frame ended: what `summary.json` says of it."""
-
-    frame_id: str
-    entry: FrameEntry
-
-    @property
-    def failure(self) -> str | None:
-        """Why it failed, or None."""
-        return self.entry.get("reason")
-
-
 @dataclass
 class GroupReport:
     """What became of a group.
 
     Attributes:
-        ends: of its frames, in the order in which they ended.
+        ends: what `summary.json` says of its frames, in the order in which they ended.
         calls: of the refiner.
         num_halved: calls that did not work and were tried again with half of the frames.
         cpu_s: time that the processor spent on it, reading and writing included, whatever else the machine did.
@@ -78,17 +65,13 @@ class GroupReport:
         stopped: why no other frame could be refined either, or None.
     """
 
-    ends: list[FrameEnd] = field(default_factory=list)
+    ends: dict[str, FrameEntry] = field(default_factory=dict)
     calls: list[CallTiming] = field(default_factory=list)
     num_halved: int = 0
     cpu_s: float = 0.0
     peak_memory_mb: float | None = None
     peak_device_memory_mb: float | None = None
     stopped: str | None = None
-
-    def has(self, frame_id: str) -> bool:
-        """Whether a frame has ended."""
-        return any(end.frame_id == frame_id for end in self.ends)
 
 
 @dataclass(frozen=True)
@@ -99,23 +82,17 @@ class _Ready:
     inputs: dict[str, str]
 
 
-class GroupRefiner:
-    """Refines groups of frames in this process."""
-
-    def __init__(self, job: RunJob) -> None:
-        self._job = job
-
-    def refine(self, group: FrameGroup) -> GroupReport:
-        """Refine a group; errors of a frame are in its end, those of the whole run in `stopped`."""
-        step, cpu_start_s = _GroupStep(self._job, group), time.process_time()
-        try:
-            step.refine(group.frame_ids)
-        except _STOPS_THE_RUN as error:
-            step.report.stopped = _reason(error)
-        step.report.cpu_s = time.process_time() - cpu_start_s
-        device = self._job.refiner.prior.origin.device
-        step.report.peak_memory_mb, step.report.peak_device_memory_mb = peak_memory_mb(), peak_device_memory_mb(device)
-        return step.report
+def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
+    """Refine a group in this process; errors of a frame are in its end, those of the whole run in `stopped`."""
+    step, cpu_start_s = _GroupStep(job, group), time.process_time()
+    try:
+        step.refine(group.frame_ids)
+    except _STOPS_THE_RUN as error:
+        step.report.stopped = _reason(error)
+    step.report.cpu_s = time.process_time() - cpu_start_s
+    device = job.refiner.prior.origin.device
+    step.report.peak_memory_mb, step.report.peak_device_memory_mb = peak_memory_mb(), peak_device_memory_mb(device)
+    return step.report
 
 
 class _GroupStep:
@@ -127,7 +104,7 @@ class _GroupStep:
 
     def refine(self, frame_ids: Sequence[str]) -> None:
         """Together, or by halves where that does not work, down to the frame that is the cause."""
-        frame_ids = [frame_id for frame_id in frame_ids if not self.report.has(frame_id)]
+        frame_ids = [frame_id for frame_id in frame_ids if frame_id not in self.report.ends]
         if self.group.wanted.isdisjoint(frame_ids):
             return
         problem = self._attempt(frame_ids)
@@ -198,34 +175,12 @@ class _GroupStep:
                 raise lost from error
             self._fail(loaded.frame_id, _reason(error))
             return
-        self.report.ends.append(FrameEnd(loaded.frame_id, entry))
+        self.report.ends[loaded.frame_id] = entry
 
     def _fail(self, frame_id: str, reason: str) -> None:
         # A finished frame that was only to keep the others company stays finished.
         if frame_id in self.group.wanted:
-            self.report.ends.append(FrameEnd(frame_id, failed_entry(reason)))
-
-
-def load_job(content: bytes) -> GroupRefiner:
-    """A worker's own copy of the job, from `dump_job`."""
-    import pickle
-
-    job: RunJob = pickle.loads(content)
-    return GroupRefiner(job)
-
-
-def dump_job(job: RunJob) -> bytes:
-    """A job for workers, as multiprocessing would send it, but as bytes: tensors are copied and not shared.
-
-    Raises:
-        DirectShapeError: the data set or the refiner cannot be sent to another process.
-    """
-    import pickle
-
-    try:
-        return pickle.dumps(job)
-    except (pickle.PicklingError, TypeError, AttributeError) as error:
-        raise DirectShapeError(f"the job cannot be sent to other processes: {error}") from error
+            self.report.ends[frame_id] = failed_entry(reason)
 
 
 @contextmanager

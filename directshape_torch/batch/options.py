@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Literal, get_args
 
 from directshape_torch.errors import InputError
 
@@ -84,26 +84,14 @@ class WorkerOptions:
         return self.threads if self.in_this_process or self.threads is not None else 1
 
 
-class RunObserver(Protocol):
-    """Is told how a run comes along; a progress bar, for example."""
+class RunObserver:
+    """Is told how a run comes along, as a progress bar is; this one says nothing."""
 
     def started(self, frame_ids: Sequence[str]) -> None:
         """The frames that are about to be refined; finished ones of an earlier run are not among them."""
-        ...
 
     def finished(self, frame_id: str, failure: str | None) -> None:
         """A frame is done, or failed for the given reason."""
-        ...
-
-
-class SilentObserver:
-    """Says nothing."""
-
-    def started(self, frame_ids: Sequence[str]) -> None:
-        """Nothing."""
-
-    def finished(self, frame_id: str, failure: str | None) -> None:
-        """Nothing."""
 
 
 def _check_at_least(least: int, name: str, number: int) -> None:

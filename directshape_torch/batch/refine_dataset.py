@@ -14,17 +14,17 @@ import torch
 from directshape_torch.batch.content_hashes import hash_fields, hash_prior
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups, track_windows
 from directshape_torch.batch.frame_outputs import failed_entry
-from directshape_torch.batch.group_refinement import FrameEnd, GroupRefiner, GroupReport, RunJob, limited_threads
-from directshape_torch.batch.options import RefineOptions, RunObserver, SilentObserver, WorkerOptions
+from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads
+from directshape_torch.batch.options import RefineOptions, RunObserver, WorkerOptions
 from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
 from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, find_warnings
 from directshape_torch.batch.timing import RunTimings, write_timings
-from directshape_torch.batch.workers import GroupDispatch, ThisProcess, Workers
+from directshape_torch.batch.workers import GroupDispatch, LocalWorkers, ThisProcess, Workers
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
-from directshape_torch.io.run_manifest import RunManifest, SharedHashes
+from directshape_torch.io.run_manifest import FrameEntry, RunManifest, SharedHashes
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.track_files import write_tracks
 from directshape_torch.refinement.scene_problem import TermFactory
@@ -73,7 +73,7 @@ def refine_dataset(
         is_cleared = fresh and remove_results(out_dir, (_TIMINGS,))
         manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior), options.batch_frames)
         earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
-        return _Run(dataset, refiner, earlier, log, options, observer or SilentObserver(), workers).execute()
+        return _Run(dataset, refiner, earlier, log, options, observer or RunObserver(), workers).execute()
 
 
 class _Run:
@@ -138,14 +138,12 @@ class _Run:
             workers.close()
             self.timings.wall_s = time.perf_counter() - start
         for frame_id, reason in dispatch.lost.items():
-            self._note(FrameEnd(frame_id, failed_entry(reason)))
+            self._note(frame_id, failed_entry(reason))
 
     def _workers(self) -> Workers:
         who, threads = self.who, self.who.threads_per_worker
         if who.in_this_process:
-            return ThisProcess(GroupRefiner(self.job))
-        from directshape_torch.batch.local_workers import LocalWorkers
-
+            return ThisProcess(self.job)
         self.timings.threads, self.timings.workers = threads or 1, who.workers or 1
         return LocalWorkers(self.job, self.timings.workers, threads)
 
@@ -153,25 +151,27 @@ class _Run:
         self.timings.add(report.calls, report.peak_memory_mb, report.peak_device_memory_mb)
         self.timings.cpu_s += report.cpu_s
         self.num_halved += report.num_halved
-        for end in report.ends:
-            self._note(end)
+        for frame_id, entry in report.ends.items():
+            self._note(frame_id, entry)
         if report.stopped is not None:
             raise DirectShapeError(report.stopped)
 
-    def _note(self, end: FrameEnd) -> None:
-        self.earlier.manifest.frames[end.frame_id] = end.entry
-        if end.failure is not None:
-            self.failed[end.frame_id] = end.failure
-        self.log.frame(end.frame_id, end.failure)
-        self.observer.finished(end.frame_id, end.failure)
+    def _note(self, frame_id: str, entry: FrameEntry) -> None:
+        self.earlier.manifest.frames[frame_id] = entry
+        failure = entry.get("reason")
+        if failure is not None:
+            self.failed[frame_id] = failure
+        self.log.frame(frame_id, failure)
+        self.observer.finished(frame_id, failure)
 
     def _finished(self, frame_ids: Collection[str]) -> Collection[str]:
         """Which frames are finished after all; for the group of a worker that died."""
-        entries = ((frame_id, self.earlier.entry(frame_id)) for frame_id in sorted(frame_ids))
-        found = [FrameEnd(frame_id, entry) for frame_id, entry in entries if entry is not None]
-        for end in found:
-            self._note(end)
-        return [end.frame_id for end in found]
+        found = []
+        for frame_id in sorted(frame_ids):
+            if (entry := self.earlier.entry(frame_id)) is not None:
+                self._note(frame_id, entry)
+                found.append(frame_id)
+        return found
 
     def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
         """Write what is known at the end of the run, whatever end that is."""

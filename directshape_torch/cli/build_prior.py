@@ -1,21 +1,26 @@
-"""`directshape build-prior`: a shape prior from a folder of car meshes."""
+"""`directshape build-prior`: make a shape prior from a folder of car meshes.
+
+Make meshes solid, sample their signed distance and keep the principal components. Writes the prior and a report (.json)
+beside it.
+"""
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
 
 from directshape_torch.errors import DataFormatError, InputError, MeshError
 from directshape_torch.files import atomic_files
+from directshape_torch.files.mesh_files import MESH_SUFFIXES
+from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.pca_fit import fit_pca
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions
-    from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
+from directshape_torch.shape.prior_quality import leave_one_out_errors_cm
 
 REPORT_SCHEMA = "directshape_torch.prior_report/1"
 
@@ -43,14 +48,8 @@ class PriorReport:
     skipped: dict[str, str]
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Register the command with the program's parser."""
-    parser = subparsers.add_parser(
-        "build-prior",
-        help="make a shape prior from a folder of car meshes",
-        description="Make meshes solid, sample their signed distance and keep the principal components. Writes the "
-        "prior and a report (.json) beside it.",
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Meshes, axes and scale of their files, grid and components."""
     parser.add_argument(
         "--meshes", type=Path, required=True, help="folder of obj, ply, glb, off or stl files, searched deep"
     )
@@ -70,21 +69,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--voxel", type=float, default=0.025, metavar="M", help="fine voxels (default: %(default)s)")
     parser.add_argument("--no-symmetry", action="store_true", help="do not average left and right")
     parser.add_argument("--licence", default="as the meshes", help="kept inside the prior (default: %(default)s)")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build the prior; 0 when all meshes were used, 3 when some were skipped.
-
-    Raises:
-        InputError: no mesh files, too few usable ones, or an option out of range.
-    """
-    import torch
-
-    from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions
-    from directshape_torch.shape.pca_prior import PriorProvenance
-
-    _check_options(args)
+    """Build the prior; 0 when all meshes were used, 3 when some were skipped."""
+    if not 0.02 <= args.spacing <= 0.5:
+        raise InputError("--spacing", "0.02 to 0.5 m", f"{args.spacing}")
+    if args.num_codes < 1:
+        raise InputError("--num-codes", "at least 1", f"{args.num_codes}")
     options = MeshOptions(
         args.forward_axis,
         args.up_axis,
@@ -95,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         closing_m=args.closing,
     )
     grid = GridSpec.for_cars(args.spacing)
-    files = find_meshes(args.meshes, args.pattern)
+    files = _find_meshes(args.meshes, args.pattern)
     _check_enough(len(files), {}, args.num_codes)
     grids, skipped = _read_meshes(files, args.meshes, grid, options)
     _check_enough(len(grids), skipped, args.num_codes)
@@ -110,13 +102,6 @@ def run(args: argparse.Namespace) -> int:
     return 3 if skipped else 0
 
 
-def _check_options(args: argparse.Namespace) -> None:
-    if not 0.02 <= args.spacing <= 0.5:
-        raise InputError("--spacing", "0.02 to 0.5 m", f"{args.spacing}")
-    if args.num_codes < 1:
-        raise InputError("--num-codes", "at least 1", f"{args.num_codes}")
-
-
 def _check_enough(num_usable: int, skipped: dict[str, str], num_codes: int) -> None:
     if num_usable <= num_codes:
         reasons = f" ({len(skipped)} skipped: {'; '.join(skipped.values())})" if skipped else ""
@@ -124,14 +109,8 @@ def _check_enough(num_usable: int, skipped: dict[str, str], num_codes: int) -> N
         raise InputError("--meshes", expected, f"{num_usable}{reasons}", "add meshes or lower --num-codes")
 
 
-def find_meshes(folder: Path, pattern: str) -> list[Path]:
-    """Mesh files below a folder, sorted.
-
-    Raises:
-        InputError: no such folder, or nothing that matches.
-    """
-    from directshape_torch.files.mesh_files import MESH_SUFFIXES
-
+def _find_meshes(folder: Path, pattern: str) -> list[Path]:
+    """Mesh files below a folder, sorted."""
     if not folder.is_dir():
         raise InputError("--meshes", "a folder", str(folder))
     files = sorted(f for f in folder.glob(pattern) if f.suffix.lower() in MESH_SUFFIXES and f.is_file())
@@ -144,11 +123,6 @@ def _read_meshes(
     files: list[Path], folder: Path, grid: GridSpec, options: MeshOptions
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Signed distance grids by file name, and why the others were skipped."""
-    import torch
-    from tqdm import tqdm
-
-    from directshape_torch.shape.mesh_to_sdf import load_mesh_obj, mesh_to_sdf
-
     grids: dict[str, Tensor] = {}
     skipped: dict[str, str] = {}
     for file in tqdm(files, desc="meshes", unit="mesh"):
@@ -161,8 +135,6 @@ def _read_meshes(
 
 
 def _make_report(prior: PCAShapePrior, samples: Tensor, names: tuple[str, ...], skipped: dict[str, str]) -> PriorReport:
-    from directshape_torch.shape.prior_quality import leave_one_out_errors_cm
-
     errors = leave_one_out_errors_cm(samples, prior) if len(samples) >= 3 else samples.new_full((1,), float("nan"))
     return PriorReport(
         schema=REPORT_SCHEMA,

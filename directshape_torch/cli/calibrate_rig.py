@@ -1,19 +1,5 @@
-"""`directshape calibrate-rig`: what is known of a stereo rig and of a detector, from every kind of evidence."""
+"""`directshape calibrate-rig`: what a stereo rig's disparities and a detector's depths are off by.
 
-from __future__ import annotations
-
-import argparse
-import sys
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from directshape_torch.cli.options import add_data_options, dataset_of
-
-if TYPE_CHECKING:
-    from directshape_torch.rig.estimate import RigEstimate
-    from directshape_torch.rig.frames_with_truth import TruthSource
-
-_DESCRIPTION = """
 Estimate by how much disparities are off over the images of a stereo rig, and the depths of a detector, for 'directshape
 refine --rig FILE'. 'refine' does this by itself from detections (docs/your_rig.md); here other evidence joins them:
 LiDAR scans (training/velodyne), disparity maps (training/disp_noc_0 or disp_occ_0), or consecutive
@@ -21,46 +7,52 @@ frames of a car that drives past still things ('motion': ROOT is one sequence wi
 calib.txt, as in KITTI's tracking benchmark). All kinds add up, those in the file of --rig too.
 """
 
-_SOURCES = ("detections", "lidar", "disparity", "motion")
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from directshape_torch.cli.options import add_data_options, dataset_of
+from directshape_torch.cli.progress import Bar
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.atomic_files import write_png
+from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.frames_with_truth import TruthSource, add_truth, chosen_frames, observe_frame, truth_files
+from directshape_torch.rig.of_dataset import estimate_rigs
+from directshape_torch.rig.rig_file import load_rigs, save_rigs
+from directshape_torch.rig.self_calibration import self_calibrate
+from directshape_torch.rig.stereo_sequence import observe_motion, open_sequence
+from directshape_torch.visualize.rig_picture import draw_rigs
 
 
-# argparse's own type for this argument is private, hence the generic `_SubParsersAction` in quotes.
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser(
-        "calibrate-rig",
-        help="what a stereo rig's disparities and a detector's depths are off by",
-        description=_DESCRIPTION,
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The data, kinds of evidence, and the file to write."""
     add_data_options(parser, with_disparity=False)
     parser.add_argument(
         "--from",
         dest="sources",
         nargs="+",
-        choices=_SOURCES,
+        choices=("detections", "lidar", "disparity", "motion"),
         default=["detections"],
         help="kinds of evidence (default: detections); of motion, 0 as --camera-height means that it is not known",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE.json", help="file to write, and a picture .png"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate, write file and picture, report; 0, or 1 where there is no evidence.
-
-    Raises:
-        DirectShapeError: a missing or damaged file, or too few observations.
-    """
-    # Imported here so that `directshape --help` does not wait for torch.
-    from directshape_torch.files.atomic_files import write_png
-    from directshape_torch.rig.rig_file import load_rigs, save_rigs
-    from directshape_torch.visualize.rig_picture import draw_rigs
-
+    """Estimate, write file and picture, report; 0, or 1 where there is no evidence."""
     rigs = [] if args.rig == "none" else load_rigs(args.rig)
     for source in dict.fromkeys(args.sources):
-        _add(source, args, rigs)
+        if source == "detections":
+            with Bar(desc=source, unit="frame", disable=None) as bar:
+                estimate_rigs(dataset_of(args), lambda _: bar.update(), rigs)
+        elif source == "motion":
+            _add_motion(args, rigs)
+        else:
+            _add_truth(args, source, rigs)
     if not rigs:
         print("error: no frame could be read", file=sys.stderr)
         return 1
@@ -74,33 +66,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add(source: str, args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
-    """The evidence of one kind to the estimates that it belongs to."""
-    if source == "detections":
-        _add_detections(args, rigs)
-    elif source == "motion":
-        _add_motion(args, rigs)
-    else:
-        _add_truth(args, source, rigs)  # type: ignore[arg-type]
-
-
-def _add_detections(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
-    from directshape_torch.cli.progress import Bar
-    from directshape_torch.rig.of_dataset import estimate_rigs
-
-    with Bar(desc="detections", unit="frame", file=sys.stderr, disable=not sys.stderr.isatty()) as bar:
-        estimate_rigs(dataset_of(args), lambda _: bar.update(), rigs)
-
-
 def _add_truth(args: argparse.Namespace, source: TruthSource, rigs: list[RigEstimate]) -> None:
     """Every frame that can be read; one that cannot is reported and left out."""
-    from directshape_torch.cli.progress import Bar
-    from directshape_torch.errors import DataFormatError
-    from directshape_torch.rig.frames_with_truth import add_truth, chosen_frames, observe_frame, truth_files
-
     files, frames = truth_files(args.data, source), []
     names = chosen_frames(list(files), args.frames)
-    for frame_id in Bar(names, desc=source, unit="frame", disable=not sys.stderr.isatty()):
+    for frame_id in Bar(names, desc=source, unit="frame", disable=None):
         try:
             frames.append(observe_frame(args.data, frame_id, files[frame_id], source))
         except DataFormatError as error:
@@ -109,21 +79,14 @@ def _add_truth(args: argparse.Namespace, source: TruthSource, rigs: list[RigEsti
 
 
 def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
-    from directshape_torch.cli.progress import Bar
-    from directshape_torch.errors import InputError
-    from directshape_torch.rig.estimate import rig_among
-    from directshape_torch.rig.self_calibration import self_calibrate
-    from directshape_torch.rig.stereo_sequence import observe_motion, open_sequence
-
     if not 0 <= args.camera_height < 10:
         raise InputError("--camera-height", "metres between 0 (not known) and 10", str(args.camera_height))
     sequence = open_sequence(args.data, args.frames)
     for before, after in sequence.gaps():
         print(f"warning: frames {before} and {after} are not consecutive: few points are found again", file=sys.stderr)
-    hidden = not sys.stderr.isatty()
-    shown = Bar(sequence.frame_ids, desc="motion", unit="frame", disable=hidden)
+    shown = Bar(sequence.frame_ids, desc="motion", unit="frame", disable=None)
     constraints, size_wh = observe_motion(sequence, args.camera_height or None, shown)
-    with Bar(desc="fit to all frames, then to halves", unit="step", disable=hidden) as bar:
+    with Bar(desc="fit to all frames, then to halves", unit="step", disable=None) as bar:
         found = self_calibrate(constraints, size_wh, len(sequence.frame_ids), bar.update)
     if not found.converged:
         print("warning: the fit was still moving when it was ended", file=sys.stderr)

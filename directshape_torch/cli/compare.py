@@ -1,29 +1,28 @@
-"""`directshape compare`: result files before and after a refinement against labels."""
+"""`directshape compare`: measure results before and after a refinement.
 
-from __future__ import annotations
-
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from directshape_torch.cli.options import add_frame_choice, add_interval_options, bootstrap_settings
-
-if TYPE_CHECKING:
-    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
-
-_DESCRIPTION = """
 Compare result files before and after a refinement with labels: centre, yaw, bird's-eye and 3D overlap, shares above 0.7
 and made worse by 0.05, for all detections and by distance, with n and bootstrap intervals over cars. A detection takes
 the label of largest 2D overlap (at least 0.3, one to one). Counted are Car labels at least 25 px high, occluded <= 1,
 truncated <= 0.5.
 """
 
+from __future__ import annotations
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser(
-        "compare", help="measure results before and after a refinement", description=_DESCRIPTION
-    )
+import argparse
+from pathlib import Path
+
+from directshape_torch.cli.options import add_frame_choice, add_interval_options
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
+from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
+from directshape_torch.evaluation.comparison_report import (
+    format_comparison,
+    write_comparison_csv,
+    write_comparison_json,
+)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Labels, results before and after, frames, tables."""
     parser.add_argument(
         "--labels",
         type=Path,
@@ -40,22 +39,10 @@ def add_parser(subparsers: Subparsers) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all groups")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each detection")
     add_interval_options(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Compare, print and write; returns the exit code.
-
-    Raises:
-        DirectShapeError: for the main program to show.
-    """
-    from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
-    from directshape_torch.evaluation.comparison_report import (
-        format_comparison,
-        write_comparison_csv,
-        write_comparison_json,
-    )
-
+    """Compare, print and write."""
     comparison = compare_results(
         args.labels,
         args.before,
@@ -63,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         split=args.split,
         frames=args.frames,
         keep_line=None if args.shapes is None else lines_with_left_mask(args.shapes),
-        bootstrap=bootstrap_settings(args),
+        bootstrap=BootstrapSettings(args.draws, seed=args.seed),
     )
     print(format_comparison(comparison), end="")
     if args.json is not None:

@@ -1,23 +1,44 @@
-"""`directshape demo`: refine the bundled stereo frame, print what changed, write pictures and a 3D scene."""
+"""`directshape demo`: refine the bundled stereo frame.
 
-from __future__ import annotations
-
-import argparse
-from pathlib import Path
-
-from directshape_torch.cli.options import add_config_option, add_device_option, make_refiner
-
-DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
-
-_DESCRIPTION = """
 Refine the bundled stereo frame, a path-traced street with cars of our own, from noisy detections; print the errors
 before and after, and write the results, a picture and a 3D scene (scene.glb) for any glTF viewer.
 """
 
+from __future__ import annotations
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser("demo", help="refine the bundled stereo frame", description=_DESCRIPTION)
+import argparse
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from directshape_torch.batch.group_refinement import limited_threads
+from directshape_torch.batch.options import RefineOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.run_summary import format_summary
+from directshape_torch.cli.options import add_config_option, add_device_option, make_refiner
+from directshape_torch.cli.progress import ProgressBar
+from directshape_torch.evaluation.matching import match_to_labels
+from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
+from directshape_torch.evaluation.tables import align
+from directshape_torch.export.gltf_scene import frame_glb
+from directshape_torch.export.painted_cars import PaintedFrame
+from directshape_torch.files.atomic_files import write_bytes
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.run_folder import FrameResult, RunFolder
+from directshape_torch.io.stereo_dataset import LoadedFrame
+
+DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
+
+
+def demo_dataset(frames: Iterable[int | str] | None = None) -> KittiStereoDataset:
+    """The bundled frame, with noisy detections."""
+    folder = DEMO_FOLDER
+    return KittiStereoDataset(folder, folder / "detections/noisy_stereo", folder / "training/masks", frames=frames)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Folder, settings and device."""
     parser.add_argument(
         "--out",
         type=Path,
@@ -27,40 +48,47 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     add_config_option(parser)
     add_device_option(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refine by the same way as `directshape refine`, then report; returns the exit code.
-
-    Raises:
-        DirectShapeError: an output folder of another run, or no such device; for the main program to show.
-    """
-    from directshape_torch.batch.group_refinement import limited_threads
-    from directshape_torch.batch.options import RefineOptions
-    from directshape_torch.batch.refine_dataset import refine_dataset
-    from directshape_torch.batch.run_summary import format_summary
-    from directshape_torch.cli.demo_report import error_table
-    from directshape_torch.cli.progress import ProgressBar
-    from directshape_torch.export.gltf_scene import frame_glb
-    from directshape_torch.export.painted_cars import PaintedFrame
-    from directshape_torch.files.atomic_files import write_bytes
-    from directshape_torch.io.kitti_dataset import KittiStereoDataset
-    from directshape_torch.io.run_folder import RunFolder
-
-    dataset = KittiStereoDataset(
-        DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training/masks"
-    )
+    """Refine by the same way as `directshape refine`, then report."""
+    dataset = demo_dataset()
     refiner = make_refiner(args.config, [], "pca", args.device)
     # Where others share the cores, several threads wait for each other: minutes instead of seconds for one frame.
     with ProgressBar() as progress, limited_threads(1):
         summary = refine_dataset(dataset, refiner, args.out, RefineOptions(overlays=True), progress)
         (frame_id,) = dataset.frame_ids
-        loaded = dataset.load(frame_id)
-        painted = PaintedFrame(RunFolder(args.out).read(frame_id), refiner.prior, loaded)
-        write_bytes(args.out / "scene.glb", frame_glb(painted, loaded))
-    print(error_table(loaded, args.out))
+        loaded, result = dataset.load(frame_id), RunFolder(args.out).read(frame_id)
+        write_bytes(args.out / "scene.glb", frame_glb(PaintedFrame(result, refiner.prior, loaded), loaded))
+    print(error_table(loaded, result))
     print(format_summary(summary))
     print(f"picture  {args.out / 'overlays' / f'{frame_id}.png'}")
     print(f"scene    {args.out / 'scene.glb'}")
     return summary.exit_code
+
+
+def error_table(loaded: LoadedFrame, result: FrameResult) -> str:
+    """Centre, heading and bird's-eye overlap of each car against its label, before and after."""
+    before, after = loaded.detected_objects, result.cars
+    labels = loaded.labels or []
+    partners = match_to_labels(before, labels)
+    pairs = [car for car, partner in enumerate(partners) if partner >= 0]
+    true = [labels[partners[car]] for car in pairs]
+    errors = [pose_errors(boxes_of([objects[car] for car in pairs]), boxes_of(true)) for objects in (before, after)]
+    rows = [["car", "depth", "centre [m]", "yaw [deg]", "BEV IoU", "status"]]
+    for row, car in enumerate(pairs):
+        depth = f"{true[row].location_ref[2]:.1f} m"
+        rows.append([str(before[car].line_number), depth, *_columns(errors, [row]), result.shapes.statuses[car]])
+    if pairs:
+        rows.append(["mean", "", *_columns(errors, range(len(pairs))), ""])
+    return align(rows)
+
+
+def _columns(errors: Sequence[PoseErrors[Tensor]], rows: Sequence[int]) -> tuple[str, str, str]:
+    """Before and after of centre, yaw and overlap, averaged over the rows."""
+
+    def change(name: str, decimals: int) -> str:
+        values = [float(getattr(e, name)[list(rows)].mean()) for e in errors]
+        return " -> ".join(f"{value:{decimals + 3}.{decimals}f}" for value in values)
+
+    return change("centre_m", 2), change("yaw_deg", 1), change("bev_iou", 2)

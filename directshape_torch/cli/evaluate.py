@@ -1,43 +1,30 @@
-"""`directshape evaluate`: average precision by the rules of KITTI's own evaluation."""
+"""`directshape evaluate`: average precision of results, as KITTI measures it.
 
-from __future__ import annotations
-
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
-
-_DESCRIPTION = """
 Score result files as KITTI's object devkit (2017) does: average precision of 2D boxes, in bird's-eye view and in 3D at
 IoU 0.7 and 0.5, easy / moderate / hard, over 11 and over 40 recall points, orientation similarity where the results
 carry alpha.
 """
 
+from __future__ import annotations
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser(
-        "evaluate", help="average precision of results, as KITTI measures it", description=_DESCRIPTION
-    )
+import argparse
+from pathlib import Path
+
+from directshape_torch.evaluation.kitti_ap import evaluate_kitti
+from directshape_torch.evaluation.kitti_ap_report import format_scores, write_scores_json
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Labels, results and the class."""
     parser.add_argument("--labels", type=Path, required=True, metavar="DIR", help="KITTI labels, NNNNNN.txt")
     parser.add_argument("--results", type=Path, required=True, metavar="DIR", help="result files (or DIR/data)")
     parser.add_argument("--split", type=Path, metavar="FILE", help="one frame id a line; default: all of --labels")
     parser.add_argument("--type", default="Car", metavar="CLASS", help="Car (default), Pedestrian, Cyclist ..")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all scores and curves")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate, print and write; returns the exit code.
-
-    Raises:
-        DirectShapeError: for the main program to show.
-    """
-    from directshape_torch.evaluation.kitti_ap import evaluate_kitti
-    from directshape_torch.evaluation.kitti_ap_report import format_scores, write_scores_json
-
+    """Evaluate, print and write."""
     scores = evaluate_kitti(args.labels, args.results, split=args.split, object_type=args.type)
     print(format_scores(scores), end="")
     if args.json is not None:

@@ -1,34 +1,29 @@
-"""`directshape evaluate-shape`: refined shapes against true surfaces."""
+"""`directshape evaluate-shape`: refined shapes against true surfaces.
 
-from __future__ import annotations
-
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from directshape_torch.cli.options import add_frame_choice, add_interval_options, bootstrap_settings
-
-if TYPE_CHECKING:
-    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
-
-_DESCRIPTION = """
 Measure shapes before (mean shape at the pose of the detection) and after a refinement against true depths:
 completeness, accuracy, F1 and RMSE over the distance tau, 0.05 to 1.0 m, as the paper defines them, with n and
 bootstrap intervals over cars. Counted are Car labels at least 25 px high, occluded <= 1, truncated <= 0.5.
 """
 
+from __future__ import annotations
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser(
-        "evaluate-shape", help="refined shapes against true surfaces", description=_DESCRIPTION
-    )
-    _add_inputs(parser)
-    _add_outputs(parser)
-    parser.set_defaults(run=run)
+import argparse
+from pathlib import Path
+
+from directshape_torch.batch.content_hashes import hash_prior
+from directshape_torch.cli.options import add_frame_choice, add_interval_options
+from directshape_torch.evaluation.bootstrap import BootstrapSettings
+from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
+from directshape_torch.evaluation.shape_report import (
+    format_shape_scores,
+    write_shape_scores_csv,
+    write_shape_scores_json,
+)
+from directshape_torch.shape.load_prior import load_prior
 
 
-def _add_inputs(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """What went in, what came out, the truth, tables."""
     parser.add_argument(
         "--data", type=Path, required=True, metavar="ROOT", help="holds training, with calib, disp_occ_0 .."
     )
@@ -41,28 +36,12 @@ def _add_inputs(parser: argparse.ArgumentParser) -> None:
     add_frame_choice(parser, "all that have truth")
     parser.add_argument("--prior", metavar="FILE|NAME", help="the shape prior of the refinement (default: pca)")
     add_interval_options(parser)
-
-
-def _add_outputs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all curves")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="write one line for each label and tau")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate, print and write; returns the exit code.
-
-    Raises:
-        DirectShapeError: for the main program to show.
-    """
-    from directshape_torch.batch.content_hashes import hash_prior
-    from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
-    from directshape_torch.evaluation.shape_report import (
-        format_shape_scores,
-        write_shape_scores_csv,
-        write_shape_scores_json,
-    )
-    from directshape_torch.shape.load_prior import load_prior
-
+    """Evaluate, print and write."""
     prior = load_prior("pca" if args.prior is None else args.prior)
     scores = evaluate_shapes(
         args.data,
@@ -74,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         frames=args.frames,
         split=args.split,
         prior_sha256=hash_prior(prior),
-        bootstrap=bootstrap_settings(args),
+        bootstrap=BootstrapSettings(args.draws, seed=args.seed),
     )
     print(format_shape_scores(scores), end="")
     if args.json is not None:

@@ -1,33 +1,31 @@
-"""`directshape export`: a finished run in the formats of other programs."""
+"""`directshape export`: a finished run for other programs.
 
-from __future__ import annotations
-
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-from directshape_torch.cli.options import mask_source
-from directshape_torch.cli.run_inputs import add_run_inputs, dataset_of_run, has_detections, prior_of_run
-from directshape_torch.errors import InputError
-
-if TYPE_CHECKING:
-    from directshape_torch.export.frame_source import ExportInputs
-    from directshape_torch.io.run_folder import RunFolder
-    from directshape_torch.refiner import DirectShapeRefiner
-    from directshape_torch.shape.shape_prior import ShapePrior
-
-_FORMATS = ("glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun")
-
-_DESCRIPTION = """
 Write the finished frames of an output folder of 'directshape refine' for other programs: surfaces as GLB or PLY and
 points as PLY, coloured by the left image, boxes as KITTI, COCO-3D or nuScenes files, and all of it as a recording for
 Rerun's viewer. OUT itself is only read. docs/outputs.md says what is in which frame.
 """
 
+from __future__ import annotations
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser("export", help="a finished run for other programs", description=_DESCRIPTION)
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from directshape_torch.cli.options import mask_source
+from directshape_torch.cli.progress import ProgressBar
+from directshape_torch.cli.run_inputs import add_run_inputs, dataset_of_run, has_detections, prior_of_run
+from directshape_torch.errors import InputError
+from directshape_torch.export.export_run import export_run
+from directshape_torch.export.frame_source import ExportInputs
+from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.shape.shape_prior import ShapePrior
+
+_FORMATS = ("glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun")
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The run, formats, inputs of the run, appearance."""
     parser.add_argument("run_folder", type=Path, metavar="OUT", help="output folder of 'refine'")
     parser.add_argument(
         "--format", nargs="+", required=True, choices=_FORMATS, metavar="NAME", help=", ".join(_FORMATS)
@@ -39,35 +37,23 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     inputs.add_argument(
         "--disparity", type=Path, metavar="DIR", help="disparity maps, for the stereo points of 'points'"
     )
-    _add_appearance(parser.add_argument_group("surfaces, points and recordings"))
-    parser.set_defaults(run=run)
-
-
-def _add_appearance(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
+    looks = parser.add_argument_group("surfaces, points and recordings")
+    looks.add_argument(
         "--unseen",
         choices=("mirror", "grey"),
         default="mirror",
         help="what the image does not show: the colour of the car's other side where that is seen (default), or grey",
     )
-    group.add_argument(
+    looks.add_argument(
         "--iterations",
         action="store_true",
         help="rerun: refine again (--detections and --masks of the run) and record every iteration",
     )
-    group.add_argument("--points", type=int, default=10_000, metavar="N", help="points a car (default: %(default)s)")
+    looks.add_argument("--points", type=int, default=10_000, metavar="N", help="points a car (default: %(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Export and say where to; returns the exit code.
-
-    Raises:
-        DirectShapeError: for the main program to show.
-    """
-    from directshape_torch.cli.progress import ProgressBar
-    from directshape_torch.export.export_run import export_run
-    from directshape_torch.io.run_folder import RunFolder
-
+    """Export and say where to."""
     folder = RunFolder(args.run_folder, args.frames)
     inputs = _make_inputs(args, folder)
     with ProgressBar("export") as progress:
@@ -77,16 +63,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make_inputs(args: argparse.Namespace, folder: RunFolder) -> ExportInputs:
-    from directshape_torch.export.frame_source import ExportInputs
-
     prior, dataset = prior_of_run(args.prior, folder), dataset_of_run(args, folder)
     needs_rig = args.iterations or "points" in args.format
-    if (
-        dataset is not None
-        and needs_rig
-        and not dataset.disparity_fields
-        and folder.manifest.sha256["stereo_bias"] is not None
-    ):
+    lacks_rig = dataset is not None and not dataset.disparity_fields
+    if needs_rig and lacks_rig and folder.manifest.sha256["stereo_bias"] is not None:
         purpose = "stereo points" if "points" in args.format else "--iterations"
         raise InputError("--rig", f"the file that the run was made with, for {purpose}", "nothing")
     return ExportInputs(
@@ -102,10 +82,6 @@ def _make_inputs(args: argparse.Namespace, folder: RunFolder) -> ExportInputs:
 
 def _make_refiner(args: argparse.Namespace, folder: RunFolder, prior: ShapePrior | None) -> DirectShapeRefiner:
     """The refiner of the run, on the processor and not compiled: a few frames are not worth it."""
-    from dataclasses import replace
-
-    from directshape_torch.refiner import DirectShapeRefiner
-
     if "rerun" not in args.format:
         raise InputError("--iterations", "--format rerun, which alone records them", " ".join(args.format))
     given = {"data": args.data, "detections": args.detections, "masks": mask_source(args)}
@@ -114,5 +90,4 @@ def _make_refiner(args: argparse.Namespace, folder: RunFolder, prior: ShapePrior
             raise InputError(f"--{name}", "that of the run, for --iterations", "nothing")
     if prior is None:
         raise InputError("--prior", "the shape prior of the run", "nothing")
-    config = folder.refiner_config()
-    return DirectShapeRefiner(prior, replace(config, compile="off"))
+    return DirectShapeRefiner(prior, replace(folder.refiner_config(), compile="off"))

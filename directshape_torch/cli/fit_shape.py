@@ -1,23 +1,5 @@
-"""`directshape fit-shape`: poses and shapes of cars from LiDAR points in their boxes, without images."""
+"""`directshape fit-shape`: fit shapes to LiDAR points in boxes.
 
-from __future__ import annotations
-
-import argparse
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, get_args
-
-from directshape_torch.cli.options import add_layout_options
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from directshape_torch.batch.fit_shape import ShapeFit
-
-    Subparsers = argparse._SubParsersAction[argparse.ArgumentParser]
-
-_DESCRIPTION = """
 Fit a pose and a shape to the points in each box, without images. Of one cloud (--points, --boxes FILE), in its own
 frame: OUT/boxes.txt (seven numbers a line in the convention of the input), OUT/shapes.npz (poses, codes, statuses,
 distances of the points) and OUT/meshes/NNN.ply. Of a data set (--data, --lidar, --boxes DIR): OUT/data/ID.txt
@@ -25,12 +7,31 @@ distances of the points) and OUT/meshes/NNN.ply. Of a data set (--data, --lidar,
 Exit code: 0, or 2 for wrong usage or input.
 """
 
+from __future__ import annotations
 
-def add_parser(subparsers: Subparsers) -> None:
-    """Add the command and its options."""
-    from directshape_torch.geometry.box_formats import BoxFormat
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
 
-    parser = subparsers.add_parser("fit-shape", help="fit shapes to LiDAR points in boxes", description=_DESCRIPTION)
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
+from directshape_torch.batch.scan_fits import fit_scan, write_scan_fit
+from directshape_torch.cli.options import add_layout_options
+from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
+from directshape_torch.files.text_files import read_lines
+from directshape_torch.geometry.box_formats import BoxFormat
+from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.velodyne import read_points
+from directshape_torch.shape.load_prior import load_prior
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """A cloud or a data set with scans, boxes, shapes."""
     where = parser.add_mutually_exclusive_group(required=True)
     where.add_argument(
         "--points", type=Path, metavar="FILE", help="points.npy (P, 3 or more), or KITTI's velodyne .bin"
@@ -52,24 +53,14 @@ def add_parser(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--prior", metavar="FILE|NAME", default="pca", help="shapes (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, fit, write, print; returns the exit code.
-
-    Raises:
-        DirectShapeError: input that cannot be used; for the main program to show.
-    """
+    """Read, fit, write, print."""
     return _fit_cloud(args) if args.lidar is None else _fit_scans(args)
 
 
 def _fit_scans(args: argparse.Namespace) -> int:
-    from directshape_torch.batch.scan_fits import fit_scan, write_scan_fit
-    from directshape_torch.errors import InputError
-    from directshape_torch.io.open_dataset import open_dataset
-    from directshape_torch.shape.load_prior import load_prior
-
     if args.data is None:
         raise InputError("--data", "the folder of the data set that the scans belong to", "none", "--data ROOT")
     options = {"frames": args.frames, "classes": args.classes, "lidar_dir": args.lidar}
@@ -91,8 +82,6 @@ def _fit_scans(args: argparse.Namespace) -> int:
 
 def _summary(fits: Sequence[ShapeFit]) -> str:
     """How many cars were fitted, and how far their points are from the surfaces in the mean."""
-    import torch
-
     refined = torch.cat([fit.cars.refined for fit in fits])
     before, after = (
         float(torch.cat([getattr(fit, f"distance_{when}_m") for fit in fits])[refined].mean())
@@ -103,18 +92,9 @@ def _summary(fits: Sequence[ShapeFit]) -> str:
 
 
 def _fit_cloud(args: argparse.Namespace) -> int:
-    import numpy as np
-    import torch
     from trimesh.exchange.ply import export_ply
 
-    from directshape_torch.batch.fit_shape import fit_shape
-    from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
-    from directshape_torch.io.velodyne import read_points
-    from directshape_torch.shape.load_prior import load_prior
-
-    points, boxes = (
-        torch.from_numpy(read(path)) for read, path in ((read_points, args.points), (read_boxes, args.boxes))
-    )
+    points, boxes = torch.from_numpy(read_points(args.points)), torch.from_numpy(read_boxes(args.boxes))
     fit = fit_shape(points, boxes, args.convention, load_prior(args.prior))
     cars = fit.cars
     fitted = cars.to_boxes(args.convention, T_cam_boxes=torch.eye(4, dtype=boxes.dtype))
@@ -144,11 +124,6 @@ def read_boxes(path: Path) -> NDArray[np.float64]:
     Raises:
         DataFormatError: the file cannot be read, or a line holds something else.
     """
-    import numpy as np
-
-    from directshape_torch.errors import DataFormatError
-    from directshape_torch.files.text_files import read_lines
-
     rows = []
     for line in read_lines(path):
         try:

@@ -1,28 +1,26 @@
-"""`directshape inspect`: figures of what happened to single cars."""
+"""`directshape inspect`: figures of single cars.
+
+Refine the cars of a frame and draw the course of every one: sampled pixels, residuals, contour, box and costs of each
+iteration, and how it would drift by silhouettes alone. docs/inspect.md shows the pictures.
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.cli.demo import demo_dataset
+from directshape_torch.cli.inspect_cars import inspect_frame
+from directshape_torch.cli.inspect_tracks import inspect_tracks
 from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, frame_id_of, make_refiner
 from directshape_torch.errors import InputError
-
-if TYPE_CHECKING:
-    from directshape_torch.io.stereo_dataset import LoadedFrame
-    from directshape_torch.io.stereo_files import FileStereoDataset
-
-_DESCRIPTION = """
-Refine the cars of a frame and draw the course of every one: sampled pixels, residuals, contour, box and costs of each
-iteration, and how it would drift by silhouettes alone. docs/inspect.md shows the pictures.
-"""
+from directshape_torch.io.figure_files import check_figures
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_files import FileStereoDataset
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser("inspect", help="figures of single cars", description=_DESCRIPTION)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Frame and car, or frames and their tracks; settings."""
     data = parser.add_argument_group("input")
     data.add_argument("--demo", action="store_true", help="the bundled frame, without data")
     data.add_argument("--frame", metavar="ID", type=frame_id_of, help="the frame; --frames for several")
@@ -31,41 +29,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     data.add_argument("--tracks", action="store_true", help="refine --frames together and let each car move")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets a folder of figures a car")
     add_refiner_options(parser.add_argument_group("settings"))
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Draw what the options ask for; returns the exit code.
-
-    Raises:
-        DirectShapeError: wrong options or input, no such frame or car; for the main program to show.
-    """
-    from directshape_torch.io.figure_files import check_figures
-
+    """Draw what the options ask for."""
     check_figures("directshape inspect")
-    from directshape_torch.cli.inspect_cars import inspect_frame
-
     dataset = _dataset(args)
     # One frame is not worth a compilation, and pictures need no graphics card.
     refiner = make_refiner(args.config, ["compile=off", *args.set], args.prior, "cpu")
     if args.tracks:
-        from directshape_torch.cli.inspect_tracks import inspect_tracks
-
         if not inspect_tracks([dataset.load(frame_id) for frame_id in dataset.frame_ids], refiner, args.out):
             raise InputError("--tracks", "a car in several of these frames", "none", "give more --frames")
-        print(f"figures  {args.out}")
-        return 0
-    for frame_id in dataset.frame_ids:
-        loaded = dataset.load(frame_id)
-        rows = _rows(loaded, args.car)
-        inspect_frame(loaded, refiner, rows, args.out, must_refine=args.car is not None)
+    else:
+        for frame_id in dataset.frame_ids:
+            loaded = dataset.load(frame_id)
+            inspect_frame(loaded, refiner, _rows(loaded, args.car), args.out, must_refine=args.car is not None)
     print(f"figures  {args.out}")
     return 0
 
 
 def _dataset(args: argparse.Namespace) -> FileStereoDataset:
-    from directshape_torch.io.kitti_dataset import KittiStereoDataset
-
     if args.tracks and args.car is not None:
         raise InputError("--tracks", "all cars of several frames", f"--car {args.car} too", "leave one of them out")
     if args.demo:
@@ -73,9 +56,7 @@ def _dataset(args: argparse.Namespace) -> FileStereoDataset:
             raise InputError("--tracks", "frames of a sequence", "--demo, one frame", "give --data with --frames")
         if args.data is not None:
             raise InputError("--demo", "the bundled frame alone", f"--data {args.data} too", "leave one of them out")
-        frames = None if args.frame is None else [args.frame]
-        folder = DEMO_FOLDER
-        return KittiStereoDataset(folder, folder / "detections/noisy_stereo", folder / "training/masks", frames=frames)
+        return demo_dataset(None if args.frame is None else [args.frame])
     if args.data is None:
         raise InputError("inspect", "something to inspect", "no frame", "give --data with --frame, or --demo")
     if args.frame is not None:

@@ -18,7 +18,8 @@ EXIT_INTERRUPTED = 130
 EXIT_OUTPUT_CLOSED = 141
 EXIT_TERMINATED = 143
 
-# Each module has `add_parser(subparsers)` and `run(args) -> int`, and imports what is heavy inside `run`.
+# Each module has a docstring that is the command's help, `add_options(parser)` and `run(args) -> int`, whose errors
+# `main` shows; it imports what is heavy inside `run`.
 COMMANDS = (
     "refine",
     "status",
@@ -110,7 +111,12 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, help="print the version and stop")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND")
     for name in COMMANDS:
-        importlib.import_module(f"directshape_torch.cli.{name}").add_parser(subparsers)
+        module = importlib.import_module(f"directshape_torch.cli.{name}")
+        title, _, description = (module.__doc__ or "").partition("\n\n")
+        words = title.partition(": ")[2].rstrip(".")
+        command = subparsers.add_parser(name.replace("_", "-"), help=words, description=description)
+        module.add_options(command)
+        command.set_defaults(run=module.run)
     return parser
 
 

@@ -5,21 +5,22 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import get_args
 
+import torch
+
+from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
+from directshape_torch.io.instance_masks import MaskSource
+from directshape_torch.io.mask_files import CocoFileMasks
+from directshape_torch.io.open_dataset import LayoutName, open_dataset
+from directshape_torch.io.stereo_dataset import GroundSource
+from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.refinement.scene_problem import TermFactory
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rig.rig_file import load_fields
+from directshape_torch.shape.load_prior import load_prior
 
-if TYPE_CHECKING:
-    import torch
-
-    from directshape_torch.evaluation.bootstrap import BootstrapSettings
-    from directshape_torch.io.instance_masks import MaskSource
-    from directshape_torch.io.stereo_files import FileStereoDataset
-    from directshape_torch.refinement.scene_problem import TermFactory
-    from directshape_torch.refiner import DirectShapeRefiner
-
-# As in io/open_dataset.py, which is not imported for it loads PyTorch; a test holds the two together.
-LAYOUTS = ("kitti", "raw", "tracking", "stereo2015", "folder")
 _EITHER = "either a folder (--masks DIR) or COCO files (--masks-left FILE, --masks-right FILE)"
 
 
@@ -45,7 +46,7 @@ def add_data_options(group: argparse._ActionsContainer, with_disparity: bool = T
         )
     group.add_argument(
         "--ground",
-        choices=("auto", "file", "stereo", "camera_height"),
+        choices=get_args(GroundSource),
         default="auto",
         help="where ground planes come from (default: file, else stereo, else camera height; with a corrected rig: "
         "stereo, else file, else camera height)",
@@ -58,7 +59,7 @@ def add_layout_options(group: argparse._ActionsContainer, required: bool = False
     group.add_argument("--data", type=Path, required=required, metavar="ROOT", help="folder of the data set")
     group.add_argument(
         "--layout",
-        choices=LAYOUTS,
+        choices=get_args(LayoutName),
         default="kitti",
         help="of the files below ROOT (docs/inputs.md): KITTI's object benchmark (default), a raw drive or day of "
         "drives, a tracking sequence or all of them, Stereo 2015, or a plain folder with JSON",
@@ -121,9 +122,6 @@ def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
         DataFormatError: a folder or file is missing or not laid out so.
         InputError: options that contradict each other, or no frames.
     """
-    from directshape_torch.io.open_dataset import open_dataset
-    from directshape_torch.rig.rig_file import load_fields
-
     masks = mask_source(args)
     if masks is None and args.layout != "folder":
         raise InputError("--masks", _EITHER, "neither")
@@ -155,8 +153,6 @@ def mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
     Raises:
         InputError: a folder and COCO files.
     """
-    from directshape_torch.io.mask_files import CocoFileMasks
-
     files = (args.masks_left, args.masks_right)
     if args.masks is not None and files != (None, None):
         raise InputError("--masks", _EITHER, "both")
@@ -164,13 +160,6 @@ def mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
         return CocoFileMasks(*files)
     masks: Path | None = args.masks
     return masks
-
-
-def bootstrap_settings(args: argparse.Namespace) -> BootstrapSettings:
-    """What `--seed` and `--draws` ask for."""
-    from directshape_torch.evaluation.bootstrap import BootstrapSettings
-
-    return BootstrapSettings(num_draws=args.draws, seed=args.seed)
 
 
 def make_refiner(
@@ -187,10 +176,6 @@ def make_refiner(
         DataFormatError: a prior that cannot be used.
         InputError: no such device.
     """
-    from directshape_torch.config_files import load_config
-    from directshape_torch.refiner import DirectShapeRefiner
-    from directshape_torch.shape.load_prior import load_prior
-
     settings = load_config(config, overrides)
     refiner = DirectShapeRefiner(load_prior("pca" if prior is None else prior), settings, extra_terms)
     return refiner.to(find_device(device))
@@ -202,8 +187,6 @@ def find_device(name: str) -> torch.device:
     Raises:
         InputError: PyTorch does not know or does not have it.
     """
-    import torch
-
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:

@@ -8,6 +8,8 @@ from typing import Self
 
 from tqdm import tqdm
 
+from directshape_torch.batch.options import RunObserver
+
 
 class Bar(tqdm):  # type: ignore[type-arg]
     """Without the thread that would outlive it."""
@@ -15,7 +17,7 @@ class Bar(tqdm):  # type: ignore[type-arg]
     monitor_interval = 0
 
 
-class ProgressBar:
+class ProgressBar(RunObserver):
     """Counts frames and tells of those that fail, while `refine_dataset` runs or an export."""
 
     def __init__(self, task: str = "refine") -> None:

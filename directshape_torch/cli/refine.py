@@ -1,12 +1,20 @@
-"""`directshape refine`: all frames of a data set."""
+"""`directshape refine`: refine the cars of a data set.
+
+Refine the rough 3D boxes of a detector: poses, boxes and shapes of all cars of all frames. A second run with the same
+settings continues where the first stopped, however it stopped; 'directshape status' tells how far it is. Exit code: 0
+all frames done, 1 some frames failed, 2 wrong usage or input, or a run that could not go on.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from directshape_torch.batch.options import RefineOptions, WorkerOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.run_summary import format_summary
 from directshape_torch.cli.options import (
     add_data_options,
     add_device_option,
@@ -14,27 +22,27 @@ from directshape_torch.cli.options import (
     dataset_of,
     make_refiner,
 )
-from directshape_torch.errors import InputError
-
-if TYPE_CHECKING:
-    from directshape_torch.config import RefinerConfig
-    from directshape_torch.io.stereo_files import FileStereoDataset
-    from directshape_torch.rig.estimate import RigEstimate
+from directshape_torch.cli.progress import Bar, ProgressBar
+from directshape_torch.config import RefinerConfig
+from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.files.atomic_files import write_png
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.rig.estimate import RigEstimate, RigEstimates
+from directshape_torch.rig.of_dataset import estimate_rigs
+from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, holds_rigs, load_rigs, save_rigs
+from directshape_torch.scene_check.check_scene import check_scene
+from directshape_torch.terms.lidar import LidarPoints
+from directshape_torch.visualize.rig_picture import draw_rigs
 
 # Enough to tell a mistake from the noise of a detector.
 _CHECKED_FRAMES = 3
 # Beyond, the views of a car add little; longer sequences go through windows of so many.
 _TRACK_FRAMES = 16
-_DESCRIPTION = """
-Refine the rough 3D boxes of a detector: poses, boxes and shapes of all cars of all frames. A second run with the same
-settings continues where the first stopped, however it stopped; 'directshape status' tells how far it is. Exit code: 0
-all frames done, 1 some frames failed, 2 wrong usage or input, or a run that could not go on.
-"""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser("refine", help="refine the cars of a data set", description=_DESCRIPTION)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Input, output, settings, workers."""
     inputs = parser.add_argument_group("input")
     add_data_options(inputs)
     inputs.set_defaults(rig="auto")
@@ -49,7 +57,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_outputs(parser.add_argument_group("output"))
     _add_settings(parser.add_argument_group("settings"))
     _add_workers(parser.add_argument_group("workers (docs/run_on_everything.md)"))
-    parser.set_defaults(run=run)
 
 
 def _add_outputs(group: argparse._ArgumentGroup) -> None:
@@ -91,18 +98,7 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Refine, write, report; returns the exit code.
-
-    Raises:
-        DirectShapeError: wrong input, or an output folder of another run; for the main program to show.
-    """
-    from directshape_torch.batch.options import RefineOptions, WorkerOptions
-    from directshape_torch.batch.refine_dataset import refine_dataset
-    from directshape_torch.batch.run_summary import format_summary
-    from directshape_torch.cli.progress import ProgressBar
-    from directshape_torch.rig.estimate import RigEstimates
-    from directshape_torch.terms.lidar import LidarPoints
-
+    """Refine, write, report."""
     workers = WorkerOptions(args.workers, args.threads, args.retries)
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
@@ -110,10 +106,13 @@ def run(args: argparse.Namespace) -> int:
     chosen = [] if args.method is None else [f"method={args.method}"]
     extra = [] if args.lidar is None else [LidarPoints()]
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)
-    _check_disparity_is_used(args.disparity, refiner.config.method)
+    if args.disparity is not None and refiner.config.method in ("direct", "box_alignment"):
+        raise InputError(
+            "--disparity", "a method that uses it", refiner.config.method, "add --method geometric or combined"
+        )
     dataset = dataset_of(args)
     refiner.config = _warned_of(dataset, refiner.config)
-    rigs = rigs_of_run(dataset, args.rig, args.out, args.fresh)
+    rigs = _rigs_of_run(dataset, args.rig, args.out, args.fresh)
     if rigs:
         dataset = dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
         refiner.rig = RigEstimates(rigs)
@@ -128,12 +127,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _warned_of(dataset: FileStereoDataset, config: RefinerConfig) -> RefinerConfig:
     """Print what the first frames show to be wrong; settings with which calls do not look again."""
-    from dataclasses import replace
-
-    from directshape_torch.errors import DirectShapeError
-    from directshape_torch.io.frame_collation import collate
-    from directshape_torch.scene_check.check_scene import check_scene
-
     if config.check == "off":
         return config
     try:
@@ -145,46 +138,22 @@ def _warned_of(dataset: FileStereoDataset, config: RefinerConfig) -> RefinerConf
     return replace(config, check="off")
 
 
-def _check_disparity_is_used(folder: Path | None, method: str) -> None:
-    if folder is not None and method in ("direct", "box_alignment"):
-        raise InputError("--disparity", "a method that uses it", method, "add --method geometric or combined")
-
-
-def rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool) -> list[RigEstimate]:
-    """The estimates that `--rig` names: those of a file, or of the run's folder, made first where there are none yet.
-
-    Raises:
-        DataFormatError: the folder has a file of that name which is no estimate.
-    """
-    from directshape_torch.rig.rig_file import RIG_FILE, holds_rigs, load_rigs, save_rigs
-
+def _rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool) -> list[RigEstimate]:
+    """The estimates that `--rig` names: those of a file, or of the run's folder, made where there are none."""
     if rig != "auto":
         return load_rigs(rig) if rig != "none" and holds_rigs(rig) else []
     path = out_dir / RIG_FILE
     # Whatever lies there is not overwritten, unless it is an estimate.
     kept = load_rigs(path) if path.is_file() else None
-    rigs = _estimate(dataset) if kept is None or fresh else kept
-    if rigs is not kept:
-        save_rigs(path, rigs)
-        write_rig_picture(out_dir, rigs)
-    for estimate in rigs:
-        print(estimate if rigs is not kept else f"{estimate} (kept)")
-    return rigs
-
-
-def _estimate(dataset: FileStereoDataset) -> list[RigEstimate]:
-    from directshape_torch.cli.progress import Bar
-    from directshape_torch.rig.of_dataset import estimate_rigs
-
+    if kept is not None and not fresh:
+        for estimate in kept:
+            print(f"{estimate} (kept)")
+        return kept
     with Bar(desc="rig", unit="frame", file=sys.stderr) as bar:
-        return estimate_rigs(dataset, lambda _: bar.update())
-
-
-def write_rig_picture(out_dir: Path, rigs: list[RigEstimate]) -> None:
-    """`rig.png`: each field with the cars that it was estimated from."""
-    from directshape_torch.files.atomic_files import write_png
-    from directshape_torch.rig.rig_file import RIG_PICTURE
-    from directshape_torch.visualize.rig_picture import draw_rigs
-
+        rigs = estimate_rigs(dataset, lambda _: bar.update())
+    save_rigs(path, rigs)
     if rigs:
         write_png(out_dir / RIG_PICTURE, draw_rigs(rigs))
+    for estimate in rigs:
+        print(estimate)
+    return rigs

@@ -1,4 +1,10 @@
-"""`directshape report`: one HTML page about a run, which opens without a network."""
+"""`directshape report`: write an HTML page about a run.
+
+Write one self-contained HTML page about a run of 'directshape refine': summary, sortable table of cars, distributions,
+best and worst cars, pictures before and after, residual maps, and a 3D view of each frame. It opens from the disk,
+without a network. Images, detections and masks are not in the run's folder: name them as for 'refine'; those that have
+changed since are not used, and what is missing the page says.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +12,14 @@ import argparse
 import sys
 from pathlib import Path
 
+from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.cli.run_inputs import add_run_inputs, dataset_of_run, has_detections, prior_of_run
-
-_DESCRIPTION = """
-Write one self-contained HTML page about a run of 'directshape refine': summary, sortable table of cars, distributions,
-best and worst cars, pictures before and after, residual maps, and a 3D view of each frame. It opens from the disk,
-without a network. Images, detections and masks are not in the run's folder: name them as for 'refine'; those that have
-changed since are not used, and what is missing the page says.
-"""
+from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.report.make_report import make_report
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command and its options."""
-    parser = subparsers.add_parser("report", help="write an HTML page about a run", description=_DESCRIPTION)
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The run, its inputs, and what is shown."""
     parser.add_argument("out", type=Path, metavar="OUT", help="the folder of --out of 'directshape refine'")
     parser.add_argument("--html", type=Path, metavar="FILE", help="the page (default: OUT/report.html)")
     add_run_inputs(parser.add_argument_group("inputs of the run"), "for pictures and residual maps")
@@ -27,19 +28,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     shown.add_argument(
         "--max-frames", type=int, default=100, metavar="N", help="frames with pictures and 3D views (default: 100)"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the page and say how large it is; returns the exit code.
-
-    Raises:
-        DirectShapeError: wrong input; for the main program to show.
-    """
-    from directshape_torch.cli.progress import ProgressBar
-    from directshape_torch.io.run_folder import RunFolder
-    from directshape_torch.report.make_report import make_report
-
+    """Write the page and say how large it is."""
     run_folder = RunFolder(args.out, args.frames)
     page = args.out / "report.html" if args.html is None else args.html
     dataset = dataset_of_run(args, run_folder) if run_folder.frame_ids else None

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import get_args
 
-from directshape_torch.cli.options import LAYOUTS, add_mask_options, add_rig_option, mask_source
+from directshape_torch.batch.content_hashes import hash_fields, hash_prior
+from directshape_torch.cli.options import add_mask_options, add_rig_option, mask_source
 from directshape_torch.errors import InputError
-
-if TYPE_CHECKING:
-    from directshape_torch.geometry.disparity_field import DisparityField
-    from directshape_torch.io.run_folder import RunFolder
-    from directshape_torch.io.stereo_files import FileStereoDataset
-    from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.open_dataset import LayoutName, open_dataset
+from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.rig.rig_file import RIG_FILE, load_fields
+from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
+from directshape_torch.shape.shape_prior import ShapePrior
 
 
 def add_run_inputs(group: argparse._ActionsContainer, needed_for: str) -> None:
     """`--data`, `--layout`, `--detections`, masks, rig and prior of a run; all may be left out."""
     group.add_argument("--data", type=Path, metavar="ROOT", help=f"data set of the run, {needed_for}")
-    group.add_argument("--layout", choices=LAYOUTS, default="kitti", help="of that data set (default: kitti)")
+    group.add_argument(
+        "--layout", choices=get_args(LayoutName), default="kitti", help="of that data set (default: kitti)"
+    )
     group.add_argument(
         "--detections", type=Path, metavar="DIR", help="detections of the run (default: its results; folder: ROOT's)"
     )
@@ -35,8 +39,6 @@ def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> FileStereoDatase
         DataFormatError: a folder is missing or not laid out so.
         InputError: options that say nothing without `--data`, or another rig than the run's.
     """
-    from directshape_torch.io.open_dataset import open_dataset
-
     if args.data is None:
         names = ("detections", "masks", "masks_left", "masks_right", "disparity", "rig")
         given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name, None) not in (None, "none")]
@@ -70,9 +72,6 @@ def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
         DataFormatError: a file that is no prior.
         InputError: the named prior is not that of the run.
     """
-    from directshape_torch.batch.content_hashes import hash_prior
-    from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
-
     wanted = run.manifest.sha256["prior"]
     priors = map(load_prior, BUNDLED_PRIORS if source is None else (source,))
     found = next((prior for prior in priors if hash_prior(prior) == wanted), None)
@@ -88,9 +87,6 @@ def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:
         DataFormatError: the file holds none.
         InputError: the run was made with others, or with none.
     """
-    from directshape_torch.batch.content_hashes import hash_fields
-    from directshape_torch.rig.rig_file import RIG_FILE, load_fields
-
     own = run.path / RIG_FILE
     if rig == "none" and not own.is_file():
         return ()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from directshape_torch.batch.content_hashes import hash_prior
-from directshape_torch.batch.options import RunObserver, SilentObserver
+from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import InputError
 from directshape_torch.export.coco3d_file import Coco3dDataset, image_numbers
 from directshape_torch.export.frame_source import Exporter, ExportInputs, FrameSource
@@ -52,7 +52,7 @@ def export_run(
         raise InputError("frames", f"finished frames of {run.path}", "none")
     if inputs.prior is not None and hash_prior(inputs.prior) != run.manifest.sha256["prior"]:
         raise InputError("prior", "that of the run", "another one", "name that of the run with --prior")
-    observer = SilentObserver() if observer is None else observer
+    observer = RunObserver() if observer is None else observer
     exporters = [_make(one, Path(folder), run, inputs) for one in dict.fromkeys(formats)]
     with ExitStack() as stack:
         for exporter in exporters:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from directshape_torch.batch.mesh_files import T_GLTF_CAM
+from directshape_torch.batch.frame_outputs import T_GLTF_CAM
 from directshape_torch.files.mesh_files import read_mesh
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from directshape_torch.batch.content_hashes import hash_prior
-from directshape_torch.batch.options import RunObserver, SilentObserver
+from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.config import RefinerConfig
@@ -78,7 +78,7 @@ def make_report(
         raise InputError("most_frames", "0 or more", str(most_frames))
     right = None if prior is None or run.manifest.sha256["prior"] != hash_prior(prior) else prior
     writer = _PageOfRun(run, dataset, dataset is not None and has_detections, right, prior is not None)
-    return writer.write(page, most_frames, SilentObserver() if observer is None else observer)
+    return writer.write(page, most_frames, RunObserver() if observer is None else observer)
 
 
 class _PageOfRun:

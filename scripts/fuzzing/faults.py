@@ -19,7 +19,7 @@ from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset
 
-from directshape_torch.batch.options import SilentObserver, WorkerOptions
+from directshape_torch.batch.options import RunObserver, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_log import log_path, read_log
 from directshape_torch.errors import DirectShapeError
@@ -92,7 +92,7 @@ class _FaultyFile:
         return getattr(self._file, name)
 
 
-class _Taker(SilentObserver):
+class _Taker(RunObserver):
     """Does something to the output folder once the first frame has ended."""
 
     def __init__(self, out: Path, take: Callable[[Path], None]) -> None:
@@ -186,7 +186,7 @@ def _judge(
     shutil.rmtree(out, ignore_errors=True)
 
 
-def _ended(root: Path, out: Path, observer: SilentObserver | None = None) -> str:
+def _ended(root: Path, out: Path, observer: RunObserver | None = None) -> str:
     """How a run ended: "success", "told by its exit code", "told by an error", "foreign exception"."""
     try:
         code = _run(root, out, observer).exit_code
@@ -197,5 +197,5 @@ def _ended(root: Path, out: Path, observer: SilentObserver | None = None) -> str
     return "told by its exit code" if code else "success"
 
 
-def _run(root: Path, out: Path, observer: SilentObserver | None = None) -> Any:
+def _run(root: Path, out: Path, observer: RunObserver | None = None) -> Any:
     return refine_dataset(dataset(root), QuickRefiner(root), out, observer=observer, workers=WorkerOptions(threads=1))

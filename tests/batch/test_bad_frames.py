@@ -15,7 +15,7 @@ from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
 from directshape_torch.batch.content_hashes import hash_prior
-from directshape_torch.batch.options import RefineOptions, SilentObserver
+from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
 from directshape_torch.batch.resumption import EarlierResults
 from directshape_torch.errors import DirectShapeError
@@ -136,7 +136,7 @@ def test_a_full_disk_stops_the_run_and_the_next_goes_on(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    class Filler(SilentObserver):
+    class Filler(RunObserver):
         def finished(self, frame_id: str, failure: str | None) -> None:
             monkeypatch.setattr("directshape_torch.batch.group_refinement.write_frame_outputs", full)
 

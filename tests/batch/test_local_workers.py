@@ -10,7 +10,7 @@ from helpers.faulty_refiners import DeadlyRefiner, HungryRefiner, QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
-from directshape_torch.batch.options import RefineOptions, SilentObserver, WorkerOptions
+from directshape_torch.batch.options import RefineOptions, RunObserver, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
@@ -28,7 +28,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-class Listener(SilentObserver):
+class Listener(RunObserver):
     def __init__(self) -> None:
         self.ended: list[tuple[str, bool]] = []
 
@@ -42,7 +42,7 @@ def refine(
     refiner: DirectShapeRefiner,
     batch_frames: int,
     who: WorkerOptions,
-    listener: SilentObserver | None = None,
+    listener: RunObserver | None = None,
 ) -> RunSummary:
     dataset = KittiStereoDataset(root, root / "detections", root / "masks")
     return refine_dataset(dataset, refiner, out, RefineOptions("ply", batch_frames=batch_frames), listener, who)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 import pytest
 
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
-from directshape_torch.batch.group_refinement import FrameEnd, GroupReport
+from directshape_torch.batch.group_refinement import GroupReport
 from directshape_torch.batch.workers import GroupDispatch, WorkerDiedError
 from directshape_torch.errors import DirectShapeError
 
@@ -33,7 +33,7 @@ class Imagined:
             return [(group, WorkerDiedError("killed"))]
         done = [frame_id for frame_id in group.frame_ids if frame_id in group.wanted]
         self.written += done
-        return [(group, GroupReport([FrameEnd(frame_id, {"state": "done"}) for frame_id in done]))]
+        return [(group, GroupReport({frame_id: {"state": "done"} for frame_id in done}))]
 
     def close(self) -> None:
         pass

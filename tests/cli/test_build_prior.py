@@ -1,19 +1,17 @@
-import argparse
 import json
 from pathlib import Path
 
 import pytest
 
 from directshape_torch.cli import build_prior
+from directshape_torch.cli.main import make_parser
 from directshape_torch.errors import InputError
 from directshape_torch.shape.parametric_cars import car_mesh, sample_car
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
 def run(*arguments: str) -> int:
-    parser = argparse.ArgumentParser()
-    build_prior.add_parser(parser.add_subparsers())
-    args = parser.parse_args(["build-prior", *arguments])
+    args = make_parser().parse_args(["build-prior", *arguments])
     code: int = args.run(args)
     return code
 

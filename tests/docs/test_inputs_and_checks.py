@@ -6,9 +6,10 @@ import json
 import re
 from dataclasses import fields
 from pathlib import Path
+from typing import get_args
 
-from directshape_torch.cli.options import LAYOUTS
 from directshape_torch.io import folder_json
+from directshape_torch.io.open_dataset import LayoutName
 from directshape_torch.scene_check.conventions import all_conventions
 from directshape_torch.scene_check.known_mistakes import MISTAKES
 
@@ -24,7 +25,7 @@ def first_column(text: str) -> set[str]:
 
 
 def test_every_layout_is_in_the_table() -> None:
-    assert first_column(INPUTS.split("## A plain folder")[0]) == set(LAYOUTS)
+    assert first_column(INPUTS.split("## A plain folder")[0]) == set(get_args(LayoutName))
 
 
 def test_keys_of_the_folder() -> None:

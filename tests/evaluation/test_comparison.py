@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.shape_arrays import shape_arrays
 
-from directshape_torch.cli import compare
+from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
 from directshape_torch.evaluation.comparison_report import format_comparison
@@ -180,15 +180,10 @@ def test_files_of_the_tracking_benchmark(folders: tuple[Path, Path, Path], tmp_p
 def test_command_prints_and_writes(
     folders: tuple[Path, Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    import argparse
-
-    parser = argparse.ArgumentParser()
-    compare.add_parser(parser.add_subparsers())
     names = ("--labels", "--before", "--after")
     options = [text for pair in zip(names, map(str, folders), strict=True) for text in pair]
     outputs = ["--json", str(tmp_path / "c.json"), "--csv", str(tmp_path / "c.csv"), "--draws", "50"]
-    args = parser.parse_args(["compare", *options, *outputs])
-    assert args.run(args) == 0
+    assert main(["compare", *options, *outputs]) == 0
     printed = capsys.readouterr().out
     assert "3 detections of 3 counted labels in 2 frames" in printed
     assert "BEV IoU, mean" in printed

@@ -21,7 +21,7 @@ from helpers.output_folders import result_files
 from helpers.quick_runs import dataset
 
 import directshape_torch
-from directshape_torch.batch.options import SilentObserver, WorkerOptions
+from directshape_torch.batch.options import RunObserver, WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
@@ -32,9 +32,7 @@ from directshape_torch.io.run_folder import RunFolder, done_frames
 THREADS = WorkerOptions(threads=1)
 
 
-def refine(
-    root: Path, out: Path, workers: WorkerOptions = THREADS, observer: SilentObserver | None = None
-) -> RunSummary:
+def refine(root: Path, out: Path, workers: WorkerOptions = THREADS, observer: RunObserver | None = None) -> RunSummary:
     return refine_dataset(dataset(root), QuickRefiner(root), out, observer=observer, workers=workers)
 
 
@@ -66,7 +64,7 @@ def test_workers_that_are_killed_as_they_start(shared_kitti: Path, tmp_path: Pat
     assert result_files(tmp_path / "out") == result_files(undisturbed)
 
 
-class Mover(SilentObserver):
+class Mover(RunObserver):
     """Renames the output folder once a frame has ended."""
 
     def __init__(self, out: Path, to: Path) -> None:
@@ -90,7 +88,7 @@ def test_a_folder_that_is_moved_away_is_not_success(shared_kitti: Path, tmp_path
     assert result_files(moved) == result_files(undisturbed)
 
 
-class Thief(SilentObserver):
+class Thief(RunObserver):
     """Removes a file of each frame that has ended."""
 
     def __init__(self, out: Path) -> None:

@@ -6,7 +6,6 @@ import json
 import pickle
 import shutil
 from pathlib import Path
-from typing import get_args
 
 import pytest
 import torch
@@ -22,7 +21,6 @@ from helpers.layouts import (
     write_stereo2015,
 )
 
-from directshape_torch.cli.options import LAYOUTS
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
@@ -59,10 +57,6 @@ def assert_same(dataset: StereoDataset, frame_id: str, expected: LoadedFrame) ->
         torch.testing.assert_close(getattr(loaded.detections, name), getattr(expected.detections, name))
     for role, path in dataset.input_files(frame_id).items():
         assert path.is_file(), role
-
-
-def test_the_cli_offers_every_layout() -> None:
-    assert get_args(LayoutName) == LAYOUTS
 
 
 def test_kitti(kitti: Path, expected: LoadedFrame) -> None:

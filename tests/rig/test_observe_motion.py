@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.cli import calibrate_rig
+from directshape_torch.cli.main import make_parser
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.rig.motion import MotionConstraint
@@ -64,10 +63,8 @@ def test_a_wall_is_followed_to_where_it_is(tmp_path: Path) -> None:
 
 
 def calibrate(root: Path, out: Path, *more: str) -> int:
-    parser = argparse.ArgumentParser()
-    calibrate_rig.add_parser(parser.add_subparsers())
     arguments = ["calibrate-rig", "--data", str(root), "--from", "motion", "--out", str(out), *more]
-    args = parser.parse_args(arguments)
+    args = make_parser().parse_args(arguments)
     return int(args.run(args))
 
 

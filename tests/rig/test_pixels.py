@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.cli import calibrate_rig
+from directshape_torch.cli.main import make_parser
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import polynomial_basis
@@ -102,9 +101,7 @@ def write_frame(root: Path, frame_id: str, bias_px: float, focal_px: float = FOC
 
 
 def calibrate(root: Path, *more: str) -> int:
-    parser = argparse.ArgumentParser()
-    calibrate_rig.add_parser(parser.add_subparsers())
-    args = parser.parse_args(
+    args = make_parser().parse_args(
         ["calibrate-rig", "--data", str(root), "--from", "disparity", "--out", str(root / "bias.json"), *more]
     )
     return int(args.run(args))
