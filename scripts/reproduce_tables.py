@@ -24,8 +24,8 @@ from command_line import run_command
 
 from directshape_torch.cli.main import main as directshape
 from directshape_torch.errors import DirectShapeError, InputError
-from directshape_torch.evaluation.bootstrap import CarBootstrap, weighted_mean
-from directshape_torch.evaluation.comparison import Comparison, compare_results, lines_with_left_mask
+from directshape_torch.evaluation.bootstrap import CarBootstrap
+from directshape_torch.evaluation.comparison import Comparison, compare_results
 from directshape_torch.evaluation.kitti_ap import evaluate_kitti
 from directshape_torch.evaluation.tables import number, with_interval
 
@@ -133,8 +133,7 @@ def comparison(args: argparse.Namespace, name: str) -> Comparison:
     """A row's boxes against the labels, of the cars that have a mask."""
     out = refined(args, name)
     labels = args.data / "training" / "label_2"
-    with_mask = lines_with_left_mask(out / "shapes")
-    return compare_results(labels, args.detections, out / "data", frames=args.frames, keep_line=with_mask)
+    return compare_results(labels, args.detections, out / "data", frames=args.frames, shapes_dir=out / "shapes")
 
 
 def box_cells(found: Comparison, when: str) -> list[str]:
@@ -150,7 +149,7 @@ def difference(default: Comparison, found: Comparison) -> str:
     cars = [{(car.frame_id, car.detection_line): car.after.bev_iou for car in side.cars} for side in (default, found)]
     common = sorted(set(cars[0]) & set(cars[1]))
     before, after = (np.array([side[key] for key in common]) for side in cars)
-    return with_interval("", CarBootstrap(len(common)).change(before, after, weighted_mean), sign=True)
+    return with_interval("", CarBootstrap(len(common)).summary(before, after).change, sign=True)
 
 
 def ap_cells(args: argparse.Namespace, results: Path) -> list[str]:

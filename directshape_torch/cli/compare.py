@@ -13,12 +13,8 @@ from pathlib import Path
 
 from directshape_torch.cli.options import add_frame_choice, add_interval_options
 from directshape_torch.evaluation.bootstrap import BootstrapSettings
-from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
-from directshape_torch.evaluation.comparison_report import (
-    format_comparison,
-    write_comparison_csv,
-    write_comparison_json,
-)
+from directshape_torch.evaluation.comparison import compare_results
+from directshape_torch.evaluation.reports import format_comparison, write_comparison_csv, write_scores
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -49,12 +45,12 @@ def run(args: argparse.Namespace) -> int:
         args.after,
         split=args.split,
         frames=args.frames,
-        keep_line=None if args.shapes is None else lines_with_left_mask(args.shapes),
+        shapes_dir=args.shapes,
         bootstrap=BootstrapSettings(args.draws, seed=args.seed),
     )
     print(format_comparison(comparison), end="")
     if args.json is not None:
-        write_comparison_json(args.json, comparison)
+        write_scores(args.json, comparison)
     if args.csv is not None:
         write_comparison_csv(args.csv, comparison.cars)
     return 0

@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 from directshape_torch.evaluation.kitti_ap import evaluate_kitti
-from directshape_torch.evaluation.kitti_ap_report import format_scores, write_scores_json
+from directshape_torch.evaluation.reports import format_scores, write_scores
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -28,5 +28,5 @@ def run(args: argparse.Namespace) -> int:
     scores = evaluate_kitti(args.labels, args.results, split=args.split, object_type=args.type)
     print(format_scores(scores), end="")
     if args.json is not None:
-        write_scores_json(args.json, scores)
+        write_scores(args.json, scores)
     return 0

@@ -14,11 +14,7 @@ from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.cli.options import add_frame_choice, add_interval_options
 from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
-from directshape_torch.evaluation.shape_report import (
-    format_shape_scores,
-    write_shape_scores_csv,
-    write_shape_scores_json,
-)
+from directshape_torch.evaluation.reports import format_shape_scores, write_scores, write_shape_scores_csv
 from directshape_torch.shape.load_prior import load_prior
 
 
@@ -57,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     )
     print(format_shape_scores(scores), end="")
     if args.json is not None:
-        write_shape_scores_json(args.json, scores)
+        write_scores(args.json, scores)
     if args.csv is not None:
         write_shape_scores_csv(args.csv, scores.cars)
     return 0

@@ -6,28 +6,21 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.bootstrap import (
-    BootstrapSettings,
-    CarBootstrap,
-    Estimate,
-    MetricSummary,
-    Statistic,
-    weighted_mean,
-    weighted_median,
-)
+from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, Estimate, MetricSummary, Statistic
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
-from directshape_torch.evaluation.pose_error import CarErrors, boxes_of, car_errors, pose_errors
+from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.tracking_files import FrameObjects
 
-GOOD_BEV_IOU = 0.7
 WORSE_BY_BEV_IOU = 0.05
+# Depth of the label along the optical axis, metres; the last bin is open.
+_DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))
 
 
 @dataclass(frozen=True)
@@ -54,8 +47,7 @@ class ComparedCar:
     after: CarErrors
 
 
-@dataclass(frozen=True)
-class Metric:
+class Metric(NamedTuple):
     """How one figure is made: a value for each car, and the statistic over cars."""
 
     key: str
@@ -66,15 +58,13 @@ class Metric:
 
 
 METRICS = (
-    Metric("bev_iou_mean", "BEV IoU, mean", "", lambda e: e.bev_iou, weighted_mean),
-    Metric("iou_3d_mean", "3D IoU, mean", "", lambda e: e.iou_3d, weighted_mean),
-    Metric(
-        "bev_iou_good_share", f"BEV IoU > {GOOD_BEV_IOU}", "%", lambda e: float(e.bev_iou > GOOD_BEV_IOU), weighted_mean
-    ),
-    Metric("centre_m_median", "centre error, median", "m", lambda e: e.centre_m, weighted_median),
-    Metric("centre_bev_m_median", "centre error BEV, median", "m", lambda e: e.centre_bev_m, weighted_median),
-    Metric("yaw_deg_median", "yaw error mod 360, median", "deg", lambda e: e.yaw_deg, weighted_median),
-    Metric("yaw_axis_deg_median", "yaw error mod 180, median", "deg", lambda e: e.yaw_axis_deg, weighted_median),
+    Metric("bev_iou_mean", "BEV IoU, mean", "", lambda e: e.bev_iou, np.mean),
+    Metric("iou_3d_mean", "3D IoU, mean", "", lambda e: e.iou_3d, np.mean),
+    Metric("bev_iou_good_share", "BEV IoU > 0.7", "%", lambda e: float(e.bev_iou > 0.7), np.mean),
+    Metric("centre_m_median", "centre error, median", "m", lambda e: e.centre_m, np.median),
+    Metric("centre_bev_m_median", "centre error BEV, median", "m", lambda e: e.centre_bev_m, np.median),
+    Metric("yaw_deg_median", "yaw error mod 360, median", "deg", lambda e: e.yaw_deg, np.median),
+    Metric("yaw_axis_deg_median", "yaw error mod 180, median", "deg", lambda e: e.yaw_axis_deg, np.median),
 )
 
 
@@ -95,38 +85,6 @@ class GroupSummary:
     worse_share: Estimate | None
 
 
-def summarise(name: str, cars: Sequence[ComparedCar], settings: BootstrapSettings) -> GroupSummary:
-    """Figures of a group of detections.
-
-    Examples:
-        >>> summarise("nothing", [], BootstrapSettings()).num_detections
-        0
-    """
-    if not cars:
-        return GroupSummary(name, 0, {}, None)
-    # By label, so that the draws do not depend on the order of the detections.
-    cars = sorted(cars, key=lambda car: f"{car.frame_id}:{car.label_line}")
-    bootstrap = CarBootstrap(len(cars), settings)
-    metrics = {}
-    for metric in METRICS:
-        before = _values([metric.value(car.before) for car in cars])
-        after = _values([metric.value(car.after) for car in cars])
-        metrics[metric.key] = bootstrap.summary(before, after, metric.statistic)
-    worse = _values([car.after.bev_iou < car.before.bev_iou - WORSE_BY_BEV_IOU for car in cars])
-    return GroupSummary(name, len(cars), metrics, bootstrap.estimate(worse, weighted_mean))
-
-
-def _values(values: Sequence[float]) -> NDArray[np.float64]:
-    return np.array(values, dtype=np.float64)
-
-
-# Depth of the label along the optical axis, metres; the last bin is open.
-DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))
-
-# Whether a detection, given by frame id and line number from 1, takes part.
-LineFilter = Callable[[str, int], bool]
-
-
 @dataclass(frozen=True)
 class Comparison:
     """Everything `compare_results` finds.
@@ -134,10 +92,10 @@ class Comparison:
     Attributes:
         cars: every counted label with a detection, in the order of frames and detection lines.
         overall: figures over detections.
-        by_depth: figures for each bin of `DEPTH_BINS_M`.
+        by_depth: figures for bins of the label's depth.
         num_frames: frames compared.
         num_labels_counted: labels that count, found by a detection or not.
-        num_filtered_out: found labels whose detection was left out by the line filter.
+        num_filtered_out: found labels whose detection had no mask, where only those with one count.
     """
 
     cars: tuple[ComparedCar, ...]
@@ -155,7 +113,7 @@ def compare_results(
     *,
     split: Path | str | None = None,
     frames: Iterable[str | int] | None = None,
-    keep_line: LineFilter | None = None,
+    shapes_dir: Path | str | None = None,
     counted: CountedLabels | None = None,
     bootstrap: BootstrapSettings | None = None,
 ) -> Comparison:
@@ -169,7 +127,8 @@ def compare_results(
         split: file with one frame id a line; default every frame of `before_dir`; where that is of the tracking
             benchmark, those of `after_dir`.
         frames: ids of the frames to compare, instead of `split`.
-        keep_line: leaves detections out (see `lines_with_left_mask`); they still take their labels.
+        shapes_dir: `OUT/shapes` of the refinement: leaves out detections that had no left mask, and lines that were
+            only copied; they still take their labels.
         counted: which labels count.
         bootstrap: settings of the confidence intervals.
 
@@ -184,48 +143,47 @@ def compare_results(
     if not frame_ids:
         raise InputError("frames", f"at least one frame; result files NNNNNN.txt in {before_dir}", "none")
     pairs: list[_Pair] = []
-    num_counted = 0
+    num_counted = num_found = 0
     objects = FrameObjects()
     for frame_id in frame_ids:
         found, count = _pairs_of_frame(objects, sources, frame_id, counted)
-        pairs += found
+        num_found += len(found)
         num_counted += count
-    kept = [p for p in pairs if keep_line is None or keep_line(p.frame_id, p.before.line_number)]
-    cars = _compared_cars(kept)
+        pairs += found if shapes_dir is None else _with_left_mask(found, Path(shapes_dir) / f"{frame_id}.npz")
+    cars = _compared_cars(pairs)
     settings = BootstrapSettings() if bootstrap is None else bootstrap
     return Comparison(
         cars=cars,
-        overall=summarise("all detections", cars, settings),
+        overall=_summarised("all detections", cars, settings),
         by_depth=tuple(
-            summarise(_bin_name(low, high), [c for c in cars if low <= c.depth_m < high], settings)
-            for low, high in pairwise(DEPTH_BINS_M)
+            _summarised(
+                f"{low:.0f}-{high:.0f} m" if high < float("inf") else f"over {low:.0f} m",
+                [c for c in cars if low <= c.depth_m < high],
+                settings,
+            )
+            for low, high in pairwise(_DEPTH_BINS_M)
         ),
         num_frames=len(frame_ids),
         num_labels_counted=num_counted,
-        num_filtered_out=len(pairs) - len(kept),
+        num_filtered_out=num_found - len(pairs),
     )
 
 
-def lines_with_left_mask(shapes_dir: Path | str) -> LineFilter:
-    """A filter for `compare_results`: detections that had a left mask, by the shape files of the refinement.
-
-    Args:
-        shapes_dir: `OUT/shapes` with `NNNNNN.npz`. Lines without a left mask, and lines that were only copied,
-            are left out.
-    """
-    lines: dict[str, frozenset[int]] = {}
-
-    def keep(frame_id: str, line: int) -> bool:
-        if frame_id not in lines:
-            shapes = read_shapes(Path(shapes_dir) / f"{frame_id}.npz")
-            lines[frame_id] = frozenset(shapes.input_lines[shapes.has_mask_left].tolist())
-        return line in lines[frame_id]
-
-    return keep
+def _summarised(name: str, cars: Sequence[ComparedCar], settings: BootstrapSettings) -> GroupSummary:
+    if not cars:
+        return GroupSummary(name, 0, {}, None)
+    # By label, so that the draws do not depend on the order of the detections.
+    cars = sorted(cars, key=lambda car: f"{car.frame_id}:{car.label_line}")
+    bootstrap = CarBootstrap(len(cars), settings)
+    metrics = {}
+    for metric in METRICS:
+        before, after = (np.array([metric.value(getattr(car, when)) for car in cars]) for when in ("before", "after"))
+        metrics[metric.key] = bootstrap.summary(before, after, metric.statistic)
+    worse = np.array([car.after.bev_iou < car.before.bev_iou - WORSE_BY_BEV_IOU for car in cars], dtype=np.float64)
+    return GroupSummary(name, len(cars), metrics, bootstrap.estimate(worse))
 
 
-@dataclass(frozen=True)
-class _Pair:
+class _Pair(NamedTuple):
     frame_id: str
     label: KittiObject
     before: KittiObject
@@ -259,11 +217,11 @@ def _pairs_of_frame(
         raise DataFormatError(after_path, f"there is no result of frame {frame_id}", cure=cure)
     before, after = objects.read(before_path, frame_id), objects.read(after_path, frame_id)
     _check_same_lines(before_path, before, after_path, after)
-    rows = [row for row, o in enumerate(before) if o.type in counted.types and o.has_box_3d]
-    partners = match_to_labels([before[row] for row in rows], labels)
+    lines = [pair for pair in zip(before, after, strict=True) if pair[0].type in counted.types and pair[0].has_box_3d]
+    partners = match_to_labels([old for old, _ in lines], labels)
     pairs = [
-        _Pair(frame_id, labels[index], before[row], after[row])
-        for row, index in zip(rows, partners, strict=True)
+        _Pair(frame_id, labels[index], *pair)
+        for pair, index in zip(lines, partners, strict=True)
         if index >= 0 and counted.counts(labels[index])
     ]
     return pairs, sum(counted.counts(label) for label in labels)
@@ -281,26 +239,25 @@ def _check_same_lines(
             raise DataFormatError(after_path, problem, line_number=new.line_number, line=new.raw_line, cure=cure)
 
 
+def _with_left_mask(pairs: Sequence[_Pair], path: Path) -> list[_Pair]:
+    shapes = read_shapes(path)
+    lines = set(shapes.input_lines[shapes.has_mask_left].tolist())
+    return [pair for pair in pairs if pair.before.line_number in lines]
+
+
 def _compared_cars(pairs: Sequence[_Pair]) -> tuple[ComparedCar, ...]:
-    true_boxes = boxes_of([p.label for p in pairs])
-    before = car_errors(pose_errors(boxes_of([p.before for p in pairs]), true_boxes))
-    after = car_errors(pose_errors(boxes_of([p.after for p in pairs]), true_boxes))
-    cars = []
-    for pair, errors_before, errors_after in zip(pairs, before, after, strict=True):
-        cars.append(
-            ComparedCar(
-                frame_id=pair.frame_id,
-                detection_line=pair.before.line_number,
-                label_line=pair.label.line_number,
-                depth_m=pair.label.location_ref[2],
-                height_px=pair.label.box_2d[3] - pair.label.box_2d[1],
-                score=pair.before.score,
-                before=errors_before,
-                after=errors_after,
-            )
+    labels = [pair.label for pair in pairs]
+    before, after = (errors_of([getattr(pair, when) for pair in pairs], labels) for when in ("before", "after"))
+    return tuple(
+        ComparedCar(
+            frame_id=pair.frame_id,
+            detection_line=pair.before.line_number,
+            label_line=pair.label.line_number,
+            depth_m=pair.label.location_ref[2],
+            height_px=pair.label.box_2d[3] - pair.label.box_2d[1],
+            score=pair.before.score,
+            before=errors_before,
+            after=errors_after,
         )
-    return tuple(cars)
-
-
-def _bin_name(low: float, high: float) -> str:
-    return f"{low:.0f}-{high:.0f} m" if high < float("inf") else f"over {low:.0f} m"
+        for pair, errors_before, errors_after in zip(pairs, before, after, strict=True)
+    )

@@ -10,14 +10,13 @@ import numpy as np
 import torch
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, MetricSummary, weighted_mean
+from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, MetricSummary
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
 from directshape_torch.evaluation.shape_error import ShapeError
-from directshape_torch.evaluation.shape_truth import EstimatedCar, SegmentSource, SegmentTruth
-from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.evaluation.shape_truth import EstimatedCar, SegmentSource
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
-from directshape_torch.io.kitti_labels import KittiObject, poses_cam, read_objects
+from directshape_torch.io.kitti_labels import poses_cam, read_objects
 from directshape_torch.io.mask_files import mask_source
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
 from directshape_torch.io.run_folder import shapes_path
@@ -129,155 +128,111 @@ def evaluate_shapes(
         DataFormatError: a file is missing or damaged, or belongs to another prior.
         InputError: nothing to evaluate.
     """
-    training = _training(Path(data_dir))
-    source = SegmentSource(training, mask_source(masks) if isinstance(masks, (str, Path)) else masks)
+    training = Path(data_dir) / "training"
+    if not training.is_dir():
+        raise DataFormatError(
+            data_dir, "holds no folder 'training'", cure="give the folder above it, in KITTI's layout"
+        )
     inputs = _Inputs(
+        training=training,
         labels_dir=training / "label_2" if labels_dir is None else Path(labels_dir),
         detections_dir=Path(detections_dir),
         refined_dir=Path(refined_dir),
-        calib_dir=training / "calib",
-        source=source,
+        source=SegmentSource(training, mask_source(masks) if isinstance(masks, (str, Path)) else masks),
         prior=prior,
         prior_sha256=prior_sha256,
         counted=CountedLabels() if counted is None else counted,
     )
-    frame_ids = _choose_frames(inputs, named_frames(frames, split))
-    parts = [_evaluate_frame(inputs, frame_id) for frame_id in frame_ids]
-    cars = tuple(car for part in parts for car in part.cars)
+    frame_ids = inputs.choose_frames(named_frames(frames, split))
+    found, counts, with_truth = zip(*(inputs.evaluate(frame_id) for frame_id in frame_ids), strict=True)
+    cars = tuple(car for cars_of_frame in found for car in cars_of_frame)
     if not cars:
         raise InputError(
-            "frames", "a counted label with a detection and a true surface", f"none in {len(parts)} frames"
+            "frames", "a counted label with a detection and a true surface", f"none in {len(frame_ids)} frames"
         )
     settings = BootstrapSettings() if bootstrap is None else bootstrap
     return ShapeScores(
         cars=cars,
         curves=tuple(_curve(metric, cars, settings) for metric in METRICS),
-        num_frames=len(parts),
-        num_labels_counted=sum(part.num_counted for part in parts),
-        num_without_truth=sum(part.num_without_truth for part in parts),
-        num_without_detection=sum(part.num_without_detection for part in parts),
+        num_frames=len(frame_ids),
+        num_labels_counted=sum(counts),
+        num_without_truth=sum(counts) - sum(with_truth),
+        num_without_detection=sum(with_truth) - len(cars),
         mean_num_true=float(np.mean([car.after.num_true for car in cars])),
     )
 
 
 @dataclass(frozen=True)
 class _Inputs:
+    training: Path
     labels_dir: Path
     detections_dir: Path
     refined_dir: Path
-    calib_dir: Path
     source: SegmentSource
     prior: ShapePrior
     prior_sha256: str | None
     counted: CountedLabels
 
-
-@dataclass(frozen=True)
-class _FrameCars:
-    cars: list[EvaluatedCar]
-    num_counted: int
-    num_without_truth: int
-    num_without_detection: int
-
-
-def _training(root: Path) -> Path:
-    if not (root / "training").is_dir():
-        raise DataFormatError(root, "holds no folder 'training'", cure="give the folder above it, in KITTI's layout")
-    return root / "training"
-
-
-def _choose_frames(inputs: _Inputs, named: tuple[str, ...] | None) -> tuple[str, ...]:
-    known = inputs.source.frame_ids()
-    if named is not None:
-        missing = sorted(set(named) - set(known))
-        if missing:
+    def choose_frames(self, named: tuple[str, ...] | None) -> tuple[str, ...]:
+        known = self.source.frame_ids()
+        if named is None:
+            named = tuple(frame_id for frame_id in known if shapes_path(self.refined_dir, frame_id).is_file())
+        if missing := sorted(set(named) - set(known)):
             raise InputError("frames", "frames with ground truth", ", ".join(missing[:5]))
-    refined = [frame_id for frame_id in known if shapes_path(inputs.refined_dir, frame_id).is_file()]
-    chosen = tuple(refined) if named is None else named
-    if not chosen:
-        where = f"{inputs.refined_dir} has no shapes/NNNNNN.npz of any of the {len(known)} frames with ground truth"
-        raise InputError("frames", "refined frames with ground truth", f"none: {where}")
-    return chosen
+        if not named:
+            where = f"{self.refined_dir} has no shapes/NNNNNN.npz of any of the {len(known)} frames with ground truth"
+            raise InputError("frames", "refined frames with ground truth", f"none: {where}")
+        return named
 
-
-def _evaluate_frame(inputs: _Inputs, frame_id: str) -> _FrameCars:
-    name = f"{frame_id}.txt"
-    camera = to_stereo_camera([read_calibration(inputs.calib_dir / name)], dtype=torch.float64)
-    labels = read_objects(file_of_frame(inputs.labels_dir, name))
-    detections = read_objects(file_of_frame(inputs.detections_dir, name))
-    shapes = _shapes_of(inputs, frame_id, len(detections))
-    counted = [label for label in labels if inputs.counted.counts(label)]
-    # All labels compete for a mask, so that one that does not count keeps its own.
-    truths = inputs.source.truths(frame_id, [label for label in labels if label.has_box_3d], camera)
-    row_of_label = _rows_of_labels(labels, detections, shapes)
-    cars = [
-        _evaluate_car(inputs, label, truths[label.line_number], _Estimate(frame_id, row, detections, shapes, camera))
-        for label in counted
-        if label.line_number in truths and (row := row_of_label.get(label.line_number)) is not None
-    ]
-    num_with_truth = sum(label.line_number in truths for label in counted)
-    cars.sort(key=lambda car: car.detection_line)
-    return _FrameCars(cars, len(counted), len(counted) - num_with_truth, num_with_truth - len(cars))
-
-
-def _shapes_of(inputs: _Inputs, frame_id: str, num_lines: int) -> ShapeArrays:
-    path = shapes_path(inputs.refined_dir, frame_id)
-    shapes = read_shapes(path)
-    if inputs.prior_sha256 is not None and shapes.prior_sha256 != inputs.prior_sha256:
-        raise DataFormatError(
-            path, "holds codes of another shape prior", cure="give the prior that the refinement used"
+    def evaluate(self, frame_id: str) -> tuple[list[EvaluatedCar], int, int]:
+        """The cars of a frame, how many labels count, and how many of these have a true surface."""
+        name, prior = f"{frame_id}.txt", self.prior
+        camera = to_stereo_camera([read_calibration(self.training / "calib" / name)], dtype=torch.float64)
+        labels, detections = (
+            read_objects(file_of_frame(folder, name)) for folder in (self.labels_dir, self.detections_dir)
         )
-    if shapes.codes.shape[1] != inputs.prior.num_codes:
-        raise DataFormatError(path, f"has {shapes.codes.shape[1]} codes, the shape prior {inputs.prior.num_codes}")
-    if len(shapes.input_lines) and shapes.input_lines.max() > num_lines:
-        problem = f"names line {shapes.input_lines.max()} of a detection file that has {num_lines} lines"
-        raise DataFormatError(path, problem, cure="give the detections that went into the refinement")
-    return shapes
+        shapes = self._shapes(frame_id, len(detections))
+        # All labels compete for a mask, so that one that does not count keeps its own.
+        truths = self.source.truths(frame_id, [label for label in labels if label.has_box_3d], camera)
+        row_of_line = {line: row for row, line in enumerate(shapes.input_lines.tolist())}
+        refined = [detection for detection in detections if detection.line_number in row_of_line]
+        partners = zip(match_to_labels(refined, labels), refined, strict=True)
+        detection_of = {labels[index].line_number: detection for index, detection in partners if index >= 0}
+        counted = [label for label in labels if self.counted.counts(label)]
+        cars = []
+        for label in counted:
+            truth, detection = truths.get(label.line_number), detection_of.get(label.line_number)
+            if truth is None or detection is None:
+                continue
+            row = row_of_line[detection.line_number]
+            code, T_refined = (torch.from_numpy(array[row]).double() for array in (shapes.codes, shapes.T_cam_obj))
+            T_input = poses_cam([detection], camera.t_cam_ref[0])[0]
+            car = EvaluatedCar(
+                frame_id=frame_id,
+                detection_line=detection.line_number,
+                label_line=label.line_number,
+                status=shapes.statuses[row],
+                depth_m=label.location_ref[2],
+                segment=truth.segment,
+                before=truth.errors(EstimatedCar(prior, prior.initial_code(1)[0], T_input)),
+                after=truth.errors(EstimatedCar(prior, code, T_refined)),
+            )
+            cars.append(car)
+        cars.sort(key=lambda car: car.detection_line)
+        return cars, len(counted), sum(label.line_number in truths for label in counted)
 
-
-def _rows_of_labels(
-    labels: Sequence[KittiObject], detections: Sequence[KittiObject], shapes: ShapeArrays
-) -> dict[int, int]:
-    """For line numbers of labels the row of their car in the shape file."""
-    row_of_line = {line: row for row, line in enumerate(shapes.input_lines.tolist())}
-    refined = [detection for detection in detections if detection.line_number in row_of_line]
-    partners = match_to_labels(refined, labels)
-    return {
-        labels[index].line_number: row_of_line[detection.line_number]
-        for detection, index in zip(refined, partners, strict=True)
-        if index >= 0
-    }
-
-
-@dataclass(frozen=True)
-class _Estimate:
-    frame_id: str
-    row: int
-    detections: Sequence[KittiObject]
-    shapes: ShapeArrays
-    camera: StereoCamera
-
-
-def _evaluate_car(inputs: _Inputs, label: KittiObject, truth: SegmentTruth, estimate: _Estimate) -> EvaluatedCar:
-    line = int(estimate.shapes.input_lines[estimate.row])
-    (detection,) = (o for o in estimate.detections if o.line_number == line)
-    prior = inputs.prior
-    T_input = poses_cam([detection], estimate.camera.t_cam_ref[0])[0]
-    before = EstimatedCar(prior, prior.initial_code(1)[0], T_input)
-    code, T_refined = (
-        torch.from_numpy(array[estimate.row]).double() for array in (estimate.shapes.codes, estimate.shapes.T_cam_obj)
-    )
-    after = EstimatedCar(prior, code, T_refined)
-    return EvaluatedCar(
-        frame_id=estimate.frame_id,
-        detection_line=line,
-        label_line=label.line_number,
-        status=estimate.shapes.statuses[estimate.row],
-        depth_m=label.location_ref[2],
-        segment=truth.segment,
-        before=truth.errors(before),
-        after=truth.errors(after),
-    )
+    def _shapes(self, frame_id: str, num_lines: int) -> ShapeArrays:
+        path = shapes_path(self.refined_dir, frame_id)
+        shapes = read_shapes(path)
+        if self.prior_sha256 is not None and shapes.prior_sha256 != self.prior_sha256:
+            cure = "give the prior that the refinement used"
+            raise DataFormatError(path, "holds codes of another shape prior", cure=cure)
+        if shapes.codes.shape[1] != self.prior.num_codes:
+            raise DataFormatError(path, f"has {shapes.codes.shape[1]} codes, the shape prior {self.prior.num_codes}")
+        if len(shapes.input_lines) and shapes.input_lines.max() > num_lines:
+            problem = f"names line {shapes.input_lines.max()} of a detection file that has {num_lines} lines"
+            raise DataFormatError(path, problem, cure="give the detections that went into the refinement")
+        return shapes
 
 
 def _curve(metric: str, cars: Sequence[EvaluatedCar], settings: BootstrapSettings) -> ShapeCurve:
@@ -285,7 +240,7 @@ def _curve(metric: str, cars: Sequence[EvaluatedCar], settings: BootstrapSetting
     before, after = (np.array(side, dtype=np.float64) for side in sides)  # (N, T)
     known = np.isfinite(before) & np.isfinite(after)
     summaries = [
-        CarBootstrap(int(kept.sum()), settings).summary(b[kept], a[kept], weighted_mean) if kept.any() else None
+        CarBootstrap(int(kept.sum()), settings).summary(b[kept], a[kept]) if kept.any() else None
         for b, a, kept in zip(before.T, after.T, known.T, strict=True)
     ]
     taus = tuple(cars[0].after.taus_m.tolist())

@@ -18,40 +18,29 @@ Number = TypeVar("Number", Tensor, float)
 
 
 class PoseErrors(NamedTuple, Generic[Number]):
-    """Errors of N boxes against the true ones, each (N,); or of one box, each a number.
+    """Errors of N boxes against the true ones, each (N,); or of one box, each a number."""
 
-    Attributes:
-        centre_m: distance of the centres of the boxes (not of their bottom faces), metres.
-        centre_bev_m: the same seen from above, along x and z alone.
-        yaw_deg: difference of heading, 0 .. 180 degrees (modulo 360).
-        yaw_axis_deg: the same without regard to front and back, 0 .. 90 degrees (modulo 180).
-        bev_iou: overlap of the footprints.
-        iou_3d: overlap of the boxes.
-        along_m, across_m: of the centre seen from above, along the viewing ray of the true box (above 0: too far) and
-            across it (above 0: to the right).
-        length_m: above 0 where a box is too long.
-    """
-
-    centre_m: Number
-    centre_bev_m: Number
-    yaw_deg: Number
-    yaw_axis_deg: Number
-    bev_iou: Number
-    iou_3d: Number
-    along_m: Number
-    across_m: Number
-    length_m: Number
+    centre_m: Number  # distance of the centres of the boxes (not of their bottom faces), metres
+    centre_bev_m: Number  # the same seen from above, along x and z alone
+    yaw_deg: Number  # difference of heading, 0 .. 180 degrees (modulo 360)
+    yaw_axis_deg: Number  # the same without regard to front and back, 0 .. 90 degrees (modulo 180)
+    bev_iou: Number  # overlap of the footprints
+    iou_3d: Number  # overlap of the boxes
+    along_m: Number  # of the centre seen from above, along the viewing ray of the true box; above 0: too far
+    across_m: Number  # across that ray; above 0: to the right
+    length_m: Number  # above 0 where a box is too long
 
 
 CarErrors = PoseErrors[float]
 
 
-def car_errors(errors: PoseErrors[Tensor]) -> list[CarErrors]:
-    """Those of each box."""
+def errors_of(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> list[CarErrors]:
+    """The errors of each object against the true one of the same place."""
+    errors = pose_errors(boxes_of(objects), boxes_of(true))
     return [PoseErrors(*row) for row in torch.stack(list(errors), dim=-1).tolist()]
 
 
-def boxes_of(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64) -> Tensor:
+def boxes_of(objects: Sequence[KittiObject]) -> Tensor:
     """Boxes (N, 7) of label or result lines: x, y, z of the bottom centre, height, width, length, rotation_y.
 
     Examples:
@@ -59,7 +48,7 @@ def boxes_of(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64)
         torch.Size([0, 7])
     """
     rows = [(*o.location_ref, *o.hwl, o.rotation_y) for o in objects]
-    return torch.tensor(rows, dtype=dtype).reshape(-1, 7)
+    return torch.tensor(rows, dtype=torch.float64).reshape(-1, 7)
 
 
 def pose_errors(
@@ -82,7 +71,7 @@ def pose_errors(
     """
     check_shape("boxes", boxes, ("N", 7))
     check_shape("true_boxes", true_boxes, (len(boxes), 7))
-    offset = box_centres(boxes) - box_centres(true_boxes)
+    offset = _centres(boxes) - _centres(true_boxes)
     ray = true_boxes[:, [0, 2]] / true_boxes[:, [0, 2]].norm(dim=-1, keepdim=True).clamp_min(1e-9)
     yaw = wrap_angle(boxes[:, 6] - true_boxes[:, 6]).abs()
     return PoseErrors(
@@ -98,13 +87,5 @@ def pose_errors(
     )
 
 
-def box_centres(boxes: Tensor) -> Tensor:
-    """Centres (*, 3) of boxes (*, 7) whose place is that of their bottom face; y points down.
-
-    Examples:
-        >>> box_centres(torch.tensor([[0.0, 1.6, 10.0, 1.5, 1.7, 4.0, 0.0]]))
-        tensor([[ 0.0000,  0.8500, 10.0000]])
-    """
-    up = torch.zeros_like(boxes[..., :3])
-    up[..., 1] = 0.5 * boxes[..., 3]
-    return boxes[..., :3] - up
+def _centres(boxes: Tensor) -> Tensor:
+    return boxes[:, :3] - 0.5 * boxes[:, 3:4] * boxes.new_tensor([0.0, 1.0, 0.0])

@@ -67,15 +67,12 @@ def iou_3d(
     """
     check_shape("boxes_a", boxes_a, ("N", 7), _BOX_LAYOUT)
     check_shape("boxes_b", boxes_b, (len(boxes_a), 7), _BOX_LAYOUT)
-    return _iou_3d(boxes_a, boxes_b)
-
-
-def _iou_3d(a: Tensor, b: Tensor) -> Tensor:
-    footprint_a, footprint_b = bev_boxes(a), bev_boxes(b)
-    bottom = torch.minimum(a[..., 1], b[..., 1])
-    top = torch.maximum(a[..., 1] - a[..., 3].clamp_min(0), b[..., 1] - b[..., 3].clamp_min(0))
-    shared = _intersection_area(footprint_a, footprint_b) * (bottom - top).clamp_min(0)
-    return _ratio(shared, _area(footprint_a) * a[..., 3].clamp_min(0), _area(footprint_b) * b[..., 3].clamp_min(0))
+    footprints = bev_boxes(boxes_a), bev_boxes(boxes_b)
+    height_a, height_b = boxes_a[:, 3].clamp_min(0), boxes_b[:, 3].clamp_min(0)
+    bottom = torch.minimum(boxes_a[:, 1], boxes_b[:, 1])
+    top = torch.maximum(boxes_a[:, 1] - height_a, boxes_b[:, 1] - height_b)
+    shared = _intersection_area(*footprints) * (bottom - top).clamp_min(0)
+    return _ratio(shared, _area(footprints[0]) * height_a, _area(footprints[1]) * height_b)
 
 
 def _area(footprint: Tensor) -> Tensor:

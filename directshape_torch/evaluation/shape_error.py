@@ -18,22 +18,14 @@ TAUS_M = tuple(k / 20 for k in range(1, 21))
 
 @dataclass(frozen=True)
 class ShapeError:
-    """Matches between the true and the estimated points of one car at T distances tau.
+    """Matches between the true and the estimated points of one car at T distances tau."""
 
-    Attributes:
-        taus_m: (T,) metres.
-        num_true, num_estimated: points.
-        num_true_matched: (T,) true points with an estimated point within tau.
-        num_estimated_matched: (T,) estimated points with a true point within tau.
-        squared_distances_m2: (T,) sum, over the matched true points, of the squared distance to the closest estimate.
-    """
-
-    taus_m: NDArray[np.float64]
+    taus_m: NDArray[np.float64]  # (T,)
     num_true: int
     num_estimated: int
-    num_true_matched: NDArray[np.int64]
-    num_estimated_matched: NDArray[np.int64]
-    squared_distances_m2: NDArray[np.float64]
+    num_true_matched: NDArray[np.int64]  # (T,) true points with an estimated point within tau
+    num_estimated_matched: NDArray[np.int64]  # (T,) estimated points with a true point within tau
+    squared_distances_m2: NDArray[np.float64]  # (T,) of the matched true points to their closest estimates, sum
 
     @property
     def completeness(self) -> NDArray[np.float64]:

@@ -31,67 +31,40 @@ _SAMPLES_PER_RAY = 96
 
 @dataclass(frozen=True)
 class EstimatedCar:
-    """One car as a refinement sees it.
+    """One car as a refinement sees it."""
 
-    Attributes:
-        prior: the family of shapes.
-        code: (K,) standard deviations.
-        T_cam_obj: (4, 4) object to left camera.
-    """
-
-    prior: ShapePrior
-    code: Tensor
-    T_cam_obj: Tensor
-
-    def depth_at_pixels(
-        self,
-        uv_left: NDArray[np.float64],  # (P, 2)
-        K_left: Tensor,  # (3, 3)
-    ) -> NDArray[np.float64]:  # (P,)
-        """Depth along the optical axis where the rays of left pixels first meet the surface, NaN where they miss it."""
-        like = self.prior.origin
-        rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double()).to(like)
-        state = CarState.of(se3.inverse(self.T_cam_obj.double())[None].to(like), self._code())
-        return np.asarray(
-            cast(self.prior, state, torch.zeros_like(like), rays_cam, _SAMPLES_PER_RAY).depth.double().cpu()
-        )
+    prior: ShapePrior  # the family of shapes
+    code: Tensor  # (K,) standard deviations
+    T_cam_obj: Tensor  # (4, 4)
 
     def points_at_pixels(
         self,
         uv_left: NDArray[np.float64],  # (P, 2)
         K_left: Tensor,  # (3, 3)
-    ) -> Points:
-        """The points of these depths, (Q, 3) in camera coordinates; rays that miss are left out."""
-        depth = self.depth_at_pixels(uv_left, K_left)
-        rays_cam = rays_from_pixels(torch.from_numpy(uv_left), K_left.double()).numpy()
-        hit = np.isfinite(depth)
-        return np.asarray(depth[hit, None] * rays_cam[hit])
-
-    def _code(self) -> Tensor:
-        return self.code[None].to(self.prior.origin)
+    ) -> Points:  # (P, 3)
+        """Where the rays of left pixels first meet the surface, left camera frame, metres; NaN where they miss it."""
+        like, rays_cam = self.prior.origin, rays_from_pixels(torch.from_numpy(uv_left), K_left.double())
+        state = CarState.of(se3.inverse(self.T_cam_obj.double())[None].to(like), self.code[None].to(like))
+        depth = cast(self.prior, state, torch.zeros_like(like), rays_cam.to(like), _SAMPLES_PER_RAY).depth
+        return np.asarray(depth.double().cpu()[:, None] * rays_cam)
 
 
 @dataclass(frozen=True)
 class SegmentTruth:
-    """The pixels inside the segment of one car whose true depth is known.
+    """The N pixels inside the segment of one car whose true depth is known.
 
     One ray is cast for each of these pixels, so a shape that fits perfectly gives the true points themselves.
-
-    Attributes:
-        segment: which pixels these are, for reports.
-        uv_left: (N, 2) pixels of the left image.
-        points_cam: (N, 3) left camera frame, metres.
-        K_left: (3, 3) pixels.
     """
 
-    segment: str
-    uv_left: NDArray[np.float64]
-    points_cam: Points
-    K_left: Tensor
+    segment: str  # which pixels these are, for reports
+    uv_left: NDArray[np.float64]  # (N, 2) pixels of the left image
+    points_cam: Points  # (N, 3) left camera frame, metres
+    K_left: Tensor  # (3, 3) pixels
 
     def errors(self, car: EstimatedCar) -> ShapeError:
         """Errors of an estimated car."""
-        return shape_error(self.points_cam, car.points_at_pixels(self.uv_left, self.K_left))
+        points_cam = car.points_at_pixels(self.uv_left, self.K_left)
+        return shape_error(self.points_cam, points_cam[np.isfinite(points_cam).all(axis=1)])
 
 
 @dataclass(frozen=True)
@@ -100,7 +73,7 @@ class SegmentSource:
 
     The segment of a label is the mask of the left image of largest overlap with its 2D box (at least 0.3, one to one).
 
-    Attributes:
+    Args:
         training: folder with `disp_occ_0/NNNNNN.png` (disparity x 256), or else `depth_2/NNNNNN.png` (metres x 256),
             16 bits, 0 where unknown.
         masks: of the left images.
@@ -162,26 +135,17 @@ def segment_truth(
 
 
 def read_depth(path: Path) -> NDArray[np.float64]:
-    """A map of 16 bits, metres times 256, as (H, W) metres, NaN where it is 0.
-
-    Raises:
-        DataFormatError: no such file, or another kind of image.
-    """
+    """A map of 16 bits, metres times 256, as (H, W) metres, NaN where it is 0."""
     values = read_single_channel(path)
     if values.dtype != np.uint16:
         raise DataFormatError(path, f"expected 16 bits (metres times 256), got {values.dtype}")
     return np.where(values > 0, values / 256.0, np.nan)
 
 
-def _depth_of(
-    disparity: NDArray[Any],  # (H, W) pixels, NaN where unknown
-    camera: StereoCamera,
-) -> NDArray[np.float64]:  # (H, W) metres
-    """The residual disparity field of a rig plays no part: it corrects what a stereo pair measures, not the truth."""
-    v, u = np.nonzero(disparity > 0)
-    uv = torch.from_numpy(np.stack([u, v], axis=-1).astype(np.float64))
-    known = torch.from_numpy(disparity[v, u].astype(np.float64))
+def _depth_of(disparity: NDArray[np.floating[Any]], camera: StereoCamera) -> NDArray[np.float64]:
+    """Metres; the residual disparity field of a rig plays no part: it corrects what a pair measures, not the truth."""
+    height, width = disparity.shape
+    uv = torch.from_numpy(np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64))
     K_left, K_right, T_right_cam = (x[0].double() for x in (camera.K_left, camera.K_right, camera.T_right_cam))
-    depth = np.full(disparity.shape, np.nan)
-    depth[v, u] = depth_from_disparity(uv, known, K_left, K_right, T_right_cam).numpy()
-    return depth
+    known = np.where(disparity > 0, disparity, np.nan).astype(np.float64)
+    return depth_from_disparity(uv, torch.from_numpy(known), K_left, K_right, T_right_cam).numpy()

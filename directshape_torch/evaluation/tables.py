@@ -1,4 +1,4 @@
-"""Figures as text tables (aligned columns, units, intervals), as CSV and as JSON."""
+"""Figures as text tables (aligned columns, units, intervals) and as CSV."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from directshape_torch.evaluation.bootstrap import Estimate
 from directshape_torch.files import atomic_files
@@ -77,21 +74,3 @@ def _cell(value: Any) -> Any:
     if isinstance(value, float):
         return f"{value:.6g}" if math.isfinite(value) else ""
     return value
-
-
-def plain(value: Any) -> Any:
-    """Nested dataclasses, tuples and arrays as JSON has them: objects, lists, and null for what is not finite.
-
-    Examples:
-        >>> plain((Estimate(0.5, None, math.inf), np.arange(2)))
-        [{'value': 0.5, 'low': None, 'high': None}, [0, 1]]
-    """
-    if is_dataclass(value):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, dict):
-        return {name: plain(part) for name, part in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (tuple, list)):
-        return [plain(part) for part in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

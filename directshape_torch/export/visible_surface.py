@@ -50,7 +50,7 @@ class FrameView:
         seen[seen] = self._on_mask(car, uv[seen])
         for other in (car, *(row for row in range(len(self.cars)) if row != car)):
             rows = np.flatnonzero(seen)
-            depth = self.cars[other].depth_at_pixels(uv[rows], torch.from_numpy(self.K_left))
+            depth = self.cars[other].points_at_pixels(uv[rows], torch.from_numpy(self.K_left))[:, 2]
             # A ray that passes a car by has depth NaN, which hides nothing.
             seen[rows[depth < points_cam[rows, 2] - _SAME_SURFACE_M]] = False
         return np.asarray(seen)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
-from directshape_torch.evaluation.pose_error import CarErrors, boxes_of, car_errors, pose_errors
+from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.page_data import known
@@ -172,16 +172,12 @@ def judge_cars(
         return {}
     true = [labels[partners[car]] for car in cars]
     counted = CountedLabels(tuple({o.type for o in after}))
-    errors_after = _errors([after[car] for car in cars], true)
-    errors_before = [None] * len(cars) if before is None else _errors([before[car] for car in cars], true)
+    errors_after = errors_of([after[car] for car in cars], true)
+    errors_before = [None] * len(cars) if before is None else errors_of([before[car] for car in cars], true)
     return {
         car: JudgedCar(counted.counts(label), e_before, e_after)
         for car, label, e_before, e_after in zip(cars, true, errors_before, errors_after, strict=True)
     }
-
-
-def _errors(objects: Sequence[KittiObject], true: Sequence[KittiObject]) -> list[CarErrors]:
-    return car_errors(pose_errors(boxes_of(objects), boxes_of(true)))
 
 
 def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:

@@ -11,8 +11,8 @@ from helpers.shape_arrays import shape_arrays
 
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.comparison import compare_results, lines_with_left_mask
-from directshape_torch.evaluation.comparison_report import format_comparison
+from directshape_torch.evaluation.comparison import compare_results
+from directshape_torch.evaluation.reports import format_comparison
 from directshape_torch.io.result_files import ShapeArrays, write_shapes
 
 BOXES_2D = {
@@ -118,7 +118,7 @@ def _shapes(frame_id: str, lines: list[int], statuses: list[str]) -> ShapeArrays
 def test_cars_without_a_mask_are_left_out(folders: tuple[Path, Path, Path], tmp_path: Path):
     write_shapes(tmp_path / "shapes" / "000001.npz", _shapes("000001", [1, 2, 3], ["converged", "no_mask", "no_mask"]))
     write_shapes(tmp_path / "shapes" / "000002.npz", _shapes("000002", [2], ["rejected_worse"]))
-    comparison = compare_results(*folders, keep_line=lines_with_left_mask(tmp_path / "shapes"))
+    comparison = compare_results(*folders, shapes_dir=tmp_path / "shapes")
     assert [(c.frame_id, c.detection_line) for c in comparison.cars] == [("000001", 1), ("000002", 2)]
     assert comparison.num_filtered_out == 1
     assert "1 more detections have no left mask" in format_comparison(comparison)

@@ -1,0 +1,214 @@
+"""Average precision as KITTI measures it: every rule by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers.kitti_lines import evaluate, line, objects, precision
+
+from directshape_torch.evaluation.kitti_ap import evaluate_kitti
+from directshape_torch.evaluation.kitti_rules import score_thresholds
+
+DIFFICULTIES = ("easy", "moderate", "hard")
+
+
+class TestDifficulty:
+    @pytest.mark.parametrize(
+        ("label", "counts"),
+        [
+            (line(height=40.5, occluded=0, truncated=0.15), (1, 1, 1)),
+            (line(height=40), (0, 1, 1)),  # a label must be HIGHER than 40 px
+            (line(height=25.5, occluded=1, truncated=0.30), (0, 1, 1)),
+            (line(height=25), (0, 0, 0)),
+            (line(occluded=1), (0, 1, 1)),
+            (line(occluded=2), (0, 0, 1)),
+            (line(occluded=3), (0, 0, 0)),
+            (line(truncated=0.16), (0, 1, 1)),
+            (line(truncated=0.31), (0, 0, 1)),
+            (line(truncated=0.51), (0, 0, 0)),
+            (line(kind="Van"), (0, 0, 0)),
+            (line(kind="DontCare"), (0, 0, 0)),
+        ],
+    )
+    def test_which_labels_count(self, label: str, counts: tuple[int, int, int]) -> None:
+        scores = evaluate([label], [line(score=1)])
+        assert tuple(scores.score("3d", 0.7, name).num_labels for name in DIFFICULTIES) == counts
+
+    @pytest.mark.parametrize(("height", "easy", "moderate"), [(40, 1 / 2, 1 / 2), (39.9, 1, 1 / 2), (24.9, 1, 1)])
+    def test_a_wrong_detection_counts_from_the_least_height_on(
+        self, height: float, easy: float, moderate: float
+    ) -> None:
+        scores = evaluate([line()], [line(1, height=height, score=0.9), line(score=0.5)])
+        assert precision(scores.score("3d", 0.7, "easy"), 1) == [easy]
+        assert precision(scores.score("3d", 0.7, "moderate"), 1) == [moderate]
+
+    def test_finding_a_label_that_is_too_hard_is_neither_right_nor_wrong(self) -> None:
+        scores = evaluate([line(), line(1, occluded=2)], [line(score=0.5), line(1, score=0.9)])
+        assert precision(scores.score("3d", 0.7, "moderate"), 1) == [1]
+        assert precision(scores.score("3d", 0.7, "hard"), 2) == [1, 1]
+
+    def test_a_small_detection_is_taken_only_where_there_is_no_other(self) -> None:
+        """The small box overlaps its label by 24/26, the full one by 26/30; only the full one can be right."""
+        labels, other = [line(height=26), line(1)], line(1, score=0.7)
+        small, full = line(height=24, score=0.9), line(height=30, score=0.8)
+        both, alone = (evaluate(labels, [small, *more, other]).score("2d", 0.7, "hard") for more in ([full], []))
+        # The small one has the better score and hides the full one's from the choice of thresholds.
+        assert both.curve.thresholds.tolist() == alone.curve.thresholds.tolist() == [0.7]
+        assert (precision(both, 1), both.curve.recall.tolist()) == ([1], [1])
+        assert (precision(alone, 1), alone.curve.recall.tolist()) == ([1], [0.5])
+
+    def test_a_small_detection_of_another_class_is_ignored_too(self) -> None:
+        """The devkit asks for the height first: the small cyclist takes the car, which then cannot be right."""
+        small, full = line(kind="Cyclist", height=24, score=0.9), line(kind="Cyclist", height=26, score=0.9)
+        for cyclist, thresholds in ((small, [0.7]), (full, [0.8, 0.7])):
+            results = [cyclist, line(height=26, score=0.8), line(1, score=0.7)]
+            score = evaluate([line(height=26), line(1)], results).score("2d", 0.7, "hard")
+            assert score.curve.thresholds.tolist() == thresholds
+
+
+class TestNeighboursAndRegions:
+    def test_a_van_may_be_found_and_may_be_missed(self) -> None:
+        for results in ([line(score=0.5), line(1, score=0.9)], [line(score=0.5)]):
+            score = evaluate([line(), line(1, kind="Van")], results).score("3d", 0.7, "easy")
+            assert precision(score, 1) == [1]
+            assert score.ap_area == 100
+
+    def test_a_detection_of_a_lorry_is_wrong(self) -> None:
+        scores = evaluate([line(), line(1, kind="Truck")], [line(score=0.5), line(1, score=0.9)])
+        assert precision(scores.score("3d", 0.7, "easy"), 1) == [0.5]
+
+    def test_people_who_sit_are_neighbours_of_pedestrians_whatever_the_case(self) -> None:
+        labels = [line(kind="pedestrian"), line(1, kind="Person_sitting")]
+        results = [line(kind="Pedestrian", score=0.5), line(1, kind="PEDESTRIAN", score=0.9), line(2, score=1)]
+        score = evaluate(labels, results, "Pedestrian").score("bev", 0.5, "easy")
+        assert precision(score, 1) == [1]
+
+    def test_a_van_in_the_results_is_no_car(self) -> None:
+        scores = evaluate([line()], [line(kind="Van", score=0.9)])
+        assert scores.num_detections == 0
+        assert scores.score("2d", 0.5, "easy").ap_area == 0
+
+    def test_detections_in_a_region_nobody_labelled_are_not_wrong_in_the_image(self) -> None:
+        """The region holds 60 of 100 columns of the detection: 0.6 of its own area, whatever the region's."""
+        region = "DontCare -1 -1 -10 340 0 900 900 -1 -1 -1 -1000 -1000 -1000 -10"
+        scores = evaluate([line(), region], [line(score=0.5), line(1, score=0.9)])
+        assert precision(scores.score("2d", 0.5, "easy"), 1) == [1]
+        assert precision(scores.score("2d", 0.7, "easy"), 1) == [0.5]
+        for metric in ("bev", "3d"):
+            assert precision(scores.score(metric, 0.5, "easy"), 1) == [0.5]
+
+    def test_two_regions_excuse_a_detection_once(self) -> None:
+        region = "DontCare -1 -1 -10 290 0 900 900 -1 -1 -1 -1000 -1000 -1000 -10"
+        results = [line(score=0.5), line(1, score=0.9), line(1, score=0.8), line(5, score=0.7)]
+        scores = evaluate([line(), region, region], results)
+        assert precision(scores.score("2d", 0.7, "easy"), 1) == [0.5]
+
+
+class TestMatching:
+    def test_overlap_must_be_larger_than_the_threshold(self) -> None:
+        """Half of the box is an IoU of exactly one half."""
+        half, more = (evaluate([line()], [line(width=width, score=1)]) for width in (50, 51))
+        assert half.score("2d", 0.5, "easy").ap_area == 0
+        assert more.score("2d", 0.5, "easy").ap_area == 100
+
+    def test_each_metric_looks_at_its_own_box(self) -> None:
+        """A shift by 0.5 of 4 m leaves (4 - 0.5) / (4 + 0.5) = 0.78, one by 1 m 0.6, one by 2 m 1/3."""
+        for shift, found in ((0.5, {0.7, 0.5}), (1, {0.5}), (2, set())):
+            scores = evaluate([line()], [line(shift=shift, score=1)])
+            for iou in (0.7, 0.5):
+                assert scores.score("2d", iou, "easy").ap_area == 100
+                for metric in ("bev", "3d"):
+                    assert scores.score(metric, iou, "easy").ap_area == (100 if iou in found else 0)
+
+    def test_thresholds_take_the_best_score_and_counting_the_largest_overlap(self) -> None:
+        """Of label 0, A overlaps more and B scores higher; the thresholds are B's score and that of label 1.
+
+        Above 0.8 there is B alone: 1 of 1 is right, its orientation too. Above 0.2 label 0 takes A, whose alpha is off
+        by a quarter turn (similarity 1/2), B is wrong and label 1 is found: 2 of 3 are right, similarity 1.5 of 3.
+        """
+        a, b = line(width=99, alpha=math.pi / 2, score=0.3), line(width=80, score=0.8)
+        score = evaluate([line(), line(1)], [a, b, line(1, score=0.2)]).score("2d", 0.7, "easy")
+        assert score.curve.thresholds.tolist() == [0.8, 0.2]
+        assert precision(score, 2) == pytest.approx([1, 2 / 3])
+        assert score.curve.orientation is not None
+        assert score.curve.orientation[:3].tolist() == pytest.approx([1, 0.5, 0])
+
+    def test_a_detection_serves_one_label(self) -> None:
+        score = evaluate([line(), line()], [line(score=1)]).score("3d", 0.7, "easy")
+        assert score.num_labels == 2
+        assert (precision(score, 1), score.curve.recall.tolist()) == ([1], [0.5])
+
+    def test_frames_do_not_mix(self) -> None:
+        labels = {"1": objects(line()), "2": objects(line())}
+        results = {"1": objects(line(score=0.9), line(score=0.8)), "2": []}
+        score = evaluate_kitti(labels, results).score("3d", 0.7, "easy")
+        assert (precision(score, 1), score.curve.recall.tolist()) == ([1], [0.5])
+
+
+class TestCurve:
+    def test_precision_is_the_best_at_any_lower_threshold(self) -> None:
+        """From the top: right, wrong, right, right: 1/1, 2/3, 3/4, so the second becomes 3/4."""
+        results = [line(0, score=0.9), line(7, score=0.8), line(1, score=0.7), line(2, score=0.6)]
+        score = evaluate([line(0), line(1), line(2)], results).score("3d", 0.7, "easy")
+        assert precision(score, 3) == [1, 0.75, 0.75]
+        assert score.curve.recall.tolist() == pytest.approx([1 / 3, 2 / 3, 1])
+        # R11 takes every fourth of 41 values, of which the first is 1; R40 leaves the first out.
+        assert score.ap_r11 == pytest.approx(100 / 11)
+        assert score.ap_r40 == pytest.approx(100 * 1.5 / 40)
+        assert score.ap_area == pytest.approx(100 * 2.5 / 3)
+
+    @pytest.mark.parametrize("num_labels", [41, 80, 200])
+    def test_everything_found_is_100_percent(self, num_labels: int) -> None:
+        labels = {str(k): objects(line()) for k in range(num_labels)}
+        results = {str(k): objects(line(score=k)) for k in range(num_labels)}
+        score = evaluate_kitti(labels, results).score("3d", 0.7, "easy")
+        assert (score.ap_r11, score.ap_r40, score.ap_area) == pytest.approx((100, 100, 100))
+
+    def test_thresholds_come_as_close_to_each_recall_as_they_can(self) -> None:
+        """Of 80 labels the first is closest to recall 0, and then every second is one fortieth further."""
+        assert score_thresholds(np.arange(80.0, 0, -1), 80).tolist() == [80, *range(79, 0, -2)]
+
+    def test_the_last_score_is_always_a_threshold(self) -> None:
+        """The third of 80 would be passed over for the fourth, if there were one."""
+        assert score_thresholds(np.array([3.0, 2, 1]), 80).tolist() == [3, 2, 1]
+
+    def test_half_found(self) -> None:
+        """40 of 80: thresholds at recall 0, 1/40 .. 20/40, where precision is 1: 6 of 11 and 20 of 40 points."""
+        labels = {str(k): objects(line()) for k in range(80)}
+        results = {str(k): objects(line(score=k)) for k in range(40)}
+        scores = evaluate_kitti(labels, results)
+        score = scores.score("3d", 0.7, "easy")
+        assert scores.num_frames_without_results == 40
+        assert (score.ap_r11, score.ap_r40, score.ap_area) == pytest.approx((600 / 11, 50, 50))
+
+    def test_scores_may_have_any_range(self) -> None:
+        scores = evaluate([line(), line(1)], [line(score=-3000), line(1, score=1e12)])
+        assert scores.score("3d", 0.7, "easy").curve.thresholds.tolist() == [1e12, -3000]
+
+
+class TestOrientation:
+    @pytest.mark.parametrize(("off_by", "percent"), [(0, 100), (math.pi / 3, 75), (math.pi / 2, 50), (math.pi, 0)])
+    def test_all_off_by_the_same_angle(self, off_by: float, percent: float) -> None:
+        labels = {str(k): objects(line(alpha=1)) for k in range(41)}
+        results = {str(k): objects(line(alpha=1 - off_by, score=k)) for k in range(41)}
+        score = evaluate_kitti(labels, results).score("2d", 0.7, "easy")
+        assert (score.ap_r40, score.aos_r11, score.aos_r40) == pytest.approx((100, percent, percent))
+
+    def test_wrong_detections_have_no_similarity(self) -> None:
+        scores = evaluate([line()], [line(score=0.5), line(1, score=0.9)])
+        orientation = scores.score("2d", 0.7, "easy").curve.orientation
+        assert orientation is not None
+        assert orientation[:2].tolist() == [0.5, 0]
+
+    def test_it_belongs_to_image_boxes(self) -> None:
+        scores = evaluate([line()], [line(score=1)])
+        assert scores.score("2d", 0.7, "easy").aos_r11 == pytest.approx(100 / 11)
+        for metric in ("bev", "3d"):
+            score = scores.score(metric, 0.7, "easy")
+            assert (score.aos_r11, score.aos_r40, score.curve.orientation) == (None, None, None)
+
+    def test_one_result_without_alpha_leaves_it_out(self) -> None:
+        scores = evaluate([line()], [line(score=1), line(1, kind="Cyclist", alpha=-10, score=0.1)])
+        assert scores.score("2d", 0.7, "easy").aos_r40 is None
