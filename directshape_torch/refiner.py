@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -17,24 +17,23 @@ from directshape_torch.figures.car_record import kept, placed
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
-from directshape_torch.observation.car_points import PointSamples, car_points
 from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
-from directshape_torch.refinement.box_alignment import align_boxes
-from directshape_torch.refinement.outcome import Outcome, outcome_of_boxes
+from directshape_torch.refinement.outcome import Outcome
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.refinement.tracks import refined
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import search_start
 from directshape_torch.status import Status, is_refined
-from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.terms.cars import CarBatch, CarState
+
+if TYPE_CHECKING:
+    from directshape_torch.observation.car_points import PointSamples
 
 
 class KnownRig(Protocol):
@@ -90,7 +89,10 @@ class DirectShapeRefiner(nn.Module):
         if self.extra_terms and self.config.method == "box_alignment":
             raise InputError("extra_terms", "none with method box_alignment", f"{len(extra_terms)}", "choose direct")
         needs_graph = self.config.solver.jacobian == "autograd" or self.config.backward.mode != "none"
-        check_prior(self.prior, by_autograd=needs_graph)
+        if prior is not None or needs_graph:
+            from directshape_torch.shape.check_prior import check_prior
+
+            check_prior(self.prior, by_autograd=needs_graph)
 
     def forward(
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None = None
@@ -215,9 +217,11 @@ class DirectShapeRefiner(nn.Module):
         pixels = pack_pixels(frames, detections, self.config.sampling, extents)
         if self.config.method in ("direct", "box_alignment"):
             return _Seen(pixels, None)
-        cloud = self.config.point_cloud
+        from directshape_torch.observation.car_points import car_points
+        from directshape_torch.stereo_matching.disparity import with_disparity
+
         matched = with_disparity(frames, needed=detections.frame_index)
-        return _Seen(pixels, car_points(matched, detections, cloud))
+        return _Seen(pixels, car_points(matched, detections, self.config.point_cloud))
 
     def _problem(
         self,
@@ -233,7 +237,9 @@ class DirectShapeRefiner(nn.Module):
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
         if self.config.method == "box_alignment":
-            return outcome_of_boxes(problem, align_boxes(problem, initial, cars))
+            from directshape_torch.refinement.box_alignment import align_boxes
+
+            return align_boxes(problem, initial, cars)
         with torch.no_grad():
             start = search_start(problem, initial, cars.search_moves(self.config.search))
         return refined(problem, cars, initial, start)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -15,12 +16,14 @@ from directshape_torch.errors import InputError
 from directshape_torch.numerics.checks import FOLLOWING
 from directshape_torch.numerics.gradient_mode import is_forward_mode
 from directshape_torch.numerics.tensors import occurrences
-from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.extents import SceneExtents, scene_extents
 from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
+
+if TYPE_CHECKING:
+    from directshape_torch.observation.car_points import PointSamples
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
 _MIN_DEPTH_M = 1.0

@@ -8,19 +8,17 @@ instance mask, and the norm is that of the photometric term.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from directshape_torch.depth import Hits
-from directshape_torch.diagnosis.disparity_profile import (
-    disparity_profile,
-    shifted_costs,
-)
-from directshape_torch.figures.disparity_profile import DisparityProfile, profile_figures, profile_offsets
+from directshape_torch.diagnosis.disparity_profile import disparity_profile, shifted_costs
+from directshape_torch.figures.disparity_profile import profile_figures, profile_offsets
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.refinement.outcome import Outcome
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import where_rows
@@ -28,26 +26,21 @@ from directshape_torch.status import Status
 from directshape_torch.terms.cars import CarBatch, CarState, move_by_disparity
 from directshape_torch.terms.photometric import Photometric, Surface
 
-ROUNDS_PX = ((3.0, 0.25), (3.0, 0.25), (0.5, 0.05))
-"""Range and step of each search: near cars may begin further away than the first one reaches."""
+# Range and step of each search: near cars may begin further away than the first one reaches.
+_ROUNDS_PX = ((3.0, 0.25), (3.0, 0.25), (0.5, 0.05))
 # Lower and upper corner of a box, and the top of its lower half, in units of its length, height and width.
 _UNIT_BOX = (-0.5, -1.0, -0.5, 0.5, 0.0, 0.5)
 _TOP = -0.5
 
 
-class BoxAlignment(NamedTuple):
-    """Aligned boxes of B cars."""
-
-    state: CarState  # the input's where the status says so
-    status: Tensor  # (B,) `converged`, `no_evidence` where the cost has no valley in the last range, or `non_finite`
-    profile: DisparityProfile  # of the near sides at the input and where the search ended
-
-
 @torch.no_grad()
-def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch) -> BoxAlignment:
-    """Move the detector's boxes of B cars along the viewing rays of their origins to the lowest photometric cost."""
+def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
+    """Move the detector's boxes of B cars along the viewing rays of their origins to the lowest photometric cost.
+
+    The status is `converged`, `no_evidence` where the cost has no valley in the last range, or `non_finite`.
+    """
     state = initial
-    for range_px, step_px in ROUNDS_PX:
+    for range_px, step_px in _ROUNDS_PX:
         term, surface = _begun(problem, state, cars)
         offsets = profile_offsets(range_px, step_px).to(state.code.device)
         moved_m = torch.stack([_depth(move_by_disparity(state, cars.focal_baseline, x)) for x in offsets.tolist()])
@@ -61,7 +54,16 @@ def align_boxes(problem: CarProblem, initial: CarState, cars: CarBatch) -> BoxAl
     term, at_end = _begun(problem, state, cars)
     at_input = term.where(problem.look(initial)._replace(hits=_near_sides(problem, initial, cars)))
     profile = disparity_profile(term, at_input, at_end, len(cars), state.code)
-    return BoxAlignment(where_rows(converged, state, initial), status, profile)
+    before, after = (cost[:, None] for cost in profile.cost_at(0.0))
+    return replace(
+        Outcome.nothing(problem, where_rows(converged, state, initial)),
+        status=status,
+        iterations=torch.full_like(status, len(_ROUNDS_PX)),
+        cost_before=before,
+        cost_after=after,
+        profile=profile,
+        has_shape=False,
+    )
 
 
 def box_hits(

@@ -23,7 +23,6 @@ from directshape_torch.figures.observability import Observability
 from directshape_torch.figures.quality import FitQuality
 from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
-from directshape_torch.refinement.box_alignment import ROUNDS_PX, BoxAlignment
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
@@ -174,20 +173,6 @@ def _of_calibrated_rig(problem: CarProblem, figures: Figures) -> Figures:
     factor = torch.ones_like(figures.term_costs)
     factor[:, problem.term_names.index("rig")] = bundled_trust_model().sigma_factors[0] ** 2 / RIG_WEIGHT
     return figures._replace(information=figures.information * factor[..., None, None])
-
-
-def outcome_of_boxes(problem: CarProblem, aligned: BoxAlignment) -> Outcome:
-    """What there is to say of boxes that were moved: their costs and profiles."""
-    before, after = (cost[:, None] for cost in aligned.profile.cost_at(0.0))
-    return replace(
-        Outcome.nothing(problem, aligned.state),
-        status=aligned.status,
-        iterations=torch.full_like(aligned.status, len(ROUNDS_PX)),
-        cost_before=before,
-        cost_after=after,
-        profile=aligned.profile,
-        has_shape=False,
-    )
 
 
 def judged(minimum: Minimum[CarState], initial: CarState, outcome: Outcome, limits: AcceptanceConfig) -> Outcome:

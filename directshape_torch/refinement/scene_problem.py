@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 from torch import Tensor
@@ -14,21 +14,21 @@ from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.image.grey_levels import GreyPair, grey_levels
 from directshape_torch.numerics.checks import check_shape, check_stored
-from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.packing import Observation
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.check_term import check_term
 from directshape_torch.terms.motion import MOTION_NAMES
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import LeftPixels
-from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import Term
+
+if TYPE_CHECKING:
+    from directshape_torch.observation.car_points import PointSamples
 
 # Those of "point_cloud" hold for the methods with points, the first two for the others.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
@@ -71,6 +71,8 @@ def problem_of_scene(
     masks = MaskRows.of_pixels(pixels, sides, config.silhouette, len(cars))
     terms: list[Term] = []
     if points is not None:
+        from directshape_torch.terms.point_cloud import PointCloud
+
         cloud, weight = config.point_cloud, config.point_cloud.combined_weight
         cloud = cloud if config.method == "geometric" else replace(cloud, weight=weight)
         terms += [PointCloud.of_points(cloud, points)] if cloud.weight > 0 else []
@@ -96,6 +98,8 @@ def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
     """Raise `InputError` unless the terms behind our `own` are what `Term` says, at the detector's poses."""
     if own == len(problem.terms):
         return
+    from directshape_torch.terms.check_term import check_term
+
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
     sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
     names = [*MOTION_NAMES, *(name for term in problem.terms[:own] for name in term.names)]
