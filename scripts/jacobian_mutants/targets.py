@@ -16,10 +16,7 @@ class Target:
     tests: tuple[str, ...]
 
 
-_SE3_TESTS = tuple(
-    f"tests/geometry/test_se3_{name}.py"
-    for name in ("generators", "group", "exp_log", "series", "references", "gradients")
-)
+_SE3_TESTS = ("tests/geometry/test_se3.py",)
 _LABORATORY = "tests/laboratory/test_three_ways.py"
 _SUMS = (f"{_LABORATORY}::test_sums_are_those_of_single_residuals",)
 _JACOBIANS = (

@@ -1,0 +1,161 @@
+"""Rigid motions against the matrix exponential, kornia's Lie groups and what they must satisfy, in every regime."""
+
+from __future__ import annotations
+
+import math
+from decimal import Decimal, localcontext
+
+import pytest
+import torch
+from helpers.twists import REGIMES, twists
+from kornia.geometry.liegroup import Se3
+from torch.autograd import gradcheck, gradgradcheck
+
+from directshape_torch.errors import InputError
+from directshape_torch.geometry import se3
+
+AXIS = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_exp_is_the_matrix_exponential(regime: str) -> None:
+    twist = twists(regime)
+    matrices = (twist[:, :, None, None] * se3.generators()).sum(1)
+    torch.testing.assert_close(se3.exp(twist), torch.linalg.matrix_exp(matrices), atol=1e-13, rtol=0)
+    single = twists(regime, dtype=torch.float32)
+    torch.testing.assert_close(se3.exp(single).double(), se3.exp(single.double()), atol=2e-6, rtol=0)
+
+
+def test_translations_come_first() -> None:
+    G = se3.generators(torch.float32)
+    assert G.dtype == torch.float32
+    point = torch.tensor([1.0, 2.0, 3.0, 1.0])
+    # v, then omega x (1, 2, 3) for the three axes, by hand.
+    expected = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, -3, 2], [3, 0, -1], [-2, 1, 0]], dtype=torch.float32)
+    torch.testing.assert_close((G @ point)[:, :3], expected)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_inverse_is_two_sided(regime: str) -> None:
+    T = se3.exp(twists(regime))
+    identity = torch.eye(4, dtype=T.dtype).expand_as(T)
+    torch.testing.assert_close(se3.inverse(T) @ T, identity, atol=1e-14, rtol=0)
+    torch.testing.assert_close(T @ se3.inverse(T), identity, atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (5,), (2, 3)])
+def test_leading_shapes_are_kept(shape: tuple[int, ...]) -> None:
+    T = se3.exp(0.1 * torch.randn(*shape, 6))
+    assert T.shape == (*shape, 4, 4)
+    assert T.dtype == torch.float32
+    assert se3.inverse(T).shape == T.shape
+    assert se3.transform(T, torch.zeros(*shape, 3)).shape == (*shape, 3)
+
+
+def test_transform_broadcasts_one_transform_over_points() -> None:
+    T = se3.exp(twists("uniform", 1))[0]
+    points = torch.randn(7, 3, dtype=T.dtype)
+    expected = torch.stack([T[:3, :3] @ p + T[:3, 3] for p in points])
+    torch.testing.assert_close(se3.transform(T, points), expected)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_exp_gradcheck(regime: str) -> None:
+    assert gradcheck(se3.exp, twists(regime, 3).requires_grad_())
+    if regime in ("uniform", "zero", "near_identity"):
+        assert gradgradcheck(se3.exp, twists(regime, 2).requires_grad_())
+
+
+def test_coefficients_of_the_series(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they are used a wrong last term would be below rounding, so they are tried where it is large."""
+    monkeypatch.setattr(se3, "_SERIES_ANGLE_SQUARED", 10.0)
+    t = torch.tensor([9.0, 5.0], dtype=torch.float64)
+    angle = t.sqrt()
+    b, c = se3._higher_exp_coefficients(t[:, None], math.inf).unbind(-1)
+    # First terms left out: t^7 / 16!, t^7 / 17!.
+    torch.testing.assert_close(b, (1 - angle.cos()) / t, atol=2.3e-7, rtol=0)
+    torch.testing.assert_close(c, (angle - angle.sin()) / (t * angle), atol=1.4e-8, rtol=0)
+
+
+def test_the_series_is_exact_where_it_is_used() -> None:
+    """Against the closed forms, with more digits than float64 has."""
+    t = se3._SERIES_ANGLE_SQUARED
+    with localcontext(prec=60):
+        terms = [Decimal(-t) ** n / math.factorial(2 * n + 2) for n in range(30)]
+        b, c = sum(terms), sum(term / (2 * n + 3) for n, term in enumerate(terms))
+    found = se3._higher_exp_coefficients(torch.tensor([t * (1 - 1e-16)], dtype=torch.float64), math.inf)
+    torch.testing.assert_close(found, torch.tensor([b, c], dtype=torch.float64), atol=0, rtol=3e-16)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.59, 0.6, 3.0])
+def test_a_known_largest_angle_changes_no_result(angle: float) -> None:
+    """Below the threshold of the series, and above it, where series would be wrong: as much as they leave out."""
+    twist = torch.cat([torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), angle * AXIS])
+    torch.testing.assert_close(se3.exp(twist, angle + 1e-3), se3.exp(twist), atol=0, rtol=0)
+    turn = torch.cat([torch.zeros(3, dtype=torch.float64), angle * AXIS])
+    error = float(torch.linalg.matrix_norm(se3.exp(turn, 0.59) - se3.exp(turn), ord=2))
+    assert error == pytest.approx(angle**16 / math.factorial(16), rel=0.03, abs=1e-15)
+
+
+def test_exp_can_be_compiled() -> None:
+    compiled = torch.compile(se3.exp, backend="eager", fullgraph=True)
+    twist = torch.cat([torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64), 0.3 * AXIS])
+    torch.testing.assert_close(compiled(twist), se3.exp(twist), atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+@pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-14), (torch.float32, 2e-6)])
+def test_there_and_back_by_kornia(regime: str, dtype: torch.dtype, atol: float) -> None:
+    twist = twists(regime, dtype=dtype)
+    T = se3.exp(twist)
+    theirs = se3.to_kornia(T)
+    torch.testing.assert_close(se3.from_kornia(theirs), T, atol=atol, rtol=0)
+    torch.testing.assert_close(Se3.exp(twist).matrix(), T, atol=10 * atol, rtol=0)
+    torch.testing.assert_close(se3.exp(theirs.log()), T, atol=10 * atol, rtol=0)
+    # The quaternion has its real part first, and the tangent its translation.
+    assert theirs.quaternion.data.shape == (len(T), 4)
+    half_angle = twist[:, 3:].norm(dim=1) / 2
+    torch.testing.assert_close(theirs.quaternion.data[:, 0].abs(), half_angle.cos(), atol=atol, rtol=0)
+    if dtype == torch.float64:
+        torch.testing.assert_close(theirs.log(), twist, atol=1e-12, rtol=1e-12)
+
+
+def test_motions_compose_alike() -> None:
+    A, B = se3.exp(twists("uniform")), se3.exp(twists("normal"))
+    torch.testing.assert_close(se3.from_kornia(se3.to_kornia(A) * se3.to_kornia(B)), A @ B, atol=1e-13, rtol=0)
+    law = se3.to_kornia(A).adjoint() @ twists("normal")[..., None]
+    torch.testing.assert_close(A @ B @ se3.inverse(A), se3.exp(law[..., 0]), atol=1e-13, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (1,), (2, 3)])
+def test_leading_shapes_are_those_of_kornia(shape: tuple[int, ...]) -> None:
+    theirs = se3.to_kornia(torch.eye(4).repeat(*shape, 1, 1))
+    assert theirs.log().shape == (*shape, 6)
+    assert se3.from_kornia(theirs).shape == (*shape, 4, 4)
+
+
+def test_gradients_flow_where_they_are_asked_for() -> None:
+    T = se3.exp(twists("normal", 3))
+    theirs = se3.to_kornia(T)
+    assert not se3.from_kornia(theirs).requires_grad
+    theirs.translation.add_(1)
+    torch.testing.assert_close(T, se3.exp(twists("normal", 3)), atol=0, rtol=0)
+
+    twist = twists("normal", 3).requires_grad_()
+    assert gradcheck(lambda d: se3.to_kornia(se3.exp(d)).log(), twist)
+    assert gradcheck(lambda d: se3.from_kornia(Se3.exp(d)), twist)
+
+
+def test_a_car_without_a_pose_stays_without_one() -> None:
+    T = torch.eye(4).repeat(2, 1, 1)
+    T[0, :3] = torch.nan
+    back = se3.from_kornia(se3.to_kornia(T))
+    assert back[0, :3].isnan().all()
+    assert torch.equal(back[1], T[1])
+
+
+def test_wrong_input_is_named() -> None:
+    with pytest.raises(InputError, match=r"motion: expected kornia's Se3, got Tensor"):
+        se3.from_kornia(torch.eye(4))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"T: expected shape \(\*, 4, 4\), got \(3, 4\)"):
+        se3.to_kornia(torch.zeros(3, 4))
