@@ -16,7 +16,8 @@ from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.shape_error import Points, ShapeError, shape_error
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.camera import depth_from_disparity, rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
+from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.io.image_files import read_single_channel

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.camera import points_from_disparity
+from directshape_torch.geometry.projection import points_from_disparity
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.scene import Detections, FrameBatch
 

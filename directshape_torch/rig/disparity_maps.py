@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from directshape_torch.geometry.camera import depth_from_disparity
+from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.rig.disparity_observations import KnownDepth

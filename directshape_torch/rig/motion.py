@@ -19,9 +19,9 @@ from kornia.geometry.liegroup import So3
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.geometry.camera import depth_from_disparity, rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.geometry.projection import disparity_of_depth, project
+from directshape_torch.geometry.projection import depth_from_disparity, disparity_of_depth, project
 from directshape_torch.geometry.se3 import exp, from_rotation_translation, transform
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.disparity_observations import DisparityObservations, matched_pixels

@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.geometry.camera import depth_from_disparity, rays_from_pixels
+from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.disparity_field import polynomial_basis
-from directshape_torch.geometry.projection import disparity_of_depth
+from directshape_torch.geometry.projection import depth_from_disparity, disparity_of_depth
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.disparity_observations import DisparityObservations, matched_pixels
 from directshape_torch.rig.field_constraint import (

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.geometry.camera import depth_from_disparity
+from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.finding import Finding, Severity
 from directshape_torch.scene_check.known_mistakes import found

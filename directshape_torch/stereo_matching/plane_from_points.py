@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.geometry.camera import points_from_disparity
+from directshape_torch.geometry.projection import points_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.stereo_matching.disparity import match_disparity
 

@@ -8,9 +8,8 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.camera import depth_from_disparity, points_from_disparity
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.geometry.projection import disparity_of_depth
+from directshape_torch.geometry.projection import depth_from_disparity, disparity_of_depth, points_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane, fit_ground_plane
 
