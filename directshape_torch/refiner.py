@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from directshape_torch.compile import compiling
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
-from directshape_torch.figures.car_record import kept, placed
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
+from directshape_torch.numerics.records import kept, placed
 from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks

@@ -20,16 +20,14 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import (
-    Dense,
-    TensorRecord,
     check_positive,
     check_rotation,
     check_shape,
     check_sigmas,
-    check_stored,
     check_type,
     is_no_rotation,
 )
+from directshape_torch.numerics.records import Dense, TensorRecord
 
 # Of B cars in an image: (B, H, W), or (H, W) and None for each.
 Masks = Tensor | Sequence[Tensor | None]
@@ -374,7 +372,6 @@ def _stacked(name: str, masks: Masks, count: int) -> Tensor:
         for number, mask in enumerate(masks):
             if mask is not None:
                 check_shape(f"{name}[{number}]", mask, ("H", "W"))
-                check_stored(f"{name}[{number}]", mask)
         present = [mask for mask in masks if mask is not None]
         if len(masks) != count or not present or len({mask.shape for mask in present}) > 1:
             got = f"{len(masks)} entries of sizes {sorted({tuple(mask.shape) for mask in present})}"

@@ -110,7 +110,7 @@ def test_images_normalised_by_mean_and_deviation_are_refused() -> None:
         ),
         (
             {"images_right": torch.zeros(1, 3, 120, 160, dtype=torch.float64, device="meta")},
-            "images_right: expected the device of images_left (cpu), got meta",
+            "images_right: expected a tensor with numbers, got one on the device 'meta'; make it on",
         ),
         ({"ground": GroundPlane.from_camera_height(1.6, 2)}, "ground: expected 1 frames, got 2"),
         (

@@ -13,7 +13,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.numerics.checks import check_shape, check_stored
+from directshape_torch.numerics.checks import check_shape
 from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
@@ -74,7 +74,6 @@ def fit_shape(
         (True, tensor([200]))
     """
     check_shape("points", points, ("P", 3), kind="floating")
-    check_stored("points", points)
     T_points_obj, hwl = boxes_to_poses(boxes, convention, torch.eye(4))  # their frame stands for the camera
     points = points.to(boxes)
     count = len(boxes)

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.figures.car_record import CarRecord
-from directshape_torch.numerics.checks import Dense
+from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.numerics.tensors import made_once
 
 # Two minima nearer than this are one with a dent.

@@ -10,8 +10,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from directshape_torch.figures.car_record import CarRecord
-from directshape_torch.numerics.checks import Dense
+from directshape_torch.numerics.records import CarRecord, Dense
 
 CAR_QUANTITIES = ("depth", "sideways position", "height above ground", "heading", "length", "width", "height")
 """The quantities (7) that a direction is made of; all in metres.

@@ -8,8 +8,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from directshape_torch.figures.car_record import CarRecord
-from directshape_torch.numerics.checks import Dense
+from directshape_torch.numerics.records import CarRecord, Dense
 
 EVIDENCE_NAMES = (
     "log_depth",

@@ -26,7 +26,7 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_about_y
-from directshape_torch.numerics.checks import check_rotation, check_shape, check_stored
+from directshape_torch.numerics.checks import check_rotation, check_shape
 
 BoxFormat = Literal["kitti", "mmdet3d_camera", "mmdet3d_lidar", "nuscenes", "opencv"]
 # Corners that were rounded to centimetres still make a box, those in another order do not.
@@ -86,11 +86,9 @@ def boxes_to_poses(
     if not isinstance(boxes, Tensor) or boxes.ndim != 3:
         cure = "give x, y, z, three sizes and heading, or corners (N, 8, 3)"
         check_shape("boxes", boxes, ("N", 7), cure, "floating")
-        check_stored("boxes", boxes)
         T_boxes_obj, hwl = _from_numbers(boxes, form)
     else:
         check_shape("boxes", boxes, ("N", 8, 3), kind="floating")
-        check_stored("boxes", boxes)
         T_boxes_obj, hwl = _from_corners(boxes, form, convention)
     T = _to_camera(T_cam_boxes, convention, T_boxes_obj)
     return (T_boxes_obj if T is None else T @ T_boxes_obj), hwl
@@ -141,7 +139,6 @@ def _to_camera(T_cam_boxes: Tensor | None, convention: str, like: Tensor) -> Ten
         )
     shape = (4, 4) if isinstance(T_cam_boxes, Tensor) and T_cam_boxes.ndim == 2 else (len(like), 4, 4)
     check_shape("T_cam_boxes", T_cam_boxes, shape, "give one motion, or one for each box", "floating")
-    check_stored("T_cam_boxes", T_cam_boxes)
     check_rotation("T_cam_boxes", T_cam_boxes.reshape(-1, 4, 4))
     return T_cam_boxes.to(like)
 

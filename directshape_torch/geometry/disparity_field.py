@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_shape, check_size_wh, check_stored
+from directshape_torch.numerics.checks import check_shape, check_size_wh
 from directshape_torch.numerics.gradient_mode import is_plain
 
 # Exponents of the normalised (u, v) in each basis function: 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, u^4.
@@ -120,7 +120,6 @@ class DisparityField:
         check_size_wh("size_wh", self.size_wh)
         for name, shape in TENSOR_SHAPES.items():
             check_shape(name, getattr(self, name), ["M" if n is None else n for n in shape], kind="floating")
-            check_stored(name, getattr(self, name))
         if len(self.hull_uv) < 3:
             raise InputError("hull_uv", "shape (M, 2) with at least 3 vertices", f"{tuple(self.hull_uv.shape)}")
         for name in TENSOR_SHAPES:

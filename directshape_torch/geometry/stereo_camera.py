@@ -12,16 +12,8 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.se3 import from_rotation_translation
-from directshape_torch.numerics.checks import (
-    Dense,
-    TensorRecord,
-    check_alike,
-    check_positive,
-    check_rotation,
-    check_shape,
-    check_stored,
-    check_type,
-)
+from directshape_torch.numerics.checks import check_alike, check_positive, check_rotation, check_shape, check_type
+from directshape_torch.numerics.records import Dense, TensorRecord
 
 if TYPE_CHECKING:
     from kornia.geometry import camera as kornia_camera
@@ -97,7 +89,6 @@ class StereoCamera(TensorRecord):
             raise InputError("K_right", f"one matrix, or {len(K_left)}", f"{len(of_right)}")
         if isinstance(baseline_m, Tensor):
             check_shape("baseline_m", baseline_m, ("F",) if baseline_m.ndim else ())
-            check_stored("baseline_m", baseline_m)
         else:
             check_positive("baseline_m", baseline_m, "in metres")
         baseline = torch.as_tensor(baseline_m, dtype=K_left.dtype, device=K_left.device)
@@ -136,7 +127,6 @@ class StereoCamera(TensorRecord):
         if P_left.dtype not in (torch.float32, torch.float64):
             raise InputError("P_left", "float32 or float64", str(P_left.dtype), "convert it with .float() or .double()")
         check_alike("P_right", P_right, "P_left", P_left)
-        check_stored("P_left", P_left)
         K_left, K_right = P_left[..., :3], P_right[..., :3]
         t_left, t_right = _translation("P_left", P_left), _translation("P_right", P_right)
         T_right_cam = torch.eye(4, dtype=P_left.dtype, device=P_left.device).repeat(len(P_left), 1, 1)
@@ -201,7 +191,6 @@ def _intrinsics(name: str, K: Tensor) -> Tensor:
     """Intrinsics (F, 3, 3) of one frame or of F, checked."""
     shape = (3, 3) if isinstance(K, Tensor) and K.ndim == 2 else ("F", 3, 3)
     check_shape(name, K, shape, kind="floating")
-    check_stored(name, K)
     K = K if K.ndim == 3 else K[None]
     last_row = K.new_tensor([0.0, 0.0, 1.0])
     if not bool(((K[:, 2] == last_row).all(1) & (K[:, 1, 0] == 0) & (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0)).all()):

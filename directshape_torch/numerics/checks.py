@@ -1,13 +1,11 @@
-"""Checks of arguments at the border of the package, and records of tensors that are checked when one is made."""
+"""Checks of arguments at the border of the package."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
-from functools import cache
+from collections.abc import Sequence
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, NamedTuple, Self, get_type_hints
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -42,7 +40,9 @@ _KINDS: dict[Kind, tuple[tuple[torch.dtype, ...], str, str]] = {
 def check_shape(
     name: str, tensor: Tensor, expected: Sequence[int | str], cure: str = "", kind: Kind = "number"
 ) -> None:
-    """Raise `InputError` unless `tensor` is a dense tensor of the expected shape and kind; letters stand for any size.
+    """Raise `InputError` unless `tensor` is a dense tensor of the expected shape and kind, with numbers.
+
+    Letters stand for any size.
 
     Examples:
         >>> import torch
@@ -64,6 +64,8 @@ def check_shape(
     dtypes, words, conversion = _KINDS[kind]
     if tensor.dtype not in dtypes:
         raise InputError(name, words, str(tensor.dtype), conversion)
+    if tensor.is_meta:
+        raise InputError(name, "a tensor with numbers", "one on the device 'meta'", "make it on a device with memory")
 
 
 def check_alike(name: str, value: Tensor, first_name: str, first: Tensor) -> None:
@@ -72,12 +74,6 @@ def check_alike(name: str, value: Tensor, first_name: str, first: Tensor) -> Non
         wanted, got = getattr(first, what), getattr(value, what)
         if wanted != got:
             raise InputError(name, f"the {what} of {first_name} ({wanted})", str(got), "move them together with .to()")
-
-
-def check_stored(name: str, tensor: Tensor) -> None:
-    """Raise `InputError` for a tensor on the device "meta", which has no numbers."""
-    if tensor.is_meta:
-        raise InputError(name, "a tensor with numbers", "one on the device 'meta'", "make it on a device with memory")
 
 
 def check_positive(name: str, value: object, cure: str = "") -> None:
@@ -164,113 +160,3 @@ def check_sigmas(
         row, column = wrong[0]
         got = f"{float(sigma[row, column]):g} in row {row}"
         raise InputError(name, "standard deviations above 0", got, "give infinity for what the detector does not know")
-
-
-class Dense:
-    """What a tensor of a `TensorRecord` must be: `Annotated[Tensor, Dense("F", 3, 3)]`.
-
-    Args:
-        shape: sizes; a letter is any size, the same one wherever it stands in the record.
-        kind: of its numbers.
-        cure: what to do where the shape is another one.
-    """
-
-    def __init__(self, *shape: int | str, kind: Kind = "floating", cure: str = "") -> None:
-        self.shape, self.kind, self.cure = shape, kind, cure
-
-
-def check_declared(name: str, value: Tensor, spec: Dense, sizes: dict[int | str, int]) -> None:
-    """Raise `InputError` unless a tensor is what its field declares; `sizes` are those of the letters, and grow."""
-    check_shape(name, value, [sizes.get(size, size) for size in spec.shape], spec.cure, spec.kind)
-    sizes |= dict(zip(spec.shape, value.shape, strict=True))
-
-
-class DeclaredTensor(NamedTuple):
-    """A tensor of a record, its name from the outermost record on, and the kind of its numbers."""
-
-    name: str
-    value: Tensor
-    kind: Kind
-
-
-class Record:
-    """Base of frozen dataclasses of tensors, of further such records, and of other values."""
-
-    # Fields that are one for all rows: kept where rows are chosen.
-    shared: ClassVar[frozenset[str]] = frozenset()
-
-    def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
-        """A copy on another device and, for floating-point tensors, of another dtype, which may come alone."""
-        if isinstance(device, torch.dtype):
-            device, dtype = None, device
-        return self._with(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
-
-    def cpu(self) -> Self:
-        """A copy in the memory of the host."""
-        return self.to("cpu")
-
-    def detach(self) -> Self:
-        """A copy without gradients."""
-        return self._with(Tensor.detach)
-
-    def _with(self, change: Callable[[Tensor], Tensor], by_row: bool = False) -> Self:
-        """A copy with all tensors changed; `by_row`, but those that are shared."""
-        changed: dict[str, Any] = {}
-        for each in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, each.name)
-            if isinstance(value, Record):
-                changed[each.name] = value._with(change, by_row)
-            elif isinstance(value, Tensor) and not (by_row and each.name in self.shared):
-                changed[each.name] = change(value)
-        return replace(self, **changed)  # type: ignore[type-var]
-
-
-class TensorRecord(Record):
-    """Base of records whose tensors are declared (`Dense`; optional ones have None as default) and checked.
-
-    Raises:
-        InputError: a tensor is none, not dense, or of another shape or kind; floating-point ones differ in dtype or
-            device.
-
-    Examples:
-        >>> from directshape_torch.scene import GroundPlane
-        >>> GroundPlane(torch.zeros(5, 3), torch.ones(4), ("file",) * 5)
-        Traceback (most recent call last):
-        ...
-        directshape_torch.errors.InputError: offset: expected shape (5,), got (4,)
-    """
-
-    def __post_init__(self) -> None:
-        sizes: dict[int | str, int] = {}
-        first: DeclaredTensor | None = None
-        for name, (spec, is_optional) in self._declared().items():
-            value = getattr(self, name)
-            if value is None and is_optional:
-                continue
-            check_declared(name, value, spec, sizes)
-            if spec.kind in FOLLOWING:
-                first = first or DeclaredTensor(name, value, spec.kind)
-                check_alike(name, value, first.name, first.value)
-            check_stored(name, value)
-
-    @classmethod
-    @cache
-    def _declared(cls) -> dict[str, tuple[Dense, bool]]:
-        """The tensors by name: what they must be, and whether None will do."""
-        hints = get_type_hints(cls, include_extras=True)
-        return {
-            each.name: (spec, each.default is None)
-            for each in fields(cls)  # type: ignore[arg-type]
-            for spec in getattr(hints[each.name], "__metadata__", ())
-            if isinstance(spec, Dense)
-        }
-
-    def tensors(self, name: str) -> Iterator[DeclaredTensor]:
-        """All tensors of the record, named `name`, and of those in it."""
-        declared = self._declared()
-        for each in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, each.name)
-            if isinstance(value, TensorRecord):
-                yield from value.tensors(f"{name}.{each.name}")
-            elif each.name in declared and value is not None:
-                yield DeclaredTensor(f"{name}.{each.name}", value, declared[each.name][0].kind)

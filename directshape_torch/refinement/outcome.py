@@ -17,12 +17,12 @@ from directshape_torch.diagnosis.observability import (
     without_offset,
 )
 from directshape_torch.diagnosis.quality import fit_quality
-from directshape_torch.figures.car_record import CarRecord, placed
 from directshape_torch.figures.disparity_profile import DisparityProfile
 from directshape_torch.figures.observability import Observability
 from directshape_torch.figures.quality import FitQuality
 from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
+from directshape_torch.numerics.records import CarRecord, placed
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows

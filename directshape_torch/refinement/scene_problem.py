@@ -13,7 +13,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.image.grey_levels import GreyPair, grey_levels
-from directshape_torch.numerics.checks import check_shape, check_stored
+from directshape_torch.numerics.checks import check_shape
 from directshape_torch.observation.packing import Observation
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import Rows
@@ -123,7 +123,6 @@ def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: T
         if name not in names:
             raise InputError("term_weights", f"names among {', '.join(names)}", repr(name))
         check_shape(f"term_weights[{name!r}]", weight, (len(code),), "one factor for each car")
-        check_stored(f"term_weights[{name!r}]", weight)
         negative = (weight < 0).nonzero()[:, 0].tolist()
         if negative:
             got = f"{float(weight[negative[0]]):.3g} for car {negative[0]}"

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField
-from directshape_torch.numerics.checks import check_shape, check_stored
+from directshape_torch.numerics.checks import check_shape
 from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.pixels import PixelEvidence, hull
 from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
@@ -64,7 +64,6 @@ class RigEstimate(nn.Module):
         super().__init__()
         for name, matrix, size in (("K_left", K_left, 3), ("K_right", K_right, 3), ("T_right_cam", T_right_cam, 4)):
             check_shape(name, matrix, (size, size), kind="floating")
-            check_stored(name, matrix)
         matrices = (matrix.detach().double().cpu() for matrix in (K_left, K_right, T_right_cam))
         self._blank = DisparityField.constant(0.0, size_wh, *matrices)
         self.rows = torch.zeros(0, len(COLUMNS), dtype=torch.float64)
@@ -97,7 +96,6 @@ class RigEstimate(nn.Module):
             InputError: they are none: of another shape, not finite, or of pixels far from any image.
         """
         check_shape("rows", rows, ("N", len(COLUMNS)), kind="floating")
-        check_stored("rows", rows)
         largest = float(rows.detach().abs().amax()) if len(rows) else 0.0
         if not largest <= _LARGEST_PX:
             raise InputError("rows", f"finite pixels of at most {_LARGEST_PX:g}", f"{largest:g}")
@@ -242,7 +240,6 @@ class RigEstimate(nn.Module):
             InputError: it is no such state.
         """
         check_shape("state", state, ("n",))
-        check_stored("state", state)
         try:
             self._take(load(bytes(state.tolist())))
         # Bytes that are none, a damaged file, tensors that are missing or of other shapes.

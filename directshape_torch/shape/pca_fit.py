@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_positive, check_shape, check_stored, check_type
+from directshape_torch.numerics.checks import check_positive, check_shape, check_type
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 from directshape_torch.shape.sdf_grid import zero_level_extents
 
@@ -47,7 +47,6 @@ def fit_pca(
     """
     _check_samples(sdf_samples, num_codes)
     check_shape("origin", origin, (3,), kind="floating")
-    check_stored("origin", origin)
     check_positive("spacing_m", spacing_m)
     samples = sdf_samples.double().flatten(1)
     mean = samples.mean(dim=0)
@@ -84,7 +83,6 @@ def training_codes(sdf_samples: Tensor, num_codes: int) -> Tensor:
 
 def _check_samples(sdf_samples: Tensor, num_codes: int) -> None:
     check_shape("sdf_samples", sdf_samples, ("N", "nx", "ny", "nz"), kind="floating")
-    check_stored("sdf_samples", sdf_samples)
     check_type("num_codes", num_codes, (int,))
     if num_codes < 1 or len(sdf_samples) <= num_codes:
         raise InputError(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_alike, check_positive, check_shape, check_stored
+from directshape_torch.numerics.checks import check_alike, check_positive, check_shape
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative
@@ -89,7 +89,6 @@ class PCAShapePrior(nn.Module):
         for name, (tensor, shape) in tensors.items():
             check_shape(name, tensor, shape, kind="floating")
             check_alike(name, tensor, "mean", mean)
-            check_stored(name, tensor)
             if not bool(tensor.isfinite().all()):
                 raise InputError(name, "finite numbers", "NaN or infinity")
             self.register_buffer(name, tensor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from directshape_torch.figures.car_record import kept, placed
+from directshape_torch.numerics.records import kept, placed
 
 
 def test_figures_stand_in_the_rows_of_their_cars() -> None:

@@ -1,0 +1,222 @@
+"""Records of tensors: moved, cut and stored as a whole; what each tensor must be is said at its field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, replace
+from functools import cache
+from typing import Any, ClassVar, NamedTuple, Self, get_type_hints
+
+import torch
+from torch import Tensor
+
+from directshape_torch.errors import InputError, shown
+from directshape_torch.numerics.checks import FOLLOWING, Kind, check_alike, check_shape
+
+
+class Dense:
+    """What a tensor of a record must be: `Annotated[Tensor, Dense("F", 3, 3)]`.
+
+    Args:
+        shape: sizes; a letter is any size, the same one wherever it stands in the record.
+        kind: of its numbers.
+        cure: what to do where the shape is another one.
+    """
+
+    def __init__(self, *shape: int | str, kind: Kind = "floating", cure: str = "") -> None:
+        self.shape, self.kind, self.cure = shape, kind, cure
+
+    def check(self, name: str, value: Tensor, sizes: dict[int | str, int]) -> None:
+        """Raise `InputError` unless a tensor is this; `sizes` are those of the letters, and grow."""
+        check_shape(name, value, [sizes.get(size, size) for size in self.shape], self.cure, self.kind)
+        sizes |= dict(zip(self.shape, value.shape, strict=True))
+
+
+class DeclaredTensor(NamedTuple):
+    """A tensor of a record, its name from the outermost record on, and the kind of its numbers."""
+
+    name: str
+    value: Tensor
+    kind: Kind
+
+
+class Record:
+    """Base of frozen dataclasses of tensors, of further such records, and of other values."""
+
+    # Fields that are one for all rows: kept where rows are chosen.
+    shared: ClassVar[frozenset[str]] = frozenset()
+
+    def to(self, device: torch.device | torch.dtype | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """A copy on another device and, for floating-point tensors, of another dtype, which may come alone."""
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
+        return self._with(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
+
+    def cpu(self) -> Self:
+        """A copy in the memory of the host."""
+        return self.to("cpu")
+
+    def detach(self) -> Self:
+        """A copy without gradients."""
+        return self._with(Tensor.detach)
+
+    def rows(self, index: Tensor) -> Self:
+        """The rows `index` (M,), in that order.
+
+        Examples:
+            >>> from dataclasses import dataclass
+            >>> @dataclass(frozen=True)
+            ... class Depths(Record):
+            ...     depth_m: Tensor
+            >>> Depths(torch.tensor([10.0, 20.0])).rows(torch.tensor([1]))
+            Depths(depth_m=tensor([20.]))
+        """
+        return self._with(lambda value: value[index.to(value.device)], by_row=True)
+
+    def _with(self, change: Callable[..., Tensor], *others: Self, by_row: bool = False) -> Self:
+        """A copy with all tensors changed, each with its counterparts; `by_row`, but those that are shared."""
+        changed: dict[str, Any] = {}
+        for each in fields(self):  # type: ignore[arg-type]
+            value, *theirs = (getattr(record, each.name) for record in (self, *others))
+            if isinstance(value, Record):
+                changed[each.name] = value._with(change, *theirs, by_row=by_row)
+            elif isinstance(value, Tensor) and not (by_row and each.name in self.shared):
+                changed[each.name] = change(value, *theirs)
+        return replace(self, **changed)  # type: ignore[type-var]
+
+
+class TensorRecord(Record):
+    """Base of records whose tensors are declared (`Dense`; optional ones have None as default) and checked.
+
+    Raises:
+        InputError: a tensor is none, not dense, or of another shape or kind; floating-point ones differ in dtype or
+            device.
+
+    Examples:
+        >>> from directshape_torch.scene import GroundPlane
+        >>> GroundPlane(torch.zeros(5, 3), torch.ones(4), ("file",) * 5)
+        Traceback (most recent call last):
+        ...
+        directshape_torch.errors.InputError: offset: expected shape (5,), got (4,)
+    """
+
+    def __post_init__(self) -> None:
+        sizes: dict[int | str, int] = {}
+        first: DeclaredTensor | None = None
+        for name, (spec, is_optional) in self._declared().items():
+            value = getattr(self, name)
+            if value is None and is_optional:
+                continue
+            spec.check(name, value, sizes)
+            if spec.kind in FOLLOWING:
+                first = first or DeclaredTensor(name, value, spec.kind)
+                check_alike(name, value, first.name, first.value)
+
+    @classmethod
+    @cache
+    def _declared(cls) -> dict[str, tuple[Dense, bool]]:
+        """The tensors by name: what they must be, and whether None will do."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {
+            each.name: (spec, each.default is None)
+            for each in fields(cls)  # type: ignore[arg-type]
+            for spec in getattr(hints[each.name], "__metadata__", ())
+            if isinstance(spec, Dense)
+        }
+
+    def tensors(self, name: str) -> Iterator[DeclaredTensor]:
+        """All tensors of the record, named `name`, and of those in it."""
+        declared = self._declared()
+        for each in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, each.name)
+            if isinstance(value, TensorRecord):
+                yield from value.tensors(f"{name}.{each.name}")
+            elif each.name in declared and value is not None:
+                yield DeclaredTensor(f"{name}.{each.name}", value, declared[each.name][0].kind)
+
+
+class CarRecord(Record):
+    """Base of records of tensors (B, ...), one row a car, of such records, and of words and other values."""
+
+    def spread(self, rows: Tensor, count: int) -> Self:
+        """The cars `rows` (B,), ascending, placed among `count` cars; NaN for the others."""
+        return self._with(lambda value: placed(value, rows, count), by_row=True)
+
+    def where(self, condition: Tensor) -> Self:
+        """A copy with NaN for the cars where the condition (B,) does not hold."""
+        return self._with(lambda value: kept(value, condition), by_row=True)
+
+    def put(self, rows: Tensor, others: Self) -> Self:
+        """A copy with the cars `rows` (R,) replaced; figures of another width stay as they are."""
+
+        def replaced(value: Tensor, other: Tensor) -> Tensor:
+            return value.index_copy(0, rows, other) if value.shape[1:] == other.shape[1:] else value
+
+        return self._with(replaced, others, by_row=True)
+
+    def state_dict(self, prefix: str = "") -> dict[str, Tensor]:
+        """All tensors and words by flat names, as `torch.save` and safetensors take them; words are UTF-8 bytes."""
+        state: dict[str, Tensor] = {}
+        for each in fields(self):  # type: ignore[arg-type]
+            value, name = getattr(self, each.name), prefix + each.name
+            if isinstance(value, CarRecord):
+                state |= value.state_dict(f"{name}.")
+            elif isinstance(value, tuple):
+                state[name] = torch.tensor(list("\n".join(value).encode()), dtype=torch.uint8)
+            elif isinstance(value, bool):
+                state[name] = torch.tensor(value)
+            elif isinstance(value, Tensor):
+                state[name] = value.detach().clone(memory_format=torch.contiguous_format)
+        return state
+
+    @classmethod
+    def _from_state(
+        cls, state: Mapping[str, Tensor], prefix: str = "", sizes: dict[int | str, int] | None = None, **others: Any
+    ) -> Self:
+        """The record whose `state_dict` this is; `others` are the fields that are none of its values.
+
+        Raises:
+            InputError: a value is missing or is not what its field declares.
+        """
+        values, sizes = dict(others), {} if sizes is None else sizes
+        hints = get_type_hints(cls, include_extras=True)
+        for each in fields(cls):  # type: ignore[arg-type]
+            kind, name = hints[each.name], prefix + each.name
+            called = f"state[{name!r}]"
+            if each.name in others:
+                continue
+            if isinstance(kind, type) and issubclass(kind, CarRecord):
+                values[each.name] = kind._from_state(state, f"{name}.", sizes)
+            elif name not in state:
+                raise InputError("state", f"the tensor {name!r}", f"{len(state)} others", "save result.state_dict()")
+            elif kind is bool:
+                check_shape(called, state[name], ())
+                values[each.name] = bool(state[name])
+            elif hasattr(kind, "__metadata__"):
+                kind.__metadata__[0].check(called, state[name], sizes)
+                values[each.name] = state[name]
+            else:
+                values[each.name] = _words(called, state[name])
+        return cls(**values)
+
+
+def _words(name: str, letters: Tensor) -> tuple[str, ...]:
+    """Words of one line each, from their UTF-8 bytes."""
+    check_shape(name, letters, ("n",))
+    try:
+        text = bytes(letters.tolist()).decode()
+    except (TypeError, ValueError) as error:  # numbers that are no bytes, bytes that are no letters
+        raise InputError(name, "UTF-8 bytes", shown(letters.tolist()), "save result.state_dict()") from error
+    return tuple(text.split("\n")) if text else ()
+
+
+def placed(values: Tensor, rows: Tensor, count: int) -> Tensor:
+    """Figures (R, ...) of the cars `rows` (R,), ascending, among `count` cars; NaN for the others."""
+    if len(rows) == count:  # all of them, which is the usual case
+        return values
+    return values.new_full((count, *values.shape[1:]), torch.nan).index_copy(0, rows, values)
+
+
+def kept(values: Tensor, condition: Tensor) -> Tensor:
+    """The figures (B, ...) of cars where the condition (B,) holds, NaN elsewhere."""
+    return torch.where(condition.view(-1, *[1] * (values.ndim - 1)), values, torch.nan)
