@@ -21,7 +21,6 @@ from directshape_torch.figures.quality import FitQuality
 from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
-from directshape_torch.geometry.box_formats import BoxFormat, poses_to_boxes
 from directshape_torch.numerics.checks import check_alike, check_shape, check_type
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -31,6 +30,8 @@ from directshape_torch.status import Status, is_refined
 
 if TYPE_CHECKING:
     import trimesh
+
+    from directshape_torch.geometry.box_formats import BoxFormat
 
 
 Frame = Literal["ref", "cam"]
@@ -250,6 +251,8 @@ class RefinementResult(CarRecord):
         Raises:
             InputError: an unknown convention or frame, or a LiDAR convention without `T_cam_boxes`.
         """
+        from directshape_torch.geometry.box_formats import poses_to_boxes
+
         T_frame_box, dimensions = self._boxes("cam" if T_cam_boxes is not None else frame)
         return poses_to_boxes(T_frame_box, dimensions, convention, T_cam_boxes)
 

@@ -9,14 +9,13 @@ from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.diagnosis.disparity_profile import disparity_profile
-from directshape_torch.diagnosis.evidence import Course
+from directshape_torch.diagnosis.evidence import Course, fit_quality
 from directshape_torch.diagnosis.observability import (
     covariance_of,
     covariance_xyz_yaw,
     observability_of,
     without_offset,
 )
-from directshape_torch.diagnosis.quality import fit_quality
 from directshape_torch.figures.disparity_profile import DisparityProfile
 from directshape_torch.figures.observability import Observability
 from directshape_torch.figures.quality import FitQuality

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import BackwardConfig
-from directshape_torch.solver.differentiate import implicit_state, unrolled_state
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import Problem, StateT, put_rows, take_rows
 from directshape_torch.status import is_refined
@@ -34,6 +33,8 @@ def attached_state(
     rows = refined.nonzero()[:, 0]
     if not len(rows):
         return minimum.state
+    from directshape_torch.solver.differentiate import implicit_state, unrolled_state
+
     part = problem.of_problems(refined)
     if backward.mode == "unroll":
         first = take_rows(start, rows)

@@ -10,7 +10,7 @@ from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.diagnosis.quality import _probabilities, mask_ious, photometric_agreement
+from directshape_torch.diagnosis.evidence import _probabilities, mask_ious, photometric_agreement
 from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.refinement.outcome import outcome_of
 from directshape_torch.refinement.problem import CarStage
