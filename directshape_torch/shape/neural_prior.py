@@ -16,7 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.pca_prior import PriorProvenance
@@ -89,7 +89,9 @@ class NeuralShapePrior(nn.Module):
         provenance: PriorProvenance,
     ) -> None:
         super().__init__()
-        check_shape("origin", origin, (3,))
+        # Not by `check_shape`: `load` makes the prior without numbers.
+        if not isinstance(origin, Tensor) or origin.shape != (3,):
+            raise InputError("origin", "a tensor of shape (3,)", shown(origin))
         if not layer_widths or num_codes < 1:
             raise InputError("layer_widths, num_codes", "at least one each", f"{list(layer_widths)}, {num_codes}")
         if min(grid_shape) < 2 or not spacing_m > 0:
