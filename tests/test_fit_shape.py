@@ -112,7 +112,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
             assert arrays["T_points_obj"].shape == (2, 4, 4)
     (tmp_path / "boxes.txt").write_text("1 2 3\n")
     assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
-    assert "line 1: expected seven numbers: '1 2 3'" in capsys.readouterr().err
+    assert "line 1: expected 7 finite numbers, got 3: '1 2 3'" in capsys.readouterr().err
     (tmp_path / "points.npy").write_bytes(b"nothing")
     assert main(["fit-shape", *words, "--out", str(tmp_path / "out")]) == 2
     assert "points.npy: is no readable npy file" in capsys.readouterr().err

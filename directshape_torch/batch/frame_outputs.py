@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_bytes, write_png
-from directshape_torch.io.refinement_files import write_result
-from directshape_torch.io.result_files import read_shapes, write_shapes
+from directshape_torch.geometry.box3d import alpha_from_kitti
+from directshape_torch.io.result_files import RefinedBox, ShapeArrays, read_shapes, write_result_text, write_shapes
 from directshape_torch.io.run_folder import (
     FrameRecord,
     frame_entry,
@@ -26,6 +29,7 @@ from directshape_torch.io.run_folder import (
 )
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.track_files import track_name
 from directshape_torch.result import RefinementResult
 
 if TYPE_CHECKING:
@@ -39,7 +43,6 @@ def write_frame_outputs(
     out_dir: Path,
     loaded: LoadedFrame,
     result: RefinementResult,
-    first_row: int,
     run: str,
     prior_sha256: str,
     inputs: Mapping[str, str],
@@ -50,8 +53,7 @@ def write_frame_outputs(
     Args:
         out_dir: the output folder.
         loaded: the frame.
-        result: of a call with this frame's detections, alone or in a batch.
-        first_row: where the frame's detections begin in `result`.
+        result: of the frame's detections.
         run, prior_sha256, inputs: hashes of the manifest, of the shape prior and of the frame's input files.
         options: kinds of files.
 
@@ -62,13 +64,14 @@ def write_frame_outputs(
     earlier = _earlier_record(path, run, inputs)
     files = [result_path(out_dir, loaded.frame_id)]
     if options.meshes is not None:
-        files += _write_meshes(out_dir, loaded, result, first_row, options.meshes)
+        files += _write_meshes(out_dir, loaded, result, options.meshes)
     if options.overlays:
         from directshape_torch.visualize.overlay import overlay_of_frame
 
         files.append(overlay_path(out_dir, loaded.frame_id))
-        write_png(files[-1], overlay_of_frame(loaded, result, first_row))
-    shapes = write_result(out_dir, loaded, result, prior_sha256, first_row)
+        write_png(files[-1], overlay_of_frame(loaded, result))
+    shapes = shape_arrays(loaded, result, prior_sha256)
+    write_result_text(files[0], loaded.input_objects, _refined_boxes(loaded, shapes, result.refined.tolist()))
     hashes = {file.relative_to(out_dir).as_posix(): hash_bytes(file.read_bytes()) for file in files}
     outputs, masks_right = set(options.outputs), int(loaded.detections.has_mask_right.sum())
     # Those of an earlier run stay.
@@ -87,15 +90,13 @@ def _earlier_record(path: Path, run: str, inputs: Mapping[str, str]) -> FrameRec
     return None
 
 
-def _write_meshes(
-    out_dir: Path, loaded: LoadedFrame, result: RefinementResult, first_row: int, mesh_format: MeshFormat
-) -> list[Path]:
+def _write_meshes(out_dir: Path, loaded: LoadedFrame, result: RefinementResult, mesh_format: MeshFormat) -> list[Path]:
     """The surface of each refined car of a frame in the left camera frame, metres.
 
     GLB files hold the same vertices as PLY files below a node that turns them into glTF's axes (y up).
     """
     paths, refined = [], result.refined.tolist()
-    for car, line in enumerate(loaded.detected_objects, first_row):
+    for car, line in enumerate(loaded.detected_objects):
         if refined[car]:
             paths.append(mesh_path(out_dir, loaded.frame_id, line.line_number, mesh_format))
             write_bytes(paths[-1], _mesh_bytes(result.mesh(car), mesh_format))
@@ -113,6 +114,70 @@ def _mesh_bytes(mesh: trimesh.Trimesh, mesh_format: MeshFormat) -> bytes:
     scene = trimesh.Scene()
     scene.add_geometry(mesh, node_name="car", geom_name="car", transform=T_GLTF_CAM)
     return export(scene, include_normals=True)
+
+
+def shape_arrays(loaded: LoadedFrame, result: RefinementResult, prior_sha256: str) -> ShapeArrays:
+    """What `shapes/NNNNNN.npz` holds, but for its record."""
+    boxes = result.boxes()
+    lines = [loaded.input_objects[row].line_number for row in loaded.row_of_detection]
+    return ShapeArrays(
+        frame_id=loaded.frame_id,
+        prior_sha256=prior_sha256,
+        ground_source=loaded.frame.ground.source[0],
+        input_lines=np.array(lines, dtype=np.int64),
+        tracks=_tracks(loaded),
+        track_parts=_numpy(result.track_part).astype(np.int64),
+        T_cam_obj=_numpy(result.T_cam_obj),
+        T_ref_obj=_numpy(result.T_ref_obj),
+        boxes_hwl=_numpy(boxes.dimensions_hwl),
+        boxes_location_ref=_numpy(boxes.location_ref),
+        boxes_rotation_y=_numpy(boxes.rotation_y),
+        codes=_numpy(result.code),
+        covariances=_numpy(result.covariance),
+        covariances_ref=_numpy(result.covariance_xyz_yaw),
+        statuses=tuple(status.name for status in result.status),
+        messages=tuple(status.value for status in result.status),
+        term_names=result.term_names,
+        costs_before=_numpy(result.cost_before),
+        costs_after=_numpy(result.cost_after),
+        iterations=_numpy(result.iterations).astype(np.int64),
+        has_mask_left=_numpy(loaded.detections.has_mask_left),
+        mask_iou_left=_numpy(result.quality.mask_iou_left),
+        mask_iou_right=_numpy(result.quality.mask_iou_right),
+        photometric_errors_grey=_numpy(result.quality.photometric_error_grey),
+        matched_shares=_numpy(result.quality.matched_share),
+        probabilities_better=_numpy(result.quality.probability_better),
+        probabilities_not_worse=_numpy(result.quality.probability_not_worse),
+        sigmas_ref=_numpy(result.sigma_xyz_yaw),
+        unseen=tuple(result.observability.words()),
+        unseen_sigmas_m=_numpy(result.observability.sigmas_m),
+        unseen_directions=_numpy(result.observability.directions),
+        profile_offsets_px=_numpy(result.profile.offsets_px),
+        profile_costs_before=_numpy(result.profile.cost_before),
+        profile_costs_after=_numpy(result.profile.cost_after),
+    )
+
+
+def _tracks(loaded: LoadedFrame) -> tuple[str, ...]:
+    ids = loaded.detections.track_id
+    if ids is None:
+        return ("",) * len(loaded.detections)
+    return tuple(track_name(loaded.sequence or "", number) for number in ids.tolist())
+
+
+def _numpy(tensor: Tensor) -> NDArray[Any]:
+    return np.asarray(tensor.detach().cpu().numpy())
+
+
+def _refined_boxes(loaded: LoadedFrame, shapes: ShapeArrays, refined: Sequence[bool]) -> dict[int, RefinedBox]:
+    """The new box of each input line whose car was refined; all others keep their line."""
+    location_ref, rotation_y = (
+        torch.from_numpy(array).double() for array in (shapes.boxes_location_ref, shapes.boxes_rotation_y)
+    )
+    alpha = alpha_from_kitti(location_ref, rotation_y).numpy()
+    columns = (alpha, shapes.boxes_hwl, shapes.boxes_location_ref, shapes.boxes_rotation_y)
+    boxes = np.column_stack([column.astype(np.float64) for column in columns]).tolist()
+    return {line: boxes[car] for car, line in enumerate(loaded.row_of_detection) if refined[car]}
 
 
 def failed_entry(reason: str) -> FrameEntry:

@@ -138,7 +138,7 @@ class _GroupStep:
         first_row = 0
         for ready in batch:
             if ready.loaded.frame_id in self.group.wanted:
-                self._write(ready, result, first_row)
+                self._write(ready, result[first_row : first_row + len(ready.loaded.detections)])
             first_row += len(ready.loaded.detections)
 
     def _read(self, frame_id: str) -> _Ready | None:
@@ -161,11 +161,11 @@ class _GroupStep:
             result: RefinementResult = self.job.refiner(frames, detections)
         return result
 
-    def _write(self, ready: _Ready, result: RefinementResult, first_row: int) -> None:
+    def _write(self, ready: _Ready, result: RefinementResult) -> None:
         loaded, job = ready.loaded, self.job
         try:
             entry = write_frame_outputs(
-                job.out_dir, loaded, result, first_row, job.run, job.prior_sha256, ready.inputs, job.options
+                job.out_dir, loaded, result, job.run, job.prior_sha256, ready.inputs, job.options
             )
         except _STOPS_THE_RUN:
             raise

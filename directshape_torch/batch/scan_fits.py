@@ -14,10 +14,10 @@ from directshape_torch.files import atomic_files
 from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
-from directshape_torch.io.result_files import RefinedBox, write_result_text
+from directshape_torch.io.result_files import write_result_text
+from directshape_torch.io.run_folder import mesh_path, result_path, shapes_path
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.io.velodyne import read_scan
-from directshape_torch.result import RefinementResult
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
@@ -70,10 +70,11 @@ def write_scan_fit(out_dir: Path, scan: ScanFit) -> None:
     from trimesh.exchange.ply import export_ply
 
     cars, refined = scan.fit.cars, scan.fit.cars.refined.tolist()
-    for folder in ("data", "shapes", "meshes"):
-        (out_dir / folder).mkdir(parents=True, exist_ok=True)
-    boxes = {row: box for row, box, fitted in zip(scan.rows, _boxes(cars), refined, strict=True) if fitted}
-    write_result_text(out_dir / "data" / f"{scan.frame_id}.txt", scan.objects, boxes)
+    boxes = cars.boxes()
+    columns = (boxes.alpha[:, None], boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y[:, None])
+    lines = torch.cat(columns, dim=1).tolist()
+    changed = {row: lines[car] for car, row in enumerate(scan.rows) if refined[car]}
+    write_result_text(result_path(out_dir, scan.frame_id), scan.objects, changed)
     arrays = {
         "T_cam_obj": cars.T_cam_obj,
         "codes": cars.code,
@@ -84,17 +85,8 @@ def write_scan_fit(out_dir: Path, scan: ScanFit) -> None:
     }
     statuses = np.array([status.name for status in cars.status], dtype=np.str_)
     content = {**{name: each.numpy() for name, each in arrays.items()}, "statuses": statuses}
-    atomic_files.write_npz(out_dir / "shapes" / f"{scan.frame_id}.npz", content)
+    atomic_files.write_npz(shapes_path(out_dir, scan.frame_id), content)
     for car, row in enumerate(scan.rows):
         if refined[car]:
-            name = f"{scan.frame_id}_{scan.objects[row].line_number}.ply"
-            atomic_files.write_bytes(out_dir / "meshes" / name, export_ply(cars.mesh(car)))
-
-
-def _boxes(cars: RefinementResult) -> list[RefinedBox]:
-    boxes = cars.boxes()
-    columns = (boxes.dimensions_hwl, boxes.location_ref, boxes.rotation_y, boxes.alpha)
-    return [
-        RefinedBox((hwl[0], hwl[1], hwl[2]), (at[0], at[1], at[2]), rotation_y, alpha)
-        for hwl, at, rotation_y, alpha in zip(*(column.tolist() for column in columns), strict=True)
-    ]
+            path = mesh_path(out_dir, scan.frame_id, scan.objects[row].line_number, "ply")
+            atomic_files.write_bytes(path, export_ply(cars.mesh(car)))

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.batch.scan_fits import fit_scan, write_scan_fit
 from directshape_torch.cli.options import add_layout_options
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
-from directshape_torch.files.text_files import read_lines
+from directshape_torch.files.text_files import finite_numbers, read_lines
 from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.io.open_dataset import open_dataset
 from directshape_torch.io.velodyne import read_points
@@ -124,14 +124,6 @@ def read_boxes(path: Path) -> NDArray[np.float64]:
     Raises:
         DataFormatError: the file cannot be read, or a line holds something else.
     """
-    rows = []
-    for line in read_lines(path):
-        try:
-            row = [float(word) for word in line.text.split()]
-        except ValueError:
-            row = []
-        if len(row) != 7 or not np.isfinite(row).all():
-            cure = "write x y z, three sizes and the heading, metres and radians"
-            raise DataFormatError(path, "expected seven numbers", line_number=line.number, line=line.text, cure=cure)
-        rows.append(row)
+    cure = "write x y z, three sizes and the heading, metres and radians"
+    rows = [finite_numbers(path, line, 7, cure=cure) for line in read_lines(path)]
     return np.array(rows, dtype=np.float64).reshape(-1, 7)

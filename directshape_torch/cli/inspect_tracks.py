@@ -34,8 +34,8 @@ def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, o
     pictures: dict[str, list[Picture]] = {}
     first_row = 0
     for item in loaded:
-        ids = item.detections.track_id
-        for car, number in zip(refined_cars(item, result, first_row), [] if ids is None else ids.tolist(), strict=True):
+        ids, part = item.detections.track_id, result[first_row : first_row + len(item.detections)]
+        for car, number in zip(refined_cars(item, part), [] if ids is None else ids.tolist(), strict=True):
             pictures.setdefault(track_name(item.sequence or "", number), []).append(_picture(item, car))
         first_row += len(item.detections)
     paths = []

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import read_rgb
-from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError
+from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError, match_masks
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.mask_matching import match_masks
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
 from directshape_torch.scene_check.check_scene import Pair

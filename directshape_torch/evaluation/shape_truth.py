@@ -19,11 +19,9 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.disparity_files import read_disparity
-from directshape_torch.io.image_files import read_single_channel
-from directshape_torch.io.instance_masks import MaskSource
+from directshape_torch.io.image_files import read_disparity, read_single_channel
+from directshape_torch.io.instance_masks import MaskSource, match_masks
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.mask_matching import match_masks
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 

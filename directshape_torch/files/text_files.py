@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from directshape_torch.errors import DataFormatError
 from directshape_torch.files.read_files import read_text
 
 
@@ -25,3 +30,26 @@ def read_lines(path: Path | str) -> list[Line]:
     """
     lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(read_text(path).split("\n"), start=1))
     return [line for line in lines if line.text]
+
+
+def finite_numbers(
+    path: Path | str, line: Line, count: int, words: Sequence[str] | None = None, cure: str = ""
+) -> NDArray[np.float64]:
+    """The numbers (count,) of a line, or of some of its words.
+
+    Raises:
+        DataFormatError: it holds something else, or not as many; names file and line.
+
+    Examples:
+        >>> finite_numbers("calib.txt", Line(3, "1 2.5", "1 2.5"), 2)
+        array([1. , 2.5])
+    """
+    try:
+        values = np.array([float(word) for word in (line.text.split() if words is None else words)])
+    except ValueError as error:
+        problem = f"expected {count} numbers ({error})"
+        raise DataFormatError(path, problem, line_number=line.number, line=line.text, cure=cure) from error
+    if len(values) != count or not np.isfinite(values).all():
+        problem = f"expected {count} finite numbers, got {len(values)}"
+        raise DataFormatError(path, problem, line_number=line.number, line=line.text, cure=cure)
+    return values

@@ -49,12 +49,11 @@ def new_figure(width_inches: float, height_inches: float, purpose: str) -> Any:
         >>> figure_png(figure)[1:4]
         b'PNG'
     """
-    try:
-        # No pyplot: it keeps figures and picks a window system.
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError("matplotlib", "plot", purpose) from error
+    check_figures(purpose)
+    # No pyplot: it keeps figures and picks a window system.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width_inches, height_inches), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

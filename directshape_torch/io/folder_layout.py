@@ -27,8 +27,8 @@ from directshape_torch.io.instance_masks import (
     MaskSource,
     Side,
     check_count,
+    instance_of,
     read_soft_mask,
-    tight_box,
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
@@ -71,7 +71,6 @@ class FolderLayout(FrameLayout):
         return read_rig(self.root / "rig.json")
 
     def frame_ids(self) -> list[str]:
-        """Every frame that has a JSON file."""
         return sorted(path.stem for path in self.detections_dir.glob("*.json"))
 
     def frame_id(self, number: int) -> str:
@@ -82,11 +81,9 @@ class FolderLayout(FrameLayout):
         return names[0]
 
     def images(self, frame_id: str) -> tuple[Path, Path]:
-        """Left and right image."""
         return find_image(self.root / "left", frame_id), find_image(self.root / "right", frame_id)
 
     def calibration_path(self, frame_id: str) -> Path:
-        """One calibration for all."""
         return self.root / "rig.json"
 
     def calibration(self, frame_id: str) -> KittiCalibration:
@@ -94,18 +91,15 @@ class FolderLayout(FrameLayout):
         return KittiCalibration(self.root / "rig.json", *self.rig.projections())
 
     def plane_path(self, frame_id: str) -> Path | None:
-        """The frame's file, where it holds a plane."""
         return None if self._frame(frame_id).ground_plane is None else self.detection_path(frame_id)
 
     def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
-        """(a, b, c, d) in the left camera's frame."""
         plane, path = self._frame(frame_id).ground_plane, self.detection_path(frame_id)
         if plane is None:
             raise DataFormatError(path, "holds no 'ground_plane'", cure="add it, or use --ground auto")
         return upright_plane(path, np.array(plane, np.float64))
 
     def detection_path(self, frame_id: str) -> Path:
-        """One file a frame."""
         return self.detections_dir / f"{frame_id}.json"
 
     def objects(self, frame_id: str) -> list[KittiObject]:
@@ -113,7 +107,6 @@ class FolderLayout(FrameLayout):
         return self._lines(frame_id, self._frame(frame_id).objects, True)
 
     def labels(self, frame_id: str) -> list[KittiObject] | None:
-        """The entries of `labels`, where there are any."""
         labels = self._frame(frame_id).labels
         return None if labels is None else self._lines(frame_id, labels, False)
 
@@ -122,7 +115,6 @@ class FolderLayout(FrameLayout):
         return ""
 
     def motion(self, frame_id: str) -> tuple[float | None, NDArray[np.float64] | None]:
-        """What its file says."""
         frame = self._frame(frame_id)
         if frame.T_world_cam is None:
             return frame.time_s, None
@@ -137,7 +129,6 @@ class FolderLayout(FrameLayout):
         return FolderMasks(self.root, self.detections_dir) if directory is None else super().masks(directory)
 
     def given_masks(self, frame_id: str) -> GivenMasks | None:
-        """Each object carries its masks."""
         objects = self._frame(frame_id).objects
         return {side: [-1 if mask_of(o, side) is None else row for row, o in enumerate(objects)] for side in SIDES}
 
@@ -203,24 +194,15 @@ class FolderMasks:
     def _mask(
         self, path: Path, index: int, entry: FolderObject, side: Side, size_hw: tuple[int, int]
     ) -> InstanceMask | None:
-        probability = self._probability(path, index, entry, side, size_hw)
-        mask_box = tight_box(probability)
-        if mask_box is None:
-            return None
-        is_car = entry.object_class == _CAR
-        category = min(COCO_CAR_IDS) if is_car else _OTHER_CATEGORY
-        box = mask_box
-        if side == "left" and entry.box_2d is not None:
-            box = (entry.box_2d[0], entry.box_2d[1], entry.box_2d[2], entry.box_2d[3])
-        return InstanceMask(side, index, category, is_car, box, mask_box, probability, entry.score)
-
-    def _probability(
-        self, path: Path, index: int, entry: FolderObject, side: Side, size_hw: tuple[int, int]
-    ) -> NDArray[np.bool_] | NDArray[np.float32]:
-        mask = mask_of(entry, side)
+        mask, is_car = mask_of(entry, side), entry.object_class == _CAR
         if isinstance(mask, str):
-            return read_soft_mask(self.root / mask, size_hw)
-        return decode_segmentation(path, f"mask_{side} of objects[{index}]", mask, size_hw)
+            probability: Any = read_soft_mask(self.root / mask, size_hw)
+        else:
+            probability = decode_segmentation(path, f"mask_{side} of objects[{index}]", mask, size_hw)
+        category = min(COCO_CAR_IDS) if is_car else _OTHER_CATEGORY
+        box = entry.box_2d if side == "left" else None
+        box = box and (box[0], box[1], box[2], box[3])  # JSON has lists
+        return instance_of(side, index, category, probability, is_car=is_car, box=box, score=entry.score)
 
 
 def mask_of(entry: FolderObject, side: Side) -> Any:

@@ -30,13 +30,19 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
     """
     if not loaded:
         raise InputError("loaded", "at least one frame", "none")
-    size_hw = _largest_size(loaded)
+    shapes = [item.frame.images_left.shape for item in loaded]
+    size_hw = max(shape[-2] for shape in shapes), max(shape[-1] for shape in shapes)
+    grounds = [item.frame.ground for item in loaded]
     frame = FrameBatch(
         images_left=_padded([item.frame.images_left for item in loaded], size_hw),
         images_right=_padded([item.frame.images_right for item in loaded], size_hw),
         sizes=torch.cat([item.frame.sizes for item in loaded]),
         camera=_cameras([item.frame.camera for item in loaded]),
-        ground=_grounds([item.frame.ground for item in loaded]),
+        ground=GroundPlane(
+            torch.cat([ground.normal for ground in grounds]),
+            torch.cat([ground.offset for ground in grounds]),
+            tuple(source for ground in grounds for source in ground.source),
+        ),
         frame_ids=tuple(frame_id for item in loaded for frame_id in item.frame.frame_ids),
         disparity=_disparities([item.frame.disparity for item in loaded], size_hw),
         points_cam=_points([item.frame.points_cam for item in loaded]),
@@ -44,11 +50,6 @@ def collate(loaded: Sequence[LoadedFrame]) -> tuple[FrameBatch, Detections]:
         T_world_cam=_of_all([item.frame.T_world_cam for item in loaded]),
     )
     return frame, _detections([item.detections for item in loaded], size_hw, _tracks(loaded))
-
-
-def _largest_size(loaded: Sequence[LoadedFrame]) -> tuple[int, int]:
-    shapes = [item.frame.images_left.shape for item in loaded]
-    return max(shape[-2] for shape in shapes), max(shape[-1] for shape in shapes)
 
 
 def _padded(images: Sequence[Tensor], size_hw: tuple[int, int]) -> Tensor:
@@ -63,23 +64,23 @@ def _padded(images: Sequence[Tensor], size_hw: tuple[int, int]) -> Tensor:
 
 
 def _disparities(maps: Sequence[Tensor | None], size_hw: tuple[int, int]) -> Tensor | None:
-    known = [disparity for disparity in maps if disparity is not None]
-    if not known:
-        return None
-    if len(known) < len(maps):
-        raise InputError("loaded", "frames with disparity maps, or frames without", f"{len(known)} of {len(maps)} with")
+    known = _all_or_none(maps, "disparity maps")
     # Zero is no disparity, like NaN.
-    return _padded(known, size_hw)
+    return _padded(known, size_hw) if known else None
 
 
 def _points(clouds: Sequence[Tensor | None]) -> Tensor | None:
-    known = [points for points in clouds if points is not None]
-    if not known:
-        return None
-    if len(known) < len(clouds):
-        raise InputError("loaded", "frames with LiDAR points, or frames without", f"{len(known)} of {len(clouds)} with")
-    most = max(points.shape[1] for points in known)
-    return torch.cat([pad(points, (0, 0, 0, most - points.shape[1]), value=torch.nan) for points in known])
+    known = _all_or_none(clouds, "LiDAR points")
+    most = max((points.shape[1] for points in known), default=0)
+    grown = [pad(points, (0, 0, 0, most - points.shape[1]), value=torch.nan) for points in known]
+    return torch.cat(grown) if grown else None
+
+
+def _all_or_none(parts: Sequence[Tensor | None], what: str) -> list[Tensor]:
+    known = [part for part in parts if part is not None]
+    if known and len(known) < len(parts):
+        raise InputError("loaded", f"frames with {what}, or frames without", f"{len(known)} of {len(parts)} with")
+    return known
 
 
 def _of_all(parts: Sequence[Tensor | None]) -> Tensor | None:
@@ -119,14 +120,6 @@ def _same_field(a: DisparityField | None, b: DisparityField | None) -> bool:
         return a is b
     tensors = (field.name for field in fields(a) if isinstance(getattr(a, field.name), Tensor))
     return a.size_wh == b.size_wh and all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
-
-
-def _grounds(grounds: Sequence[GroundPlane]) -> GroundPlane:
-    return GroundPlane(
-        torch.cat([ground.normal for ground in grounds]),
-        torch.cat([ground.offset for ground in grounds]),
-        tuple(source for ground in grounds for source in ground.source),
-    )
 
 
 def _tracks(loaded: Sequence[LoadedFrame]) -> Tensor | None:

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.instance_masks import SIDES, InstanceMask, Side
+from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskMatches, Side, match_masks, without_duplicates
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
-from directshape_torch.io.mask_matching import MaskMatches, match_masks, without_duplicates
 from directshape_torch.scene import Detections, Occluders
 from directshape_torch.scene_check.image_boxes import project_boxes
 

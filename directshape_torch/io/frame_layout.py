@@ -21,6 +21,8 @@ from directshape_torch.io.mask_files import mask_source
 class FrameLayout(ABC):
     """Finds and reads the files of a frame, all but images and masks, whose readers the layouts share.
 
+    Its methods say what those of each layout do.
+
     Attributes:
         detections_dir: the folder that detections are read from.
         detection_file_name: what detection files are called, for messages.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.text_files import Line, read_lines
+from directshape_torch.files.text_files import Line, finite_numbers, read_lines
 
 _CURE = "write four lines: '# Plane', 'Width 4', 'Height 1', then a b c d with a x + b y + c z + d = 0"
 
@@ -29,7 +29,7 @@ def read_plane(path: Path | str) -> NDArray[np.float64]:
     lines = read_lines(path)
     if not lines:
         raise DataFormatError(path, "is empty", cure=_CURE)
-    return upright_plane(path, _four_numbers(path, lines[-1]), lines[-1])
+    return upright_plane(path, finite_numbers(path, lines[-1], 4, cure=_CURE), lines[-1])
 
 
 def upright_plane(path: Path | str, plane: NDArray[np.float64], line: Line | None = None) -> NDArray[np.float64]:
@@ -49,16 +49,6 @@ def upright_plane(path: Path | str, plane: NDArray[np.float64], line: Line | Non
             cure=_CURE,
         )
     return np.asarray(plane / (-np.sign(plane[1]) * length))
-
-
-def _four_numbers(path: Path | str, line: Line) -> NDArray[np.float64]:
-    try:
-        values = np.array([float(word) for word in line.text.split()])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != 4 or not np.isfinite(values).all():
-        raise DataFormatError(path, "expected four finite numbers", line_number=line.number, line=line.text, cure=_CURE)
-    return values
 
 
 def plane_ref_to_cam(

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.files.text_files import read_lines
+from directshape_torch.files.text_files import finite_numbers, read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 
@@ -61,7 +61,7 @@ def read_calibration(path: Path | str) -> KittiCalibration:
         words = line.text.split()
         name, shape = _LAYOUTS.get(words[0].rstrip(":"), (None, (0, 0)))
         if name is not None:
-            matrices[name] = parse_matrix(path, line.number, line.text, words[1:], shape)
+            matrices[name] = finite_numbers(path, line, shape[0] * shape[1], words[1:]).reshape(shape)
     for name in ("P2", "P3"):
         if name not in matrices:
             raise DataFormatError(path, f"has no line {name}:", cure="a stereo pair needs the projections P2 and P3")
@@ -79,33 +79,13 @@ def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
         words = line.text.split()
         shape = {"R:": (3, 3), "T:": (3, 1)}.get(words[0])
         if shape is not None:
-            found[words[0]] = parse_matrix(path, line.number, line.text, words[1:], shape)
+            found[words[0]] = finite_numbers(path, line, shape[0] * shape[1], words[1:]).reshape(shape)
     for name in ("R:", "T:"):
         if name not in found:
             raise DataFormatError(
                 path, f"has no line {name}", cure="a scan needs rotation and translation of its LiDAR"
             )
     return np.concatenate([found["R:"], found["T:"]], axis=1)
-
-
-def parse_matrix(
-    path: Path | str, number: int, text: str, words: Sequence[str], shape: tuple[int, int]
-) -> NDArray[np.float64]:
-    """The finite numbers of a line, row by row.
-
-    Raises:
-        DataFormatError: it does not hold as many.
-    """
-    wanted = shape[0] * shape[1]
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise DataFormatError(path, f"expected {wanted} numbers ({error})", line_number=number, line=text) from error
-    if len(values) != wanted or not np.isfinite(values).all():
-        raise DataFormatError(
-            path, f"expected {wanted} finite numbers, got {len(values)}", line_number=number, line=text
-        )
-    return values.reshape(shape)
 
 
 def to_stereo_camera(

@@ -121,13 +121,6 @@ def _finite_numbers(path: Path | str, line: Line, words: Sequence[str]) -> list[
     return numbers
 
 
-def poses_ref(objects: Sequence[KittiObject], dtype: torch.dtype = torch.float64) -> Tensor:
-    """`T_ref_obj` (B, 4, 4) of the 3D boxes: origin on the ground under the box centre, x forward, y down."""
-    location_ref = torch.tensor([o.location_ref for o in objects], dtype=dtype).reshape(-1, 3)
-    rotation_y = torch.tensor([o.rotation_y for o in objects], dtype=dtype)
-    return pose_from_kitti(location_ref, rotation_y)
-
-
 def poses_cam(
     objects: Sequence[KittiObject],
     t_cam_ref: Tensor,  # (3,) metres
@@ -139,8 +132,10 @@ def poses_cam(
         >>> poses_cam([parse_object("labels", line)], torch.tensor([0.06, 0.0, 0.0]))[0, :3, 3]
         tensor([ 1.0600,  1.6000, 20.0000])
     """
-    T_ref_obj = poses_ref(objects).to(t_cam_ref.device)
-    return shift_frame(T_ref_obj, t_cam_ref.double()).to(t_cam_ref.dtype)
+    exact = t_cam_ref.double()
+    location_ref = exact.new_tensor([o.location_ref for o in objects]).reshape(-1, 3)
+    rotation_y = exact.new_tensor([o.rotation_y for o in objects])
+    return pose_from_kitti(location_ref + exact, rotation_y).to(t_cam_ref.dtype)
 
 
 def box_corners_cam(
@@ -156,13 +151,3 @@ def box_corners_cam(
     """
     dimensions_hwl = torch.tensor([o.hwl for o in objects], dtype=torch.float64).reshape(-1, 3)
     return box_corners(poses_cam(objects, t_cam_ref.double()), dimensions_hwl)
-
-
-def shift_frame(
-    T_a_obj: Tensor,  # (B, 4, 4)
-    t_b_a: Tensor,  # (3,) or (B, 3)
-) -> Tensor:
-    """`T_b_obj` (B, 4, 4) for frames with parallel axes, `x_b = x_a + t_b_a` (`ref` to `cam`, or back with `-t`)."""
-    T_b_obj = T_a_obj.clone()
-    T_b_obj[..., :3, 3] += t_b_a
-    return T_b_obj

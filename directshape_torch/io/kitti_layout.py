@@ -186,7 +186,6 @@ class KittiLayout(FrameLayout):
         return None if "" in self._sequences else "" if self._single else self._split(frame_id)[0]
 
     def motion_files(self, frame_id: str) -> dict[str, Path]:
-        """The sequence's."""
         names = {"times": self._files.times, "poses": self._files.trajectory}
         paths = {role: self._path(frame_id, pattern) for role, pattern in names.items() if pattern}
         return {role: path for role, path in paths.items() if path.is_file()}
@@ -205,7 +204,6 @@ class KittiLayout(FrameLayout):
         return first_disparity(self._in_folder(folder, frame_id), self._split(frame_id)[3])
 
     def masks(self, directory: Path | None) -> MaskSource | None:
-        """See `KittiMasks`; no masks come with the layout itself."""
         return None if directory is None else KittiMasks(existing_folder(directory, "is not a folder of masks"), self)
 
     def masks_in(self, directory: Path, frame_id: str) -> tuple[Path, tuple[str, ...]]:

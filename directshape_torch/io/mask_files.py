@@ -21,6 +21,7 @@ from directshape_torch.io.instance_masks import (
     check_count,
     check_size,
     file_of_frame,
+    instance_of,
     read_soft_mask,
     tight_box,
 )
@@ -110,11 +111,10 @@ class InstancePngMasks:
             category = value // _IDS_PER_CLASS
             if category in (0, _MOTS_IGNORE_CLASS):
                 continue
-            mask = ids == value
-            box = tight_box(mask)
-            if box is not None:
-                track = value % _IDS_PER_CLASS if self.folders == _TRACKING_FOLDERS else -1
-                yield InstanceMask(side, value, category, category in self.car_ids, box, box, mask, 1.0, track)
+            track = value % _IDS_PER_CLASS if self.folders == _TRACKING_FOLDERS else -1
+            found = instance_of(side, value, category, ids == value, is_car=category in self.car_ids, track_id=track)
+            if found is not None:
+                yield found
 
 
 @dataclass(frozen=True)
@@ -205,21 +205,22 @@ def _from_coco(
     size_hw: tuple[int, int],
     car_ids: frozenset[int],
 ) -> InstanceMask | None:
-    """One instance, or None where its mask has no pixel: an empty mask says nothing about a car."""
-    probability = _probability(path, index, entry, size_hw)
-    mask_box = tight_box(probability)
-    if mask_box is None:
+    soft = entry.get("soft_probability")
+    if soft:
+        probability: Any = read_soft_mask(path.parent / str(soft), size_hw)
+    else:
+        probability = decode_segmentation(path, f"entry {index}", entry.get("segmentation"), size_hw)
+    if tight_box(probability) is None:  # whatever else its entry says
         return None
     try:
         category = int(entry["category_id"])
-        return InstanceMask(
-            side=side,
-            instance_id=int(entry.get("instance_id", index)),
-            category_id=category,
+        return instance_of(
+            side,
+            int(entry.get("instance_id", index)),
+            category,
+            probability,
             is_car=category in car_ids,
-            box=_file_box(entry) or mask_box,
-            mask_box=mask_box,
-            probability=probability,
+            box=_file_box(entry),
             score=_finite(entry.get("score", 1.0)),
         )
     except (KeyError, TypeError, ValueError) as error:
@@ -231,15 +232,6 @@ def _finite(value: Any) -> float:
     if not abs(number) < float("inf"):
         raise ValueError(f"{number} is not finite")
     return number
-
-
-def _probability(
-    path: Path, index: int, entry: Mapping[str, Any], size_hw: tuple[int, int]
-) -> NDArray[np.bool_] | NDArray[np.float32]:
-    soft = entry.get("soft_probability")
-    if soft:
-        return read_soft_mask(path.parent / str(soft), size_hw)
-    return decode_segmentation(path, f"entry {index}", entry.get("segmentation"), size_hw)
 
 
 def _file_box(entry: Mapping[str, Any]) -> tuple[float, float, float, float] | None:

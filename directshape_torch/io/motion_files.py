@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.files.text_files import Line, read_lines
-from directshape_torch.io.kitti_calibration import parse_matrix
+from directshape_torch.files.text_files import Line, finite_numbers, read_lines
 from directshape_torch.numerics.checks import is_no_rotation
 
 
@@ -80,7 +79,7 @@ def _seconds(path: Path | str, line: Line) -> float:
 
 
 def _matrix(path: Path | str, line: Line) -> NDArray[np.float64]:
-    matrix = parse_matrix(path, line.number, line.text, line.text.split(), (3, 4))
+    matrix = finite_numbers(path, line, 12).reshape(3, 4)
     if is_no_rotation(torch.from_numpy(matrix)[None]).any():
         raise DataFormatError(path, "its first three columns are no rotation", line_number=line.number, line=line.text)
     return matrix

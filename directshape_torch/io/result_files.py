@@ -26,21 +26,9 @@ _Arrays = TypeVar("_Arrays")
 _KINDS = {"str": "U", "tuple[str, ...]": "U", "Floats": "f", "NDArray[np.int64]": "i", "NDArray[np.bool_]": "b"}
 
 
-@dataclass(frozen=True)
-class RefinedBox:
-    """The part of a result line that a refinement changes.
-
-    Attributes:
-        hwl: height, width, length of the refined zero level along the object axes, metres.
-        location_ref: bottom centre of that level in the `ref` frame, metres.
-        rotation_y: heading about the y axis of `ref`, radians.
-        alpha: observation angle, radians.
-    """
-
-    hwl: tuple[float, float, float]
-    location_ref: tuple[float, float, float]
-    rotation_y: float
-    alpha: float
+# What a refinement changes of a result line, in its order: observation angle; height, width, length of the refined zero
+# level along the object axes; its bottom centre in `ref`; heading about the y axis of `ref`; metres and radians.
+RefinedBox = Sequence[float]
 
 
 def result_line(source: KittiObject, refined: RefinedBox) -> str:
@@ -50,15 +38,14 @@ def result_line(source: KittiObject, refined: RefinedBox) -> str:
         >>> from directshape_torch.io.kitti_labels import parse_object
         >>> from directshape_torch.files.text_files import Line
         >>> raw = "Car -1 -1 0.1 5.25 6 70 80.5 1.5 1.6 3.9 1 1.6 20 0 0.930"
-        >>> box = RefinedBox((1.4, 1.7, 4.1), (1.1, 1.65, 19.5), 0.02, -0.0363)
+        >>> box = (-0.0363, 1.4, 1.7, 4.1, 1.1, 1.65, 19.5, 0.02)
         >>> result_line(parse_object("results", Line(1, raw, raw)), box)
         'Car -1 -1 -0.0363 5.25 6 70 80.5 1.4000 1.7000 4.1000 1.1000 1.6500 19.5000 0.0200 0.930'
     """
     words = source.raw_line.split()
-    numbers = [refined.alpha, *refined.hwl, *refined.location_ref, refined.rotation_y]
-    if not np.isfinite(numbers).all():
-        raise InputError("refined", "finite numbers", str(numbers), "keep the input line of a car that failed")
-    alpha, *box_3d = (_decimal(number) for number in numbers)
+    if not np.isfinite(refined).all():
+        raise InputError("refined", "finite numbers", str(refined), "keep the input line of a car that failed")
+    alpha, *box_3d = (_decimal(number) for number in refined)
     line = " ".join([*words[:3], alpha, *words[4:8], *box_3d, *words[15:]])
     return line + ("\r" if source.raw_line.endswith("\r") else "")
 

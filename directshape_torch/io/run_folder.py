@@ -44,7 +44,7 @@ def summary_path(out_dir: Path | str) -> Path:
 
 
 def result_path(out_dir: Path | str, frame_id: str) -> Path:
-    """The KITTI result file of a frame."""
+    """`data/ID.txt`, KITTI's result file of a frame."""
     return Path(out_dir) / "data" / f"{frame_id}.txt"
 
 

@@ -52,37 +52,23 @@ class LoadedFrame:
 
 
 class StereoDataset(Protocol):
-    """Frames with detections and masks; every layout of files is one (docs/inputs.md)."""
+    """Frames with detections and masks; every layout of files is one (docs/inputs.md).
 
-    @property
-    def frame_ids(self) -> tuple[str, ...]:
-        """Names of the frames, each once; output files carry them, so they hold no path separator."""
-        ...
+    Attributes:
+        frame_ids: names of the frames, each once; output files carry them, so they hold no path separator.
+        classes: object types that are refined; other detections are copied.
+        ground: where ground planes come from.
+        camera_height_m: height of the camera above a level ground, the last resort.
+        disparity_fields: residual disparity of the rigs, none or one a rig.
+        detections_dir: the folder that detections are read from, which no output may overwrite.
+    """
 
-    @property
-    def classes(self) -> frozenset[str]:
-        """Object types that are refined; other detections are copied."""
-        ...
-
-    @property
-    def ground(self) -> GroundSource:
-        """Where ground planes come from."""
-        ...
-
-    @property
-    def camera_height_m(self) -> float:
-        """Height of the camera above a level ground, the last resort."""
-        ...
-
-    @property
-    def disparity_fields(self) -> tuple[DisparityField, ...]:
-        """Residual disparity of the rigs, none or one a rig."""
-        ...
-
-    @property
-    def detections_dir(self) -> Path:
-        """The folder that detections are read from, which no output may overwrite."""
-        ...
+    frame_ids: tuple[str, ...]
+    classes: frozenset[str]
+    ground: GroundSource
+    camera_height_m: float
+    disparity_fields: tuple[DisparityField, ...]
+    detections_dir: Path
 
     def __len__(self) -> int: ...
 
@@ -95,11 +81,7 @@ class StereoDataset(Protocol):
         ...
 
     def objects(self, frame_id: str) -> list[KittiObject]:
-        """The detections of a frame alone, without its images.
-
-        Raises:
-            DataFormatError: their file is missing or damaged.
-        """
+        """The detections of a frame alone, without its images; raises as `load` does."""
         ...
 
     def sequence_of(self, frame_id: str) -> str | None:

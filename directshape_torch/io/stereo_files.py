@@ -19,11 +19,10 @@ from directshape_torch.files.names import check_frame_id
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.disparity_files import read_disparity
 from directshape_torch.io.frame_detections import MatchingSummary, build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
 from directshape_torch.io.ground_plane_files import plane_ref_to_cam
-from directshape_torch.io.image_files import read_rgb
+from directshape_torch.io.image_files import read_disparity, read_rgb
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
@@ -31,8 +30,7 @@ from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.velodyne import in_image, read_scan
 from directshape_torch.scene import FrameBatch, GroundPlane
-
-DEFAULT_CAMERA_HEIGHT_M = 1.65
+from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
 
 
 class DatasetOptions(TypedDict, total=False):
@@ -86,7 +84,7 @@ class FileStereoDataset:
         frames: Iterable[str | int] | None = None,
         classes: Sequence[str] = ("Car",),
         ground: GroundSource = "auto",
-        camera_height_m: float = DEFAULT_CAMERA_HEIGHT_M,
+        camera_height_m: float = 1.65,
         disparity_field: DisparityField | Sequence[DisparityField] | None = None,
         disparity_dir: Path | str | None = None,
         lidar_dir: Path | str | None = None,
@@ -95,7 +93,7 @@ class FileStereoDataset:
     ) -> None:
         if ground not in get_args(GroundSource):
             raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
-        self.layout = layout
+        self.layout, self.detections_dir = layout, layout.detections_dir
         # Masks from elsewhere know nothing of the layout's own links between masks and detections.
         self._own_masks = masks is None
         if masks is None or isinstance(masks, (str, Path)):
@@ -120,29 +118,17 @@ class FileStereoDataset:
     def __len__(self) -> int:
         return len(self.frame_ids)
 
-    @property
-    def detections_dir(self) -> Path:
-        """The folder that detections are read from."""
-        return self.layout.detections_dir
-
     def load(self, frame_id: str) -> LoadedFrame:
-        """Read everything of one frame.
-
-        Raises:
-            DataFormatError: a file is missing or damaged; names file and reason.
-        """
         left, right = self._read_images(frame_id)
-        size_wh = (left.shape[1], left.shape[0])
-        camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, size_wh, self.dtype)
-        ground = self._ground(frame_id, left, right, camera)
         height, width = left.shape[:2]
+        camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, (width, height), self.dtype)
         time_s, T_world_cam = self._motion(frame_id, camera)
         frame = FrameBatch(
             images_left=_to_tensor(left, self.dtype),
             images_right=_to_tensor(right, self.dtype),
             sizes=torch.tensor([[height, width]]),
             camera=camera,
-            ground=ground,
+            ground=self._ground(frame_id, left, right, camera),
             frame_ids=(frame_id,),
             disparity=self._disparity(frame_id, (height, width)),
             points_cam=self._points(frame_id, (height, width)),
@@ -167,19 +153,15 @@ class FileStereoDataset:
         return other
 
     def objects(self, frame_id: str) -> list[KittiObject]:
-        """The detections of a frame alone, without its images."""
         return self.layout.objects(frame_id)
 
     def sequence_of(self, frame_id: str) -> str | None:
-        """The sequence of the frame, where tracks are wanted."""
         return self.layout.sequence_of(frame_id) if self.tracks else None
 
     def detection_path(self, frame_id: str) -> Path:
-        """The file that holds the detections of a frame."""
         return self.layout.detection_path(frame_id)
 
     def input_files(self, frame_id: str) -> dict[str, Path]:
-        """The files that `load` reads for a frame and that bear on its result, by their role."""
         left, right = self.layout.images(frame_id)
         files = {
             "image_left": left,
@@ -296,42 +278,26 @@ class FileStereoDataset:
             "camera_height": (),
         }
         for source in orders[self.ground]:
-            plane_cam = (
-                self._plane_from_file(frame_id, camera)
-                if source == "file"
-                else self._plane_from_stereo(left, right, camera)
-            )
+            if source == "file":
+                plane_cam = self._plane_from_file(frame_id, camera)
+            else:
+                plane_cam = estimate_ground_plane(left, right, camera)
             if plane_cam is not None:
-                return _ground_plane(plane_cam, source, self.dtype)
+                normal, offset = (torch.as_tensor(part).double().to(self.dtype) for part in plane_cam)
+                return GroundPlane(normal.reshape(1, 3), offset.reshape(1), (source,))
         return GroundPlane.from_camera_height(self.camera_height_m).to(dtype=self.dtype)
 
-    def _plane_from_file(self, frame_id: str, camera: StereoCamera) -> Tensor | None:
+    def _plane_from_file(self, frame_id: str, camera: StereoCamera) -> tuple[Tensor, Tensor] | None:
         if self.ground == "auto" and self.layout.plane_path(frame_id) is None:
             return None
         plane_ref = torch.from_numpy(self.layout.plane_ref(frame_id))
-        offset_cam = plane_ref_to_cam(plane_ref[:3], plane_ref[3], camera.t_cam_ref[0].double())
-        return torch.cat([plane_ref[:3], offset_cam[None]])
-
-    def _plane_from_stereo(
-        self, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
-    ) -> Tensor | None:
-        from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
-
-        plane = estimate_ground_plane(left, right, camera)
-        if plane is None:
-            return None
-        normal, offset = (torch.as_tensor(part, dtype=torch.float64).reshape(-1) for part in plane)
-        return torch.cat([normal, offset])
+        return plane_ref[:3], plane_ref_to_cam(plane_ref[:3], plane_ref[3], camera.t_cam_ref[0].double())
 
 
 def _as_fields(fields: DisparityField | Sequence[DisparityField] | None) -> tuple[DisparityField, ...]:
     if fields is None:
         return ()
     return (fields,) if isinstance(fields, DisparityField) else tuple(fields)
-
-
-def _ground_plane(plane_cam: Tensor, source: str, dtype: torch.dtype) -> GroundPlane:
-    return GroundPlane(plane_cam[None, :3].to(dtype), plane_cam[None, 3].to(dtype).reshape(1), (source,))
 
 
 def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:

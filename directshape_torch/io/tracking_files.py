@@ -62,15 +62,8 @@ class FrameObjects:
         return of_sequence if not of_frame.is_file() and of_sequence.is_file() else of_frame
 
     def read(self, path: Path, frame_id: str) -> list[KittiObject]:
-        """The objects of a frame in a file that `path` named.
-
-        Raises:
-            DataFormatError: the file is missing or damaged.
-            InputError: the name of a frame of a sequence does not end with its number.
-        """
-        if path.stem == frame_id:
-            return read_objects(path)
-        return self.of_sequence(path, frame_id)
+        """The objects of a frame in a file that `path` named; raises as `of_sequence`."""
+        return read_objects(path) if path.stem == frame_id else self.of_sequence(path, frame_id)
 
     def of_sequence(self, path: Path, frame_id: str) -> list[KittiObject]:
         """The objects of a frame in a file of the tracking benchmark.

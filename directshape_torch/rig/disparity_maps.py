@@ -8,7 +8,7 @@ import torch
 
 from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.disparity_files import read_disparity
+from directshape_torch.io.image_files import read_disparity
 from directshape_torch.rig.disparity_observations import KnownDepth
 
 FOLDERS = ("disp_noc_0", "disp_occ_0")

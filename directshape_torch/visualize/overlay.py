@@ -62,13 +62,12 @@ class DrawnCar:
         return float(self.corners_cam[:, 2].mean())
 
 
-def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult, first_row: int = 0) -> Picture:
-    """The picture of a frame that was refined alone or in a batch.
+def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
+    """The picture of a refined frame.
 
     Args:
         loaded: the frame.
-        result: of a call with its detections.
-        first_row: where they begin in `result`.
+        result: of its detections.
 
     Returns:
         (h, w, 3) RGB uint8.
@@ -78,7 +77,7 @@ def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult, first_row: i
         picture_of(frame.images_left[0]),
         frame.camera.K_left[0].double().cpu().numpy(),
         before=_initial_cars(loaded, result),
-        after=refined_cars(loaded, result, first_row),
+        after=refined_cars(loaded, result),
         truth_corners_cam=_true_corners(loaded),
         title=f"frame {loaded.frame_id}",
     )
@@ -170,7 +169,7 @@ def _initial_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCa
     return cars
 
 
-def refined_cars(loaded: LoadedFrame, result: RefinementResult, first_row: int) -> list[DrawnCar]:
+def refined_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCar]:
     """The refined shape with the box of the result file; the initial state where there is none."""
     boxes = result.boxes()
     statuses, refined = result.status, result.refined.tolist()
@@ -179,8 +178,7 @@ def refined_cars(loaded: LoadedFrame, result: RefinementResult, first_row: int) 
     T_cam_box = pose_from_kitti(location_cam, boxes.rotation_y.detach().double().cpu())
     corners = box_corners(T_cam_box, boxes.dimensions_hwl.detach().double().cpu()).numpy()
     cars = []
-    for car, initial in enumerate(_initial_cars(loaded, result)):
-        row = first_row + car
+    for row, initial in enumerate(_initial_cars(loaded, result)):
         note = statuses[row].name
         if refined[row]:
             mesh = result.mesh(row)

@@ -29,7 +29,7 @@ from directshape_torch.image.grey_levels import grey_levels, halve
 from directshape_torch.io.ground_plane_files import plane_ref_to_cam, read_plane
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
-from directshape_torch.io.result_files import RefinedBox, write_result_text
+from directshape_torch.io.result_files import write_result_text
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.shape.sdf_grid import Lookup
@@ -197,7 +197,7 @@ def test_13_result_files_keep_what_is_not_refined(tmp_path: Path) -> None:
     ]
     source, target = tmp_path / "in.txt", tmp_path / "out.txt"
     source.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
-    box = RefinedBox((1.4, 1.7, 4.1), (-16.1, 2.3, 57.0), 1.5, 1.7753)
+    box = (1.7753, 1.4, 1.7, 4.1, -16.1, 2.3, 57.0, 1.5)
     write_result_text(target, read_objects(source), {1: box})
     written = target.read_text(encoding="utf-8").splitlines()
     assert (written[0], written[2]) == (lines[0], lines[2])

@@ -28,7 +28,7 @@ from directshape_torch.errors import MeshError
 from directshape_torch.figures.trust_model import load_trust_model
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.disparity_files import read_disparity
+from directshape_torch.io.image_files import read_disparity
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import read_calibration
 from directshape_torch.io.mask_files import CocoFileMasks, InstancePngMasks

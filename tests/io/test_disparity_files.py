@@ -10,7 +10,7 @@ from helpers.disparity_maps import write_disparity
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.disparity_files import read_disparity
+from directshape_torch.io.image_files import read_disparity
 
 
 def test_round_trip_to_a_256th_of_a_pixel(tmp_path: Path) -> None:

@@ -28,8 +28,8 @@ def test_normal_is_flipped_up_and_of_unit_length(tmp_path: Path, line: str) -> N
     ("text", "message"),
     [
         ("", "is empty"),
-        (HEADER + "0 -1 0", r"line 4: expected four finite numbers: '0 -1 0'"),
-        (HEADER, r"line 3: expected four finite numbers: 'Height 1'"),
+        (HEADER + "0 -1 0", r"line 4: expected 4 finite numbers, got 3: '0 -1 0'"),
+        (HEADER, r"line 3: expected 4 numbers .*Height.*: 'Height 1'"),
         (HEADER + "0 0 1 1.65", r"line 4: the normal is not near the vertical y axis"),
         (HEADER + "0 0 0 0", r"line 4: the normal is not near the vertical y axis"),
     ],

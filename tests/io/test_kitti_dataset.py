@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-import types
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -219,14 +217,12 @@ def test_ground_from_the_file_is_moved_to_the_camera(root: Path) -> None:
 
 def fake_estimator(monkeypatch: pytest.MonkeyPatch, answer: object) -> list[tuple[Any, ...]]:
     calls: list[tuple[Any, ...]] = []
-    module = types.ModuleType("directshape_torch.stereo_matching.plane_from_points")
 
     def estimate_ground_plane(*arguments: Any) -> object:
         calls.append(arguments)
         return answer
 
-    module.estimate_ground_plane = estimate_ground_plane  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr("directshape_torch.io.stereo_files.estimate_ground_plane", estimate_ground_plane)
     return calls
 
 

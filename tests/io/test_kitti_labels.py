@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
-from directshape_torch.io.kitti_labels import poses_cam, poses_ref, read_objects, shift_frame
+from directshape_torch.io.kitti_labels import poses_cam, read_objects
 
+# No shift: the frame of the labels.
+REF = torch.zeros(3, dtype=torch.float64)
 LABEL = "Car 0.81 0 -2.08 812.76 184.44 1241.00 374.00 1.46 1.56 4.11 2.54 1.55 4.31 -1.58"
 RESULT = "Car -1 -1 -1.60 531.91 208.03 694.61 347.11 1.40 1.62 3.92 0.17 1.77 8.35 -1.58 0.9550"
 DONT_CARE = "DontCare -1 -1 -10 579.44 175.79 595.04 188.10 -1 -1 -1 -1000 -1000 -1000 -10"
@@ -77,7 +79,7 @@ def test_binary_file(tmp_path: Path) -> None:
 def test_rotation_y_minus_half_pi_points_away_from_the_camera(tmp_path: Path) -> None:
     """KITTI: a car that drives straight ahead has rotation_y = -pi/2."""
     line = f"Car 0 0 0 0 0 9 9 1.5 1.6 4.0 1.0 1.7 20.0 {-math.pi / 2}"
-    T_ref_obj = poses_ref(read_objects(write(tmp_path, line)))
+    T_ref_obj = poses_cam(read_objects(write(tmp_path, line)), REF)
     front_ref = T_ref_obj[0, :3, :3] @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(front_ref, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     corners = box_corners(T_ref_obj, torch.tensor([[1.5, 1.6, 4.0]], dtype=torch.float64))[0]
@@ -92,7 +94,7 @@ def test_camera_frame_there_and_back(tmp_path: Path) -> None:
     t_cam_ref = torch.tensor([0.0598, -0.0004, 0.0027], dtype=torch.float64)
     T_cam_obj = poses_cam(objects, t_cam_ref)
     torch.testing.assert_close(T_cam_obj[0, :3, 3], torch.tensor([2.5998, 1.5496, 4.3127], dtype=torch.float64))
-    torch.testing.assert_close(shift_frame(T_cam_obj, -t_cam_ref), poses_ref(objects))
+    torch.testing.assert_close(T_cam_obj[:, :3, 3] - t_cam_ref, poses_cam(objects, REF)[:, :3, 3])
 
 
 def test_no_objects_have_poses_of_the_right_shape() -> None:
@@ -108,7 +110,7 @@ def test_no_objects_have_poses_of_the_right_shape() -> None:
 def test_heading_and_alpha_come_back(tmp_path_factory: pytest.TempPathFactory, x: float, z: float, ry: float) -> None:
     path = tmp_path_factory.mktemp("labels") / "a.txt"
     path.write_text(f"Car 0 0 0 0 0 9 9 1.5 1.6 4.0 {x} 1.7 {z} {ry}")
-    T_ref_obj = poses_ref(read_objects(path))
+    T_ref_obj = poses_cam(read_objects(path), REF)
     assert rotation_y_from_pose(T_ref_obj).item() == pytest.approx(ry, abs=1e-9)
     alpha = alpha_from_kitti(T_ref_obj[:, :3, 3], rotation_y_from_pose(T_ref_obj)).item()
     assert -math.pi <= alpha <= math.pi

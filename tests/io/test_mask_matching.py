@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.instance_masks import InstanceMask
-from directshape_torch.io.mask_matching import (
+from directshape_torch.io.instance_masks import (
+    InstanceMask,
     match_masks,
     match_one_to_one,
     without_duplicates,

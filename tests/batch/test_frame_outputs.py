@@ -1,4 +1,4 @@
-"""Results of one frame or a batch end in the right files and lines, with the numbers of the zero level."""
+"""Results of a frame end in the right files and lines, with the numbers of the zero level."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.errors import InputError
+from directshape_torch.batch.frame_outputs import write_frame_outputs
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.figures.disparity_profile import DisparityProfile
 from directshape_torch.figures.observability import Observability
 from directshape_torch.figures.quality import FitQuality
@@ -17,8 +18,7 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import MatchingSummary
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
-from directshape_torch.io.refinement_files import write_result
-from directshape_torch.io.result_files import read_shapes, write_shapes
+from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
@@ -107,12 +107,9 @@ def result(statuses: list[Status]) -> RefinementResult:
     )
 
 
-def write_refinement(
-    out_dir: Path, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str, first_row: int = 0
-) -> None:
-    """Both files of a frame, outside of a run."""
-    shapes = write_result(out_dir, loaded, result, prior_sha256, first_row)
-    write_shapes(shapes_path(out_dir, loaded.frame_id), shapes)
+def write_refinement(out_dir: Path, loaded: LoadedFrame, result: RefinementResult, prior_sha256: str) -> None:
+    """Both files of a frame."""
+    write_frame_outputs(out_dir, loaded, result, "", prior_sha256, {}, RefineOptions())
 
 
 @pytest.fixture
@@ -146,19 +143,6 @@ def test_one_frame(tmp_path: Path, objects: list[KittiObject]) -> None:
     np.testing.assert_allclose(shapes.T_cam_obj[2, :3, 3], [2.06, 1.59, 12.003])
     np.testing.assert_allclose(shapes.boxes_hwl, [[1.5, 1.6, 4.0], [1.0, 1.0, 1.0], [1.5, 1.6, 4.0]], atol=1e-6)
     assert shapes.codes.tolist() == [[0, 1], [2, 3], [4, 5]]
-
-
-def test_frames_of_a_batch(tmp_path: Path, objects: list[KittiObject]) -> None:
-    batch = result([Status.converged] * 3)
-    first, second = loaded_frame(objects, (0, -1, 1, -1), "000001"), loaded_frame(objects, (-1, -1, -1, 0), "000002")
-    write_refinement(tmp_path, first, batch, "")
-    write_refinement(tmp_path, second, batch, "", first_row=2)
-    assert read_shapes(shapes_path(tmp_path, "000001")).iterations.tolist() == [0, 1]
-    assert read_shapes(shapes_path(tmp_path, "000002")).iterations.tolist() == [2]
-    assert read_objects(result_path(tmp_path, "000002"))[3].location_ref == (2.0, 1.6, 12.0)
-    assert result_path(tmp_path, "000002").read_text().splitlines()[:3] == [CAR, WALKER, CAR]
-    with pytest.raises(InputError, match="result: expected at least 4 cars, got 3"):
-        write_refinement(tmp_path, first, batch, "", first_row=2)
 
 
 def test_no_cars(tmp_path: Path, objects: list[KittiObject]) -> None:
