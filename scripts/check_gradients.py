@@ -29,7 +29,7 @@ from command_line import run_command
 
 from directshape_torch.errors import InputError
 from directshape_torch.laboratory.regimes import regimes_named
-from directshape_torch.laboratory.report import console_table, summary, write_report
+from directshape_torch.laboratory.report import summary, write_report
 from directshape_torch.laboratory.scenes import load_scene
 from directshape_torch.laboratory.study import SUBJECT_NAMES, StudyPlan, run_study, subjects_named
 from directshape_torch.refinement.scene_problem import TermFactory
@@ -72,16 +72,10 @@ def run(args: argparse.Namespace) -> int:
     scene = load_scene(args.data, args.frame, args.detections, args.masks)
     prior = (PCAShapePrior.load_bundled() if args.prior is None else PCAShapePrior.load(args.prior)).double()
     study = run_study(scene, prior, plan, report=lambda line: print(line, file=sys.stderr))
-    print(console_table(study.comparisons))
-    if args.out is None:
-        print(summary(scene.source, plan, study))
-    else:
+    print(summary(scene.source, plan, study), end="")
+    if args.out is not None:
         write_report(args.out, scene.source, plan, study)
-        print(f"summary  {args.out / 'summary.md'}")
-    broken = study.broken_bounds()
-    for sentence in broken:
-        print(f"BROKEN   {sentence}")
-    return 1 if broken else 0
+    return 1 if study.broken_bounds() else 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -9,8 +9,8 @@ detector. With `--sequence` the frames are of one moving scene (passing parked c
 as the seed has it), in the layout of KITTI's tracking benchmark, with tracks, times and the camera's motion.
 
 The same seed gives the same scene; the pixels are the same on the same renderer version and variant. A frame takes
-minutes (6 with `--cars 4 --paths-per-pixel 1` on two busy cores). Needs Mitsuba 3 and pyoidn (without the latter a
-simpler, rougher denoiser is used). `--variant scalar_rgb` runs as installed; `llvm_ad_rgb` needs an LLVM library of
+minutes (6 with `--cars 4 --paths-per-pixel 1` on two busy cores). Needs Mitsuba 3 and pyoidn.
+`--variant scalar_rgb` runs as installed; `llvm_ad_rgb` needs an LLVM library of
 version 19 (Debian: `apt-get install libllvm19`), older ones crash.
 """
 

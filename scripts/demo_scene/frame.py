@@ -25,11 +25,10 @@ _FEWEST_PIXELS, _NEAREST_M = 300, 0.8
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How much effort a frame gets; `scale` below 1 gives a small picture, for a look only."""
+    """How much effort a frame gets."""
 
     paths_per_pixel: int = 16
     variant: str = "scalar_rgb"
-    scale: float = 1.0
 
 
 def render_frame(layout: SceneLayout, settings: RenderSettings) -> Frame:
@@ -63,7 +62,7 @@ def _pictures(
 ) -> tuple[Picture, Picture]:
     seed = 2 * (layout.seed + number)
     radiance = [
-        sensor.denoise(renderer.path_trace(view, settings.paths_per_pixel, seed + k, settings.scale))
+        sensor.denoise(renderer.path_trace(view, settings.paths_per_pixel, seed + k))
         for k, view in enumerate(_views(layout))
     ]
     exposure = sensor.exposure_for(radiance[0])

@@ -84,15 +84,15 @@ class Renderer:
             description[f"surface_{k:04d}"] = self._mesh(f"surface_{k:04d}", surface)
         self._scene = mitsuba.load_dict(description, optimize=False)
 
-    def path_trace(self, T_view_road: Array, paths_per_pixel: int, seed: int, scale: float = 1.0) -> PathTraced:
-        """Radiance seen by a camera, and what the denoiser wants to know; `scale` shrinks the picture for trials."""
+    def path_trace(self, T_view_road: Array, paths_per_pixel: int, seed: int) -> PathTraced:
+        """Radiance seen by a camera, and what the denoiser wants to know."""
         integrator = {
             "type": "aov",
             "aovs": "albedo:albedo,normal:sh_normal",
             "path": {"type": "path", "max_depth": 6},
         }
         sampler = {"type": "independent", "sample_count": paths_per_pixel}
-        channels = self._render(T_view_road, integrator, sampler, seed, scale)
+        channels = self._render(T_view_road, integrator, sampler, seed)
         radiance = np.minimum(np.nan_to_num(channels[..., :3]), _MAX_RADIANCE)
         return PathTraced(radiance, np.clip(channels[..., -6:-3], 0.0, 1.0), channels[..., -3:])
 
@@ -101,22 +101,19 @@ class Renderer:
         integrator = {"type": "aov", "aovs": "instance:albedo,position:position"}
         # One stratified sample without jitter lies in the middle of its pixel.
         sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
-        channels = self._render(T_view_road, integrator, sampler, 0, 1.0)
+        channels = self._render(T_view_road, integrator, sampler, 0)
         instance = np.rint(channels[..., -6] * _MAX_INSTANCES).astype(np.int64) - 1
         points_road = channels[..., -3:]
         depth = points_road @ T_view_road[2, :3] + T_view_road[2, 3]
         hit = np.abs(points_road).sum(axis=-1) > 0.0
         return PixelTruth(instance, np.where(hit, depth, 0.0))
 
-    def _render(
-        self, T_view_road: Array, integrator: dict[str, Any], sampler: dict[str, Any], seed: int, scale: float
-    ) -> Array:
-        sensor = self._mi.load_dict(self._sensor(T_view_road, sampler, scale))
+    def _render(self, T_view_road: Array, integrator: dict[str, Any], sampler: dict[str, Any], seed: int) -> Array:
+        sensor = self._mi.load_dict(self._sensor(T_view_road, sampler))
         image = self._mi.render(self._scene, sensor=sensor, integrator=self._mi.load_dict(integrator), seed=seed)
         return np.array(image, dtype=np.float64)
 
-    def _sensor(self, T_view_road: Array, sampler: dict[str, Any], scale: float) -> dict[str, Any]:
-        width, height = round(IMAGE_WIDTH_PX * scale), round(IMAGE_HEIGHT_PX * scale)
+    def _sensor(self, T_view_road: Array, sampler: dict[str, Any]) -> dict[str, Any]:
         # Mitsuba looks along +z with x to the left and y up.
         to_world = np.linalg.inv(T_view_road) @ np.diag([-1.0, -1.0, 1.0, 1.0])
         return {
@@ -132,8 +129,8 @@ class Renderer:
             "principal_point_offset_y": float((0.5 * IMAGE_HEIGHT_PX - K[1, 2] - 0.5) / IMAGE_HEIGHT_PX),
             "film": {
                 "type": "hdrfilm",
-                "width": width,
-                "height": height,
+                "width": IMAGE_WIDTH_PX,
+                "height": IMAGE_HEIGHT_PX,
                 "pixel_format": "rgb",
                 "component_format": "float32",
                 "rfilter": {"type": "box"},

@@ -8,38 +8,25 @@ import numpy as np
 from demo_scene.camera import Array
 from demo_scene.rendering import PathTraced
 from demo_scene.surfaces import Picture
+from directshape_torch.errors import MissingDependencyError
 
 _NOISE_GREY_LEVELS = 1.2
 
 
 def denoise(view: PathTraced) -> Array:
-    """Radiance (H, W, 3) without path-tracing noise: Open Image Denoise if installed, else a joint bilateral filter."""
+    """Radiance (H, W, 3) without path-tracing noise, by Open Image Denoise.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
     try:
         import pyoidn
-    except ImportError:
-        return bilateral_denoise(view)
+    except ImportError as error:
+        raise MissingDependencyError("pyoidn", "render", "rendering") from error
     radiance, albedo, normals = (
         np.ascontiguousarray(a, dtype=np.float32) for a in (view.radiance, view.albedo, np.clip(view.normals, -1, 1))
     )
     return np.asarray(pyoidn.denoise(radiance, albedo, normals, hdr=True), dtype=np.float64)
-
-
-def bilateral_denoise(view: PathTraced) -> Array:
-    """Smooths the illumination, radiance over albedo, within surfaces of like normal and colour."""
-    albedo = np.maximum(view.albedo, 0.02)
-    light = np.log1p(np.where(view.albedo.sum(axis=-1, keepdims=True) > 0, view.radiance / albedo, view.radiance))
-    guide = np.concatenate([view.normals, view.albedo], axis=-1)
-    total, weights = np.zeros_like(light), np.zeros(light.shape[:2])
-    radius = 3
-    for dv in range(-radius, radius + 1):
-        for du in range(-radius, radius + 1):
-            moved_light, moved_guide = (np.roll(a, (dv, du), axis=(0, 1)) for a in (light, guide))
-            unlike = ((moved_guide - guide) ** 2).sum(axis=-1) / 0.02 + ((moved_light - light) ** 2).sum(axis=-1) / 0.5
-            weight = np.exp(-unlike - (du * du + dv * dv) / 8.0)
-            total += weight[..., None] * moved_light
-            weights += weight
-    smooth = np.expm1(total / weights[..., None])
-    return np.asarray(np.where(view.albedo.sum(axis=-1, keepdims=True) > 0, smooth * albedo, smooth))
 
 
 def exposure_for(radiance: Array) -> float:
