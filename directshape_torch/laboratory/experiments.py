@@ -30,7 +30,7 @@ from directshape_torch.terms.silhouette import (
     closest_approach_residual,
     product_residual,
 )
-from directshape_torch.terms.term import Linear, Term, by_autograd
+from directshape_torch.terms.term import Linear, Term, by_autograd, linear_of
 
 # The samples of the paper's product lie between the bounds of the grid and move with them; they are constants of a
 # linearisation by definition, and its Jacobian is that of the residual at fixed samples.
@@ -163,7 +163,7 @@ def gradient_experiment(bench: Bench, names: Sequence[str]) -> Experiment:
     def gradients(delta: Tensor) -> list[Tensor]:
         state = bench.moved(delta)
         field = field_of(bench.problem.prior.bind(state.code))
-        moved = (term.linear(field, state, at.where) for term, at in zip(terms, rows, strict=True))
+        moved = (linear_of(term, field, state, at.where) for term, at in zip(terms, rows, strict=True))
         return [row_gradients(t, at)[m].flatten() for t, at, m in zip(terms, moved, moving, strict=True)]
 
     jacobians = torch.func.jacfwd(gradients)(torch.zeros_like(_units(bench)))

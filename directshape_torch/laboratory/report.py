@@ -1,4 +1,4 @@
-"""A study as text: console table, CSV files and a one-page summary."""
+"""A study as text: a line of CSV for each comparison, and a one-page summary."""
 
 from __future__ import annotations
 
@@ -13,32 +13,6 @@ from directshape_torch.files.atomic_files import write_text
 from directshape_torch.laboratory.comparison import BOUNDS, PAIRS, Comparison
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.laboratory.study import StudyPlan, StudyResult
-
-
-def console_table(comparisons: Sequence[Comparison]) -> str:
-    """One line for each subject and regime.
-
-    Columns: entries compared; for each pair the maximum and the 99.9th percentile of the relative error; exclusions.
-    """
-    lines = [
-        f"{'subject':36}{'regime':19}{'compared':>9}  "
-        + "".join(f"{_short(pair):>20}" for pair in PAIRS)
-        + "  excluded",
-        f"{'':36}{'':19}{'':>9}  " + f"{'max / 99.9 %':>20}" * len(PAIRS),
-    ]
-    for c in comparisons:
-        errors = "".join(f"{c.errors[p].maximum:9.1e} / {c.errors[p].percentile_999:8.1e}" for p in PAIRS)
-        lines.append(f"{c.name:36}{c.regime:19}{c.compared:9d}  {errors}  {_exclusions(c)}")
-    return "\n".join(lines)
-
-
-def _short(pair: str) -> str:
-    return pair.replace("analytic", "an").replace("autograd", "auto").replace("numeric", "num")
-
-
-def _exclusions(c: Comparison) -> str:
-    rules = ", ".join(f"{rule} {count}" for rule, count in c.excluded.items())
-    return f"{100 * c.excluded_share:.2f} %" + (f": {rules}" if rules else "")
 
 
 def write_report(out: Path, source: str, plan: StudyPlan, study: StudyResult) -> None:

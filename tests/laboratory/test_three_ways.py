@@ -141,11 +141,12 @@ def test_factors(bench_of: BenchOf, factor: str) -> None:
         assert found.compared > 0
 
 
-def test_gradients_can_be_differentiated(bench_of: BenchOf) -> None:
+@pytest.mark.parametrize("regime", ["typical", "disparity_offset"])
+def test_gradients_can_be_differentiated(bench_of: BenchOf, regime: str) -> None:
     """What gradients through a refinement are made of: the derivatives of every row's gradient, by autograd."""
     names = [name for name in TERM_NAMES if name not in AT_FIXED_DEPTHS]
     with torch.no_grad():
-        for found in compare(gradient_experiment(bench_of("typical"), names), "typical"):
+        for found in compare(gradient_experiment(bench_of(regime), names), regime):
             assert found.broken_bounds() == []
             assert found.compared > 50
 
