@@ -18,7 +18,7 @@ from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.rig.estimate import RigEstimate, rig_among
-from directshape_torch.rig.frames_with_truth import TruthSource, add_truth, chosen_frames, observe_frame, truth_files
+from directshape_torch.rig.known_depth import TruthSource, add_truth, chosen_frames, observe_frame, truth_files
 from directshape_torch.rig.of_dataset import estimate_rigs
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
 from directshape_torch.rig.self_calibration import self_calibrate
@@ -85,12 +85,9 @@ def _add_motion(args: argparse.Namespace, rigs: list[RigEstimate]) -> None:
     for before, after in sequence.gaps():
         print(f"warning: frames {before} and {after} are not consecutive: few points are found again", file=sys.stderr)
     shown = Bar(sequence.frame_ids, desc="motion", unit="frame", disable=None)
-    constraints, size_wh = observe_motion(sequence, args.camera_height or None, shown)
+    constraints = observe_motion(sequence, args.camera_height or None, shown)
     with Bar(desc="fit to all frames, then to halves", unit="step", disable=None) as bar:
-        found = self_calibrate(constraints, size_wh, len(sequence.frame_ids), bar.update)
+        found = self_calibrate(constraints, len(sequence.frame_ids), bar.update)
     if not found.converged:
         print("warning: the fit was still moving when it was ended", file=sys.stderr)
-    camera = sequence.camera
-    rig_among(rigs, size_wh, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]).add_pixels(
-        "motion", found.evidence
-    )
+    rig_among(rigs, constraints[0].rig).add_pixels("motion", found.evidence)

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.stereo_files import FileStereoDataset
-from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.of_dataset import rig_of_frame
+from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.finding import Finding
 
 FEWEST_CARS = 8
@@ -24,7 +24,7 @@ def check_rig(dataset: FileStereoDataset, frame_ids: Sequence[str]) -> list[Find
         # What cannot be read was found before.
         with suppress(DirectShapeError, OSError):
             loaded = plain.load(frame_id)
-            rig_of_frame(rigs, loaded.frame).update(loaded.frame, loaded.detections)
+            rig_among(rigs, Rig.of_frame(loaded.frame)).update(loaded.frame, loaded.detections)
     enough = [rig for rig in rigs if len(rig.rows) >= FEWEST_CARS]
     return [found for rig in enough for found in (*_offset(rig, dataset), *_bias(rig))]
 

@@ -40,6 +40,22 @@ def read_rgb(path: Path | str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
+def read_pair(left_path: Path, right_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Both images of a rectified pair, see `read_rgb`.
+
+    Raises:
+        DataFormatError: one of them is missing or damaged, or they differ in size.
+    """
+    left, right = read_rgb(left_path), read_rgb(right_path)
+    if left.shape != right.shape:
+        raise DataFormatError(
+            right_path,
+            f"has {right.shape[1]} x {right.shape[0]} pixels, the left image {left.shape[1]} x {left.shape[0]}",
+            cure="give the rectified pair of one frame",
+        )
+    return left, right
+
+
 def read_single_channel(path: Path | str) -> NDArray[Any]:
     """Read a one-channel PNG as it is stored, uint8 or uint16 (H, W).
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
+from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.files.names import check_frame_id
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
@@ -22,7 +22,7 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import MatchingSummary, build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
 from directshape_torch.io.ground_plane_files import plane_ref_to_cam
-from directshape_torch.io.image_files import read_disparity, read_rgb
+from directshape_torch.io.image_files import read_disparity, read_pair
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import camera_of_rig, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
@@ -119,7 +119,7 @@ class FileStereoDataset:
         return len(self.frame_ids)
 
     def load(self, frame_id: str) -> LoadedFrame:
-        left, right = self._read_images(frame_id)
+        left, right = read_pair(*self.layout.images(frame_id))
         height, width = left.shape[:2]
         camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, (width, height), self.dtype)
         time_s, T_world_cam = self._motion(frame_id, camera)
@@ -226,17 +226,6 @@ class FileStereoDataset:
         for frame_id in known:
             check_frame_id("frames" if split is None else f"{split}, frames", frame_id)
         return tuple(known)
-
-    def _read_images(self, frame_id: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        left_path, right_path = self.layout.images(frame_id)
-        left, right = read_rgb(left_path), read_rgb(right_path)
-        if left.shape != right.shape:
-            raise DataFormatError(
-                right_path,
-                f"has {right.shape[1]} x {right.shape[0]} pixels, the left image {left.shape[1]} x {left.shape[0]}",
-                cure="give the rectified pair of one frame",
-            )
-        return left, right
 
     def _disparity(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
         if self.disparity_dir is None:

@@ -7,13 +7,13 @@ from torch import Tensor
 
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.camera import rays_from_pixels
-from directshape_torch.geometry.projection import disparity_of_depth, project
+from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.se3 import inverse, transform
-from directshape_torch.image.grey_levels import grey_levels
+from directshape_torch.rig.rig import Rig
 from directshape_torch.rows import ObjectRays
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.patch_alignment import refine_disparity
+from directshape_torch.stereo_matching.disparity import rgb8
+from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
 _SETBACK_M = 0.1
 # Share of the box's height in which its sides are near the car's.
@@ -124,52 +124,40 @@ def _rows_of_frame(frames: FrameBatch, detections: Detections, frame: int) -> li
     ahead = (detections.frame_index == frame) & (depth > _NEAREST_M) & (depth < _FARTHEST_M)
     if not bool(ahead.any()):
         return []
-    height, width = frames.sizes[frame].tolist()
-    images = [i[frame, :, :height, :width].detach().double().cpu() for i in (frames.images_left, frames.images_right)]
-    left, right = ((255 * i).round().clamp(0, 255).byte().permute(1, 2, 0).numpy() for i in images)
-    matched = torch.from_numpy(match_disparity(left, right)).double()
-    grey_left, grey_right = (grey_levels(i[None])[0] for i in images)
-    camera = frames.camera
-    calibration = tuple(t[frame].detach().double().cpu() for t in (camera.K_left, camera.K_right, camera.T_right_cam))
-    cars = ahead.nonzero()[:, 0].tolist()
-    rows = (_row_of_car(detections, car, matched, (grey_left, grey_right), calibration) for car in cars)
+    rig = Rig.of_frame(frames, frame)
+    width, height = rig.size_wh
+    images = (side[frame, :, :height, :width] for side in (frames.images_left, frames.images_right))
+    pair = MatchedPair.of(*(rgb8(image) for image in images))
+    rows = (_row_of_car(detections, car, pair, rig) for car in ahead.nonzero()[:, 0].tolist())
     return [row for row in rows if row is not None]
 
 
-def _row_of_car(
-    detections: Detections,
-    car: int,
-    matched: Tensor,  # (H, W) pixels
-    grey: tuple[Tensor, Tensor],  # left and right, (H, W)
-    calibration: tuple[Tensor, ...],  # K_left, K_right, T_right_cam
-) -> Tensor | None:
+def _row_of_car(detections: Detections, car: int, pair: MatchedPair, rig: Rig) -> Tensor | None:
     T_cam_obj, hwl = (t[car].detach().double().cpu() for t in (detections.T_cam_obj, detections.dimensions_hwl))
-    inside = _pixels_of_car(detections, car, T_cam_obj, hwl, calibration[0], matched)
-    uv = (inside & matched.isfinite()).nonzero().flip(1).double()
-    depth = near_side_depth(T_cam_obj, hwl, uv, calibration[0])
+    inside = _pixels_of_car(detections, car, T_cam_obj, hwl, rig)
+    uv = (inside & pair.matched.isfinite()).nonzero().flip(1).double()
+    depth = near_side_depth(T_cam_obj, hwl, uv, rig.K_left)
     seen = depth.isfinite().nonzero()[:, 0]
     seen = seen[:: max(1, -(-len(seen) // _POINTS_PER_CAR))]
     if len(seen) < _FEWEST_POINTS:
         return None
     uv = uv[seen]
-    implied, implied_row = disparity_of_depth(uv, depth[seen], *calibration).unbind(dim=1)
+    implied, implied_row = rig.displacement(uv, depth[seen]).unbind(dim=1)
     u, v = uv.long().unbind(dim=1)
-    found = refine_disparity(*grey, uv, matched[v, u], implied_row)
-    kept, (K_left, _, T_right_cam) = found.reliable, calibration
+    found = pair.aligned(uv, pair.matched[v, u], implied_row)
+    kept, focal_baseline = found.reliable, rig.K_left[0, 0] * -rig.T_right_cam[0, 3]
     offset, row_offset = (found.disparity - implied)[kept], (implied_row - found.row_shift)[kept]
-    reduced = _reduced(uv[kept], found.disparity[kept], offset, row_offset, K_left[0, 0] * -T_right_cam[0, 3])
-    size = size_error(T_cam_obj, hwl, inside, K_left) if bool(detections.has_mask_left[car]) else 0.0
+    reduced = _reduced(uv[kept], found.disparity[kept], offset, row_offset, focal_baseline)
+    size = size_error(T_cam_obj, hwl, inside, rig.K_left) if bool(detections.has_mask_left[car]) else 0.0
     return None if reduced is None else torch.cat([reduced, reduced.new_tensor([size])])
 
 
-def _pixels_of_car(
-    detections: Detections, car: int, T_cam_obj: Tensor, hwl: Tensor, K_left: Tensor, matched: Tensor
-) -> Tensor:
+def _pixels_of_car(detections: Detections, car: int, T_cam_obj: Tensor, hwl: Tensor, rig: Rig) -> Tensor:
     """(H, W) the car's mask; without a mask the pixels round its box."""
-    height, width = matched.shape
+    width, height = rig.size_wh
     if bool(detections.has_mask_left[car]):
         return detections.mask_left[car, :height, :width].detach().cpu() > 0.5
-    corners = project(box_corners(T_cam_obj, hwl), K_left)
+    corners = project(box_corners(T_cam_obj, hwl), rig.K_left)
     limit = torch.tensor([width, height]).double()
     low, high = corners.amin(dim=0).maximum(0 * limit).long(), corners.amax(dim=0).minimum(limit).ceil().long()
     inside = torch.zeros(height, width, dtype=torch.bool)

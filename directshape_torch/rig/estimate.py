@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
@@ -18,6 +17,7 @@ from directshape_torch.numerics.checks import check_shape
 from directshape_torch.rig.detections import COLUMNS, observe_detections
 from directshape_torch.rig.pixels import PixelEvidence, hull
 from directshape_torch.rig.posterior import BIAS, Posterior, solve_offsets, solve_rows
+from directshape_torch.rig.rig import Rig
 from directshape_torch.scene import Detections, FrameBatch
 
 # A service runs for years; so many cars say all that cars can say.
@@ -28,6 +28,10 @@ _FEWEST_CARS = 10
 _LARGEST_PX = 1e5
 # Half of a car's image: where it stands the field is seen.
 _CAR_UV_PX = (40.0, 20.0)
+_SQUARE, _LONG = (NUM_COEFFICIENTS, NUM_COEFFICIENTS), (NUM_COEFFICIENTS,)
+# What content that is missing, of other types or sizes, too large or too deep leads to.
+DAMAGE = (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError, RuntimeError)
+_OF_PIXELS = (_SQUARE, _LONG, _SQUARE, _LONG, (None, 2))
 
 
 class Detector(NamedTuple):
@@ -71,10 +75,9 @@ class RigEstimate(nn.Module):
         self._solved: tuple[Posterior, DisparityField] | None = None
 
     @classmethod
-    def of_frames(cls, frames: FrameBatch) -> RigEstimate:
+    def of_frames(cls, frames: FrameBatch) -> Self:
         """Of the rig of the first of some frames, nothing known yet."""
-        camera, (height, width) = frames.camera, frames.sizes[0].tolist()
-        return cls((width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
+        return cls(*Rig.of_frame(frames))
 
     def update(self, frames: FrameBatch, detections: Detections) -> None:
         """Take in what the detections of further frames say.
@@ -86,7 +89,8 @@ class RigEstimate(nn.Module):
         Raises:
             InputError: frames of another rig.
         """
-        self.check_frames(frames)
+        for number in range(len(frames)):
+            self._blank.check_rig(*Rig.of_frame(frames, number))
         self.add_rows(observe_detections(frames, detections))
 
     def add_rows(self, rows: Tensor) -> None:
@@ -174,16 +178,6 @@ class RigEstimate(nn.Module):
         sigma[:, 0] = torch.where(along > 0, along, torch.inf)
         return replace(detections, pose_sigma=sigma)
 
-    def check_frames(self, frames: FrameBatch) -> None:
-        """Refuse frames of another rig.
-
-        Raises:
-            InputError: image size, intrinsics or right camera differ.
-        """
-        camera = frames.camera
-        for k, (height, width) in enumerate(frames.sizes.tolist()):
-            self._blank.check_rig((width, height), camera.K_left[k], camera.K_right[k], camera.T_right_cam[k])
-
     def __str__(self) -> str:
         """One line of what was found and from what."""
         (offset, sigma), detector = self.in_the_middle(), self.detector
@@ -217,21 +211,35 @@ class RigEstimate(nn.Module):
         return True
 
     def content(self) -> dict[str, Any]:
-        """All that the estimate rests on, as tensors and numbers."""
-        rig = {name: getattr(self._blank, name) for name in ("K_left", "K_right", "T_right_cam")}
-        pixels = {kind: evidence._asdict() for kind, evidence in self.pixels.items()}
-        return {"size_wh": list(self._blank.size_wh), **rig, "rows": self.rows, "pixels": pixels}
+        """All that the estimate rests on, as numbers, lists and words; `of_content` takes it back."""
+        size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
+        pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
+        rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
+        return {"size_wh": size_wh, **rig, "rows": self.rows.tolist(), "pixels": pixels}
+
+    @classmethod
+    def of_content(cls, content: Any) -> Self:
+        """The estimate that `content` was made of.
+
+        Raises:
+            InputError: it is no such content.
+        """
+        try:
+            width, height = (int(n) for n in content["size_wh"])
+            sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
+            rig = cls((width, height), *(to_tensor(content, name, (n, n)) for name, n in sizes.items()))
+            rig.add_rows(to_tensor(content, "rows", (None, len(COLUMNS))))
+            for kind, sums in content["pixels"].items():
+                points, frames, *names = PixelEvidence._fields
+                tensors = (to_tensor(sums, name, shape) for name, shape in zip(names, _OF_PIXELS, strict=True))
+                rig.add_pixels(kind, PixelEvidence(int(sums[points]), int(sums[frames]), *tensors))
+        except DAMAGE as error:
+            raise InputError("content", "that of an estimate", f"another ({error!r})") from error
+        return rig
 
     def get_extra_state(self) -> Tensor:
-        """`content()` as the bytes of a safetensors file; `set_extra_state` takes it back."""
-        content = self.content()
-        pixels = {
-            f"pixels.{kind}.{name}": value
-            for kind, sums in content.pop("pixels").items()
-            for name, value in sums.items()
-        }
-        state = {name: torch.as_tensor(value).clone() for name, value in {**content, **pixels}.items()}
-        return torch.tensor(list(save(state)), dtype=torch.uint8)
+        """`content` as the bytes of JSON; `set_extra_state` takes it back."""
+        return torch.tensor(list(json.dumps(self.content()).encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
         """Of `get_extra_state`; nothing of what was known before stays.
@@ -241,19 +249,10 @@ class RigEstimate(nn.Module):
         """
         check_shape("state", state, ("n",))
         try:
-            self._take(load(bytes(state.tolist())))
-        # Bytes that are none, a damaged file, tensors that are missing or of other shapes.
-        except (TypeError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
+            other = self.of_content(json.loads(bytes(state.tolist())))
+        except DAMAGE as error:
             raise InputError("state", "what get_extra_state has made", f"something else ({error})") from error
-
-    def _take(self, read: dict[str, Tensor]) -> None:
-        matrices = (read[name] for name in ("K_left", "K_right", "T_right_cam"))
-        width, height = read["size_wh"].tolist()
-        self._blank = DisparityField.constant(0.0, (width, height), *matrices)
-        self.rows, self._solved, self.pixels = read["rows"], None, {}
-        for kind in sorted({name.split(".")[1] for name in read if name.startswith("pixels.")}):
-            points, frames, *others = (read[f"pixels.{kind}.{name}"] for name in PixelEvidence._fields)
-            self.pixels[kind] = PixelEvidence(int(points), int(frames), *others)
+        self._blank, self.rows, self.pixels, self._solved = other._blank, other.rows, other.pixels, None
 
     @property
     def _focal_baseline(self) -> float:
@@ -306,21 +305,35 @@ class RigEstimates(nn.ModuleList):
         return detections if rig is None else rig.informed(frames, detections)
 
     def _of(self, frames: FrameBatch) -> RigEstimate | None:
-        camera, (height, width) = frames.camera, frames.sizes[0].tolist()
-        matrices = camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
-        return next((rig for rig in self if rig.is_of((width, height), *matrices)), None)  # type: ignore[operator, return-value]
+        rig = Rig.of_frame(frames)
+        return next((known for known in self if known.is_of(*rig)), None)  # type: ignore[operator, return-value]
 
 
-def rig_among(
-    rigs: list[RigEstimate],
-    size_wh: tuple[int, int],
-    K_left: Tensor,  # (3, 3)
-    K_right: Tensor,  # (3, 3)
-    T_right_cam: Tensor,  # (4, 4)
-) -> RigEstimate:
+def rig_among(rigs: list[RigEstimate], rig: Rig) -> RigEstimate:
     """The estimate of that rig; one that knows nothing yet joins the list where there is none."""
-    known = [rig for rig in rigs if rig.is_of(size_wh, K_left, K_right, T_right_cam)]
-    if known:
-        return known[0]
-    rigs.append(RigEstimate(size_wh, K_left, K_right, T_right_cam))
-    return rigs[-1]
+    known = [estimate for estimate in rigs if estimate.is_of(*rig)] or [RigEstimate(*rig)]
+    if known[0] not in rigs:
+        rigs.append(known[0])
+    return known[0]
+
+
+def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
+    """The numbers of that name in the content of a JSON file, float64; None in a shape is any number.
+
+    Raises:
+        ValueError: they are missing, none, not finite or of another shape.
+    """
+    try:
+        tensor = torch.tensor(entry[name], dtype=torch.float64)
+    except DAMAGE as error:
+        raise ValueError(f"{name!r} must be numbers of shape {shape}") from error
+    if not tensor.numel() and None in shape:  # JSON has no rows of nothing
+        tensor = tensor.reshape([n or 0 for n in shape])
+    fits = tensor.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, tensor.shape, strict=True))
+    if not fits or not bool(tensor.isfinite().all()):
+        raise ValueError(f"{name!r} must be finite numbers of shape {shape}, got {tuple(tensor.shape)}")
+    return tensor
+
+
+def _plain(value: int | Tensor) -> Any:
+    return value.tolist() if isinstance(value, Tensor) else value

@@ -10,8 +10,9 @@ v, the field's slope along v. The known height of the camera decides that one (`
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -21,19 +22,11 @@ from torch import Tensor
 
 from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.geometry.projection import depth_from_disparity, disparity_of_depth, project
+from directshape_torch.geometry.projection import project
 from directshape_torch.geometry.se3 import exp, from_rotation_translation, transform
-from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.rig.disparity_observations import DisparityObservations, matched_pixels
-from directshape_torch.rig.field_constraint import (
-    PATCH_SIGMA_PX,
-    Linearisation,
-    disparity_slope,
-    information_share,
-    tukey_weight,
-)
-from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.patch_alignment import PatchLimits, align_patches
+from directshape_torch.rig.rig import Rig
+from directshape_torch.rig.self_calibration import PATCH_SIGMA_PX, FieldConstraint
+from directshape_torch.stereo_matching.patch_alignment import MatchedPair, PatchLimits, align_patches
 
 # Later frames to which points are followed. One step shows the near points best, several the far ones.
 STEPS = (1, 2, 4)
@@ -51,64 +44,36 @@ _FEWEST_TRACKS = 50
 _LIMITS = PatchLimits(radius_px=5, change_px=1.5, sigma_px=(0.06, 0.06))
 # A car that stands shows no depth by its motion.
 _SMALLEST_MOTION_M = 0.3
+_TRACK_SIGMA_PX = 0.12
+_DEPTH_ITERATIONS = 3
+_SMALLEST_INVERSE_DEPTH = 1e-4
 
 
-@dataclass(frozen=True)
-class StereoFeatures:
-    """Corners of one left image with their disparity.
-
-    Attributes:
-        grey_left: (H, W) the left image.
-        uv_left: (P, 2) pixels, float64.
-        disparity: (P,) measured, pixels.
-        row_shift: (P,) measured v_left - v_right, pixels.
-        points_cam: (P, 3) metres, as the raw disparity has them.
-    """
-
-    grey_left: NDArray[np.uint8]
-    uv_left: Tensor
-    disparity: Tensor
-    row_shift: Tensor
-    points_cam: Tensor
+Motion = tuple[NDArray[np.float64], NDArray[np.float64]]  # rotation vector (3,) and translation (3,)
 
 
-@dataclass(frozen=True)
-class TrackedFeatures:
-    """Corners of one left image that were found again in a later one.
+class StereoFeatures(NamedTuple):
+    """Corners of one left image with their disparity."""
 
-    Attributes:
-        uv_left: (P, 2) pixels, float64.
-        disparity, row_shift: (P,) pixels.
-        uv_later: (P, 2) pixels in the later left image.
-        T_later_cam: (4, 4) motion of the left camera, roughly.
-    """
-
-    uv_left: Tensor
-    disparity: Tensor
-    row_shift: Tensor
-    uv_later: Tensor
-    T_later_cam: Tensor
+    rig: Rig
+    grey_left: NDArray[np.uint8]  # (H, W) the left image
+    seen: Tensor  # (P, 4) see `FieldConstraint`
+    points_cam: Tensor  # (P, 3) metres, as the raw disparity has them
 
 
 def find_features(
     image_left: NDArray[np.uint8],  # (H, W, 3) RGB
-    image_right: NDArray[np.uint8],  # (H, W, 3)
-    camera: StereoCamera,  # one frame
-    matched: Tensor | None = None,  # (H, W) semi-global disparity, where it is known already
+    pair: MatchedPair,
+    rig: Rig,
 ) -> StereoFeatures:
     """Corners spread evenly over the left image, with disparities from patches whose rows are free."""
     import cv2
 
     grey = np.asarray(cv2.cvtColor(np.ascontiguousarray(image_left), cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-    if matched is None:
-        matched = torch.from_numpy(match_disparity(image_left, image_right)).double()
-    uv = _corners(grey, matched.isfinite().numpy())
-    uv, disparity, row_shift = matched_pixels(image_left, image_right, uv, matched)
-    K_left, K_right, T_right_cam = (t[0].double() for t in (camera.K_left, camera.K_right, camera.T_right_cam))
-    depth = depth_from_disparity(uv, disparity, K_left, K_right, T_right_cam)
-    in_front = depth.isfinite()
-    points_cam = depth[:, None] * rays_from_pixels(uv, K_left)
-    return StereoFeatures(grey, uv[in_front], disparity[in_front], row_shift[in_front], points_cam[in_front])
+    seen = pair.seen_at(_corners(grey, pair.matched.isfinite().numpy()))
+    points_cam = rig.depth(seen[:, :2], seen[:, 2])[:, None] * rays_from_pixels(seen[:, :2], rig.K_left)
+    in_front = points_cam[:, 2].isfinite()
+    return StereoFeatures(rig, grey, seen[in_front], points_cam[in_front])
 
 
 def _corners(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
@@ -134,9 +99,8 @@ def _corners(grey: NDArray[np.uint8], usable: NDArray[np.bool_]) -> Tensor:
 
 def track_features(
     features: StereoFeatures,
-    later: list[NDArray[np.uint8]],  # the left images (H, W) of the frames that follow, in order
-    camera: StereoCamera,  # one frame
-) -> list[TrackedFeatures]:
+    later: Sequence[NDArray[np.uint8]],  # the left images (H, W) of the frames that follow, in order
+) -> list[MotionConstraint]:
     """Follow corners into the later images that are `STEPS` away; steps that fail are left out.
 
     Each later image is compared with the first one, not with the one before it, so errors do not add up. Where to look
@@ -145,34 +109,27 @@ def track_features(
     tracked = []
     foretold: NDArray[np.float32] | None = None
     for step, grey_later in enumerate(later[: max(STEPS)], start=1):
-        uv_later, found = _follow(features.grey_left, grey_later, features.uv_left, foretold)
-        motion = _rough_motion(features.points_cam[found], uv_later[found], camera)
+        uv_later, found = _follow(features.grey_left, grey_later, features.seen[:, :2], foretold)
+        motion = _rough_motion(features.points_cam[found], uv_later[found], features.rig.K_left)
         if motion is None:
             break
         if step in STEPS and float(np.linalg.norm(motion[1])) >= _SMALLEST_MOTION_M:
-            tracked.append(_tracked(features, grey_later, uv_later, found, motion))
-        foretold = _foretell(features.points_cam, motion, (step + 1) / step, camera)
+            tracked.append(_constraint(features, grey_later, uv_later, found, motion))
+        foretold = _foretell(features, motion, (step + 1) / step)
     return tracked
 
 
-def _tracked(
-    features: StereoFeatures,
-    grey_later: NDArray[np.uint8],
-    uv_later: Tensor,
-    found: Tensor,
-    motion: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> TrackedFeatures:
+def _constraint(
+    features: StereoFeatures, grey_later: NDArray[np.uint8], uv_later: Tensor, found: Tensor, motion: Motion
+) -> MotionConstraint:
     """The points that were found, aligned anew with the size that they have in the later image."""
     T_later_cam = from_rotation_translation(torch.from_numpy(_rotation(motion[0])), torch.from_numpy(motion[1]))
     depth_later = transform(T_later_cam, features.points_cam)[:, 2]
     zoom = (features.points_cam[:, 2] / depth_later.clamp_min(0.5))[found]
     first, later = (torch.from_numpy(image).double() for image in (features.grey_left, grey_later))
-    uv_left, uv_start = features.uv_left[found], uv_later[found]
-    aligned, reliable = align_patches(first, later, uv_left, uv_start, _LIMITS, zoom)
-    uv_left, disparity, row_shift = (
-        t[found][reliable] for t in (features.uv_left, features.disparity, features.row_shift)
-    )
-    return TrackedFeatures(uv_left, disparity, row_shift, aligned[reliable], T_later_cam)
+    seen = features.seen[found]
+    aligned, reliable = align_patches(first, later, seen[:, :2], uv_later[found], _LIMITS, zoom)
+    return MotionConstraint(features.rig, seen[reliable], aligned[reliable], T_later_cam)
 
 
 def _follow(
@@ -202,9 +159,9 @@ def _follow(
 def _rough_motion(
     points_cam: Tensor,  # (P, 3)
     uv_later: Tensor,  # (P, 2)
-    camera: StereoCamera,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Rotation vector (3,) and translation (3,) that most of the points agree with."""
+    K: Tensor,
+) -> Motion | None:
+    """What most of the points agree with."""
     import cv2
 
     if len(points_cam) < _FEWEST_TRACKS:
@@ -212,7 +169,7 @@ def _rough_motion(
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points_cam.numpy(),
         uv_later.numpy(),
-        camera.K_left[0].double().numpy(),
+        K.numpy(),
         None,
         reprojectionError=_RANSAC_TOLERANCE_PX,
         iterationsCount=300,
@@ -229,114 +186,72 @@ def _rotation(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
 
 
-def _foretell(
-    points_cam: Tensor, motion: tuple[NDArray[np.float64], NDArray[np.float64]], factor: float, camera: StereoCamera
-) -> NDArray[np.float32]:
+def _foretell(features: StereoFeatures, motion: Motion, factor: float) -> NDArray[np.float32]:
     """Pixels (P, 2) of the points after `factor` times the motion; far outside of the image where they pass it."""
     rotation, translation = (torch.from_numpy(part) for part in (_rotation(motion[0] * factor), motion[1] * factor))
-    later = points_cam @ rotation.T + translation
-    uv = project(later, camera.K_left[0].double())
+    later = features.points_cam @ rotation.T + translation
+    uv = project(later, features.rig.K_left)
     return torch.where(later[:, 2:] > 0.5, uv, torch.full_like(uv, -1e3)).numpy().astype(np.float32)
 
 
-_TRACK_SIGMA_PX = 0.12
-_DEPTH_ITERATIONS = 3
-_SMALLEST_INVERSE_DEPTH = 1e-4
-
-
 @dataclass(frozen=True)
-class MotionConstraint:
+class MotionConstraint(FieldConstraint):
     """Points of one left image found in a later one; own unknowns: a twist (6,) of `T_later_cam`.
 
     Depths are unknowns too, one a point; they are always the best ones for motion and field, and eliminated.
+
+    Attributes:
+        uv_later: (P, 2) pixels in the later left image.
+        T_later_cam: (4, 4) motion of the left camera.
     """
 
-    tracks: TrackedFeatures
-    camera: StereoCamera
-    size_wh: tuple[int, int]
+    uv_later: Tensor
     T_later_cam: Tensor
-    degrees_of_freedom: int = 2
 
-    @classmethod
-    def of(cls, tracks: TrackedFeatures, camera: StereoCamera, size_wh: tuple[int, int]) -> MotionConstraint:
-        """With the rough motion as start."""
-        return cls(tracks, camera, size_wh, tracks.T_later_cam)
-
-    def linearise(self, coefficients: Tensor, scale: float) -> Linearisation:
-        """See `FieldConstraint`."""
-        inverse_depth = self._inverse_depth(coefficients)
-        residual, J_depth, J_motion = self._residual(inverse_depth, coefficients)
+    def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Disparity and later pixel, less what a change of the point's own depth could mend: that says nothing."""
+        residual, J_depth, J_motion = self._of_depths(self.inverse_depth(coefficients), coefficients)
         J_field = torch.zeros(len(residual), 3, NUM_COEFFICIENTS, dtype=residual.dtype)
-        J_field[:, 0] = polynomial_basis(self.tracks.uv_left, self.size_wh) / PATCH_SIGMA_PX
+        J_field[:, 0] = polynomial_basis(self.uv, self.rig.size_wh) / PATCH_SIGMA_PX
         along = J_depth / J_depth.norm(dim=1, keepdim=True).clamp_min(1e-12)
-        # What a change of the point's own depth could mend says nothing of field and motion.
-        J = _without(along, torch.cat([J_motion, J_field], dim=2))
-        residual = _without(along, residual[..., None])[..., 0]
-        distances = residual.norm(dim=1)
-        weight = tukey_weight(distances, scale)
-        share = information_share(weight, scale)
-        weighted = (J * (share * weight)[:, None, None]).flatten(0, 1)
-        return Linearisation(weighted.T @ J.flatten(0, 1), weighted.T @ residual.flatten(), distances)
+        columns = torch.cat([residual[..., None], J_motion, J_field], dim=2)
+        columns = columns - along[..., None] * (along[:, None] @ columns)
+        return columns[..., 0], columns[..., 1:]
 
-    def moved(self, own_step: Tensor) -> Self:
-        """See `FieldConstraint`."""
-        return replace(self, T_later_cam=exp(own_step) @ self.T_later_cam)
-
-    def observations(self, coefficients: Tensor, scale: float) -> DisparityObservations:
-        """See `FieldConstraint`; the depths are those that agree best with motion and field."""
-        inverse_depth = self._inverse_depth(coefficients)
-        residual, J_depth, _ = self._residual(inverse_depth, coefficients)
-        along = J_depth / J_depth.norm(dim=1, keepdim=True).clamp_min(1e-12)
-        kept = tukey_weight(_without(along, residual[..., None])[..., 0].norm(dim=1), scale) > 0
-        displacement = disparity_of_depth(self.tracks.uv_left, 1 / inverse_depth, *self._calibration())
-        bias, vertical = self.tracks.disparity - displacement[:, 0], displacement[:, 1] - self.tracks.row_shift
-        return DisparityObservations(self.tracks.uv_left[kept], bias[kept], vertical[kept], 1 / inverse_depth[kept])
-
-    def _inverse_depth(self, coefficients: Tensor) -> Tensor:
-        """(P,) the best ones for motion and field, by a few Newton steps from those of the disparity."""
-        bias = polynomial_basis(self.tracks.uv_left, self.size_wh) @ coefficients
-        depth = depth_from_disparity(self.tracks.uv_left, self.tracks.disparity - bias, *self._calibration())
-        inverse_depth = (1 / depth).nan_to_num(nan=_SMALLEST_INVERSE_DEPTH)
+    def inverse_depth(self, coefficients: Tensor) -> Tensor:
+        """The best ones for motion and field, by a few Newton steps from those of the disparity."""
+        bias = polynomial_basis(self.uv, self.rig.size_wh) @ coefficients
+        inverse_depth = (1 / self.rig.depth(self.uv, self.seen[:, 2] - bias)).nan_to_num(nan=_SMALLEST_INVERSE_DEPTH)
         for _ in range(_DEPTH_ITERATIONS):
-            residual, J_depth, _ = self._residual(inverse_depth, coefficients)
+            residual, J_depth, _ = self._of_depths(inverse_depth, coefficients)
             step = -(J_depth * residual).sum(dim=1) / (J_depth * J_depth).sum(dim=1).clamp_min(1e-12)
             inverse_depth = (inverse_depth + step).clamp_min(_SMALLEST_INVERSE_DEPTH)
         return inverse_depth
 
-    def _residual(self, inverse_depth: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def moved(self, own_step: Tensor) -> Self:
+        """Another motion."""
+        return replace(self, T_later_cam=exp(own_step) @ self.T_later_cam)
+
+    def known(self) -> tuple[Tensor, Tensor]:
+        """Nothing."""
+        return self.seen.new_zeros(()), self.seen.new_zeros(6)
+
+    def _of_depths(self, inverse_depth: Tensor, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Disparity and later pixel, predicted minus observed, in standard deviations (P, 3); its derivatives by the
         inverse depth (P, 3) and by the twist (P, 3, 6)."""
-        tracks, calibration = self.tracks, self._calibration()
-        disparity = disparity_of_depth(tracks.uv_left, 1 / inverse_depth, *calibration)[:, 0]
-        bias = polynomial_basis(tracks.uv_left, self.size_wh) @ coefficients
+        rays_cam, K = rays_from_pixels(self.uv, self.rig.K_left), self.rig.K_left
+        disparity, slope = self.disparity(rays_cam, inverse_depth)
+        bias = polynomial_basis(self.uv, self.rig.size_wh) @ coefficients
         R, t = self.T_later_cam[:3, :3], self.T_later_cam[:3, 3]
         # The point times its inverse depth: finite however far it is.
-        later = rays_from_pixels(tracks.uv_left, calibration[0]) @ R.T + inverse_depth[:, None] * t
-        J_uv_later = _projection_jacobian(later, calibration[0])
-        J_later_twist = torch.cat(
-            [inverse_depth[:, None, None] * torch.eye(3, dtype=later.dtype), -So3.hat(later)], dim=2
-        )
-        residual_uv = (project(later, calibration[0]) - tracks.uv_later) / _TRACK_SIGMA_PX
-        residual = torch.cat([((disparity + bias - tracks.disparity) / PATCH_SIGMA_PX)[:, None], residual_uv], dim=1)
-        slope = disparity_slope(tracks.uv_left, inverse_depth, *calibration)
+        later = rays_cam @ R.T + inverse_depth[:, None] * t
+        uv = project(later, K)
+        J_uv_later = (K[:2] - uv[..., None] * K[2]) / later[:, 2, None, None]
+        moved = inverse_depth[:, None, None] * torch.eye(3, dtype=later.dtype)
+        J_later_twist = torch.cat([moved, -So3.hat(later)], dim=2)
+        residual_uv = (uv - self.uv_later) / _TRACK_SIGMA_PX
+        residual = torch.cat([((disparity + bias - self.seen[:, 2]) / PATCH_SIGMA_PX)[:, None], residual_uv], dim=1)
         J_depth = torch.cat([slope[:, None] / PATCH_SIGMA_PX, (J_uv_later @ t) / _TRACK_SIGMA_PX], dim=1)
         J_motion = torch.zeros(len(residual), 3, 6, dtype=residual.dtype)
         J_motion[:, 1:] = J_uv_later @ J_later_twist / _TRACK_SIGMA_PX
         return residual, J_depth, J_motion
-
-    def _calibration(self) -> tuple[Tensor, Tensor, Tensor]:
-        camera = self.camera
-        return camera.K_left[0].double(), camera.K_right[0].double(), camera.T_right_cam[0].double()
-
-
-def _projection_jacobian(points: Tensor, K: Tensor) -> Tensor:
-    """J_uv_point (P, 2, 3)."""
-    z = points[:, 2]
-    uv = project(points, K)
-    return (K[:2] - uv[..., None] * K[2]) / z[:, None, None]
-
-
-def _without(along: Tensor, columns: Tensor) -> Tensor:
-    """Columns (P, 3, N) less their part along the unit vectors (P, 3)."""
-    part: Tensor = columns - along[..., None] * (along[:, None] @ columns)
-    return part

@@ -12,7 +12,7 @@ from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.rig.estimate import RigEstimate, rig_among
-from directshape_torch.scene import FrameBatch
+from directshape_torch.rig.rig import Rig
 
 # Half a second each, and an estimate from detections hardly gets better than that.
 _MOST_FRAMES = 60
@@ -35,12 +35,12 @@ def estimate_rigs(
         rigs: what is known already; the evidence is added to these, and new rigs join the list.
     """
     plain, rigs = dataset.changed(ground="camera_height", disparity_field=None), [] if rigs is None else rigs
-    for frame_ids in frames_by_rig(plain):
+    for frame_ids in _frames_by_rig(plain):
         _take_in(plain, frame_ids, tell, rigs)
     return rigs
 
 
-def frames_by_rig(dataset: FileStereoDataset) -> list[list[str]]:
+def _frames_by_rig(dataset: FileStereoDataset) -> list[list[str]]:
     """All frames that have detections, chosen or not, those of one calibration together.
 
     Frames whose calibration cannot be read are left out.
@@ -77,14 +77,8 @@ def _rig_of_first(dataset: FileStereoDataset, frame_ids: Sequence[str], rigs: li
         with suppress(DirectShapeError, OSError):
             height, width = read_rgb(dataset.layout.images(frame_id)[0]).shape[:2]
             camera = to_stereo_camera([dataset.layout.calibration(frame_id)], dtype=torch.float64)
-            return rig_among(rigs, (width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
+            return rig_among(rigs, Rig.of(camera, (width, height)))
     return None
-
-
-def rig_of_frame(rigs: list[RigEstimate], frame: FrameBatch) -> RigEstimate:
-    """The estimate of the rig of one frame; one that knows nothing yet joins the list where there is none."""
-    camera, (height, width) = frame.camera, frame.sizes[0].tolist()
-    return rig_among(rigs, (width, height), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
 
 
 def _evenly(frame_ids: Sequence[str]) -> list[str]:

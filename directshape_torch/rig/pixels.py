@@ -10,7 +10,6 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.rig.disparity_observations import DisparityObservations, cell_index
 
 _BALANCE_GRID = (16, 8)
 # Points of one cell share their scene and its errors: they count as this many independent ones at most, and those of
@@ -48,22 +47,16 @@ class PixelEvidence(NamedTuple):
 
     def __add__(self, other: PixelEvidence) -> PixelEvidence:  # type: ignore[override]
         """Both together, as independent."""
-        return PixelEvidence(
-            self.num_points + other.num_points,
-            self.num_frames + other.num_frames,
-            self.information + other.information,
-            self.vector + other.vector,
-            self.row_information + other.row_information,
-            self.row_vector + other.row_vector,
-            hull(torch.cat([self.hull_uv, other.hull_uv])),
-        )
+        sums = {name: getattr(self, name) + getattr(other, name) for name in self._fields[:-1]}
+        return PixelEvidence(**sums, hull_uv=hull(torch.cat([self.hull_uv, other.hull_uv])))
 
 
-def pixel_evidence(observations: DisparityObservations, size_wh: tuple[int, int], num_frames: int = 1) -> PixelEvidence:
+def pixel_evidence(observations: Tensor, size_wh: tuple[int, int], num_frames: int = 1) -> PixelEvidence:
     """Reweighted least squares (Tukey), each part of the image counting alike.
 
     Args:
-        observations: measured against true disparity, of one rig.
+        observations: (P, 4) u, v, measured minus true disparity, measured minus true row in the right image; pixels of
+            one rig, float64.
         size_wh: width and height of its images.
         num_frames: that they are from.
 
@@ -77,11 +70,10 @@ def pixel_evidence(observations: DisparityObservations, size_wh: tuple[int, int]
             str(len(observations)),
             "give more frames, or check that calibration and ground truth belong to the images",
         )
-    uv = observations.uv_left
+    uv = observations[:, :2]
     basis, balance = polynomial_basis(uv, size_wh), _balance(uv, size_wh)
-    parts = (_information(basis, y, balance, num_frames) for y in (observations.bias_px, observations.vertical_px))
-    (H, b), (H_row, b_row) = parts
-    return PixelEvidence(len(observations), num_frames, H, b, H_row, b_row, hull(uv))
+    of_field, of_rows = (_information(basis, offset, balance, num_frames) for offset in observations[:, 2:].T)
+    return PixelEvidence(len(observations), num_frames, *of_field, *of_rows, hull(uv))
 
 
 def hull(uv: Tensor) -> Tensor:  # (P, 2) -> (M, 2)
@@ -123,6 +115,17 @@ def _information(
         coefficients = torch.linalg.solve(H, basis.T @ (weight * offset_px))
     share = (_INDEPENDENT_PER_FRAME * num_frames / weight.sum()).clamp_max(1.0) / scale.clamp_min(_PATCH_SCALE_PX) ** 2
     return share * basis.T @ (weight[:, None] * basis), share * basis.T @ (weight * offset_px)
+
+
+def cell_index(
+    uv: Tensor,  # (P, 2)
+    size_wh: tuple[int, int],
+    grid: tuple[int, int],
+) -> Tensor:  # (P,)
+    """Number of the image cell of each pixel, row by row, in a grid of columns x rows."""
+    column = (uv[:, 0] * grid[0] / size_wh[0]).long().clamp(0, grid[0] - 1)
+    row = (uv[:, 1] * grid[1] / size_wh[1]).long().clamp(0, grid[1] - 1)
+    return row * grid[0] + column
 
 
 def _balance(uv: Tensor, size_wh: tuple[int, int]) -> Tensor:

@@ -1,4 +1,4 @@
-"""`rig.json`: the estimates of the rigs of a run, and the evidence they rest on (schema 1).
+"""JSON files of rigs: the estimates of a run with the evidence they rest on, and fields that are given.
 
 {"schema": "directshape rig", "schema_version": 1,
  "rigs": [{"size_wh": .., "K_left": .., "K_right": .., "T_right_cam": ..,   of which images
@@ -9,40 +9,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.atomic_files import write_json
 from directshape_torch.files.read_files import read_json
-from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, DisparityField
-from directshape_torch.rig.detections import COLUMNS
-from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.field_file import load_field
-from directshape_torch.rig.pixels import PixelEvidence
+from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, TENSOR_SHAPES, DisparityField
+from directshape_torch.rig.estimate import RigEstimate, to_tensor
 
 # In the folder of a run.
 RIG_FILE, RIG_PICTURE = "rig.json", "rig.png"
-SCHEMA, SCHEMA_VERSION = "directshape rig", 1
+RIGS, FIELD, SCHEMA_VERSION = "directshape rig", "directshape disparity field", 1
 _CURE = "make it again with 'directshape calibrate-rig'"
-_SQUARE, _LONG = (NUM_COEFFICIENTS, NUM_COEFFICIENTS), (NUM_COEFFICIENTS,)
-_OF_PIXELS = {
-    "information": _SQUARE,
-    "vector": _LONG,
-    "row_information": _SQUARE,
-    "row_vector": _LONG,
-    "hull_uv": (None, 2),
-}
+_EXACT = [[0.0] * NUM_COEFFICIENTS] * NUM_COEFFICIENTS
 
 
 def save_rigs(path: Path | str, rigs: Sequence[RigEstimate]) -> None:
-    """Write the estimates of one or several rigs."""
-    entries = [{**_plain(rig.content()), "says": str(rig)} for rig in rigs]
-    write_json(path, {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, "rigs": entries})
+    """Write the estimates of one or several rigs; a reader sees the old file or the new one, never half of it.
+
+    Raises:
+        OSError: the folder cannot be made or written.
+    """
+    entries = [{**rig.content(), "says": str(rig)} for rig in rigs]
+    write_json(path, {"schema": RIGS, "schema_version": SCHEMA_VERSION, "rigs": entries})
 
 
 def load_rigs(path: Path | str) -> list[RigEstimate]:
@@ -51,17 +42,45 @@ def load_rigs(path: Path | str) -> list[RigEstimate]:
     Raises:
         DataFormatError: it is missing, damaged, or holds no estimates.
     """
-    content = _read(path)
-    if content.get("schema") != SCHEMA or content.get("schema_version") != SCHEMA_VERSION:
-        raise DataFormatError(path, f"is no file of rigs (schema {SCHEMA!r}, version {SCHEMA_VERSION})", cure=_CURE)
+    content = _read(path, RIGS)
     try:
-        return [_rig(entry) for entry in content["rigs"]]
-    except (AttributeError, KeyError, TypeError, ValueError, IndexError, InputError) as error:
+        return [RigEstimate.of_content(entry) for entry in content["rigs"]]
+    except (KeyError, TypeError, InputError) as error:
         raise DataFormatError(path, f"is damaged ({error!r})", cure=_CURE) from error
 
 
+def save_field(field: DisparityField, path: Path | str) -> None:
+    """Write a field by itself, for one that is given and not estimated.
+
+    Raises:
+        OSError: the folder cannot be made or written.
+    """
+    tensors = {name: getattr(field, name).double().cpu().tolist() for name in TENSOR_SHAPES}
+    known = {"size_wh": list(field.size_wh), "provenance": dict(field.provenance)}
+    write_json(path, {"schema": FIELD, "schema_version": SCHEMA_VERSION, **known, **tensors})
+
+
+def load_field(path: Path | str) -> DisparityField:
+    """Read a field written by `save_field`, float64; without `covariance` it is exactly known.
+
+    Raises:
+        DataFormatError: the file is missing, is not valid JSON, or does not hold what a field needs.
+    """
+    content = {"covariance": _EXACT, "provenance": {}} | _read(path, FIELD)
+    size, provenance = content.get("size_wh"), content["provenance"]
+    try:
+        if not (isinstance(size, list) and len(size) == 2 and all(type(n) is int and n > 0 for n in size)):
+            raise ValueError(f"'size_wh' must be [width, height], got {shown(size)}")
+        if not isinstance(provenance, dict):
+            raise ValueError(f"'provenance' must be an object, got {shown(provenance)}")
+        tensors = {name: to_tensor(content, name, shape) for name, shape in TENSOR_SHAPES.items()}
+        return DisparityField(size_wh=(size[0], size[1]), provenance=provenance, **tensors)
+    except ValueError as error:
+        raise DataFormatError(path, str(error), cure="write it again with `save_field`") from error
+
+
 def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
-    """The disparity fields of a file of rigs, or the one of a field file of earlier versions.
+    """The disparity fields of a file of rigs, or the one of a file of `save_field`.
 
     Raises:
         DataFormatError: it is missing, damaged or neither of the two.
@@ -70,44 +89,20 @@ def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
 
 
 def holds_rigs(path: Path | str) -> bool:
-    """Whether a JSON file is one of estimates, and not a field file of earlier versions.
+    """Whether a JSON file is one of estimates, and not of `save_field`.
 
     Raises:
         DataFormatError: it is missing or damaged.
     """
-    return _read(path).get("schema") == SCHEMA
+    return _read(path).get("schema") == RIGS
 
 
-def _rig(entry: Mapping[str, Any]) -> RigEstimate:
-    width, height = (int(n) for n in entry["size_wh"])
-    matrices = (_tensor(entry, name, (n, n)) for name, n in (("K_left", 3), ("K_right", 3), ("T_right_cam", 4)))
-    rig = RigEstimate((width, height), *matrices)
-    rig.add_rows(_tensor(entry, "rows", (None, len(COLUMNS))))
-    for kind, sums in entry["pixels"].items():
-        tensors = {name: _tensor(sums, name, shape) for name, shape in _OF_PIXELS.items()}
-        rig.add_pixels(kind, PixelEvidence(int(sums["num_points"]), int(sums["num_frames"]), **tensors))
-    return rig
-
-
-def _tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
-    tensor = torch.tensor(entry[name], dtype=torch.float64)
-    if not tensor.numel() and None in shape:  # JSON has no rows of nothing
-        tensor = tensor.reshape([n or 0 for n in shape])
-    fits = tensor.ndim == len(shape) and all(n is None or n == m for n, m in zip(shape, tensor.shape, strict=True))
-    if not fits or not bool(tensor.isfinite().all()):
-        raise ValueError(f"{name!r} must be finite numbers of shape {shape}")
-    return tensor
-
-
-def _plain(value: Any) -> Any:
-    """Tensors as nested lists."""
-    if isinstance(value, Mapping):
-        return {name: _plain(part) for name, part in value.items()}
-    return value.tolist() if isinstance(value, Tensor) else value
-
-
-def _read(path: Path | str) -> dict[str, Any]:
+def _read(path: Path | str, schema: str | None = None) -> dict[str, Any]:
     content = read_json(path, _CURE)
     if not isinstance(content, dict):
         raise DataFormatError(path, "is no JSON object", cure=_CURE)
+    if schema is not None and (content.get("schema"), content.get("schema_version")) != (schema, SCHEMA_VERSION):
+        found = f"got {shown(content.get('schema'))}, version {shown(content.get('schema_version'))}"
+        what = "file of rigs" if schema == RIGS else "disparity field"
+        raise DataFormatError(path, f"is no {what} (schema {schema!r}, version {SCHEMA_VERSION}), {found}", cure=_CURE)
     return content

@@ -14,18 +14,25 @@ So motion gives constant and slopes, the road and the camera's height what motio
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
-from directshape_torch.rig.disparity_observations import DisparityObservations, concatenate
-from directshape_torch.rig.field_constraint import FieldConstraint, scale_of
+from directshape_torch.geometry.projection import warp_to_right
 from directshape_torch.rig.pixels import COEFFICIENT_SIGMA_PX, PixelEvidence, pixel_evidence
+from directshape_torch.rig.rig import Rig
 
+# Standard deviation of a patch's disparity, pixels.
+PATCH_SIGMA_PX = 0.12
+_TUKEY = 4.685
+# Points of one frame share their scene, its errors and those of the model: they count as so many independent ones.
+_INDEPENDENT_POINTS = 60
 _NUM_ITERATIONS = 150
 _FIRST_ITERATIONS = 10
 _SHRINK = 0.85
@@ -35,120 +42,185 @@ _LARGEST_SIGMA_PX = 0.5
 _LEAST_SIGMA_PX, _UNKNOWN_SIGMA_PX = 0.05, 0.2
 
 
+class Linearisation(NamedTuple):
+    """Normal equations `H delta = -g` of one constraint: its own M unknowns first, then the field's coefficients."""
+
+    H: Tensor  # (M + 10, M + 10)
+    g: Tensor  # (M + 10,)
+    spread: float  # how many times larger than expected the residuals are, by their median
+
+    def of_field(self) -> tuple[Tensor, Tensor]:
+        """H (10, 10) and g (10,) of the coefficients with the other unknowns eliminated."""
+        M = len(self.g) - NUM_COEFFICIENTS
+        solved = self._solved()
+        return self.H[M:, M:] - self.H[M:, :M] @ solved[:, 1:], self.g[M:] - self.H[M:, :M] @ solved[:, 0]
+
+    def own_step(self, step: Tensor) -> Tensor:
+        """Step (M,) of the constraint's own unknowns that belongs to a step (10,) of the coefficients."""
+        solved = self._solved()
+        return 0.0 - (solved[:, 0] + solved[:, 1:] @ step)
+
+    def _solved(self) -> Tensor:
+        M = len(self.g) - NUM_COEFFICIENTS
+        own = self.H[:M, :M]
+        # A direction of its own unknowns that nothing sees (a bend of the road) stays where it is.
+        own = own + torch.diag(1e-9 * own.diagonal() + 1e-12)
+        return torch.as_tensor(torch.linalg.solve(own, torch.cat([self.g[:M, None], self.H[:M, M:]], dim=1)))
+
+
 @dataclass(frozen=True)
-class SelfCalibration:
-    """A field from images alone.
+class FieldConstraint(ABC):
+    """Points of one pair that the field has to explain, with M unknowns of their own.
 
     Attributes:
-        evidence: on the field, as sure at its data as the halves of the constraints agree.
-        sigma_px: that standard deviation of the offset at the data, from how far the fields of the first and of the
-            second half of the constraints are apart; what both share (height, baseline) is not in it. None where one
-            of them alone determines no field: 0.2 px are taken then.
-        converged: whether the last step was below 1e-4 px.
+        rig: of the images.
+        seen: (P, 4) u, v, measured disparity, measured row shift v_left - v_right, pixels.
     """
 
-    evidence: PixelEvidence
+    rig: Rig
+    seen: Tensor
+
+    @abstractmethod
+    def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """(P, R) in standard deviations and (P, R, M + 10) by the own unknowns and the coefficients (10,)."""
+
+    @abstractmethod
+    def inverse_depth(self, coefficients: Tensor) -> Tensor:
+        """(P,) that belongs to the own unknowns, 1/m."""
+
+    @abstractmethod
+    def moved(self, own_step: Tensor) -> Self:
+        """With its own unknowns changed."""
+
+    @abstractmethod
+    def known(self) -> tuple[Tensor, Tensor]:
+        """What else is known of the own unknowns: a residual () in standard deviations, and (M,) its derivative."""
+
+    @property
+    def uv(self) -> Tensor:
+        """Pixels (P, 2)."""
+        return self.seen[:, :2]
+
+    def linearise(self, coefficients: Tensor, scale: float) -> Linearisation:
+        """At coefficients (10,) and the own unknowns, for residuals that are `scale` times too large."""
+        residual, J = self.residuals(coefficients)
+        distances = residual.norm(dim=1)
+        weight = tukey_weight(distances, scale)
+        share = (_INDEPENDENT_POINTS / weight.sum().clamp_min(1e-9)).clamp_max(1.0) / scale**2
+        weighted = (J * (share * weight)[:, None, None]).flatten(0, 1)
+        H, g = weighted.T @ J.flatten(0, 1), weighted.T @ residual.flatten()
+        known, J_known = self.known()
+        J_known = torch.cat([J_known, J_known.new_zeros(NUM_COEFFICIENTS)])
+        # Of a distance in one dimension, or in the two that a depth of its own leaves of three.
+        expected = 0.6745 if residual.shape[1] == 1 else math.sqrt(2 * math.log(2))
+        spread = float(distances.median()) / expected if len(distances) else 1.0
+        return Linearisation(H + torch.outer(J_known, J_known), g + J_known * known, spread)
+
+    def observations(self, coefficients: Tensor, scale: float) -> Tensor:
+        """What `pixel_evidence` takes (Q, 4), by the depths of the own unknowns, at the points that count."""
+        kept = tukey_weight(self.residuals(coefficients)[0].norm(dim=1), scale) > 0
+        true = self.rig.displacement(self.uv, 1 / self.inverse_depth(coefficients))
+        offsets = torch.stack([self.seen[:, 2] - true[:, 0], true[:, 1] - self.seen[:, 3]], dim=1)
+        return torch.cat([self.uv, offsets], dim=1)[kept]
+
+    def disparity(self, rays_cam: Tensor, inverse_depth: Tensor) -> tuple[Tensor, Tensor]:
+        """True disparity (P,) and its derivative by the inverse depth (P,), pixels x metres."""
+        uv_right, J_pixel_depth, _ = warp_to_right(rays_cam, 1 / inverse_depth, *self.rig[2:])
+        return self.seen[:, 0] - uv_right[:, 0], J_pixel_depth[:, 0] / inverse_depth**2
+
+
+def tukey_weight(distances: Tensor, scale: float) -> Tensor:
+    """Tukey's biweight, (P,) in [0, 1], for residuals in standard deviations that are `scale` times too large."""
+    return (1 - (distances / (_TUKEY * scale)) ** 2).clamp_min(0) ** 2
+
+
+class SelfCalibration(NamedTuple):
+    """A field from images alone."""
+
+    evidence: PixelEvidence  # as sure of the field at its data as the halves of the constraints agree
+    # That standard deviation: by how much the fields of the first and of the second half of the constraints are apart;
+    # what both share (height, baseline) is not in it. None where one of them determines no field: 0.2 px are taken.
     sigma_px: float | None
-    converged: bool
+    converged: bool  # the last step was below 1e-4 px
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """Coefficients (10,), their covariance (10, 10) were all constraints independent and the model true, the data."""
-
-    coefficients: Tensor
-    covariance: Tensor
-    observations: DisparityObservations
+class _Solution(NamedTuple):
+    coefficients: Tensor  # (10,)
+    covariance: Tensor  # (10, 10) were all constraints independent and the model true
+    observations: Tensor  # (P, 4)
     converged: bool
 
     def formal_sigma_px(self, size_wh: tuple[int, int]) -> float:
         """Of the bias at the data, median; too small by several times, but large where nothing is seen."""
         if len(self.observations) == 0:
             return math.inf
-        basis = polynomial_basis(self.observations.uv_left, size_wh)
+        basis = polynomial_basis(self.observations[:, :2], size_wh)
         return float(((basis @ self.covariance) * basis).sum(dim=-1).sqrt().median())
 
 
 def self_calibrate(
-    constraints: Sequence[FieldConstraint],
-    size_wh: tuple[int, int],
-    num_frames: int,
-    on_step: Callable[[], object] | None = None,
+    constraints: Sequence[FieldConstraint], num_frames: int, on_step: Callable[[], object] = lambda: None
 ) -> SelfCalibration:
     """The field that explains all constraints best: robust Gauss-Newton, each constraint's own unknowns eliminated.
 
     Args:
         constraints: `MotionConstraint` and `RoadConstraint` of many frames of one rig, in their order in time.
-        size_wh: width and height of its images.
         num_frames: that the constraints are from.
         on_step: called after each step, to show progress.
 
     Raises:
         InputError: no constraints, or the field is not determined by them (road alone, or a car that stands).
     """
-    solution = _solve(constraints, on_step)
-    _check_determined(solution, size_wh)
-    sigma_px = _sigma_from_halves(constraints, solution.observations.uv_left, size_wh, on_step)
+    cure = "give consecutive frames of a car that drives past still things (a road alone shows no constant, no slope)"
+    if not constraints:
+        raise InputError("frames", "points that were followed from frame to frame", "none", cure)
+    size_wh, solution = constraints[0].rig.size_wh, _solve(constraints, on_step)
+    formal_px = solution.formal_sigma_px(size_wh)
+    if not formal_px <= _LARGEST_SIGMA_PX:
+        wanted = f"images that determine the field to {_LARGEST_SIGMA_PX} px"
+        raise InputError("frames", wanted, f"{formal_px:.2g} px", cure)
+    sigma_px = _sigma_from_halves(constraints, solution.observations, size_wh, on_step)
     # What the covariance of independent points promises is several times less than what halves differ by.
-    share = (solution.formal_sigma_px(size_wh) / max(sigma_px or _UNKNOWN_SIGMA_PX, _LEAST_SIGMA_PX)) ** 2
+    share = (formal_px / max(sigma_px or _UNKNOWN_SIGMA_PX, _LEAST_SIGMA_PX)) ** 2
     information = min(share, 1.0) * torch.linalg.inv(solution.covariance)
     of_pixels = pixel_evidence(solution.observations, size_wh, num_frames)
     evidence = of_pixels._replace(information=information, vector=information @ solution.coefficients)
     return SelfCalibration(evidence, sigma_px, solution.converged)
 
 
-def _solve(constraints: Sequence[FieldConstraint], on_step: Callable[[], object] | None) -> _Solution:
+def _solve(constraints: Sequence[FieldConstraint], on_step: Callable[[], object]) -> _Solution:
     current, scales = list(constraints), [5.0] * len(constraints)
-    coefficients = torch.zeros(NUM_COEFFICIENTS, dtype=torch.float64)
-    H, converged = _prior_information(), False
+    sigma = torch.tensor([COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=torch.float64)
+    H_prior, coefficients = torch.diag(1 / sigma**2), torch.zeros_like(sigma)
+    H, converged = H_prior, False
     for iteration in range(_NUM_ITERATIONS):
         linear = [c.linearise(coefficients, scale) for c, scale in zip(current, scales, strict=True)]
         parts = [one.of_field() for one in linear]
-        H = _prior_information() + sum(part[0] for part in parts)
-        g = _prior_information() @ coefficients + sum(part[1] for part in parts)
-        step = -torch.linalg.solve(H, g)
+        H = H_prior + sum(part[0] for part in parts)
+        step = -torch.linalg.solve(H, H_prior @ coefficients + sum(part[1] for part in parts))
         coefficients = coefficients + step
         current = [c.moved(one.own_step(step)) for c, one in zip(current, linear, strict=True)]
-        spread = [scale_of(one.distances, c.degrees_of_freedom) for c, one in zip(current, linear, strict=True)]
-        scales = [
-            max(1.0, new if iteration < _FIRST_ITERATIONS else min(_SHRINK * old, new))
-            for old, new in zip(scales, spread, strict=True)
-        ]
-        if on_step is not None:
-            on_step()
+        shrink = math.inf if iteration < _FIRST_ITERATIONS else _SHRINK
+        scales = [max(1.0, min(shrink * old, new.spread)) for old, new in zip(scales, linear, strict=True)]
+        on_step()
         converged = iteration > _FIRST_ITERATIONS and float(step.abs().max()) < _CONVERGED_PX
         if converged:
             break
-    observations = concatenate([c.observations(coefficients, s) for c, s in zip(current, scales, strict=True)])
-    return _Solution(coefficients, torch.linalg.inv(H), observations, converged)
-
-
-def _prior_information() -> Tensor:
-    sigma = torch.tensor([COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=torch.float64)
-    return torch.diag(1 / sigma**2)
+    observations = [c.observations(coefficients, s) for c, s in zip(current, scales, strict=True)]
+    seen = torch.cat([sigma.new_zeros(0, 4), *observations])
+    return _Solution(coefficients, torch.linalg.inv(H), seen, converged)
 
 
 def _sigma_from_halves(
     constraints: Sequence[FieldConstraint],
-    uv_left: Tensor,  # (P, 2) pixels
+    observations: Tensor,  # (P, 4)
     size_wh: tuple[int, int],
-    on_step: Callable[[], object] | None,
+    on_step: Callable[[], object],
 ) -> float | None:
     """Half of the RMS difference between the fields of two halves: the standard deviation of the halves' mean."""
     middle = len(constraints) // 2
     first, second = (_solve(part, on_step) for part in (constraints[:middle], constraints[middle:]))
     if max(first.formal_sigma_px(size_wh), second.formal_sigma_px(size_wh)) > _LARGEST_SIGMA_PX:
         return None
-    difference = polynomial_basis(uv_left, size_wh) @ (first.coefficients - second.coefficients)
+    difference = polynomial_basis(observations[:, :2], size_wh) @ (first.coefficients - second.coefficients)
     return 0.5 * float(difference.square().mean().sqrt())
-
-
-def _check_determined(solution: _Solution, size_wh: tuple[int, int]) -> None:
-    cure = "give consecutive frames of a car that drives past still things (a road alone shows no constant, no slope)"
-    if len(solution.observations) == 0:
-        raise InputError("frames", "points that were followed from frame to frame", "none", cure)
-    sigma_px = solution.formal_sigma_px(size_wh)
-    if not sigma_px <= _LARGEST_SIGMA_PX:
-        raise InputError(
-            "frames", f"images that determine the field to {_LARGEST_SIGMA_PX} px", f"{sigma_px:.2g} px", cure
-        )

@@ -8,21 +8,19 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.image_files import find_image, read_rgb
+from directshape_torch.io.frame_layout import image_stems
+from directshape_torch.io.image_files import find_image, read_pair
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
-from directshape_torch.rig.field_constraint import FieldConstraint
-from directshape_torch.rig.frames_with_truth import chosen_frames
-from directshape_torch.rig.motion import STEPS, MotionConstraint, StereoFeatures, find_features, track_features
-from directshape_torch.rig.road import RoadConstraint, find_road_pixels
-from directshape_torch.stereo_matching.disparity import match_disparity
-
-_ENDINGS = (".png", ".jpg", ".jpeg")
+from directshape_torch.rig.known_depth import chosen_frames
+from directshape_torch.rig.motion import STEPS, StereoFeatures, find_features, track_features
+from directshape_torch.rig.rig import Rig
+from directshape_torch.rig.road import find_road
+from directshape_torch.rig.self_calibration import FieldConstraint
+from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
 
 @dataclass(frozen=True)
@@ -48,21 +46,6 @@ class StereoSequence:
         pairs = zip(pairwise(self.frame_ids), steps, strict=True)
         return tuple(pair for pair, step in pairs if step > min(steps))
 
-    def read(self, frame_id: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Left and right image, (H, W, 3) RGB.
-
-        Raises:
-            DataFormatError: an image is missing or damaged, or the two differ in size.
-        """
-        left, right = (read_rgb(find_image(self.root / name, frame_id)) for name in ("image_02", "image_03"))
-        if left.shape != right.shape:
-            raise DataFormatError(
-                find_image(self.root / "image_03", frame_id),
-                f"is {right.shape[1]} x {right.shape[0]}, the left image {left.shape[1]} x {left.shape[0]}",
-                cure="give rectified pairs of one size",
-            )
-        return left, right
-
 
 def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> StereoSequence:
     """The sequence in a folder with `image_02`, `image_03` and `calib.txt` (lines P2 and P3).
@@ -75,12 +58,12 @@ def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> Ster
         DataFormatError: there is no calibration, or no left or right image of a frame.
         InputError: one of `frames` has no image, or fewer than two frames are left.
     """
-    known = sorted(_images(root, "image_02"), key=_in_time)
-    chosen = tuple(sorted(chosen_frames(known, frames), key=_in_time))
+    left, right = (_images(root, name) for name in ("image_02", "image_03"))
+    chosen = tuple(sorted(chosen_frames(left, frames), key=_in_time))
     if len(chosen) < 2:
         raise InputError("frames", "at least two consecutive frames", str(len(chosen)), "give more frames")
     # Now rather than after minutes of work on the frames before it.
-    lonely = sorted(set(chosen) - _images(root, "image_03"), key=_in_time)
+    lonely = [frame_id for frame_id in chosen if frame_id not in right]
     if lonely:
         raise DataFormatError(
             root / "image_03",
@@ -91,16 +74,13 @@ def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> Ster
     return StereoSequence(root, chosen, camera)
 
 
-def _images(root: Path, name: str) -> set[str]:
-    """Ids of the images in a subfolder."""
-    found = {path.stem for path in (root / name).glob("*") if path.suffix in _ENDINGS}
+def _images(root: Path, name: str) -> list[str]:
+    """Ids of the images in a subfolder, in time."""
+    found = image_stems(root / name)
     if not found:
-        raise DataFormatError(
-            root,
-            f"holds no {name}/*.png",
-            cure="--from motion needs consecutive frames: a folder with image_02, image_03 and calib.txt",
-        )
-    return found
+        cure = "--from motion needs consecutive frames: a folder with image_02, image_03 and calib.txt"
+        raise DataFormatError(root, f"holds no {name}/*.png", cure=cure)
+    return sorted(found, key=_in_time)
 
 
 def _in_time(frame_id: str) -> tuple[int, str]:
@@ -109,10 +89,8 @@ def _in_time(frame_id: str) -> tuple[int, str]:
 
 
 def observe_motion(
-    sequence: StereoSequence,
-    height_m: float | None,
-    frame_ids: Iterable[str] | None = None,
-) -> tuple[list[FieldConstraint], tuple[int, int]]:
+    sequence: StereoSequence, height_m: float | None, frame_ids: Iterable[str] | None = None
+) -> list[FieldConstraint]:
     """Read the frames one after the other and collect what they show.
 
     Args:
@@ -120,49 +98,31 @@ def observe_motion(
         height_m: of the camera above the road; None leaves the road out.
         frame_ids: the sequence's own, as an iterator that shows progress, say.
 
-    Returns:
-        constraints, and (width, height) of the images.
-
     Raises:
         DataFormatError: an image is missing or damaged, or not as large as those before it.
     """
     constraints: list[FieldConstraint] = []
-    size_wh: tuple[int, int] | None = None
     waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)
     for frame_id in sequence.frame_ids if frame_ids is None else frame_ids:
-        left, right = sequence.read(frame_id)
-        size_wh = _one_size(size_wh, (left.shape[1], left.shape[0]), sequence.root / "image_02" / frame_id)
-        matched = torch.from_numpy(match_disparity(left, right)).double()
-        if height_m is not None:
-            road = find_road_pixels(left, right, sequence.camera, matched)
-            if road is not None:
-                constraints.append(RoadConstraint.of(road, sequence.camera, size_wh, height_m))
-        waiting.append(find_features(left, right, sequence.camera, matched))
+        left, right = read_pair(*(find_image(sequence.root / name, frame_id) for name in ("image_02", "image_03")))
+        rig = Rig.of(sequence.camera, (left.shape[1], left.shape[0]))
+        if waiting and waiting[0].rig.size_wh != rig.size_wh:
+            (width, height), before = rig.size_wh, waiting[0].rig.size_wh
+            problem = f"is {width} x {height}, the frames before it {before[0]} x {before[1]}"
+            raise DataFormatError(sequence.root / "image_02" / frame_id, problem, cure="give frames of one rig")
+        pair = MatchedPair.of(left, right)
+        road = None if height_m is None else find_road(pair, rig, height_m)
+        constraints += [] if road is None else [road]
+        waiting.append(find_features(left, pair, rig))
         if len(waiting) == waiting.maxlen:
-            constraints += _tracked(waiting, sequence, size_wh)
-            waiting.popleft()
-    if size_wh is None:
-        raise InputError("frame_ids", "at least one frame", "none")
+            constraints += _of_first(waiting)
     # The last frames have fewer that follow them.
-    while len(waiting) > 1:
-        constraints += _tracked(waiting, sequence, size_wh)
-        waiting.popleft()
-    return constraints, size_wh
+    while waiting:
+        constraints += _of_first(waiting)
+    return constraints
 
 
-def _one_size(before: tuple[int, int] | None, size_wh: tuple[int, int], path: Path) -> tuple[int, int]:
-    if before is not None and before != size_wh:
-        raise DataFormatError(
-            path,
-            f"is {size_wh[0]} x {size_wh[1]}, the frames before it {before[0]} x {before[1]}",
-            cure="give frames of one rig",
-        )
-    return size_wh
-
-
-def _tracked(
-    waiting: deque[StereoFeatures], sequence: StereoSequence, size_wh: tuple[int, int]
-) -> list[MotionConstraint]:
-    first, *later = waiting
-    tracked = track_features(first, [features.grey_left for features in later], sequence.camera)
-    return [MotionConstraint.of(tracks, sequence.camera, size_wh) for tracks in tracked]
+def _of_first(waiting: deque[StereoFeatures]) -> Sequence[FieldConstraint]:
+    """The first frame is taken away and found again in those that follow it."""
+    first = waiting.popleft()
+    return track_features(first, [features.grey_left for features in waiting])

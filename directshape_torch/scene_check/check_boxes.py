@@ -14,9 +14,8 @@ from directshape_torch.scene_check.conventions import (
     project_conventions,
     score_conventions,
 )
-from directshape_torch.scene_check.finding import Finding
+from directshape_torch.scene_check.finding import Finding, found
 from directshape_torch.scene_check.image_boxes import box_iou
-from directshape_torch.scene_check.known_mistakes import found
 
 ALL_FRAMES = "all frames"
 # Mean overlap that another convention must gain for boxes to be taken as written in it: with the observation angles,

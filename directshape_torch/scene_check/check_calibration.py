@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.scene_check.finding import Finding, Severity
-from directshape_torch.scene_check.known_mistakes import found
+from directshape_torch.scene_check.finding import Finding, Severity, found
 
 # With these wrong, what disparities and projections show says nothing more.
 SPOILS_CAMERA = frozenset({"baseline_sign", "baseline_length", "focal_length", "principal_point"})

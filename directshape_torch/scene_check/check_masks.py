@@ -8,9 +8,8 @@ import numpy as np
 
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence, Side
 from directshape_torch.scene_check.conventions import BoxConvention, project_conventions
-from directshape_torch.scene_check.finding import Finding, Severity
+from directshape_torch.scene_check.finding import Finding, Severity, found
 from directshape_torch.scene_check.image_boxes import box_iou
-from directshape_torch.scene_check.known_mistakes import found
 
 # Mean overlap of masks and 2D boxes, over as many pairs as there could be.
 OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene_check.check_stereo import swapped
-from directshape_torch.scene_check.finding import Finding, Severity
-from directshape_torch.scene_check.known_mistakes import found
+from directshape_torch.scene_check.finding import Finding, Severity, found
 
 # With these wrong, what disparities and projections show says nothing more.
 SPOILS_PAIR = frozenset(

@@ -18,7 +18,7 @@ from directshape_torch.scene_check.check_masks import check_masks
 from directshape_torch.scene_check.check_pair import SPOILS_PAIR, check_images
 from directshape_torch.scene_check.check_stereo import check_distances, check_swapped, measure_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
-from directshape_torch.scene_check.known_mistakes import found as found_mistake
+from directshape_torch.scene_check.finding import found as found_mistake
 
 # Left and right image, (H, W, 3) RGB.
 Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]

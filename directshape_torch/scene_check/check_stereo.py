@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
-from directshape_torch.scene_check.finding import Finding, Severity
-from directshape_torch.scene_check.known_mistakes import found
+from directshape_torch.scene_check.finding import Finding, Severity, found
 
 # The visible surface lies before the centre by about a third of the box's depth.
 _SURFACE_SHARE = 0.33

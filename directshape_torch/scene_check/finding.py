@@ -1,10 +1,10 @@
-"""One thing that is wrong, or looks wrong, with a data set."""
+"""What is wrong, or looks wrong, with data: findings, their report, and one table of what is commonly wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -33,6 +33,16 @@ class Finding:
     def __str__(self) -> str:
         """One line."""
         return f"{self.severity}: {self.check} ({self.where}): {self.measured}; expected {self.expected}; {self.cure}"
+
+    def block(self, count: int) -> str:
+        """Four lines, for it and others of its kind."""
+        more = f" and {count - 1} more" if count > 1 else ""
+        return (
+            f"{self.severity}: {self.check} ({self.where}{more})\n"
+            f"  measured  {self.measured}\n"
+            f"  expected  {self.expected}\n"
+            f"  cure      {self.cure}\n"
+        )
 
 
 def unreadable(check: str, where: str, expected: str, error: Exception, cure: str) -> Finding:
@@ -68,7 +78,15 @@ class CheckReport:
 
     def __str__(self) -> str:
         """One block a finding, of findings about single frames one a kind with the first in full, and a last line."""
-        return _text(self)
+        groups: dict[tuple[str, ...], list[Finding]] = {}
+        for finding in self.findings:
+            is_of_frame = finding.where.split()[0] == "frame"
+            kind = ("frame",) if is_of_frame else (finding.where, finding.measured)
+            groups.setdefault((finding.severity, finding.check, *kind), []).append(finding)
+        counts = ", ".join(f"{n} {name}{'' if n == 1 else 's'}" for name in SEVERITIES for n in [self.count(name)])
+        of = "" if self.num_checked == self.num_frames else f" of {self.num_frames}"
+        last = f"{counts} in {self.num_checked}{of} frames with {self.num_cars} cars"
+        return "\n".join([*(findings[0].block(len(findings)) for findings in groups.values()), last])
 
     @property
     def exit_code(self) -> int:
@@ -92,31 +110,132 @@ def names(findings: Iterable[Finding]) -> set[str]:
     return {finding.check for finding in findings if finding.severity != "warning"}
 
 
-def _text(report: CheckReport) -> str:
-    """One block a finding, of findings about single frames one a kind with the first in full, and a last line."""
-    groups: dict[tuple[str, ...], list[Finding]] = {}
-    for finding in report.findings:
-        frames = finding.where.split()[0]
-        kind = ("frame",) if frames == "frame" else (finding.where, finding.measured)
-        groups.setdefault((finding.severity, finding.check, *kind), []).append(finding)
-    blocks = [_block(findings) for findings in groups.values()]
-    return "\n".join([*blocks, _last_line(report)])
+class Mistake(NamedTuple):
+    """A kind of mistake. What depends on the case is in braces, for `str.format`."""
+
+    severity: Severity
+    expected: str
+    cure: str
 
 
-def _block(findings: Sequence[Finding]) -> str:
-    first = findings[0]
-    more = f" and {len(findings) - 1} more" if len(findings) > 1 else ""
-    return (
-        f"{first.severity}: {first.check} ({first.where}{more})\n"
-        f"  measured  {first.measured}\n"
-        f"  expected  {first.expected}\n"
-        f"  cure      {first.cure}\n"
+MISTAKES: dict[str, Mistake] = {
+    "focal_length": Mistake(
+        "error",
+        "the same within 5 percent, as rectified images have",
+        "scale fx, cx with the width and fy, cy with the height of resized images",
+    ),
+    "principal_point": Mistake(
+        "warning",
+        "near the middle of the image",
+        "use the intrinsics of this size of image; cutting moves the point, resizing scales it",
+    ),
+    "baseline_sign": Mistake(
+        "error",
+        "a positive baseline: P3[0, 3] / fx below P2[0, 3] / fx",
+        "swap P2 and P3, or flip the sign of the fourth columns",
+    ),
+    "baseline_length": Mistake(
+        "error",
+        "{low} to {high} m",
+        "give it in metres; the fourth column of P3 is -fx times the baseline, not the baseline",
+    ),
+    "images_swapped": Mistake(
+        "error",
+        "disparities u_left - u_right above 0: everything lies farther left in the right image",
+        "swap the left and the right images (or were they mirrored?)",
+    ),
+    "image_mirrored": Mistake(
+        "error", "two images of the same sense", "mirror the one that is read in the wrong direction"
+    ),
+    "same_image": Mistake(
+        "error", "disparity between the two images", "give the right camera's images, not copies of the left ones"
+    ),
+    "different_scenes": Mistake(
+        "error",
+        "at least {share:.0%} of them",
+        "check that left and right file of a frame carry the same name, and that neither is mirrored",
+    ),
+    "not_rectified": Mistake(
+        "error",
+        "within {limit} px of what the calibration says",
+        "rectify the pair (cv2.stereoRectify and initUndistortRectifyMap) with the calibration that is given",
+    ),
+    "not_synchronous": Mistake(
+        "warning", "at most {limit} px", "give images taken at the same moment, with lens distortion removed"
+    ),
+    "few_matches": Mistake(
+        "note", "at least {limit}", "nothing, where the images have little texture; the pair was not checked"
+    ),
+    "mask_size": Mistake(
+        "error",
+        "masks of the size of their image",
+        "resize the masks to the size of the images, not the images to that of the masks",
+    ),
+    "masks_elsewhere": Mistake(
+        "error",
+        "at least {limit}",
+        "check that masks and detections are of the same frames and the same size of image, and that 2D boxes are "
+        "u_min v_min u_max v_max",
+    ),
+    "masks_swapped": Mistake(
+        "error",
+        "left boxes that fit left masks, and cars farther left in the right image",
+        "swap the two sides of the masks (or detections and masks were made on the right image)",
+    ),
+    "no_masks": Mistake(
+        "error",
+        "masks of the left images, better of both",
+        "check the side ('image') and the class (category_id 3, or 1 and 26 in PNG) of the masks",
+    ),
+    "box_2d": Mistake("error", "u_min v_min u_max v_max, pixels", "add x to the width and y to the height"),
+    "box_axes": Mistake(
+        "error",
+        "x right, y down, z forward, metres, in the frame of the rectified camera",
+        "turn locations to x right, y down, z forward before writing them",
+    ),
+    "box_origin": Mistake(
+        "error",
+        "the centre of the box's bottom face",
+        "write the centre of the bottom face: add half a height to y of a centre (y points down)",
+    ),
+    "box_yaw": Mistake(
+        "error",
+        "rotation_y in radians about the y axis, 0 where the car drives along +x, -pi/2 where it drives along +z",
+        "convert headings: negate them, add or subtract pi / 2, or turn degrees into radians as found here",
+    ),
+    "box_order": Mistake("error", "height, width, length", "write height, width, length in this order"),
+    "box_units": Mistake("error", "{low} to {high} m", "write metres (for larger vehicles use --classes)"),
+    "box_projection": Mistake(
+        "error",
+        "at least {limit}",
+        "check that detections, masks, images and calibration are of the same frames; then frame, origin and units",
+    ),
+    "distance_scale": Mistake("error", "within {limit:.0%}", "check focal length, baseline and the units of the boxes"),
+}
+
+
+def found(
+    check: str,
+    where: str,
+    measured: str,
+    *,
+    severity: Severity | None = None,
+    expected: str = "",
+    cure: str = "",
+    **numbers: float,
+) -> Finding:
+    """A finding with what the table says of its kind, unless something else is said here.
+
+    Examples:
+        >>> str(found("few_matches", "frame 1", "7 feature matches between the images", limit=30))[:73]
+        'note: few_matches (frame 1): 7 feature matches between the images; expect'
+    """
+    kind = MISTAKES[check]
+    return Finding(
+        check,
+        severity or kind.severity,
+        where,
+        measured,
+        expected or kind.expected.format(**numbers),
+        cure or kind.cure,
     )
-
-
-def _last_line(report: CheckReport) -> str:
-    words = [
-        f"{report.count(severity)} {severity}{'' if report.count(severity) == 1 else 's'}" for severity in SEVERITIES
-    ]
-    of = "" if report.num_checked == report.num_frames else f" of {report.num_frames}"
-    return f"{', '.join(words)} in {report.num_checked}{of} frames with {report.num_cars} cars"

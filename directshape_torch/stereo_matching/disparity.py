@@ -113,13 +113,15 @@ def with_disparity(frames: FrameBatch, needed: Tensor | None = None) -> FrameBat
     sizes = frames.sizes.tolist()
     for k in range(len(sizes)) if needed is None else sorted(set(needed.tolist())):
         height, width = sizes[k]
-        left, right = (_rgb8(images[k, :, :height, :width]) for images in (frames.images_left, frames.images_right))
+        left, right = (rgb8(images[k, :, :height, :width]) for images in (frames.images_left, frames.images_right))
         maps[k, :height, :width] = torch.from_numpy(match_disparity(left, right)).to(maps)
     return replace(frames, disparity=maps)
 
 
-def _rgb8(image: Tensor) -> NDArray[np.uint8]:
-    """(H, W, 3) of 0..255 from (3, H, W) of [0, 1]; values that are not numbers become black."""
+def rgb8(
+    image: Tensor,  # (3, H, W) in [0, 1]
+) -> NDArray[np.uint8]:  # (H, W, 3)
+    """An image as OpenCV takes it; values that are not numbers become black."""
     levels = (image.detach().nan_to_num(nan=0.0) * 255).round().clamp(0, 255).to("cpu", torch.uint8)
     rgb: NDArray[np.uint8] = levels.permute(1, 2, 0).contiguous().numpy()
     return rgb

@@ -7,12 +7,16 @@ a few tenths of a pixel (KITTI), slanted texture would turn the row offset into 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.image.interpolate import bilinear_at
+from directshape_torch.stereo_matching.disparity import match_disparity
 
 _NUM_ITERATIONS = 10
 _HUBER_GREY = 10.0
@@ -105,24 +109,56 @@ class RefinedDisparity(NamedTuple):
     reliable: Tensor  # (P,) bool: converged near the start, textured, patch inside both images
 
 
-def refine_disparity(
-    grey_left: Tensor,  # (H, W) grey levels 0..255
-    grey_right: Tensor,  # (H, W)
-    uv_left: Tensor,  # (P, 2) pixels
-    disparity: Tensor,  # (P,) start, pixels
-    row_shift: Tensor,  # (P,) start of v_left - v_right, pixels
-) -> RefinedDisparity:
-    """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset.
+class MatchedPair(NamedTuple):
+    """A rectified pair with its semi-global disparity, from which patches are aligned."""
 
-    Examples:
-        >>> u = torch.arange(60, dtype=torch.float64)
-        >>> rows = 30 * torch.cos(u[:20, None] / 2)
-        >>> left, right = (100 + 50 * torch.sin((u + shift) / 3) + rows for shift in (0.0, 7.3))
-        >>> refined = refine_disparity(left, right, torch.tensor([[30.0, 10.0]]).double(), u[7:8], u[:1])
-        >>> round(float(refined.disparity), 1), bool(refined.reliable)
-        (7.3, True)
-    """
-    start = torch.stack([disparity, row_shift], dim=-1)
-    uv_right, reliable = align_patches(grey_left, grey_right, uv_left, uv_left - start, _OF_DISPARITY)
-    disparity, row_shift = (uv_left - uv_right).unbind(dim=-1)
-    return RefinedDisparity(disparity, row_shift, reliable)
+    grey_left: Tensor  # (H, W) grey levels 0..255
+    grey_right: Tensor  # (H, W)
+    matched: Tensor  # (H, W) pixels, NaN where unknown
+
+    @classmethod
+    def of(
+        cls,
+        image_left: NDArray[np.uint8],  # (H, W, 3) RGB
+        image_right: NDArray[np.uint8],  # (H, W, 3)
+    ) -> Self:
+        """Match two images, float64.
+
+        Raises:
+            InputError: see `match_disparity`.
+        """
+        matched = torch.from_numpy(match_disparity(image_left, image_right)).double()
+        images = (torch.from_numpy(np.ascontiguousarray(image)) for image in (image_left, image_right))
+        left, right = (grey_levels(image.permute(2, 0, 1).double()[None] / 255)[0] for image in images)
+        return cls(left, right, matched)
+
+    def aligned(
+        self,
+        uv_left: Tensor,  # (P, 2) pixels
+        disparity: Tensor,  # (P,) start, pixels
+        row_shift: Tensor,  # (P,) start of v_left - v_right, pixels
+    ) -> RefinedDisparity:
+        """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset.
+
+        Examples:
+            >>> u = torch.arange(60, dtype=torch.float64)
+            >>> rows = 30 * torch.cos(u[:20, None] / 2)
+            >>> left, right = (100 + 50 * torch.sin((u + shift) / 3) + rows for shift in (0.0, 7.3))
+            >>> pair = MatchedPair(left, right, torch.full_like(left, 7.0))
+            >>> found = pair.aligned(torch.tensor([[30.0, 10.0]]).double(), u[7:8], u[:1])
+            >>> round(float(found.disparity), 1), bool(found.reliable)
+            (7.3, True)
+        """
+        start = uv_left - torch.stack([disparity, row_shift], dim=-1)
+        uv_right, reliable = align_patches(self.grey_left, self.grey_right, uv_left, start, _OF_DISPARITY)
+        disparity, row_shift = (uv_left - uv_right).unbind(dim=-1)
+        return RefinedDisparity(disparity, row_shift, reliable)
+
+    def seen_at(
+        self,
+        uv_left: Tensor,  # (P, 2) whole pixels, float64, where a disparity is known
+    ) -> Tensor:  # (Q, 4)
+        """Those of the pixels whose patches could be aligned: u, v, disparity, row shift."""
+        start = self.matched[uv_left[:, 1].long(), uv_left[:, 0].long()]
+        found = self.aligned(uv_left, start, torch.zeros_like(start))
+        return torch.cat([uv_left, torch.stack(found[:2], dim=1)], dim=1)[found.reliable]

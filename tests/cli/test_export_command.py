@@ -129,7 +129,7 @@ def test_another_rigs_field_is_refused(
     import torch
 
     from directshape_torch.geometry.disparity_field import DisparityField
-    from directshape_torch.rig.field_file import save_field
+    from directshape_torch.rig.rig_file import save_field
 
     camera = finished.inputs().dataset.load("000000").frame.camera
     rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}

@@ -15,7 +15,7 @@ from directshape_torch.cli.options import find_device
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.rig.field_file import save_field
+from directshape_torch.rig.rig_file import save_field
 
 QUICK = ("--set", "stages=[{max_iterations: 2}]")
 

@@ -88,9 +88,9 @@ def test_prior(tmp_path: Path) -> None:
 
 
 def test_disparity_field() -> None:
-    from directshape_torch.rig import field_file
+    from directshape_torch.rig import rig_file
 
     text = section("Residual disparity field")
-    assert f'"{field_file.SCHEMA}", "schema_version": {field_file.SCHEMA_VERSION}' in text
+    assert f'"{rig_file.FIELD}", "schema_version": {rig_file.SCHEMA_VERSION}' in text
     for field in fields(DisparityField):
         assert f'"{field.name}"' in text

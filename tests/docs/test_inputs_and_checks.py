@@ -11,7 +11,7 @@ from typing import get_args
 from directshape_torch.io import folder_json
 from directshape_torch.io.open_dataset import LayoutName
 from directshape_torch.scene_check.conventions import all_conventions
-from directshape_torch.scene_check.known_mistakes import MISTAKES
+from directshape_torch.scene_check.finding import MISTAKES
 
 ROOT = Path(__file__).parents[2]
 INPUTS = (ROOT / "docs" / "inputs.md").read_text(encoding="utf-8")

@@ -40,8 +40,7 @@ from directshape_torch.io.tracking_files import read_tracking_objects
 from directshape_torch.io.velodyne import read_points, read_scan
 from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.field_file import load_field, save_field
-from directshape_torch.rig.rig_file import load_rigs, save_rigs
+from directshape_torch.rig.rig_file import load_field, load_rigs, save_field, save_rigs
 from directshape_torch.shape.load_prior import BUNDLED_PRIORS, load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 

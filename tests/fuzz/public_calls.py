@@ -32,7 +32,7 @@ from directshape_torch import (
 )
 from directshape_torch.config import RefinerConfig
 from directshape_torch.rig.detections import COLUMNS
-from directshape_torch.rig.field_file import load_field
+from directshape_torch.rig.rig_file import load_field
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PriorProvenance

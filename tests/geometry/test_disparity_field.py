@@ -14,7 +14,7 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry.disparity_field import DisparityField, nearest_in_convex_polygon, polynomial_basis
-from directshape_torch.rig.field_file import load_field, save_field
+from directshape_torch.rig.rig_file import load_field, save_field
 
 SIZE = (1242, 375)
 
@@ -172,11 +172,11 @@ def test_save_and_load_give_the_same_field(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"schema": "another"}, "no disparity field"),
-        ({"schema_version": 99}, "schema version 99"),
-        ({"coefficients": [1.0, 2.0]}, "'coefficients' must be finite numbers of shape \\(10\\)"),
+        ({"schema": "another"}, "is no disparity field"),
+        ({"schema_version": 99}, "version 99"),
+        ({"coefficients": [1.0, 2.0]}, "'coefficients' must be finite numbers of shape \\(10,\\)"),
         ({"coefficients": ["a"] * 10}, "'coefficients' must be numbers"),
-        ({"hull_uv": [[0.0, 0.0], [1.0, 1.0]]}, "'hull_uv'"),
+        ({"hull_uv": [[0.0, 0.0], [1.0, 1.0]]}, "hull_uv"),
         ({"K_left": None}, "'K_left'"),
         ({"size_wh": [1242]}, "'size_wh'"),
         ({"provenance": 3}, "'provenance'"),

@@ -14,7 +14,8 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.kitti_calibration import read_velo_to_cam, to_stereo_camera
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
-from directshape_torch.rig.lidar import known_depth_from_lidar
+from directshape_torch.rig.known_depth import known_depth_from_lidar
+from directshape_torch.rig.rig import Rig
 
 FRAME = "000000"
 SIZE_WH = (240, 96)
@@ -45,8 +46,8 @@ def layout_of(name: LayoutName, root: Path, kitti: Path, stem: str, to: Path) ->
 def scanned(layout: FrameLayout, frame_id: str, kitti: Path) -> Points:
     """Pixels and depths of the points that the left camera sees."""
     calibration, scan = layout.lidar_calibration(frame_id), kitti / "training" / "velodyne" / f"{FRAME}.bin"
-    known = known_depth_from_lidar(scan, calibration, SIZE_WH, to_stereo_camera([calibration], dtype=torch.float64))
-    return known.uv_left, known.depth_m
+    known = known_depth_from_lidar(scan, calibration, Rig.of(to_stereo_camera([calibration]), SIZE_WH))
+    return known[:, :2], known[:, 2]
 
 
 @pytest.fixture

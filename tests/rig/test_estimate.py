@@ -15,11 +15,9 @@ from torch import Tensor
 from directshape_torch import DirectShapeRefiner, RigEstimate
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField, polynomial_basis
-from directshape_torch.rig.disparity_observations import DisparityObservations
-from directshape_torch.rig.field_file import save_field
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.posterior import BIAS
-from directshape_torch.rig.rig_file import load_fields, load_rigs, save_rigs
+from directshape_torch.rig.rig_file import load_fields, load_rigs, save_field, save_rigs
 
 PLACES = torch.tensor([[200.0, 190], [450, 190], [620, 190], [800, 190], [1050, 190]], dtype=torch.float64)
 
@@ -72,13 +70,12 @@ def test_order_and_portions_do_not_matter_to_the_bit() -> None:
     assert len(by_and_by.rows) == 1000
 
 
-def true_pixels() -> DisparityObservations:
+def true_pixels() -> Tensor:
     """400 pixels of known depth all over the image."""
     generator = torch.Generator().manual_seed(3)
     uv = torch.rand(400, 2, generator=generator, dtype=torch.float64) * (torch.tensor(SIZE_WH) - 1)
     noise = 0.1 * torch.randn(400, generator=generator, dtype=torch.float64)
-    depth = torch.full_like(noise, 20.0)
-    return DisparityObservations(uv, true_offset(uv) + noise, torch.full_like(noise, 0.2), depth)
+    return torch.cat([uv, (true_offset(uv) + noise)[:, None], torch.full_like(noise, 0.2)[:, None]], dim=1)
 
 
 def test_evidence_of_several_kinds_adds_up() -> None:

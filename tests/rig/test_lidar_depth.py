@@ -11,7 +11,8 @@ import torch
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
-from directshape_torch.rig.lidar import known_depth_from_lidar
+from directshape_torch.rig.known_depth import known_depth_from_lidar
+from directshape_torch.rig.rig import Rig
 
 SIZE = (400, 160)
 # x forward, y left, z up becomes x right, y down, z forward.
@@ -25,23 +26,23 @@ def calibration() -> KittiCalibration:
     return KittiCalibration(Path("calib.txt"), P2, P3, np.eye(3), VELO_TO_CAM)
 
 
+def rig() -> Rig:
+    return Rig.of(to_stereo_camera([calibration()]), SIZE)
+
+
 def test_a_point_right_behind_a_nearer_one_and_those_outside_are_left_out(tmp_path: Path) -> None:
     scan = np.array([[10, 0, 0, 0], [40, 0.2, 0, 0], [20, 5, 1, 0], [-10, 0, 0, 0], [10, 50, 0, 0]], dtype="<f4")
     scan.tofile(tmp_path / "scan.bin")
-    rig = calibration()
-    known = known_depth_from_lidar(tmp_path / "scan.bin", rig, SIZE, to_stereo_camera([rig], dtype=torch.float64))
+    known = known_depth_from_lidar(tmp_path / "scan.bin", calibration(), rig())
     # (20, 5, 1): 300 * -5 / 20 + 200 = 125 and 300 * -1 / 20 + 80 = 65; the second point is 1.5 px beside the first.
-    expected = torch.tensor([[200.0, 80.0], [125.0, 65.0]], dtype=torch.float64)
-    torch.testing.assert_close(known.uv_left, expected)
-    torch.testing.assert_close(known.depth_m, torch.tensor([10.0, 20.0], dtype=torch.float64))
+    expected = torch.tensor([[200.0, 80.0, 10.0], [125.0, 65.0, 20.0]], dtype=torch.float64)
+    torch.testing.assert_close(known, expected)
 
 
 def test_a_cut_scan_and_a_calibration_without_lidar_are_named(tmp_path: Path) -> None:
     path = tmp_path / "scan.bin"
     path.write_bytes(b"\0" * 17)
-    rig = calibration()
-    camera = to_stereo_camera([rig], dtype=torch.float64)
     with pytest.raises(DataFormatError, match="16 bytes a point"):
-        known_depth_from_lidar(path, rig, SIZE, camera)
+        known_depth_from_lidar(path, calibration(), rig())
     with pytest.raises(DataFormatError, match="Tr_velo_to_cam"):
-        known_depth_from_lidar(path, replace(rig, Tr_velo_to_cam=None), SIZE, camera)
+        known_depth_from_lidar(path, replace(calibration(), Tr_velo_to_cam=None), rig())

@@ -15,7 +15,6 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.rig.disparity_observations import DisparityObservations, concatenate
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.pixels import pixel_evidence
 from directshape_torch.rig.rig_file import load_fields, load_rigs
@@ -33,7 +32,7 @@ def camera() -> StereoCamera:
     return StereoCamera.from_projections(P[None], P_right[None])
 
 
-def observations(count: int, outliers: float, lower_half: bool = False) -> DisparityObservations:
+def observations(count: int, outliers: float, lower_half: bool = False) -> Tensor:
     generator = torch.Generator().manual_seed(1)
     uv = torch.rand(count, 2, generator=generator).double() * torch.tensor([399.0, 159.0])
     if lower_half:
@@ -41,7 +40,7 @@ def observations(count: int, outliers: float, lower_half: bool = False) -> Dispa
     bias = polynomial_basis(uv, SIZE) @ TRUE + 0.1 * torch.randn(count, generator=generator).double()
     wrong = torch.rand(count, generator=generator) < outliers
     vertical = polynomial_basis(uv, SIZE) @ TRUE_VERTICAL + 0.1 * torch.randn(count, generator=generator).double()
-    return DisparityObservations(uv, torch.where(wrong, bias + 3.0, bias), vertical, torch.full_like(bias, 20.0))
+    return torch.cat([uv, torch.stack([torch.where(wrong, bias + 3.0, bias), vertical], dim=1)], dim=1)
 
 
 def image_grid() -> Tensor:
@@ -49,7 +48,7 @@ def image_grid() -> Tensor:
     return torch.stack([u, v], dim=-1).double()
 
 
-def fitted(seen: DisparityObservations, num_frames: int = 4) -> RigEstimate:
+def fitted(seen: Tensor, num_frames: int = 4) -> RigEstimate:
     rig = RigEstimate(SIZE, camera().K_left[0], camera().K_right[0], camera().T_right_cam[0])
     rig.add_pixels("lidar", pixel_evidence(seen, SIZE, num_frames))
     return rig
@@ -73,7 +72,7 @@ def test_outside_of_the_data_the_fit_is_tame_and_not_sure() -> None:
 
 def test_too_few_observations_are_refused() -> None:
     with pytest.raises(InputError, match="at least 50"):
-        pixel_evidence(concatenate([]), SIZE)
+        pixel_evidence(torch.zeros(49, 4).double(), SIZE)
 
 
 def write_frame(root: Path, frame_id: str, bias_px: float, focal_px: float = FOCAL_PX) -> None:
@@ -152,13 +151,12 @@ def test_each_of_two_rigs_has_its_estimate_and_unknown_frames_are_refused(tmp_pa
     "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
 )
 def test_real_frame_has_the_known_field() -> None:
-    from directshape_torch.rig.frames_with_truth import observe_frame, truth_files
+    from directshape_torch.rig.known_depth import add_truth, observe_frame, truth_files
 
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
-    frame = observe_frame(root, "007322", truth_files(root, "disparity")["007322"], "disparity")
-    rig = RigEstimate(frame.size_wh, frame.camera.K_left[0], frame.camera.K_right[0], frame.camera.T_right_cam[0])
-    rig.add_pixels("disparity", pixel_evidence(frame.observations, frame.size_wh))
-    field = rig.field
+    rigs: list[RigEstimate] = []
+    add_truth(rigs, "disparity", [observe_frame(root, "007322", truth_files(root, "disparity")["007322"], "disparity")])
+    field = rigs[0].field
     left, middle, right = field.bias(torch.tensor([[60.0, 180.0], [620.0, 180.0], [1180.0, 150.0]]).double()).tolist()
     assert -1.6 < left < -0.6
     assert -0.5 < middle < 0.0

@@ -16,10 +16,10 @@ from directshape_torch.geometry.projection import disparity_of_depth, project
 from directshape_torch.geometry.se3 import exp
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.estimate import RigEstimate
-from directshape_torch.rig.field_constraint import FieldConstraint, Linearisation
-from directshape_torch.rig.motion import MotionConstraint, TrackedFeatures
-from directshape_torch.rig.road import RoadConstraint, RoadPixels
-from directshape_torch.rig.self_calibration import SelfCalibration, self_calibrate
+from directshape_torch.rig.motion import MotionConstraint
+from directshape_torch.rig.rig import Rig
+from directshape_torch.rig.road import RoadConstraint
+from directshape_torch.rig.self_calibration import FieldConstraint, SelfCalibration, self_calibrate
 
 SIZE = (1242, 375)
 HEIGHT_M = 1.65
@@ -33,12 +33,13 @@ def camera() -> StereoCamera:
     return StereoCamera.from_projections(P[None], P_right[None])
 
 
-def measured(uv: Tensor, depth: Tensor, generator: torch.Generator, noise_px: float) -> tuple[Tensor, Tensor]:
-    """Disparity with the field and noise on it, and the row shift of the geometry less 0.2 px."""
+def measured(uv: Tensor, depth: Tensor, generator: torch.Generator, noise_px: float) -> Tensor:
+    """Pixels, disparity with the field and noise on it, and the row shift of the geometry less 0.2 px."""
     rig = camera()
     displacement = disparity_of_depth(uv, depth, rig.K_left[0], rig.K_right[0], rig.T_right_cam[0])
     noise = noise_px * torch.randn(len(uv), generator=generator, dtype=torch.float64)
-    return displacement[:, 0] + polynomial_basis(uv, SIZE) @ TRUE + noise, displacement[:, 1] - 0.2
+    disparity = displacement[:, 0] + polynomial_basis(uv, SIZE) @ TRUE + noise
+    return torch.cat([uv, disparity[:, None], displacement[:, 1:] - 0.2], dim=1)
 
 
 def random_pixels(count: int, generator: torch.Generator) -> Tensor:
@@ -59,7 +60,7 @@ def motion(
     if depth_at is not None:
         uv = uv[uv[:, 1] > 230]
         depth = depth_at(uv)
-    disparity, row_shift = measured(uv, depth, generator, noise_px)
+    seen = measured(uv, depth, generator, noise_px)
     T_later_cam = exp(torch.tensor([0.02, 0.01, -way_m, 0.002, 0.01 * (seed % 3 - 1), 0.001], dtype=torch.float64))
     own_motion = (torch.rand(len(uv), generator=generator) < moving_share)[:, None] * torch.tensor([0.0, 0.0, 1.5])
     points = depth[:, None] * rays_from_pixels(uv, rig.K_left[0]) + own_motion
@@ -67,7 +68,7 @@ def motion(
     uv_later = uv_later + noise_px * torch.randn(len(uv), 2, generator=generator, dtype=torch.float64)
     # The rough motion is that of raw disparities: a few per cent too long.
     start = exp(torch.tensor([0.0, 0.0, -0.02 * way_m, 0.001, 0.0, 0.0], dtype=torch.float64)) @ T_later_cam
-    return MotionConstraint.of(TrackedFeatures(uv, disparity, row_shift, uv_later, start), rig, SIZE)
+    return MotionConstraint(Rig.of(rig, SIZE), seen, uv_later, start)
 
 
 def road(seed: int, noise_px: float = 0.1, pitch: float = 0.0) -> RoadConstraint:
@@ -78,9 +79,9 @@ def road(seed: int, noise_px: float = 0.1, pitch: float = 0.0) -> RoadConstraint
     uv = random_pixels(3000, generator)
     depth = 1 / (rays_from_pixels(uv, rig.K_left[0]) @ plane)
     ahead = (depth > 4) & (depth < 30)
-    disparity, row_shift = measured(uv[ahead], depth[ahead], generator, noise_px)
+    seen = measured(uv[ahead], depth[ahead], generator, noise_px)
     start = plane * torch.tensor([1.0, 1.02, 1.0]) + torch.tensor([0.0, 0.0, 0.004])
-    return RoadConstraint.of(RoadPixels(uv[ahead], disparity, row_shift, start), rig, SIZE, HEIGHT_M)
+    return RoadConstraint(Rig.of(rig, SIZE), seen, start, HEIGHT_M)
 
 
 def grid() -> Tensor:
@@ -89,20 +90,20 @@ def grid() -> Tensor:
 
 
 def field_of(found: SelfCalibration) -> DisparityField:
-    rig = RigEstimate(SIZE, camera().K_left[0], camera().K_right[0], camera().T_right_cam[0])
+    rig = RigEstimate(*Rig.of(camera(), SIZE))
     rig.add_pixels("motion", found.evidence)
     return rig.field
 
 
 def largest_error(constraints: list[FieldConstraint]) -> float:
-    evidence = self_calibrate(constraints, SIZE, 1).evidence
+    evidence = self_calibrate(constraints, 1).evidence
     found = torch.linalg.solve(evidence.information, evidence.vector)
     return float((polynomial_basis(grid(), SIZE) @ (found - TRUE)).abs().max())
 
 
 def test_motion_and_road_find_the_field_beside_things_that_move() -> None:
     constraints = [*(motion(k, moving_share=0.2) for k in range(6)), *(road(k) for k in range(4))]
-    result = self_calibrate(constraints, SIZE, 2)
+    result = self_calibrate(constraints, 2)
     field = field_of(result)
     error = field.bias(grid()) - polynomial_basis(grid(), SIZE) @ TRUE
     assert float(error.abs().max()) < 0.1
@@ -119,19 +120,18 @@ def test_standard_deviation_is_that_of_halves_that_disagree() -> None:
     first = [motion(k, noise_px=0.02) for k in range(3)]
     second = [shifted(motion(k, noise_px=0.02), 0.3) for k in range(3, 6)]
     steps: list[None] = []
-    result = self_calibrate([*first, *second], SIZE, 1, on_step=lambda: steps.append(None))
+    result = self_calibrate([*first, *second], 1, on_step=lambda: steps.append(None))
     assert result.sigma_px == pytest.approx(0.15, abs=0.03)
     assert len(steps) > 30
 
 
 def test_standard_deviation_is_not_known_where_half_determines_no_field() -> None:
-    result = self_calibrate([*(road(k) for k in range(3)), *(motion(k) for k in range(3))], SIZE, 1)
+    result = self_calibrate([*(road(k) for k in range(3)), *(motion(k) for k in range(3))], 1)
     assert result.sigma_px is None
 
 
 def shifted(constraint: MotionConstraint, by_px: float) -> MotionConstraint:
-    tracks = constraint.tracks
-    return replace(constraint, tracks=replace(tracks, disparity=tracks.disparity + by_px))
+    return replace(constraint, seen=constraint.seen + torch.tensor([0.0, 0.0, by_px, 0.0]))
 
 
 def test_motion_over_a_plane_does_not_see_a_bias_proportional_to_disparity() -> None:
@@ -147,8 +147,8 @@ def test_motion_over_a_plane_does_not_see_a_bias_proportional_to_disparity() -> 
     information = []
     for depth_at in (on_plane, anywhere):
         seen = motion(0, noise_px=0.0, depth_at=depth_at)
-        basis = polynomial_basis(seen.tracks.uv_left, SIZE)
-        disparity = 720 * 0.53 / on_plane(seen.tracks.uv_left)
+        basis = polynomial_basis(seen.uv, SIZE)
+        disparity = 720 * 0.53 / on_plane(seen.uv)
         proportional = torch.linalg.lstsq(basis, disparity[:, None]).solution[:, 0]
         torch.testing.assert_close(basis @ proportional, disparity)
         H, _ = seen.linearise(TRUE, 2.0).of_field()
@@ -166,7 +166,7 @@ def test_a_wrong_height_hardly_matters_where_motion_sees_many_depths() -> None:
 
 def test_a_road_alone_does_not_determine_a_field() -> None:
     with pytest.raises(InputError, match="no constant, no slope"):
-        self_calibrate([road(k) for k in range(10)], SIZE, 1)
+        self_calibrate([road(k) for k in range(10)], 1)
 
 
 def test_a_road_does_not_see_pitch_but_height_and_bends() -> None:
@@ -183,9 +183,9 @@ def test_a_road_does_not_see_pitch_but_height_and_bends() -> None:
 
 def test_a_car_that_stands_is_refused() -> None:
     with pytest.raises(InputError, match="drives past still things"):
-        self_calibrate([motion(k, way_m=0.0) for k in range(4)], SIZE, 1)
+        self_calibrate([motion(k, way_m=0.0) for k in range(4)], 1)
     with pytest.raises(InputError, match="followed from frame to frame"):
-        self_calibrate([], SIZE, 1)
+        self_calibrate([], 1)
 
 
 @pytest.mark.parametrize("constraint", [motion(1), road(1, pitch=0.01)], ids=["motion", "road"])
@@ -201,23 +201,27 @@ def test_gradient_is_that_of_the_robust_cost(constraint: MotionConstraint | Road
             delta = torch.zeros_like(linear.g)
             delta[k] = sign * 1e-5
             moved = constraint.moved(delta[:num_own])
-            values.append(cost(moved.linearise(coefficients + delta[num_own:], scale), scale))
+            values.append(cost(distances(moved, coefficients + delta[num_own:]), scale))
         numeric[k] = (values[0] - values[1]) / 2e-5
-    weight_sum = float(tukey(linear.distances, scale).sum())
+    weight_sum = float(tukey(distances(constraint, coefficients), scale).sum())
     numeric = numeric * min(1.0, 60 / weight_sum) / scale**2
     if isinstance(constraint, RoadConstraint):
         numeric = numeric + height_gradient(constraint)
     torch.testing.assert_close(linear.g, numeric, rtol=2e-4, atol=2e-4 * float(numeric.abs().max()))
 
 
+def distances(constraint: FieldConstraint, coefficients: Tensor) -> Tensor:
+    return constraint.residuals(coefficients)[0].norm(dim=1)
+
+
 def tukey(distances: Tensor, scale: float) -> Tensor:
     return (1 - (distances / (4.685 * scale)) ** 2).clamp_min(0) ** 2
 
 
-def cost(linear: Linearisation, scale: float) -> float:
+def cost(distances: Tensor, scale: float) -> float:
     """Sum of Tukey's rho, whose derivative is r (1 - (r / c)^2)^2."""
     c = 4.685 * scale
-    inside = (1 - (linear.distances / c) ** 2).clamp_min(0) ** 3
+    inside = (1 - (distances / c) ** 2).clamp_min(0) ** 3
     return float((c**2 / 6 * (1 - inside)).sum())
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
 from directshape_torch.stereo_matching.disparity import match_disparity
-from directshape_torch.stereo_matching.patch_alignment import refine_disparity
+from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
 
 def waves(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -40,7 +40,7 @@ def test_refinement_is_free_of_pixel_locking_gain_and_offset(fraction: float, st
     u, v = torch.meshgrid(torch.arange(30.0, 140, 7), torch.arange(10.0, 50, 7), indexing="xy")
     uv = torch.stack([u, v], dim=-1).reshape(-1, 2).double()
     start = torch.full((len(uv),), 7 + fraction + start_error, dtype=torch.float64)
-    refined = refine_disparity(left, right, uv, start, torch.zeros_like(start))
+    refined = MatchedPair(left, right, left).aligned(uv, start, torch.zeros_like(start))
     assert refined.reliable.double().mean() > 0.8
     # Bilinear lookup of a curved signal leaves a few hundredths.
     error = refined.disparity[refined.reliable] - (7 + fraction)
@@ -53,7 +53,7 @@ def test_refinement_follows_the_row_shift() -> None:
     left, right = torch.from_numpy(waves(u, v)), torch.from_numpy(waves(u + 6, v - 2))
     uv = torch.tensor([[70.0, 30.0], [90.0, 25.0]], dtype=torch.float64)
     start = torch.full((2,), 6.3, dtype=torch.float64)
-    refined = refine_disparity(left, right, uv, start, torch.full((2,), -2.0, dtype=torch.float64))
+    refined = MatchedPair(left, right, left).aligned(uv, start, torch.full((2,), -2.0, dtype=torch.float64))
     torch.testing.assert_close(refined.disparity, torch.full((2,), 6.0, dtype=torch.float64), atol=1e-3, rtol=0)
 
 
@@ -62,7 +62,7 @@ def test_an_unknown_row_offset_is_found_and_does_not_leak_into_the_disparity() -
     left, right = torch.from_numpy(waves(u, v)), torch.from_numpy(waves(u + 6, v - 0.3))
     uv = torch.tensor([[70.0, 30.0], [90.0, 25.0]], dtype=torch.float64)
     start = torch.full((2,), 6.2, dtype=torch.float64)
-    refined = refine_disparity(left, right, uv, start, torch.zeros(2, dtype=torch.float64))
+    refined = MatchedPair(left, right, left).aligned(uv, start, torch.zeros(2, dtype=torch.float64))
     torch.testing.assert_close(refined.row_shift, torch.full((2,), -0.3, dtype=torch.float64), atol=0.03, rtol=0)
     torch.testing.assert_close(refined.disparity, torch.full((2,), 6.0, dtype=torch.float64), atol=0.03, rtol=0)
 
@@ -70,11 +70,11 @@ def test_an_unknown_row_offset_is_found_and_does_not_leak_into_the_disparity() -
 def test_flat_patches_borders_and_nothing_are_not_reliable() -> None:
     flat = torch.full((40, 80), 100.0, dtype=torch.float64)
     uv, start = torch.tensor([[40.0, 20.0]], dtype=torch.float64), torch.tensor([5.0], dtype=torch.float64)
-    assert not refine_disparity(flat, flat, uv, start, torch.zeros(1, dtype=torch.float64)).reliable.any()
+    assert not MatchedPair(flat, flat, flat).aligned(uv, start, torch.zeros(1, dtype=torch.float64)).reliable.any()
     left, right = (torch.from_numpy(x) for x in pair(5.0))
     border = torch.tensor([[2.0, 20.0], [6.0, 30.0]], dtype=torch.float64)
-    assert not refine_disparity(left, right, border, start.repeat(2), torch.zeros(2).double()).reliable.any()
-    none = refine_disparity(left, right, border[:0], start[:0], start[:0])
+    assert not MatchedPair(left, right, left).aligned(border, start.repeat(2), torch.zeros(2).double()).reliable.any()
+    none = MatchedPair(left, right, left).aligned(border[:0], start[:0], start[:0])
     assert none.disparity.shape == (0,)
 
 
