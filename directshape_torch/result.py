@@ -21,7 +21,7 @@ from directshape_torch.figures.quality import FitQuality
 from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
-from directshape_torch.numerics.checks import check_alike, check_shape, check_type
+from directshape_torch.numerics.checks import check_alike
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_grid import zero_level_extents
@@ -356,26 +356,19 @@ def _check_refined(result: RefinementResult) -> None:
 
 
 def _chosen_rows(index: object, count: int) -> Tensor:
-    """Numbers of the cars that an index names."""
-    if isinstance(index, (int, np.integer)) and not isinstance(index, bool):
-        if not -count <= index < count:
-            raise InputError("index", f"a car of 0..{count - 1}" if count else "no car", f"{index}: {count} cars")
-        return torch.tensor([index % count])
-    if isinstance(index, slice):
-        return torch.arange(count)[index]
-    check_type("index", index, (int, slice, Tensor, list, np.ndarray))
+    """Numbers of the cars that an index names, as NumPy understands it."""
     try:
-        chosen = torch.as_tensor(index, device="cpu")
-    except (TypeError, ValueError, RuntimeError) as error:  # a list of words, no memory, ..
-        raise InputError("index", "numbers of cars, or booleans", shown(index)) from error
-    check_shape("index", chosen, ("M",))
-    if chosen.ndim != 1 or (chosen.dtype == torch.bool and len(chosen) != count) or chosen.is_floating_point():
-        expected = f"a car, a slice, numbers of cars, or {count} booleans"
-        raise InputError("index", expected, f"{chosen.dtype} of shape {tuple(chosen.shape)}")
-    rows = chosen.nonzero()[:, 0] if chosen.dtype == torch.bool else chosen.long()
-    if bool(((rows < -count) | (rows >= count)).any()):
-        raise InputError("index", f"cars of 0..{count - 1}" if count else "no car", str(rows.tolist()))
-    return rows % max(1, count)
+        given = index.detach().cpu().numpy() if isinstance(index, Tensor) else index
+        rows = np.atleast_1d(np.arange(count)[given])  # type: ignore[call-overload]
+    except (IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise InputError("index", _cars_in_words(count), shown(index)) from error
+    if rows.ndim > 1:
+        raise InputError("index", _cars_in_words(count), shown(index))
+    return torch.from_numpy(rows)
+
+
+def _cars_in_words(count: int) -> str:
+    return f"a slice, {count} booleans, or cars of 0..{count - 1}" if count else "a slice, for there is no car"
 
 
 def _moved_prior(prior: ShapePrior, like: Tensor) -> ShapePrior:

@@ -13,11 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from directshape_torch.diagnosis.observability import cholesky_of_regular
 from directshape_torch.figures.disparity_profile import DisparityProfile
 from directshape_torch.figures.quality import EVIDENCE_NAMES, FitQuality
 from directshape_torch.figures.trust_model import bundled_trust_model
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
+from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
@@ -158,9 +159,10 @@ def _motion(course: Course) -> dict[str, Tensor]:
     shift_obj = (shift_cam[:, None] @ T_after[:, :3, :3])[:, 0]
     motion = torch.cat([shift_obj[:, 0::2], turned[:, None], change_hwl[:, 1:].flip(1)], dim=1)
     misfit, gain = _expected(motion, _footprint_sigmas(course, dimensions), hwl)
-    J = _view_jacobian(T_after[:, :3, 3])
-    shift_and_turn = torch.cat([shift_cam, turned[:, None]], dim=1)
-    in_view = (J @ shift_and_turn[..., None])[..., 0]
+    # Along and across the viewing ray on the ground, and the heading.
+    J = torch.nn.functional.pad(viewing_axes(T_after[:, :3, 3])[:, :2], (0, 1, 0, 1))
+    J[:, 2, 3] = 1
+    in_view = (J @ torch.cat([shift_cam, turned[:, None]], dim=1)[..., None])[..., 0]
     covariance = J @ course.covariance_xyz_yaw @ J.mT
     log_sigma = 0.5 * covariance.diagonal(dim1=1, dim2=2).clamp_min(_TINY**2).log()
     return {
@@ -278,25 +280,8 @@ def _conflict(at_end: Figures, photometric: list[bool], cost: Tensor) -> Tensor:
     return torch.log1p(100 * gain / cost.clamp_min(_TINY))
 
 
-def _view_jacobian(location: Tensor) -> Tensor:
-    """J (B, 3, 4) of shifts along and across the viewing ray in the plane y = 0, and of the heading, by (x, y, z, yaw).
-
-    Args:
-        location: (B, 3) of the object origins.
-    """
-    ray = location[:, 0::2]
-    x, z = (ray / ray.norm(dim=1, keepdim=True).clamp_min(_TINY)).unbind(dim=1)
-    zero = torch.zeros_like(x)
-    rows = [x, zero, z, zero, z, zero, -x, zero, zero, zero, zero, zero + 1]
-    return torch.stack(rows, dim=1).view(-1, 3, 4)
-
-
 def _mahalanobis(vector: Tensor, matrix: Tensor) -> Tensor:
     """sqrt(v^T M^-1 v) (B,) of vectors (B, n); NaN where M is not positive definite."""
-    finite = matrix.flatten(1).isfinite().all(1)
-    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], matrix, identity))
-    regular = finite & (info == 0)
-    factor = torch.where(regular[:, None, None], factor, identity)
+    factor, regular = cholesky_of_regular(matrix)
     white = torch.linalg.solve_triangular(factor, vector[..., None], upper=False)[..., 0]
-    return torch.where(regular, white.norm(dim=1), torch.full_like(white[:, 0], torch.nan))
+    return torch.where(regular, white.norm(dim=1), torch.nan)

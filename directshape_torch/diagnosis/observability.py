@@ -7,7 +7,8 @@ from torch import Tensor
 
 from directshape_torch.figures.observability import HEADING_LEVER_M, Observability
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose
+from directshape_torch.geometry.box3d import alpha_from_kitti, rotation_y_from_pose, viewing_axes
+from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 
@@ -21,12 +22,18 @@ def covariance_of(fisher: Tensor) -> Tensor:
     Silhouette pixels count with weight 1 (not the solver's 1/r), sums run over effective pixels (not means). It is
     uncalibrated: multiply by the s^2 fitted on data with ground truth.
     """
-    finite = fisher.flatten(1).isfinite().all(1)
-    identity = torch.eye(fisher.shape[-1], dtype=fisher.dtype, device=fisher.device)
-    factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], fisher, identity))
-    regular = (finite & (info == 0))[:, None, None]
-    covariance = torch.cholesky_inverse(torch.where(regular, factor, identity))
-    return torch.where(regular, covariance, torch.full_like(covariance, torch.nan))
+    factor, regular = cholesky_of_regular(fisher)
+    covariance = torch.cholesky_inverse(factor)
+    return torch.where(regular[:, None, None], covariance, torch.nan)
+
+
+def cholesky_of_regular(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower factors (B, D, D), and where (B,) a matrix has one; the identity stands for the others."""
+    finite = matrix.flatten(1).isfinite().all(1)
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], matrix, identity))
+    regular = finite & (info == 0)
+    return torch.where(regular[:, None, None], factor, identity), regular
 
 
 def without_offset(information: Tensor, num_kept: int) -> Tensor:
@@ -85,14 +92,12 @@ def quantities_jacobian(prior: ShapePrior, state: CarState) -> Tensor:
     T_cam_obj = se3.inverse(state.T_obj_cam).to(torch.float64)
     R_cam_obj = T_cam_obj[:, :3, :3]
     J_hwl_code = prior.dimensions_and_derivative(state.code).J_hwl_code.to(torch.float64)
-    ray = T_cam_obj[:, 0:3:2, 3]
-    x, z = (ray / ray.norm(dim=1, keepdim=True).clamp_min(1e-9)).unbind(dim=1)
-    zero = torch.zeros_like(x)
-    axes = torch.stack([-x, zero, -z, -z, zero, x, zero, zero + 1, zero], dim=1).view(-1, 3, 3)
-    J_position = torch.cat([axes @ R_cam_obj, torch.zeros_like(R_cam_obj)], dim=2)
+    # Height grows against the y axis.
+    towards = viewing_axes(T_cam_obj[:, :3, 3]) * constant_like((-1.0, -1.0, 1.0), T_cam_obj)[:, None]
+    J_position = torch.cat([towards @ R_cam_obj, torch.zeros_like(R_cam_obj)], dim=2)
     J_heading = torch.cat([torch.zeros_like(R_cam_obj[:, 1]), -HEADING_LEVER_M * R_cam_obj[:, 1]], dim=1)
     J_pose = torch.cat([J_position, J_heading[:, None]], dim=1)
-    no_pose, no_code = J_pose.new_zeros(len(x), 3, 6), J_pose.new_zeros(len(x), 4, J_hwl_code.shape[2])
+    no_pose, no_code = J_pose.new_zeros(len(J_pose), 3, 6), J_pose.new_zeros(len(J_pose), 4, J_hwl_code.shape[2])
     return torch.cat([torch.cat([J_pose, no_code], dim=2), torch.cat([no_pose, J_hwl_code.flip(1)], dim=2)], dim=1)
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from directshape_torch.errors import DataFormatError
 from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.files.read_files import read_json
+from directshape_torch.geometry.box3d import viewing_axes
 from directshape_torch.numerics.tensors import constant_like
 
 SCHEMA = "directshape_torch.trust_model/1"
@@ -81,7 +82,9 @@ class TrustModel:
         location: Tensor,  # (B, 3) of the cars, for their viewing rays
     ) -> Tensor:  # (B, 4, 4)
         """Covariance of (x, y, z, yaw) in true units: metres and radians."""
-        J = _view_from_xyz_yaw(location.to(covariance_xyz_yaw))
+        # To (along the ray, across it, y, yaw).
+        J = torch.nn.functional.pad(viewing_axes(location.to(covariance_xyz_yaw)), (0, 1, 0, 1))
+        J[:, 3, 3] = 1
         factors, floors = (constant_like(x, covariance_xyz_yaw) for x in (self.sigma_factors, self.sigma_floors))
         in_view = factors[:, None] * (J @ covariance_xyz_yaw @ J.mT) * factors + torch.diag(floors**2)
         return J.mT @ in_view @ J
@@ -125,14 +128,3 @@ def _head(content: Mapping[str, Any]) -> LogisticHead:
     if any(len(value) != len(columns) for value in values.values()):
         raise ValueError(f"{len(columns)} columns need as many {', '.join(numbers)}")
     return LogisticHead(columns, **values, bias=float(content["bias"]))
-
-
-def _view_from_xyz_yaw(location: Tensor) -> Tensor:
-    """Rotations (B, 4, 4) from (x, y, z, yaw) to (along the ray, across it to the right, y, yaw)."""
-    x, z = location[:, 0], location[:, 2]
-    distance = torch.hypot(x, z).clamp_min(1e-9)
-    J = torch.zeros(len(location), 4, 4, dtype=location.dtype, device=location.device)
-    J[:, 0, 0], J[:, 0, 2] = x / distance, z / distance
-    J[:, 1, 0], J[:, 1, 2] = z / distance, -x / distance
-    J[:, 2, 1] = J[:, 3, 3] = 1
-    return J

@@ -73,6 +73,20 @@ def alpha_from_kitti(
     return wrap_angle(rotation_y - torch.atan2(location_ref[..., 0], location_ref[..., 2]))
 
 
+def viewing_axes(origin_cam: Tensor) -> Tensor:
+    """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down.
+
+    Examples:
+        >>> viewing_axes(torch.tensor([[0.0, 1.6, 10.0]]))[0, 0]
+        tensor([0., 0., 1.])
+    """
+    x, z = origin_cam[:, 0], origin_cam[:, 2]
+    distance = torch.sqrt(x * x + z * z)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    rows = (x / distance, zero, z / distance, z / distance, zero, -x / distance, zero, one, zero)
+    return torch.stack(rows, dim=-1).view(-1, 3, 3)
+
+
 def box_corners(
     T_a_obj: Tensor,  # (*, 4, 4)
     dimensions_hwl: Tensor,  # (*, 3) height, width, length, metres

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from directshape_torch.config import PriorConfig, StageConfig
 from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import viewing_axes
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
@@ -274,17 +275,3 @@ def rig_prior(cars: CarBatch, state: CarState) -> PriorResidual:
     return PriorResidual(
         state.offset_px / sigma, torch.nn.functional.pad(1 / sigma, (6 + state.code.shape[1], 0))[:, None]
     )
-
-
-def viewing_axes(origin_cam: Tensor) -> Tensor:
-    """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down.
-
-    Examples:
-        >>> viewing_axes(torch.tensor([[0.0, 1.6, 10.0]]))[0, 0]
-        tensor([0., 0., 1.])
-    """
-    x, z = origin_cam[:, 0], origin_cam[:, 2]
-    distance = torch.sqrt(x * x + z * z)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    rows = (x / distance, zero, z / distance, z / distance, zero, -x / distance, zero, one, zero)
-    return torch.stack(rows, dim=-1).view(-1, 3, 3)

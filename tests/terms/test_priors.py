@@ -13,7 +13,7 @@ from helpers.twists import twists
 from torch import Tensor
 
 from directshape_torch.geometry import se3
-from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.box3d import pose_from_kitti, viewing_axes
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.priors import (
@@ -24,7 +24,6 @@ from directshape_torch.terms.priors import (
     shape_prior,
     tilt_prior_cosine,
     tilt_prior_normal,
-    viewing_axes,
 )
 
 NUM_CODES = 3
