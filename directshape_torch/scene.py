@@ -19,10 +19,11 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import (
+    check_finite,
     check_positive,
     check_rotation,
+    check_rows,
     check_shape,
-    check_sigmas,
     check_type,
     is_no_rotation,
 )
@@ -62,13 +63,9 @@ class GroundPlane(TensorRecord):
         downwards = self.normal[:, 1] >= 0
         not_unit = (self.normal.norm(dim=-1) - 1).abs() > 1e-3
         # One wait for the device for both of them. NaN passes: it fails the cars of its own frame.
-        if not bool((downwards | not_unit).any()):
-            return
-        if downwards.any():
-            raise InputError(
-                "normal", "a normal pointing up (negative y)", str(self.normal.tolist()), "flip the plane's signs"
-            )
-        raise InputError("normal", "unit length", str(self.normal.norm(dim=-1).tolist()), "divide the plane by it")
+        if bool((downwards | not_unit).any()):
+            check_rows("normal", downwards, self.normal, "a normal pointing up (negative y)", "flip the plane's signs")
+            check_rows("normal", not_unit, self.normal, "unit length", "divide the plane by its length")
 
     @classmethod
     def from_camera_height(cls, height_m: float, num_frames: int = 1) -> GroundPlane:
@@ -264,15 +261,18 @@ class Detections(TensorRecord):
         # One wait for the device for both. Dimensions that are NaN pass: they fail their own car.
         if bool((is_no_rotation(T_known) | (self.dimensions_hwl <= 0).any(dim=1).to(T_known.device)).any()):
             check_rotation("T_cam_obj", T_known)
-            _raise_not_positive("dimensions_hwl", self.dimensions_hwl)
+            expected, cure = "height, width and length above 0, metres", "leave out objects without a 3D box"
+            unfit = (self.dimensions_hwl <= 0).any(dim=1)
+            check_rows("dimensions_hwl", unfit, self.dimensions_hwl, expected, cure)
         if self.pose_sigma is not None:
-            check_sigmas("pose_sigma", self.pose_sigma)
+            cure = "give infinity for what the detector does not know"
+            unfit = (~(self.pose_sigma.detach() > 0)).any(dim=1)
+            check_rows("pose_sigma", unfit, self.pose_sigma, "standard deviations above 0", cure)
         if self.offset_sigma_px is not None:
-            wrong = (~((self.offset_sigma_px >= 0) & self.offset_sigma_px.isfinite())).nonzero()[:, 0].tolist()
-            if wrong:
-                got = f"{float(self.offset_sigma_px[wrong[0]]):g} in row {wrong[0]}"
-                cure = "give 0 for cars at which the rig's disparity is known"
-                raise InputError("offset_sigma_px", "finite standard deviations of at least 0, pixels", got, cure)
+            expected = "finite standard deviations of at least 0, pixels"
+            cure = "give 0 for cars at which the rig's disparity is known"
+            unfit = ~((self.offset_sigma_px >= 0) & self.offset_sigma_px.isfinite())
+            check_rows("offset_sigma_px", unfit, self.offset_sigma_px, expected, cure)
         if self.track_id is not None:
             _check_tracks(self.track_id, self.frame_index)
 
@@ -411,17 +411,15 @@ def _check_words(name: str, words: object, count: int, what: str) -> None:
 
 
 def _check_motion(time_s: Tensor | None, T_world_cam: Tensor | None) -> None:
-    if time_s is not None and not bool(time_s.isfinite().all()):
-        raise InputError("time_s", "finite seconds", str(time_s.tolist()), "leave it out where times are not known")
     if time_s is not None:
+        check_finite("time_s", time_s, "leave it out where times are not known")
         _check_fine("time_s", time_s, _FINE_S, "s")
     if T_world_cam is None:
         return
-    if not bool(T_world_cam.isfinite().all()):
-        raise InputError("T_world_cam", "finite poses", "NaN or infinity", "leave it out where poses are not known")
+    check_finite("T_world_cam", T_world_cam, "leave it out where poses are not known")
     check_rotation("T_world_cam", T_world_cam)
-    if bool((T_world_cam[:, 3] != T_world_cam.new_tensor([0.0, 0.0, 0.0, 1.0])).any()):
-        raise InputError("T_world_cam", "0, 0, 0, 1 as last rows", str(T_world_cam[:, 3].tolist()))
+    not_last = (T_world_cam[:, 3] != T_world_cam.new_tensor([0.0, 0.0, 0.0, 1.0])).any(dim=1)
+    check_rows("T_world_cam", not_last, T_world_cam, "0, 0, 0, 1 as last rows")
     _check_fine("T_world_cam", T_world_cam[:, :3, 3], _FINE_M, "m")
 
 
@@ -443,15 +441,6 @@ def _check_tracks(
             got = f"track {view[0]} in rows {seen[view]} and {row} of frame {view[1]}"
             raise InputError("track_id", "one view of a track in a frame", got, "give -1 to cars by themselves")
         seen[view] = row
-
-
-def _raise_not_positive(
-    name: str,
-    dimensions: Tensor,  # (B, 3)
-) -> None:
-    row = int((dimensions <= 0).any(dim=1).int().argmax())
-    got = f"{dimensions[row].tolist()} in row {row}"
-    raise InputError(name, "height, width and length above 0, metres", got, "leave out objects without a 3D box")
 
 
 def _check_brightness(name: str, images: Tensor) -> None:

@@ -436,7 +436,7 @@ def test_factors_of_single_cars_count_in_everything() -> None:
     [
         ({"photometrics": torch.ones(5)}, r"term_weights: expected names among silhouette_left, .*'photometrics'"),
         ({"photometric": torch.ones(4)}, r"term_weights\['photometric'\]: .*one factor for each car"),
-        ({"shape": torch.tensor([1.0, 1, -0.5, 1, 1])}, r"factors of at least 0, got -0.5 for car 2"),
+        ({"shape": torch.tensor([1.0, 1, -0.5, 1, 1])}, r"factors of at least 0, got -0.5 in row 2"),
     ],
 )
 def test_wrong_factors_say_so(weights: dict[str, Tensor], message: str) -> None:

@@ -15,12 +15,7 @@ from directshape_torch.geometry.se3 import from_rotation_translation, transform
 
 
 def rotation_about_y(angle: Tensor) -> Tensor:
-    """Rotation matrices (*, 3, 3) by angles (*,) in radians about the y axis, in KITTI's sense.
-
-    Examples:
-        >>> rotation_about_y(torch.tensor(0.0))[0]
-        tensor([1., 0., 0.])
-    """
+    """Rotation matrices (*, 3, 3) by angles (*,) in radians about the y axis, in KITTI's sense."""
     c, s = torch.cos(angle), torch.sin(angle)
     zero, one = torch.zeros_like(c), torch.ones_like(c)
     rows = torch.stack([c, zero, s, zero, one, zero, 0.0 - s, zero, c], dim=-1)
@@ -51,12 +46,7 @@ def rotation_y_from_pose(T: Tensor) -> Tensor:
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """Angles brought into [-pi, pi).
-
-    Examples:
-        >>> wrap_angle(torch.tensor(2 * math.pi + 0.5))
-        tensor(0.5000)
-    """
+    """Angles brought into [-pi, pi)."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
@@ -74,12 +64,7 @@ def alpha_from_kitti(
 
 
 def viewing_axes(origin_cam: Tensor) -> Tensor:
-    """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down.
-
-    Examples:
-        >>> viewing_axes(torch.tensor([[0.0, 1.6, 10.0]]))[0, 0]
-        tensor([0., 0., 1.])
-    """
+    """Unit vectors (B, 3, 3), rows: along the viewing ray of points (B, 3) with y left out, across it, and down."""
     x, z = origin_cam[:, 0], origin_cam[:, 2]
     distance = torch.sqrt(x * x + z * z)
     zero, one = torch.zeros_like(x), torch.ones_like(x)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_shape, check_size_wh
+from directshape_torch.numerics.checks import check_finite, check_shape, check_size_wh
 from directshape_torch.numerics.gradient_mode import is_plain
 
 # Exponents of the normalised (u, v) in each basis function: 1, u, v, u^2, uv, v^2, u^3, u^2 v, u v^2, u^4.
@@ -51,14 +51,7 @@ def nearest_in_convex_polygon(
     points: Tensor,  # (*, 2)
     polygon: Tensor,  # (M, 2) vertices in order, either sense
 ) -> Tensor:  # (*, 2)
-    """The points themselves where they lie in the polygon, else the nearest point of its border.
-
-    Examples:
-        >>> square = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
-        >>> nearest_in_convex_polygon(torch.tensor([[1.0, 2.0], [9.0, 2.0]]), square)
-        tensor([[1., 2.],
-                [4., 2.]])
-    """
+    """The points themselves where they lie in the polygon, else the nearest point of its border."""
     dtype = torch.promote_types(points.dtype, polygon.dtype)
     flat, polygon = points.reshape(-1, 2).to(dtype), polygon.to(dtype)
     inside = _is_inside(flat, polygon)
@@ -120,11 +113,9 @@ class DisparityField:
         check_size_wh("size_wh", self.size_wh)
         for name, shape in TENSOR_SHAPES.items():
             check_shape(name, getattr(self, name), ["M" if n is None else n for n in shape], kind="floating")
+            check_finite(name, getattr(self, name))
         if len(self.hull_uv) < 3:
             raise InputError("hull_uv", "shape (M, 2) with at least 3 vertices", f"{tuple(self.hull_uv.shape)}")
-        for name in TENSOR_SHAPES:
-            if not bool(getattr(self, name).isfinite().all()):
-                raise InputError(name, "finite numbers", str(getattr(self, name).tolist()))
 
     @classmethod
     def constant(
@@ -171,26 +162,14 @@ class DisparityField:
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> Tensor:  # (*,)
-        """Measured minus predicted row in the right image, pixels; beyond the hull that of its nearest point.
-
-        Examples:
-            >>> K, T = torch.eye(3), torch.eye(4)
-            >>> DisparityField.constant(0.25, (640, 480), K, K, T).vertical(torch.zeros(1, 2))
-            tensor([0.])
-        """
+        """Measured minus predicted row in the right image, pixels; beyond the hull that of its nearest point."""
         return self.offsets(uv_left)[1]
 
     def offsets(
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> tuple[Tensor, Tensor]:  # (*,), (*,)
-        """`bias` and `vertical` in little more time than one of them.
-
-        Examples:
-            >>> K, T = torch.eye(3), torch.eye(4)
-            >>> DisparityField.constant(0.25, (640, 480), K, K, T).offsets(torch.zeros(1, 2))
-            (tensor([0.2500]), tensor([0.]))
-        """
+        """`bias` and `vertical` in little more time than one of them."""
         sizes = uv_left.shape[:-1] if isinstance(uv_left, Tensor) and not uv_left.is_nested else ()
         check_shape("uv_left", uv_left, (*sizes, 2), kind="floating")
         inside = nearest_in_convex_polygon(uv_left, self.hull_uv.to(uv_left))
@@ -203,13 +182,7 @@ class DisparityField:
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> Tensor:  # (*,)
-        """Standard deviation of `bias`, pixels; beyond the hull that of the place itself, for nobody has looked there.
-
-        Examples:
-            >>> K, T = torch.eye(3), torch.eye(4)
-            >>> DisparityField.constant(0.25, (640, 480), K, K, T).sigma(torch.zeros(1, 2))
-            tensor([0.])
-        """
+        """Standard deviation of `bias`, pixels; beyond the hull it grows, for nobody has looked there."""
         basis = polynomial_basis(uv_left, self.size_wh)
         return ((basis @ self.covariance.to(basis)) * basis).sum(dim=-1).clamp_min(0).sqrt()
 
@@ -227,31 +200,19 @@ class DisparityField:
         """
         cure = "estimate this rig with 'directshape calibrate-rig', or refine with --rig auto or none"
         if tuple(size_wh) != tuple(self.size_wh):
-            raise InputError(
-                "disparity_field",
-                f"images of {self.size_wh[0]} x {self.size_wh[1]}",
-                f"{size_wh[0]} x {size_wh[1]}",
-                cure,
-            )
-        self._check_close("K_left", K_left, _TOLERANCE_PX, "px", cure)
-        self._check_close("K_right", K_right, _TOLERANCE_PX, "px", cure)
-        self._check_close("T_right_cam", T_right_cam, _TOLERANCE_M, "m", cure)
-        rotation = _largest_difference(self.T_right_cam[:3, :3], T_right_cam[:3, :3])
-        if not rotation <= _TOLERANCE_ROTATION:
-            raise InputError(
-                "disparity_field", "the rig's right camera", f"one turned by about {rotation:.2g} rad", cure
-            )
-
-    def _check_close(self, name: str, other: Tensor, tolerance: float, unit: str, cure: str) -> None:
-        difference = _largest_difference(getattr(self, name), other)
-        # `not <=` so that a calibration with NaN is refused too.
-        if not difference <= tolerance:
-            raise InputError(
-                "disparity_field",
-                f"the rig's {name} to {tolerance} {unit}",
-                f"a difference of {difference:.4g} {unit}",
-                cure,
-            )
+            expected, came = (f"{width} x {height}" for width, height in (self.size_wh, size_wh))
+            raise InputError("disparity_field", f"images of {expected}", came, cure)
+        for name, mine, other, tolerance, unit in (
+            ("K_left", self.K_left, K_left, _TOLERANCE_PX, "px"),
+            ("K_right", self.K_right, K_right, _TOLERANCE_PX, "px"),
+            ("T_right_cam", self.T_right_cam, T_right_cam, _TOLERANCE_M, "m"),
+            ("rotation", self.T_right_cam[:3, :3], T_right_cam[:3, :3], _TOLERANCE_ROTATION, "rad"),
+        ):
+            difference = float((mine.detach().double().cpu() - other.detach().double().cpu()).abs().max())
+            # `not <=` so that a calibration with NaN is refused too.
+            if not difference <= tolerance:
+                came = f"a difference of {difference:.4g} {unit}"
+                raise InputError("disparity_field", f"the rig's {name} to {tolerance} {unit}", came, cure)
 
     @property
     def rig(self) -> tuple[tuple[int, int], Tensor, Tensor, Tensor]:
@@ -268,7 +229,3 @@ TENSOR_SHAPES: dict[str, tuple[int | None, ...]] = {
     "T_right_cam": (4, 4),
     "covariance": (NUM_COEFFICIENTS, NUM_COEFFICIENTS),
 }
-
-
-def _largest_difference(a: Tensor, b: Tensor) -> float:
-    return float((a.detach().double().cpu() - b.detach().double().cpu()).abs().max())

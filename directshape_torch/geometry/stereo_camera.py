@@ -12,7 +12,14 @@ from torch import Tensor
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.se3 import from_rotation_translation
-from directshape_torch.numerics.checks import check_alike, check_positive, check_rotation, check_shape, check_type
+from directshape_torch.numerics.checks import (
+    check_alike,
+    check_finite,
+    check_positive,
+    check_rotation,
+    check_shape,
+    check_type,
+)
 from directshape_torch.numerics.records import Dense, TensorRecord
 
 if TYPE_CHECKING:
@@ -47,8 +54,7 @@ class StereoCamera(TensorRecord):
         super().__post_init__()
         check_type("disparity_field", self.disparity_field, (DisparityField, NoneType))
         for name in ("K_left", "K_right", "T_right_cam", "t_cam_ref"):
-            if not bool(getattr(self, name).isfinite().all()):
-                raise InputError(name, "finite numbers", "NaN or infinity", "check the calibration of every frame")
+            check_finite(name, getattr(self, name), "check the calibration of every frame")
         check_rotation("T_right_cam", self.T_right_cam)
         if (self.baseline <= 0).any():
             raise InputError(

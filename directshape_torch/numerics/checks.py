@@ -77,11 +77,7 @@ def check_alike(name: str, value: Tensor, first_name: str, first: Tensor) -> Non
 
 
 def check_positive(name: str, value: object, cure: str = "") -> None:
-    """Raise `InputError` unless `value` is a finite number above 0.
-
-    Examples:
-        >>> check_positive("height_m", 1.65)
-    """
+    """Raise `InputError` unless `value` is a finite number above 0."""
     try:
         fits = isinstance(value, Real) and not isinstance(value, bool) and 0 < float(value) < math.inf
     except OverflowError:  # a whole number that no float holds
@@ -91,11 +87,7 @@ def check_positive(name: str, value: object, cure: str = "") -> None:
 
 
 def check_size_wh(name: str, size: object) -> None:
-    """Raise `InputError` unless `size` is a width and a height in whole pixels.
-
-    Examples:
-        >>> check_size_wh("size_wh", (1242, 375))
-    """
+    """Raise `InputError` unless `size` is a width and a height in whole pixels."""
     sides = size if isinstance(size, Sequence) and len(size) == 2 else ()
     if not sides or not all(isinstance(n, Integral) and 0 < int(n) <= _WIDEST_PX for n in sides):
         raise InputError(name, f"(width, height) in pixels, whole, from 1 to {_WIDEST_PX}", shown(size))
@@ -110,13 +102,7 @@ def check_type(name: str, value: object, kinds: tuple[type, ...]) -> None:
 def is_no_rotation(
     transform: Tensor,  # (N, 4, 4), finite
 ) -> Tensor:  # (N,) bool
-    """Where the upper left part of a transform is no rotation.
-
-    Examples:
-        >>> import torch
-        >>> is_no_rotation(torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))[None])
-        tensor([True])
-    """
+    """Where the upper left part of a transform is no rotation."""
     rotation = transform.detach()[:, :3, :3].double()
     error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().amax(dim=(1, 2))
     wrong: Tensor = (error > _ROTATION_TOLERANCE) | (torch.linalg.det(rotation) < 0)
@@ -127,36 +113,20 @@ def check_rotation(
     name: str,
     transform: Tensor,  # (N, 4, 4), finite
 ) -> None:
-    """Raise `InputError` unless the upper left part of every transform is a rotation.
+    """Raise `InputError` unless the upper left part of every transform is a rotation."""
+    cure = "leave scale out of the transform, and build it from a rotation matrix"
+    expected = "rotations R with R R^T = I and determinant 1"
+    check_rows(name, is_no_rotation(transform), transform[:, :3, :3], expected, cure)
 
-    Examples:
-        >>> import torch
-        >>> check_rotation("T_cam_obj", torch.eye(4)[None])
-    """
-    wrong = is_no_rotation(transform)
-    if wrong.any():
+
+def check_rows(name: str, wrong: Tensor, values: Tensor, expected: str, cure: str = "") -> None:
+    """Raise `InputError` that shows the first of the rows (N, ...) that are wrong (N,), if there are any."""
+    if bool(wrong.any()):
         row = int(wrong.int().argmax())
-        rotation = transform.detach()[:, :3, :3].double()
-        raise InputError(
-            name,
-            "rotations R with R R^T = I and determinant 1",
-            f"R = {rotation[row].tolist()} in row {row}",
-            "leave scale out of the transform, and build it from a rotation matrix",
-        )
+        raise InputError(name, expected, f"{values[row].tolist()} in row {row}", cure)
 
 
-def check_sigmas(
-    name: str,
-    sigma: Tensor,  # (N, M)
-) -> None:
-    """Raise `InputError` unless every standard deviation is above 0; infinity is.
-
-    Examples:
-        >>> import torch
-        >>> check_sigmas("pose_sigma", torch.tensor([[0.5, torch.inf]]))
-    """
-    wrong = (~(sigma.detach() > 0)).nonzero().tolist()
-    if wrong:
-        row, column = wrong[0]
-        got = f"{float(sigma[row, column]):g} in row {row}"
-        raise InputError(name, "standard deviations above 0", got, "give infinity for what the detector does not know")
+def check_finite(name: str, tensor: Tensor, cure: str = "") -> None:
+    """Raise `InputError` for a tensor with NaN or infinity."""
+    if not bool(tensor.isfinite().all()):
+        raise InputError(name, "finite numbers", "NaN or infinity", cure)

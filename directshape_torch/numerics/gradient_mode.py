@@ -14,27 +14,12 @@ _R = TypeVar("_R")
 
 
 def nothing_is_differentiated() -> bool:
-    """Whether neither gradients nor a forward mode are on; `torch.func` enables gradients or opens a level of its own.
-
-    Examples:
-        >>> with torch.no_grad():
-        ...     nothing_is_differentiated()
-        True
-        >>> with torch.no_grad():
-        ...     torch.func.jvp(lambda x: x * nothing_is_differentiated(), (torch.ones(1),), (torch.ones(1),))
-        (tensor([0.]), tensor([0.]))
-    """
+    """Whether neither gradients nor a forward mode are on, nor one of `torch.func`, which enables either."""
     return not (torch.is_grad_enabled() or is_forward_mode())
 
 
 def is_forward_mode() -> bool:
-    """Whether this is inside a region of forward-mode differentiation.
-
-    Examples:
-        >>> with torch.autograd.forward_ad.dual_level():
-        ...     is_forward_mode()
-        True
-    """
+    """Whether this is inside a region of forward-mode differentiation."""
     return torch.autograd.forward_ad._current_level >= 0
 
 
@@ -71,12 +56,7 @@ def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def map_tensors(change: Callable[..., Tensor], value: Any, *others: Any) -> Any:
-    """A tensor, or the tensors of nested named tuples, changed: each together with its counterparts in the others.
-
-    Examples:
-        >>> map_tensors(torch.add, torch.ones(1), torch.ones(1))
-        tensor([2.])
-    """
+    """A tensor, or the tensors of nested named tuples, changed: each together with its counterparts in the others."""
     if isinstance(value, Tensor):
         return change(value, *others)
     if not value:
@@ -89,10 +69,6 @@ def is_plain(tensor: Tensor) -> bool:
 
     Only such ones may be kept for later, and asked for numbers: the others mean nothing outside of the call that made
     them. Of code that is being compiled none is.
-
-    Examples:
-        >>> is_plain(torch.ones(1)), torch.func.grad(lambda x: x * is_plain(x))(torch.tensor(2.0)).item()
-        (True, 0.0)
     """
     if torch.compiler.is_compiling() or type(tensor) not in (Tensor, torch.nn.Parameter):
         return False

@@ -17,12 +17,7 @@ def take(
     flat: Tensor,  # (A,)
     index: Tensor,  # (*,) integer, 0 .. A - 1
 ) -> Tensor:
-    """The entries (*,) of a flat tensor at indices of any shape.
-
-    Examples:
-        >>> take(torch.tensor([5.0, 6.0, 7.0]), torch.tensor([[2, 0]]))
-        tensor([[7., 5.]])
-    """
+    """The entries (*,) of a flat tensor at indices of any shape."""
     if torch.compiler.is_compiling():
         # The same compiled code from one step instead of three: every step costs the compiler milliseconds.
         return flat[index]
@@ -36,10 +31,6 @@ def occurrences(
     """How often (count,) each of the numbers from 0 to below `count` occurs among indices.
 
     `bincount` would let the host wait for a graphics card, to learn the largest number.
-
-    Examples:
-        >>> occurrences(torch.tensor([2, 0, 2]), 4)
-        tensor([1, 0, 2, 0])
     """
     return index.new_zeros(count).scatter_add(0, index, torch.ones_like(index))
 
@@ -48,12 +39,7 @@ _T = TypeVar("_T")
 
 
 def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
-    """The numbers (n,) as a tensor of the dtype and on the device of another; not to be written to.
-
-    Examples:
-        >>> constant_like((0.5, 2.0), torch.zeros(1))
-        tensor([0.5000, 2.0000])
-    """
+    """The numbers (n,) as a tensor of the dtype and on the device of another; not to be written to."""
     return _kept(_CONSTANTS, values, like, lambda dtype, device: torch.tensor(values, dtype=dtype, device=device))
 
 
@@ -105,34 +91,19 @@ def _kept(
 
 
 def length(vectors: Tensor, dim: int) -> Tensor:
-    """Euclidean length along an axis; at zero its derivative is NaN.
-
-    Examples:
-        >>> length(torch.tensor([[3.0], [4.0]]), dim=0)
-        tensor([5.])
-    """
+    """Euclidean length along an axis; at zero its derivative is NaN."""
     return (vectors * vectors).sum(dim).sqrt()
 
 
 def all_along(flags: Tensor, dim: int) -> Tensor:
-    """`flags.all(dim)` of an axis with few entries.
-
-    Examples:
-        >>> all_along(torch.tensor([[True, False], [True, True]]), dim=0)
-        tensor([ True, False])
-    """
+    """`flags.all(dim)` of an axis with few entries."""
     if torch.compiler.is_compiling():
         return flags.all(dim)  # one step to trace, and the compiler writes the loop
     return functools.reduce(torch.logical_and, flags.unbind(dim))
 
 
 def cross(left: Tensor, right: Tensor) -> Tensor:
-    """Cross products (*, 3) of vectors (*, 3).
-
-    Examples:
-        >>> cross(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 1.0, 0.0]))
-        tensor([0., 0., 1.])
-    """
+    """Cross products (*, 3) of vectors (*, 3)."""
     if not torch.compiler.is_compiling():
         product: Tensor = torch.linalg.cross(left, right)
         return product

@@ -379,14 +379,7 @@ class CarIterations:
 
 
 def method_stages(config: RefinerConfig) -> list[StageConfig]:
-    """The stages of `config.method`: rounds of its own for "geometric", else those of the configuration.
-
-    Examples:
-        >>> from directshape_torch.config_files import load_config
-        >>> stages = method_stages(load_config(None, ["method=geometric", "point_cloud.rounds=2"]))
-        >>> [stage.unknowns for stage in stages]
-        ['pose', 'shape', 'pose', 'shape']
-    """
+    """The stages of `config.method`: rounds of its own for "geometric", else those of the configuration."""
     if config.method != "geometric":
         return list(config.stages)
     # Contour and pyramid level mean nothing to a point cloud: the last stage's, for whoever draws or measures.

@@ -13,7 +13,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.image.grey_levels import GreyPair, grey_levels
-from directshape_torch.numerics.checks import check_shape
+from directshape_torch.numerics.checks import check_rows, check_shape
 from directshape_torch.observation.packing import Observation
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import Rows
@@ -123,10 +123,7 @@ def _factors(weights: Mapping[str, Tensor] | None, names: Sequence[str], code: T
         if name not in names:
             raise InputError("term_weights", f"names among {', '.join(names)}", repr(name))
         check_shape(f"term_weights[{name!r}]", weight, (len(code),), "one factor for each car")
-        negative = (weight < 0).nonzero()[:, 0].tolist()
-        if negative:
-            got = f"{float(weight[negative[0]]):.3g} for car {negative[0]}"
-            cure = "let a network predict their logarithm"
-            raise InputError(f"term_weights[{name!r}]", "factors of at least 0", got, cure)
+        cure = "let a network predict their logarithm"
+        check_rows(f"term_weights[{name!r}]", weight < 0, weight, "factors of at least 0", cure)
     ones = code.new_ones(len(code))
     return torch.stack([weights[name].to(code) if name in weights else ones for name in names], dim=1)

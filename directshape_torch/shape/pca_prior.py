@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError
-from directshape_torch.numerics.checks import check_alike, check_positive, check_shape
+from directshape_torch.numerics.checks import check_alike, check_finite, check_positive, check_shape
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.shape.sdf_grid import GridShape
 from directshape_torch.shape.shape_prior import DimensionsDerivative
@@ -89,8 +89,7 @@ class PCAShapePrior(nn.Module):
         for name, (tensor, shape) in tensors.items():
             check_shape(name, tensor, shape, kind="floating")
             check_alike(name, tensor, "mean", mean)
-            if not bool(tensor.isfinite().all()):
-                raise InputError(name, "finite numbers", "NaN or infinity")
+            check_finite(name, tensor)
             self.register_buffer(name, tensor)
         check_positive("spacing_m", spacing_m)
         self.spacing_m = float(spacing_m)

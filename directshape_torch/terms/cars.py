@@ -26,12 +26,7 @@ class CarState(NamedTuple):
 
     @classmethod
     def of(cls, T_obj_cam: Tensor, code: Tensor, num_offsets: int = 0) -> CarState:
-        """Cars of a pose (B, 4, 4) and a shape (B, K), where the rig's disparity is as it is calibrated.
-
-        Examples:
-            >>> CarState.of(torch.eye(4)[None], torch.zeros(1, 2), num_offsets=1).offset_px
-            tensor([[0.]])
-        """
+        """Cars of a pose (B, 4, 4) and a shape (B, K), where the rig's disparity is as it is calibrated."""
         # No view of the code: compiled functions take other strides for another form.
         offset_px, path = code.new_zeros(len(code), num_offsets), code.new_zeros(len(code), 0)
         return cls(T_obj_cam, code, offset_px, path)

@@ -258,10 +258,6 @@ def J_heading_omega(R_obj: Tensor) -> Tensor:
     """Derivative (B, 3) of the heading `atan2(-h_z, h_x)` of cars of rotation (B, 3, 3) by omega; h is their x axis.
 
     It moves by R (e_x x omega) = omega_y R[:, 2] - omega_z R[:, 1], its angle by (h_z dh_x - h_x dh_z) / |h|^2.
-
-    Examples:
-        >>> J_heading_omega(torch.eye(3)[None])
-        tensor([[ 0., -1.,  0.]])
     """
     x_axis, dh_y, dh_z = R_obj[:, 0::2, 0], R_obj[:, 0::2, 2], -R_obj[:, 0::2, 1]
     by_y, by_z = (x_axis[:, 1] * dh[:, 0] - x_axis[:, 0] * dh[:, 1] for dh in (dh_y, dh_z))

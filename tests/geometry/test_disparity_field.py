@@ -137,7 +137,7 @@ def test_same_rig_passes_even_in_float32() -> None:
         (0, (0, 0), 2.7, "K_left"),
         (1, (0, 2), -0.2, "K_right"),
         (2, (0, 3), 0.005, "T_right_cam"),
-        (2, (0, 1), 5e-4, "turned"),
+        (2, (0, 1), 5e-4, "rig.s rotation to"),
     ],
 )
 def test_another_rig_is_refused(index: int, entry: tuple[int, int], change: float, text: str) -> None:

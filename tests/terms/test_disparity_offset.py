@@ -127,7 +127,7 @@ def test_a_sigma_of_zero_is_no_unknown_and_beside_other_cars_it_is_held() -> Non
 
 def test_sigmas_that_are_none_are_refused() -> None:
     given = rectified_street().detections
-    with pytest.raises(InputError, match=r"offset_sigma_px: expected finite .* at least 0, pixels, got -1 in row 1"):
+    with pytest.raises(InputError, match=r"offset_sigma_px: expected finite .* at least 0, pixels, got -1.0 in row 1"):
         replace(given, offset_sigma_px=torch.tensor([0.5, -1.0]).double())
     with pytest.raises(InputError, match="offset_sigma_px"):
         replace(given, offset_sigma_px=torch.ones(3))

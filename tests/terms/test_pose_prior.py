@@ -107,7 +107,7 @@ def test_a_certain_depth_holds_the_depth_alone() -> None:
 def test_standard_deviations_are_above_zero(wrong: float) -> None:
     sigma = SIGMA.repeat(2, 1)
     sigma[1, 2] = wrong
-    message = r"pose_sigma: expected standard deviations above 0, got \S+ in row 1; give infinity for what"
+    message = r"pose_sigma: expected standard deviations above 0, got \[.*\] in row 1; give infinity for what"
     with pytest.raises(InputError, match=message):
         _start(sigma)
     with pytest.raises(InputError, match=r"pose_sigma"):
