@@ -16,6 +16,7 @@ from torch import Tensor
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_bytes, write_png
+from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.geometry.box3d import alpha_from_kitti
 from directshape_torch.io.result_files import RefinedBox, ShapeArrays, read_shapes, write_result_text, write_shapes
 from directshape_torch.io.run_folder import (
@@ -34,9 +35,6 @@ from directshape_torch.result import RefinementResult
 
 if TYPE_CHECKING:
     import trimesh
-
-# glTF demands y up and the viewer in front of +z; the camera has y down and looks along +z.
-T_GLTF_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_frame_outputs(

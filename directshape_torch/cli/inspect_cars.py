@@ -18,8 +18,7 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.course_figures import write_drift_figure, write_iteration_animation
-from directshape_torch.visualize.inspection.residual_figure import write_residual_figure
-from directshape_torch.visualize.inspection.sampling_figure import write_sampling_figure
+from directshape_torch.visualize.inspection.still_figures import write_residual_figure, write_sampling_figure
 from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 

@@ -13,8 +13,8 @@ from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.io.track_files import track_name
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.visualize.drawing import BLUE, GREY, Picture, View, draw_box, draw_contour, draw_text, picture_of
-from directshape_torch.visualize.overlay import DrawnCar, refined_cars
+from directshape_torch.visualize.drawing import Picture, View, draw_box, draw_contour, draw_text
+from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars
 
 _SIZE_PX = (480, 360)
 _SECONDS_A_FRAME = 0.4
@@ -35,7 +35,7 @@ def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, o
     first_row = 0
     for item in loaded:
         ids, part = item.detections.track_id, result[first_row : first_row + len(item.detections)]
-        for car, number in zip(refined_cars(item, part), [] if ids is None else ids.tolist(), strict=True):
+        for car, number in zip(drawn_cars(item, part)[1], [] if ids is None else ids.tolist(), strict=True):
             pictures.setdefault(track_name(item.sequence or "", number), []).append(_picture(item, car))
         first_row += len(item.detections)
     paths = []
@@ -48,16 +48,16 @@ def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, o
 
 def _picture(item: LoadedFrame, car: DrawnCar) -> Picture:
     """The car's part of the left image, with its box and contour; all of one size."""
-    image, K = picture_of(item.frame.images_left[0]), item.frame.camera.K_left[0].double().numpy()
+    image = View.of_frame(item.frame)
     ahead = car.corners_cam[car.corners_cam[:, 2] > 0.5]
-    pixels = View(image, K).project(ahead if len(ahead) else np.array([[0.0, 0.0, 1.0]]))
+    pixels = image.project(ahead if len(ahead) else np.array([[0.0, 0.0, 1.0]]))
     (u0, v0), (u1, v1) = pixels.min(axis=0), pixels.max(axis=0)
     height = round(max(_MARGIN * (v1 - v0), _MARGIN * (u1 - u0) * _SIZE_PX[1] / _SIZE_PX[0], 12.0) / 3) * 3
     width = height * 4 // 3
     left, top = round((u0 + u1 - width) / 2), round((v0 + v1 - height) / 2)
-    view = View.of_window(image, K, (left, top, left + width, top + height), _SIZE_PX[0] / width)
-    ink = BLUE if car.is_refined else GREY
-    draw_box(view, car.corners_cam, ink)
-    draw_contour(view, car.surface, ink)
-    draw_text(view.picture, f"{item.frame_id}: {car.distance_m:.1f} m, {car.note}", (8, 20))
+    view = image.part((left, top, left + width, top + height), _SIZE_PX[0] / width)
+    draw_box(view, car.corners_cam, car.colour)
+    if car.surface is not None:
+        draw_contour(view, car.surface, car.colour)
+    draw_text(view.picture, f"{item.frame_id}: {car.distance_m:.1f} m, {car.status}", (8, 20))
     return view.picture

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.batch.frame_outputs import T_GLTF_CAM
 from directshape_torch.export.coco3d_file import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.painted_cars import Paint, PaintedFrame
 from directshape_torch.files.atomic_files import write_bytes
+from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.io.run_folder import FrameResult, ResultObject
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.visualize.ground_grid import ground_grid

@@ -31,7 +31,7 @@ from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.status import Status
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, picture_of
 from directshape_torch.visualize.ground_grid import ground_grid
-from directshape_torch.visualize.inspection.residual_figure import CarResiduals, PixelResiduals, car_residuals
+from directshape_torch.visualize.inspection.pixel_residuals import CarResiduals, PixelResiduals, car_residuals
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 LEFT, RIGHT = "world/cam/image", "right/image"

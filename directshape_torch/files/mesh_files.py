@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.files.read_files import read_bytes
 
+# glTF demands y up and the viewer in front of +z; the camera has y down and looks along +z.
+T_GLTF_CAM = np.diag([1.0, -1.0, -1.0, 1.0])
 MESH_SUFFIXES = (".obj", ".ply", ".glb", ".off", ".stl")
 # trimesh needs up to a hundred bytes for one of a text.
 _MOST_BYTES = 2**28

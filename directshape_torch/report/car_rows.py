@@ -4,86 +4,48 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.page_data import known
-from directshape_torch.status import Status
-
-
-@dataclass(frozen=True)
-class JudgedCar:
-    """A car whose label is known.
-
-    Attributes:
-        counts: whether `directshape compare` would count the label.
-        before: None where the detections are not at hand.
-        after: of the result.
-    """
-
-    counts: bool
-    before: CarErrors | None
-    after: CarErrors
+from directshape_torch.visualize.drawn_car import is_refined
 
 
 @dataclass(frozen=True)
 class CarRow:
-    """One car of the table; None for what is not known.
+    """One car of the table; None for what is not known."""
 
-    Attributes:
-        frame: number of its frame in the page.
-        line: its line in the detection file, from 1.
-        track: the name of its track, "" for none.
-        track_part: 0 where it shares the track's shape, 1, 2 .. for a later part of one that was split, -1 alone.
-        type: its class.
-        status: how its refinement ended.
-        refined: whether its state is a refined one.
-        x_m, y_m, distance_m: of the result in the left camera frame, on the ground.
-        score: the detector's.
-        cost_before, cost_after: sum over the terms.
-        mask_iou: overlap with the left mask, with the right one where there is no left.
-        photometric_error_grey: mean difference of the images, 0..255.
-        probability_better: calibrated.
-        sigma_depth_m: calibrated, along z.
-        iterations: of the solver.
-        length_m, width_m, height_m: of the result.
-        counts: whether its label counts in a comparison; None without a label.
-        centre_before_m, centre_after_m, yaw_before_deg, yaw_after_deg, iou_before, iou_after: against the label.
-        unseen: the direction that the view shows least, in words.
-    """
-
-    frame: int
-    line: int
-    track: str
-    track_part: int
+    frame: int  # number of its frame in the page
+    line: int  # in the detection file, from 1
+    track: str  # the name of its track, "" for none
+    track_part: int  # 0 where it shares the track's shape, 1, 2 .. for later parts of one that was split, -1 alone
     type: str
-    status: str
-    refined: bool
-    x_m: float | None
+    status: str  # how its refinement ended
+    refined: bool  # whether its state is a refined one
+    x_m: float | None  # of the result in the left camera frame, on the ground
     y_m: float | None
     distance_m: float | None
-    score: float | None
-    cost_before: float | None
+    score: float | None  # the detector's
+    cost_before: float | None  # sum over the terms
     cost_after: float | None
-    mask_iou: float | None
-    photometric_error_grey: float | None
-    probability_better: float | None
-    sigma_depth_m: float | None
+    mask_iou: float | None  # overlap with the left mask, with the right one where there is no left
+    photometric_error_grey: float | None  # mean difference of the images, 0..255
+    probability_better: float | None  # calibrated
+    sigma_depth_m: float | None  # calibrated, along z
     iterations: int
-    length_m: float | None
+    length_m: float | None  # of the result
     width_m: float | None
     height_m: float | None
-    counts: bool | None
-    centre_before_m: float | None
+    counts: bool | None  # whether `directshape compare` would count its label; None without a label
+    centre_before_m: float | None  # errors against the label
     centre_after_m: float | None
     yaw_before_deg: float | None
     yaw_after_deg: float | None
     iou_before: float | None
     iou_after: float | None
-    unseen: str
+    unseen: str  # the direction that the view shows least, in words
 
 
 CAR_COLUMNS = tuple(entry.name for entry in fields(CarRow))
@@ -103,18 +65,19 @@ def car_rows(
         detections: the lines of its cars in the detection file, or None.
         labels: its labels, or None.
     """
-    judged = {} if labels is None else judge_cars(detections, result.cars, labels)
-    return [_row(frame, result, car, judged.get(car)) for car in range(len(result.cars))]
+    judged = {} if labels is None else _judged(detections, result.cars, labels)
+    return [_row(frame, result, car, *judged.get(car, (None, None, None))) for car in range(len(result.cars))]
 
 
-def as_json(row: CarRow) -> list[Any]:
-    """The values of a row in the order of `CAR_COLUMNS`."""
-    return [getattr(row, name) for name in CAR_COLUMNS]
-
-
-def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) -> CarRow:
+def _row(
+    frame: int,
+    result: FrameResult,
+    car: int,
+    counts: bool | None,
+    before: CarErrors | None,
+    after: CarErrors | None,
+) -> CarRow:
     shapes, kitti = result.shapes, result.cars[car]
-    before, after = (None, None) if judged is None else (judged.before, judged.after)
     ious = [known(array[car]) for array in (shapes.mask_iou_left, shapes.mask_iou_right)]
     height, width, length = (known(size, 3) for size in shapes.boxes_hwl[car])
     x_m, y_m, distance_m = (known(coordinate, 2) for coordinate in shapes.T_cam_obj[car, :3, 3])
@@ -140,7 +103,7 @@ def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) ->
         length_m=length,
         width_m=width,
         height_m=height,
-        counts=None if judged is None else judged.counts,
+        counts=counts,
         centre_before_m=None if before is None else known(before.centre_m),
         centre_after_m=None if after is None else known(after.centre_m),
         yaw_before_deg=None if before is None else known(before.yaw_deg, 2),
@@ -151,33 +114,20 @@ def _row(frame: int, result: FrameResult, car: int, judged: JudgedCar | None) ->
     )
 
 
-def is_refined(status: str) -> bool:
-    """Whether a status is one of a refined state; one of a later version is taken for none."""
-    return status in Status.__members__ and Status[status].is_refined
-
-
-def judge_cars(
+def _judged(
     before: Sequence[KittiObject] | None, after: Sequence[KittiObject], labels: Sequence[KittiObject]
-) -> dict[int, JudgedCar]:
-    """The errors of each car that has a label, by its place in `after`.
+) -> dict[int, tuple[bool, CarErrors | None, CarErrors]]:
+    """For each place in `after` whose car has a label: whether that counts, and the errors before and after.
 
-    Args:
-        before: the same cars as the detector gave them, or None.
-        after: result lines of the refined classes; matched by their 2D boxes, which a refinement leaves alone.
-        labels: of the frame, all classes.
+    Cars are matched by their 2D boxes, which a refinement leaves alone.
     """
-    partners = match_to_labels(after, labels)
-    cars = [car for car, partner in enumerate(partners) if partner >= 0]
-    if not cars:
-        return {}
-    true = [labels[partners[car]] for car in cars]
+    partners = {car: partner for car, partner in enumerate(match_to_labels(after, labels)) if partner >= 0}
+    cars, true = list(partners), [labels[partner] for partner in partners.values()]
     counted = CountedLabels(tuple({o.type for o in after}))
     errors_after = errors_of([after[car] for car in cars], true)
     errors_before = [None] * len(cars) if before is None else errors_of([before[car] for car in cars], true)
-    return {
-        car: JudgedCar(counted.counts(label), e_before, e_after)
-        for car, label, e_before, e_after in zip(cars, true, errors_before, errors_after, strict=True)
-    }
+    rows = zip(map(counted.counts, true), errors_before, errors_after, strict=True)
+    return dict(zip(cars, rows, strict=True))
 
 
 def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:

@@ -1,4 +1,4 @@
-"""Everything of one frame that the page shows on demand: thumbnails, residual maps, picture and 3D scene."""
+"""What the page shows of one frame beside its rows: pictures of cars, residual maps, and a 3D scene."""
 
 from __future__ import annotations
 
@@ -9,97 +9,53 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
+from directshape_torch.config import RefinerConfig
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import ShapeArrays
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.observation.occlusion import OcclusionOrder, occlusion_map
-from directshape_torch.report.car_rows import is_refined
-from directshape_torch.report.drawn_cars import (
-    CarState,
-    DrawnCars,
-    ObjectMesh,
-    frame_t_cam_ref,
-    states_after,
-    states_before,
-    true_corners,
-    window_of_states,
-)
+from directshape_torch.observation.occlusion import occlusion_map
 from directshape_torch.report.page_data import FRAME_QUALITY, data_url, mesh_data, numbers
-from directshape_torch.report.residual_maps import (
-    MapSettings,
-    ViewedPair,
-    Window,
-    photometric_picture,
-    residual_maps,
-    silhouette_picture,
-)
-from directshape_torch.scene import Detections
+from directshape_torch.report.residual_maps import photometric_picture, residual_maps, silhouette_picture
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import (
-    BLUE,
-    GREY,
     ORANGE,
     Colour,
     Picture,
+    Surface,
     View,
+    Window,
     draw_box,
     draw_contour,
-    picture_of,
+    window_around,
 )
+from directshape_torch.visualize.drawn_car import DrawnCar, cars_after, cars_before, corners_cam, true_corners
 
 _WIDTH_PX = 260
 _LARGEST_SCALE = 4.0
+_LEAST_ASPECT = 1.2
 
 
 @dataclass(frozen=True)
 class FrameMaterial:
-    """One frame as far as it is known.
+    """One frame as far as it is known."""
 
-    Attributes:
-        result: what the run left.
-        loaded: what went in, or None.
-        detections: the lines of its cars in the detection file, or None.
-        labels: the truth, or None.
-    """
-
-    result: FrameResult
-    loaded: LoadedFrame | None
-    detections: list[KittiObject] | None
-    labels: list[KittiObject] | None
+    result: FrameResult  # what the run left
+    loaded: LoadedFrame | None  # what went in
+    detections: list[KittiObject] | None  # the lines of its cars in the detection file
+    labels: list[KittiObject] | None  # the truth
 
 
 @dataclass(frozen=True)
 class DetailSettings:
-    """What all frames share.
+    """What all frames share."""
 
-    Attributes:
-        classes: refined types.
-        prior: shapes, or None where those of the run are not at hand.
-        mean: the mesh of its mean shape.
-        maps: settings of residual maps.
-        occlusion_order: see `occlusion_map`.
-    """
-
-    classes: Sequence[str]
-    prior: ShapePrior | None
-    mean: ObjectMesh | None
-    maps: MapSettings
-    occlusion_order: OcclusionOrder
-
-
-@dataclass(frozen=True)
-class _View:
-    """The left image of a frame."""
-
-    image: Picture
-    K: npt.NDArray[np.float64]
-
-    @classmethod
-    def of_frame(cls, loaded: LoadedFrame) -> _View:
-        frame = loaded.frame
-        return cls(picture_of(frame.images_left[0]), frame.camera.K_left[0].double().numpy())
+    classes: Sequence[str]  # refined types
+    prior: ShapePrior | None  # shapes, or None where those of the run are not at hand
+    mean: Surface | None  # the mean one
+    config: RefinerConfig  # of the run
 
 
 def frame_details(material: FrameMaterial, settings: DetailSettings) -> dict[str, Any]:
@@ -108,64 +64,77 @@ def frame_details(material: FrameMaterial, settings: DetailSettings) -> dict[str
     `thumbnails`: for each car its pictures "before" and "after". `maps`: for each car its residual maps, costs by term
     and disparity profile. `scene`: image, camera, ground, boxes and meshes.
     """
-    cars, loaded = _drawn_cars(material, settings), material.loaded
-    view = None if loaded is None else _View.of_frame(loaded)
+    shapes, t_cam_ref = material.result.shapes, _t_cam_ref(material.result.shapes)
+    before = None
+    if material.detections is not None:
+        before = cars_before(material.detections, t_cam_ref, settings.mean, shapes.codes.shape[1])
+    after = _cars_after(material.result, t_cam_ref, before, settings.prior)
+    cars = [{"after": now} if before is None else {"before": before[k], "after": now} for k, now in enumerate(after)]
+    view = None if material.loaded is None else View.of_frame(material.loaded.frame)
+    windows = [None if view is None else _window(view, list(states.values())) for states in cars]
     return {
-        "thumbnails": _thumbnails(view, cars, material.result),
-        "maps": _car_maps(view, material, settings, cars),
-        "scene": _scene(view, loaded, cars, material.result.shapes.ground_source),
+        "thumbnails": [_thumbnails(view, window, states) for window, states in zip(windows, cars, strict=True)],
+        "maps": [
+            {**_figures(shapes, car), "pictures": _maps(view, material.loaded, settings, car, window, states)}
+            for car, (window, states) in enumerate(zip(windows, cars, strict=True))
+        ],
+        "scene": {
+            **_background(view, material.loaded),
+            "ground_source": shapes.ground_source,
+            "truth": [
+                numbers(corners.reshape(-1), 3)
+                for corners in true_corners(material.labels, settings.classes, t_cam_ref)
+            ],
+            "cars": [_car(states.get("before"), states["after"]) for states in cars],
+        },
     }
 
 
-def _drawn_cars(material: FrameMaterial, settings: DetailSettings) -> DrawnCars:
-    result = material.result
-    t_cam_ref = frame_t_cam_ref(result)
-    before = None
-    if material.detections is not None:
-        before = states_before(material.detections, t_cam_ref, result.shapes.codes.shape[1], settings.mean)
-    truth = [] if material.labels is None else true_corners(material.labels, settings.classes, t_cam_ref)
-    return DrawnCars(before, states_after(result, before, settings.prior), truth)
+def _cars_after(
+    result: FrameResult, t_cam_ref: Tensor, before: Sequence[DrawnCar] | None, prior: ShapePrior | None
+) -> list[DrawnCar]:
+    shapes = result.shapes
+    boxes = (torch.from_numpy(x) for x in (shapes.boxes_location_ref, shapes.boxes_rotation_y, shapes.boxes_hwl))
+    lines, corners = shapes.input_lines.tolist(), corners_cam(*boxes, t_cam_ref)
+    states = (lines, shapes.statuses, shapes.T_cam_obj, shapes.codes, corners)
+    return cars_after(*states, before, prior, result.mesh_files)
 
 
-def _thumbnails(view: _View | None, cars: DrawnCars, result: FrameResult) -> list[dict[str, str]]:
+def _t_cam_ref(shapes: ShapeArrays) -> Tensor:
+    """`x_cam = x_ref + t_cam_ref` (3,), float64, from the states themselves; zero for a frame without cars."""
+    if not len(shapes.input_lines):
+        return torch.zeros(3, dtype=torch.float64)
+    offset = shapes.T_cam_obj.astype(np.float64)[:, :3, 3] - shapes.T_ref_obj.astype(np.float64)[:, :3, 3]
+    return torch.from_numpy(np.median(offset, axis=0))
+
+
+def _window(view: View, states: Sequence[DrawnCar]) -> Window | None:
+    """The part of the image that shows a car in all of its states, or None where it shows none."""
+    bounds = view.bounds(np.concatenate([state.corners_cam for state in states]))
+    if bounds is None:
+        return None
+    tall = 1.2 * (bounds[3] - bounds[1]) + 1
+    u0, v0, u1, v1 = window_around(bounds, max(1.2 * (bounds[2] - bounds[0]) + 4, _LEAST_ASPECT * tall), tall)
+    height, width = view.picture.shape[:2]
+    return max(u0, 0), max(v0, 0), min(u1, width), min(v1, height)
+
+
+def _thumbnails(view: View | None, window: Window | None, states: dict[str, DrawnCar]) -> dict[str, str]:
     """Nothing for a car that the image does not show."""
-    pictures: list[dict[str, str]] = []
-    for car, status in enumerate(result.shapes.statuses):
-        states = cars.states(car)
-        window = None if view is None else window_of_states(view.image, view.K, list(states.values()))
-        colours = {"before": ORANGE, "after": BLUE if is_refined(status) else GREY}
-        pictures.append(
-            {
-                name: data_url(_thumbnail(view, window, state, colours[name]))
-                for name, state in states.items()
-                if view is not None and window is not None
-            }
-        )
-    return pictures
+    if view is None or window is None:
+        return {}
+    colours = {"before": ORANGE, "after": states["after"].colour}
+    return {name: data_url(_thumbnail(view, window, state, colours[name])) for name, state in states.items()}
 
 
-def _thumbnail(view: _View, window: Window, state: CarState, colour: Colour) -> Picture:
-    scale = min(_WIDTH_PX / (window[2] - window[0]), _LARGEST_SCALE)
-    part = View.of_window(view.image, view.K, window, scale)
+def _thumbnail(view: View, window: Window, state: DrawnCar, colour: Colour) -> Picture:
+    part = view.part(window, min(_WIDTH_PX / (window[2] - window[0]), _LARGEST_SCALE))
     surface = state.surface
     if surface is None:
         draw_box(part, state.corners_cam, colour)
     else:
         draw_contour(part, surface, colour, 2)
     return part.picture
-
-
-def _car_maps(
-    view: _View | None, material: FrameMaterial, settings: DetailSettings, cars: DrawnCars
-) -> list[dict[str, Any]]:
-    """For each car its costs, its profile, and where images are at hand its residual maps."""
-    loaded, prior = material.loaded, settings.prior
-    parts = [_figures(material.result.shapes, car) for car in range(len(cars.after))]
-    if view is not None and loaded is not None and prior is not None:
-        pair = ViewedPair.of_frame(loaded.frame)
-        for car, part in enumerate(parts):
-            part["pictures"] = _maps(view, pair, loaded.detections, settings, prior, car, cars.states(car))
-    return parts
 
 
 def _figures(shapes: ShapeArrays, car: int) -> dict[str, Any]:
@@ -178,63 +147,62 @@ def _figures(shapes: ShapeArrays, car: int) -> dict[str, Any]:
         "profile_before": numbers(shapes.profile_costs_before[car]),
         "profile_after": numbers(shapes.profile_costs_after[car]),
         "sigmas_ref": numbers(shapes.sigmas_ref[car]),
-        "pictures": {},
     }
 
 
 def _maps(
-    view: _View,
-    pair: ViewedPair,
-    detections: Detections,
+    view: View | None,
+    loaded: LoadedFrame | None,
     settings: DetailSettings,
-    prior: ShapePrior,
     car: int,
-    states: dict[str, CarState],
+    window: Window | None,
+    states: dict[str, DrawnCar],
 ) -> dict[str, str]:
-    """Maps by the names "photometric_before" and so on."""
-    window = window_of_states(view.image, view.K, list(states.values()))
-    if window is None:
+    """Maps by the names "photometric_before" and so on, where images and shapes are at hand."""
+    if view is None or loaded is None or settings.prior is None or window is None:
         return {}
-    has_mask = bool(detections.has_mask_left[car])
-    foreground = detections.mask_left[car].float().numpy() if has_mask else None
-    hidden = _hidden(detections, car, window, settings.occlusion_order)
+    detections, config = loaded.detections, settings.config
+    foreground = detections.mask_left[car].float().numpy() if bool(detections.has_mask_left[car]) else None
+    hidden = _hidden(loaded, car, window, config)
     pictures = {}
     for name, state in states.items():
-        maps = residual_maps(pair, prior, state.T_cam_obj, state.code, window, foreground, hidden, settings.maps)
-        pictures[f"photometric_{name}"] = data_url(photometric_picture(view.image, window, maps.photometric))
-        if maps.silhouette is not None:
-            pictures[f"silhouette_{name}"] = data_url(silhouette_picture(view.image, window, maps.silhouette))
+        photometric, silhouette = residual_maps(
+            loaded.frame, settings.prior, state.T_cam_obj, state.code, window, foreground, hidden, config
+        )
+        pictures[f"photometric_{name}"] = data_url(photometric_picture(view.picture, window, photometric))
+        if silhouette is not None:
+            pictures[f"silhouette_{name}"] = data_url(silhouette_picture(view.picture, window, silhouette))
     return pictures
 
 
-def _hidden(detections: Detections, car: int, window: Window, order: OcclusionOrder) -> npt.NDArray[np.bool_]:
+def _hidden(loaded: LoadedFrame, car: int, window: Window, config: RefinerConfig) -> npt.NDArray[np.bool_]:
     """(H, W), true where an instance in front of the car covers a pixel of the window."""
     u0, v0, u1, v1 = window
-    hidden = torch.zeros(detections.mask_left.shape[1:], dtype=torch.bool)
-    hidden[v0:v1, u0:u1] = occlusion_map(detections, "left", order).window(car, window)
+    hidden = torch.zeros(loaded.detections.mask_left.shape[1:], dtype=torch.bool)
+    occluders = occlusion_map(loaded.detections, "left", config.sampling.occlusion_order)
+    hidden[v0:v1, u0:u1] = occluders.window(car, window)
     return np.asarray(hidden.numpy())
 
 
-def _scene(view: _View | None, loaded: LoadedFrame | None, cars: DrawnCars, ground_source: str) -> dict[str, Any]:
-    """Image with its camera, ground, and for each car pose, boxes and mesh, in the left camera frame."""
-    ground = None if loaded is None else loaded.frame.ground
+def _background(view: View | None, loaded: LoadedFrame | None) -> dict[str, Any]:
+    """The image with its camera, and the ground, in the left camera frame."""
+    if view is None or loaded is None:
+        return dict.fromkeys(("image", "size_wh", "K", "ground"))
+    ground = loaded.frame.ground
     return {
-        "image": None if view is None else data_url(view.image, FRAME_QUALITY),
-        "size_wh": None if view is None else [view.image.shape[1], view.image.shape[0]],
-        "K": None if view is None else numbers(view.K.reshape(-1), 3),
-        "ground": None if ground is None else numbers([*ground.normal[0].tolist(), float(ground.offset[0])], 6),
-        "ground_source": ground_source,
-        "truth": [numbers(corners.reshape(-1), 3) for corners in cars.truth],
-        "cars": [_car(cars.states(car)) for car in range(len(cars.after))],
+        "image": data_url(view.picture, FRAME_QUALITY),
+        "size_wh": [view.picture.shape[1], view.picture.shape[0]],
+        "K": numbers(view.K.reshape(-1), 3),
+        "ground": numbers([*ground.normal[0].tolist(), float(ground.offset[0])], 6),
     }
 
 
-def _car(states: dict[str, CarState]) -> dict[str, Any]:
-    before, after = states.get("before"), states["after"]
+def _car(before: DrawnCar | None, after: DrawnCar) -> dict[str, Any]:
+    """Pose, boxes and mesh of a car; None for the mean shape, which the page has once."""
+    mesh = None if before is not None and after.mesh is before.mesh else after.mesh
     return {
         "T_cam_obj": numbers(after.T_cam_obj.reshape(-1), 5),
         "box_before": None if before is None else numbers(before.corners_cam.reshape(-1), 3),
         "box_after": numbers(after.corners_cam.reshape(-1), 3),
-        # None for the mean shape, which the page has once.
-        "mesh": None if after.mesh is None or after is before else mesh_data(after.mesh.vertices_obj, after.mesh.faces),
+        "mesh": None if mesh is None else mesh_data(mesh.vertices, mesh.faces),
     }

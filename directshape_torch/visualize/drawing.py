@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,10 +14,13 @@ import torch
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import BOX_EDGES
+from directshape_torch.scene import FrameBatch
 
 Picture = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.floating[Any]]
 Colour = tuple[int, int, int]
+Window = tuple[int, int, int, int]
+"""A part of an image, half open: u_min, v_min, u_max, v_max."""
 
 ORANGE, BLUE, GREEN, GREY = (255, 140, 0), (30, 144, 255), (60, 220, 80), (170, 170, 170)
 WHITE, BLACK = (255, 255, 255), (0, 0, 0)
@@ -41,43 +45,36 @@ def picture_of(image: Tensor) -> Picture:
 
 @dataclass(frozen=True)
 class View:
-    """A picture with the intrinsics that its pixels have: an image, or an enlarged part of one.
+    """A picture with the intrinsics that its pixels have: an image, or an enlarged part of one."""
 
-    Attributes:
-        picture: (h, w, 3), drawn in place.
-        K: (3, 3), pixels of the picture.
-    """
-
-    picture: Picture
-    K: Array
+    picture: Picture  # (h, w, 3), drawn in place
+    K: Array  # (3, 3), pixels of the picture
 
     @classmethod
-    def of_window(
-        cls,
-        image: Picture,
-        K: Array,  # (3, 3) of the image
-        window: tuple[int, int, int, int],
-        scale: float,
-    ) -> View:
-        """The window (u_min, v_min, u_max, v_max), half open, of an image, enlarged; beyond the image it is black.
+    def of_frame(cls, frame: FrameBatch) -> View:
+        """The left image of a frame."""
+        return cls(picture_of(frame.images_left[0]), frame.camera.K_left[0].double().cpu().numpy())
+
+    def part(self, window: Window, scale: float) -> View:
+        """A window, enlarged; beyond the picture it is black.
 
         Examples:
-            >>> view = View.of_window(np.zeros((4, 6, 3), np.uint8), np.eye(3), (1, 1, 5, 3), 2.0)
+            >>> view = View(np.zeros((4, 6, 3), np.uint8), np.eye(3)).part((1, 1, 5, 3), 2.0)
             >>> view.picture.shape, view.K[0].tolist()
             ((4, 8, 3), [2.0, 0.0, -1.5])
         """
         u0, v0, u1, v1 = window
         part = np.zeros((v1 - v0, u1 - u0, 3), np.uint8)
-        height, width = image.shape[:2]
+        height, width = self.picture.shape[:2]
         a, b, c, d = max(u0, 0), max(v0, 0), min(u1, width), min(v1, height)
         if c > a and d > b:
-            part[b - v0 : d - v0, a - u0 : c - u0] = image[b:d, a:c]
+            part[b - v0 : d - v0, a - u0 : c - u0] = self.picture[b:d, a:c]
         size = (max(1, round(scale * (u1 - u0))), max(1, round(scale * (v1 - v0))))
         picture = cv2.resize(part, size, interpolation=cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA)
         s_u, s_v = size[0] / (u1 - u0), size[1] / (v1 - v0)
         # Pixel centres are whole numbers: the edge of a picture lies at -0.5.
         to_view = np.array([[s_u, 0, s_u * (0.5 - u0) - 0.5], [0, s_v, s_v * (0.5 - v0) - 0.5], [0, 0, 1]])
-        return cls(np.ascontiguousarray(picture, dtype=np.uint8), to_view @ K)
+        return View(np.ascontiguousarray(picture, dtype=np.uint8), to_view @ self.K)
 
     def project(self, points_cam: Array) -> Array:
         """Pixels (N, 2) of points (N, 3) in front of the camera."""
@@ -85,13 +82,59 @@ class View:
         projected: Array = np.clip(pixels[:, :2] / pixels[:, 2:], -_FARTHEST_PX, _FARTHEST_PX)
         return projected
 
+    def bounds(self, points_cam: Array) -> tuple[float, float, float, float] | None:
+        """u_min, v_min, u_max, v_max around points as far as they are seen, or None where they are not."""
+        in_front = points_cam[points_cam[:, 2] > NEAR_PLANE_M]
+        if not len(in_front):
+            return None
+        height, width = self.picture.shape[:2]
+        pixels = np.clip(self.project(in_front), 0, [width - 1, height - 1])
+        (u0, v0), (u1, v1) = pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()
+        return None if u1 - u0 < 1 or v1 - v0 < 1 else (u0, v0, u1, v1)
+
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles of a shape in the left camera frame: vertices (V, 3), metres, and faces (F, 3)."""
+    """Triangles of a shape."""
 
-    vertices_cam: Array
-    faces: npt.NDArray[np.integer[Any]]
+    vertices: Array  # (V, 3) metres
+    faces: npt.NDArray[np.integer[Any]]  # (F, 3)
+
+    def moved(self, T: Array) -> Surface:
+        """The same surface where T (4, 4) puts it."""
+        return Surface(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
+
+
+def window_around(bounds: tuple[float, float, float, float], wide: float, tall: float) -> Window:
+    """A part of an image of some size with bounds in its middle."""
+    u, v = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
+    return round(u - wide / 2), round(v - tall / 2), round(u + wide / 2), round(v + tall / 2)
+
+
+def pixel_grid(window: Window, columns: int) -> Tensor:
+    """Pixels (h, w, 2) at equal steps over a window, so many in a row.
+
+    Examples:
+        >>> pixel_grid((10, 20, 30, 30), 10).shape
+        torch.Size([5, 10, 2])
+    """
+    u0, v0, u1, v1 = window
+    step = (u1 - u0) / columns
+    # Counted in whole numbers: a range of float steps may end on the window's border, outside of the image.
+    u, v = u0 + torch.arange(columns) * step, v0 + torch.arange(math.ceil((v1 - v0) * columns / (u1 - u0))) * step
+    return torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+
+
+def blue_white_red(values: Array, limit: float) -> Array:
+    """Colours (*, 3), 0 .. 255: blue from -limit on, white at 0, red from the limit on; nothing for NaN.
+
+    Examples:
+        >>> blue_white_red(np.array([-9.0, 0.0, 1.0]), 2.0).tolist()
+        [[49.0, 87.0, 200.0], [245.0, 245.0, 245.0], [229.5, 146.0, 142.0]]
+    """
+    share = np.clip(np.nan_to_num(values) / limit, -1, 1)[..., None]
+    white, red, blue = (np.array(c, dtype=np.float64) for c in ((245, 245, 245), (214, 47, 39), (49, 87, 200)))
+    return np.asarray(white + np.abs(share) * (np.where(share > 0, red, blue) - white))
 
 
 def draw_contour(view: View, surface: Surface, colour: Colour, thickness: int = 2) -> None:
@@ -110,9 +153,9 @@ def silhouette_mask(view: View, surface: Surface, padding: int = 0) -> Picture:
     """
     height, width = view.picture.shape[:2]
     mask = np.zeros((height + 2 * padding, width + 2 * padding), np.uint8)
-    in_front = surface.vertices_cam[:, 2] > NEAR_PLANE_M
-    pixels = np.zeros((len(surface.vertices_cam), 2), np.int32)
-    pixels[in_front] = _fixed_point(view.project(surface.vertices_cam[in_front]) + padding)
+    in_front = surface.vertices[:, 2] > NEAR_PLANE_M
+    pixels = np.zeros((len(surface.vertices), 2), np.int32)
+    pixels[in_front] = _fixed_point(view.project(surface.vertices[in_front]) + padding)
     # One by one: a common fill would leave what two triangles cover empty.
     for triangle in pixels[surface.faces[in_front[surface.faces].all(axis=1)]]:
         cv2.fillConvexPoly(mask, triangle, 255, cv2.LINE_8, _SHIFT)

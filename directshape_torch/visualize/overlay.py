@@ -3,63 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.result import RefinementResult
-from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.visualize.birds_eye import Footprint, birds_eye_picture
 from directshape_torch.visualize.drawing import (
     BLUE,
     GREEN,
     GREY,
-    NEAR_PLANE_M,
     ORANGE,
     Array,
     Colour,
     Picture,
-    Surface,
     View,
     draw_box,
     draw_contour,
     draw_legend,
     draw_text,
-    picture_of,
     text_size_for,
+    window_around,
 )
+from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars, true_corners
 
 _LEAST_WIDTH_PX = 1000
 _BIRDS_EYE_WIDTH_PX = 560
 # A thick contour would hide smaller cars.
 _TALL_PX = 60
-
-
-@dataclass(frozen=True)
-class DrawnCar:
-    """A car in one state, in the left camera frame.
-
-    Attributes:
-        corners_cam: (8, 3) of its box, in the order of `box_corners`, metres.
-        surface: its shape.
-        label: the number of its line.
-        note: what is said about it, below its distance.
-        is_refined: whether the state comes from a refinement.
-    """
-
-    corners_cam: Array
-    surface: Surface
-    label: str
-    note: str = ""
-    is_refined: bool = True
-
-    @property
-    def distance_m(self) -> float:
-        """Depth of its middle."""
-        return float(self.corners_cam[:, 2].mean())
+_TILE_HEIGHTS_PX = (150, 135, 120)
+# Width of a tile as a share of its height.
+_LEAST_ASPECT, _LARGEST_ASPECT = 0.95, 2.2
+_CAPTION_LINE_PX = 26
+_GAP_PX = 6
+_TILE_GROUND = 24
 
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
@@ -72,20 +49,14 @@ def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
     Returns:
         (h, w, 3) RGB uint8.
     """
-    frame = loaded.frame
-    return overlay_picture(
-        picture_of(frame.images_left[0]),
-        frame.camera.K_left[0].double().cpu().numpy(),
-        before=_initial_cars(loaded, result),
-        after=refined_cars(loaded, result),
-        truth_corners_cam=_true_corners(loaded),
-        title=f"frame {loaded.frame_id}",
-    )
+    before, after = drawn_cars(loaded, result)
+    classes = [one.type for one in loaded.detected_objects]
+    truth = true_corners(loaded.labels, classes, loaded.frame.camera.t_cam_ref[0])
+    return overlay_picture(View.of_frame(loaded.frame), before, after, truth, f"frame {loaded.frame_id}")
 
 
 def overlay_picture(
-    image: Picture,
-    K: Array,
+    view: View,
     before: Sequence[DrawnCar],
     after: Sequence[DrawnCar],
     truth_corners_cam: Sequence[Array] = (),
@@ -94,152 +65,66 @@ def overlay_picture(
     """Two rows with the image, before and after; below them each car enlarged; beside them the view from above.
 
     Args:
-        image: (H, W, 3) left image.
-        K: (3, 3) its intrinsics.
-        before, after: the same cars in both states.
+        view: the left image.
+        before, after: the same cars in both states, with their shapes.
         truth_corners_cam: (8, 3) corners of each true box.
         title: of the picture.
-
-    Returns:
-        (h, w, 3) RGB uint8.
     """
+    inks = [car.colour for car in after]
     rows = [
-        _image_row(image, K, before, ORANGE, f"{title}  before: the detection's box, mean shape"),
-        _image_row(image, K, after, BLUE, f"{title}  after: refined box and shape"),
+        _image_row(view, before, [ORANGE] * len(before), f"{title}  before: the detection's box, mean shape"),
+        _image_row(view, after, inks, f"{title}  after: refined box and shape"),
     ]
-    tiles = [
-        CarTile(b.surface, a.surface, BLUE if a.is_refined else GREY, (f"{a.label}: {a.distance_m:.1f} m", a.note))
-        for b, a in zip(before, after, strict=True)
+    left = np.concatenate([*rows, _tile_strip(view, before, after, rows[0].shape[1])])
+    footprints = [
+        *(Footprint(corners, GREEN, 2, is_framed=False) for corners in truth_corners_cam),
+        *(Footprint(car.corners_cam, ORANGE) for car in before),
+        *(Footprint(car.corners_cam, car.colour, 2, f"{car.line}") for car in after),
     ]
-    left = np.concatenate([*rows, tile_strip(image, K, tiles, rows[0].shape[1])])
-    footprints = _footprints(before, after, truth_corners_cam)
     right = birds_eye_picture(footprints, (left.shape[0], _BIRDS_EYE_WIDTH_PX))
     legend: list[tuple[str, Colour]] = [("before", ORANGE), ("after", BLUE)]
     legend += [("ground truth", GREEN)] if truth_corners_cam else []
-    legend += [("not refined", GREY)] if any(not car.is_refined for car in after) else []
+    legend += [("not refined", GREY)] if GREY in inks else []
     draw_legend(right, legend, (12, 10), 0.9)
     return np.concatenate([left, right], axis=1)
 
 
-def _image_row(image: Picture, K: Array, cars: Sequence[DrawnCar], colour: Colour, title: str) -> Picture:
-    height, width = image.shape[:2]
-    view = View.of_window(image, K, (0, 0, width, height), max(1.0, _LEAST_WIDTH_PX / width))
+def _image_row(image: View, cars: Sequence[DrawnCar], inks: Sequence[Colour], title: str) -> Picture:
+    height, width = image.picture.shape[:2]
+    view = image.part((0, 0, width, height), max(1.0, _LEAST_WIDTH_PX / width))
     # Far cars first, so that near ones are drawn over them.
-    for car in sorted(cars, key=lambda car: -car.distance_m):
-        ink = colour if car.is_refined else GREY
+    for car, ink in sorted(zip(cars, inks, strict=True), key=lambda drawn: -drawn[0].distance_m):
         draw_box(view, car.corners_cam, ink)
-        draw_contour(view, car.surface, ink, 2 if _height_px(view, car) > _TALL_PX else 1)
-        _draw_label(view, car, ink)
+        height_px = float(view.K[1, 1]) * float(np.ptp(car.corners_cam[:, 1])) / max(car.distance_m, 1.0)
+        if car.surface is not None:
+            draw_contour(view, car.surface, ink, 2 if height_px > _TALL_PX else 1)
+        roof = car.corners_cam[4:].mean(axis=0, keepdims=True)
+        if roof[0, 2] > 1:
+            u, v = view.project(roof)[0]
+            draw_text(view.picture, f"{car.line}", (u - 8, max(v - 8, 22)), ink, 0.9)
     draw_text(view.picture, title, (8, 32), size=text_size_for(title, view.picture.shape[1] - 16, 1.0))
     return view.picture
 
 
-def _height_px(view: View, car: DrawnCar) -> float:
-    return float(view.K[1, 1]) * float(np.ptp(car.corners_cam[:, 1])) / max(car.distance_m, 1.0)
-
-
-def _draw_label(view: View, car: DrawnCar, colour: Colour) -> None:
-    roof = car.corners_cam[4:].mean(axis=0, keepdims=True)
-    if roof[0, 2] > 1:
-        u, v = view.project(roof)[0]
-        draw_text(view.picture, car.label, (u - 8, max(v - 8, 22)), colour, 0.9)
-
-
-def _footprints(
-    before: Sequence[DrawnCar], after: Sequence[DrawnCar], truth_corners_cam: Sequence[Array]
-) -> list[Footprint]:
-    return [
-        *(Footprint(corners, GREEN, 2, is_framed=False) for corners in truth_corners_cam),
-        *(Footprint(car.corners_cam, ORANGE) for car in before),
-        *(Footprint(car.corners_cam, BLUE if car.is_refined else GREY, 2, car.label) for car in after),
-    ]
-
-
-def _initial_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCar]:
-    """The mean shape at the pose of the detection, with the detection's box."""
-    detections, prior = loaded.detections, result.prior
-    T_cam_obj = detections.T_cam_obj.double()
-    corners = box_corners(T_cam_obj, detections.dimensions_hwl.double()).numpy()
-    mean = sdf_to_mesh(prior.values(prior.initial_code(1))[0], prior.origin, prior.spacing_m)
-    cars = []
-    for car, detected in enumerate(loaded.detected_objects):
-        T = T_cam_obj[car].numpy()
-        surface = Surface(mean.vertices @ T[:3, :3].T + T[:3, 3], mean.faces)
-        cars.append(DrawnCar(corners[car], surface, str(detected.line_number)))
-    return cars
-
-
-def refined_cars(loaded: LoadedFrame, result: RefinementResult) -> list[DrawnCar]:
-    """The refined shape with the box of the result file; the initial state where there is none."""
-    boxes = result.boxes()
-    statuses, refined = result.status, result.refined.tolist()
-    t_cam_ref = loaded.frame.camera.t_cam_ref[0].double()
-    location_cam = boxes.location_ref.detach().double().cpu() + t_cam_ref
-    T_cam_box = pose_from_kitti(location_cam, boxes.rotation_y.detach().double().cpu())
-    corners = box_corners(T_cam_box, boxes.dimensions_hwl.detach().double().cpu()).numpy()
-    cars = []
-    for row, initial in enumerate(_initial_cars(loaded, result)):
-        note = statuses[row].name
-        if refined[row]:
-            mesh = result.mesh(row)
-            cars.append(DrawnCar(corners[row], Surface(mesh.vertices, mesh.faces), initial.label, note))
-        else:
-            cars.append(replace(initial, note=note, is_refined=False))
-    return cars
-
-
-def _true_corners(loaded: LoadedFrame) -> list[Array]:
-    """Corners of the labelled boxes of the classes that were refined."""
-    classes = {one.type for one in loaded.detected_objects}
-    labels = [label for label in loaded.labels or () if label.type in classes and label.has_box_3d]
-    return list(box_corners_cam(labels, loaded.frame.camera.t_cam_ref[0]).numpy())
-
-
-_TILE_HEIGHTS_PX = (150, 135, 120)
-# Width of a tile as a share of its height.
-_LEAST_ASPECT, _LARGEST_ASPECT = 0.95, 2.2
-_CAPTION_LINE_PX = 26
-_GAP_PX = 6
-_TILE_GROUND = 24
-
-
-@dataclass(frozen=True)
-class CarTile:
-    """One car in two states, the colour of the second, and the lines of its caption."""
-
-    before: Surface
-    after: Surface
-    colour_after: Colour
-    caption: tuple[str, ...]
-
-
-def tile_strip(
-    image: Picture,
-    K: Array,  # (3, 3)
-    tiles: Sequence[CarTile],
-    width_px: int,
-) -> Picture:
+def _tile_strip(image: View, before: Sequence[DrawnCar], after: Sequence[DrawnCar], width_px: int) -> Picture:
     """All cars that are seen in the image, side by side; (h, width_px, 3).
 
     Tiles are made a little smaller where that saves a second row, else they wrap into as many rows as needed.
     """
-    for height_px in _TILE_HEIGHTS_PX:
-        rows = _wrapped([_tile(image, K, tile, height_px) for tile in tiles], width_px)
+    for height_px in (*_TILE_HEIGHTS_PX, _TILE_HEIGHTS_PX[0]):
+        tiles = [_tile(image, *pair, height_px) for pair in zip(before, after, strict=True)]
+        rows = _wrapped([tile for tile in tiles if tile is not None], width_px)
         if len(rows) <= 1:
             break
-    else:
-        rows = _wrapped([_tile(image, K, tile, _TILE_HEIGHTS_PX[0]) for tile in tiles], width_px)
     strips = [_row(row, width_px) for row in rows]
     return np.concatenate(strips) if strips else np.zeros((0, width_px, 3), np.uint8)
 
 
-def _wrapped(pictures: Sequence[Picture | None], width_px: int) -> list[list[Picture]]:
+def _wrapped(pictures: Sequence[Picture], width_px: int) -> list[list[Picture]]:
     """Rows of pictures that fit the width; a row holds at least one."""
     rows: list[list[Picture]] = []
     used = width_px
     for picture in pictures:
-        if picture is None:
-            continue
         if not rows or used + picture.shape[1] > width_px:
             rows.append([])
             used = 0
@@ -258,37 +143,22 @@ def _row(pictures: Sequence[Picture], width_px: int) -> Picture:
     return row
 
 
-def _tile(image: Picture, K: Array, tile: CarTile, height_px: int) -> Picture | None:
+def _tile(image: View, before: DrawnCar, after: DrawnCar, height_px: int) -> Picture | None:
     """Caption, before, after; None for a car that the image does not show."""
-    window = _window(image, K, (tile.before, tile.after))
-    if window is None:
+    states = [(s, ink) for s, ink in ((before.surface, ORANGE), (after.surface, after.colour)) if s is not None]
+    bounds = image.bounds(np.concatenate([surface.vertices for surface, _ in states]))
+    if bounds is None:
         return None
-    scale = height_px / (window[3] - window[1])
-    states: list[tuple[Surface, Colour]] = [(tile.before, ORANGE), (tile.after, tile.colour_after)]
-    views = []
-    for surface, colour in states:
-        view = View.of_window(image, K, window, scale)
-        draw_contour(view, surface, colour, 1)
-        views.append(view.picture)
-    width = views[0].shape[1]
-    caption = np.full((_CAPTION_LINE_PX * len(tile.caption) + 4, width, 3), _TILE_GROUND, np.uint8)
-    for line, text in enumerate(tile.caption):
-        draw_text(caption, text, (3, _CAPTION_LINE_PX * (line + 1) - 5), size=text_size_for(text, width - 6, 0.8))
-    return np.concatenate([caption, *views])
-
-
-def _window(image: Picture, K: Array, surfaces: Sequence[Surface]) -> tuple[int, int, int, int] | None:
-    """The part of the image around both states, of a shape that makes a handy tile."""
-    points = np.concatenate([surface.vertices_cam for surface in surfaces])
-    points = points[points[:, 2] > NEAR_PLANE_M]
-    if not len(points):
-        return None
-    height, width = image.shape[:2]
-    pixels = np.clip(View(image, K).project(points), 0, [width - 1, height - 1])
-    (u0, v0), (u1, v1) = pixels.min(axis=0), pixels.max(axis=0)
-    if u1 - u0 < 1 or v1 - v0 < 1:
-        return None
+    u0, v0, u1, v1 = bounds
     tall = max(1.3 * max(v1 - v0, 6.0), 1.15 * (u1 - u0) / _LARGEST_ASPECT)
-    wide = max(1.15 * (u1 - u0), _LEAST_ASPECT * tall)
-    u, v = (u0 + u1) / 2, (v0 + v1) / 2
-    return round(u - wide / 2), round(v - tall / 2), round(u + wide / 2), round(v + tall / 2)
+    window = window_around(bounds, max(1.15 * (u1 - u0), _LEAST_ASPECT * tall), tall)
+    pictures = []
+    for surface, ink in states:
+        view = image.part(window, height_px / (window[3] - window[1]))
+        draw_contour(view, surface, ink, 1)
+        pictures.append(view.picture)
+    lines, width = (f"{after.line}: {after.distance_m:.1f} m", after.status), pictures[0].shape[1]
+    caption = np.full((_CAPTION_LINE_PX * len(lines) + 4, width, 3), _TILE_GROUND, np.uint8)
+    for line, text in enumerate(lines):
+        draw_text(caption, text, (3, _CAPTION_LINE_PX * (line + 1) - 5), size=text_size_for(text, width - 6, 0.8))
+    return np.concatenate([caption, *pictures])

@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.visualize.drawing import BLACK, Picture, blue_white_red
 
 if TYPE_CHECKING:
     from directshape_torch.rig.estimate import RigEstimate
@@ -21,132 +22,6 @@ _TITLE_HEIGHT_PX = 34
 _CONTOUR_STEP_PX = 0.25
 # Pixels of known depth are many, cars are few.
 _FEW, _DOT_RADIUS_PX, _DOT_RADIUS_OF_FEW_PX = 500, 2, 6
-_GREY = (150, 150, 150)
-
-Picture = NDArray[np.uint8]
-
-
-def draw_disparity_field(
-    field: DisparityField,
-    uv_left: Tensor,  # (P, 2) pixels of the data
-    bias_px: Tensor,  # (P,) measured minus true disparity there
-) -> Picture:  # (3 * (H + title), W, 3) RGB
-    """Three panels, blue negative, white zero, red positive: the field, the data before, the data after.
-
-    The field is shown as it is used, continued beyond the hull of the data (grey polygon) by its nearest value.
-
-    Raises:
-        InputError: `uv_left` and `bias_px` do not belong together.
-
-    Examples:
-        >>> K, T = torch.eye(3), torch.eye(4)
-        >>> field = DisparityField.constant(-0.3, (320, 96), K, K, T)
-        >>> draw_disparity_field(field, torch.tensor([[50.0, 40.0]]), torch.tensor([-0.4])).shape
-        (390, 320, 3)
-    """
-    if bias_px.shape != uv_left.shape[:-1]:
-        raise InputError("bias_px", f"shape {tuple(uv_left.shape[:-1])}", f"{tuple(bias_px.shape)}")
-    values = _field_values(field)
-    limit = _colour_limit(values, bias_px)
-    after = bias_px - field.bias(uv_left)
-    before_text, after_text = (_summary(name, data) for name, data in (("before", bias_px), ("after", after)))
-    panels = [
-        titled(f"measured - true disparity [px], colours +-{limit:g}", _field_panel(field, values, limit)),
-        titled(before_text, _data_panel(field, uv_left, bias_px, limit)),
-        titled(after_text, _data_panel(field, uv_left, after, limit)),
-    ]
-    return np.concatenate(panels, axis=0)
-
-
-def _field_values(field: DisparityField) -> NDArray[np.float64]:
-    """The field at every fourth pixel, brought to full size; it is smooth."""
-    import cv2
-
-    width, height = field.size_wh
-    u = torch.linspace(0, width - 1, max(width // 4, 2), dtype=torch.float64)
-    v = torch.linspace(0, height - 1, max(height // 4, 2), dtype=torch.float64)
-    uv = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
-    coarse = field.to(device="cpu", dtype=torch.float64).bias(uv).numpy()
-    return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float64)
-
-
-def _colour_limit(values: NDArray[np.float64], bias_px: Tensor) -> float:
-    """Half a pixel or the next multiple of it that holds the field and nearly all of the data."""
-    data = float(bias_px.abs().quantile(0.9)) if len(bias_px) else 0.0
-    return max(0.5, math.ceil(2 * max(float(np.abs(values).max()), data)) / 2)
-
-
-def _colours(values: NDArray[np.float64], limit: float) -> Picture:
-    """Blue - white - red."""
-    t = np.clip(values / limit, -1, 1)[..., None]
-    white, red, blue = (np.array(rgb, dtype=np.float64) for rgb in ((255, 255, 255), (190, 20, 30), (20, 60, 180)))
-    end = np.where(t > 0, red, blue)
-    return np.asarray(white + np.abs(t) * (end - white), dtype=np.uint8)
-
-
-def _field_panel(field: DisparityField, values: NDArray[np.float64], limit: float) -> Picture:
-    import cv2
-
-    panel = _colours(values, limit)
-    first, last = (math.floor(float(x) / _CONTOUR_STEP_PX) for x in (values.min(), values.max()))
-    for step in range(first + 1, last + 1):
-        level = step * _CONTOUR_STEP_PX
-        outlines, _ = cv2.findContours((values >= level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        for outline in outlines:
-            _draw_contour(panel, outline[:, 0], level)
-    _draw_hull(panel, field)
-    return panel
-
-
-def _draw_contour(panel: Picture, outline: NDArray[Any], level: float) -> None:
-    """The outline less the parts that only follow the picture's border, with its level written in the middle."""
-    import cv2
-
-    height, width = panel.shape[:2]
-    interior = ((outline > 0) & (outline < np.array([width - 1, height - 1]))).all(axis=1)
-    points = outline[interior]
-    panel[points[:, 1], points[:, 0]] = 0
-    room = points[(points[:, 0] < width - 60) & (points[:, 1] > 16)]
-    if len(room) > 40:
-        u, v = (int(x) for x in room[len(room) // 2])
-        cv2.putText(panel, f"{level:.2f}", (u, v), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-
-
-def _data_panel(field: DisparityField, uv_left: Tensor, values_px: Tensor, limit: float) -> Picture:
-    import cv2
-
-    width, height = field.size_wh
-    panel = np.full((height, width, 3), 225, np.uint8)
-    colours = _colours(values_px.double().cpu().numpy(), limit).tolist()
-    radius = _DOT_RADIUS_PX if len(values_px) > _FEW else _DOT_RADIUS_OF_FEW_PX
-    for (u, v), colour in zip(uv_left.round().long().cpu().tolist(), colours, strict=True):
-        cv2.circle(panel, (u, v), radius, colour, -1)
-    _draw_hull(panel, field)
-    return panel
-
-
-def _draw_hull(panel: Picture, field: DisparityField) -> None:
-    import cv2
-
-    corners = field.hull_uv.round().int().cpu().numpy()[:, None]
-    cv2.polylines(panel, [corners], True, _GREY, 2, cv2.LINE_AA)
-
-
-def titled(title: str, panel: Picture) -> Picture:
-    """The panel with a line of text above it."""
-    import cv2
-
-    bar = np.full((_TITLE_HEIGHT_PX, panel.shape[1], 3), 255, np.uint8)
-    cv2.putText(bar, title, (8, 23), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([bar, panel], axis=0)
-
-
-def _summary(name: str, values_px: Tensor) -> str:
-    if len(values_px) == 0:
-        return f"{name}: no data"
-    median = values_px.median()
-    mad: Sequence[float] = (float(median), float((values_px - median).abs().median()))
-    return f"{name}: {len(values_px)} points, median {mad[0]:+.3f} px, MAD {mad[1]:.3f} px"
 
 
 def draw_rigs(
@@ -163,12 +38,91 @@ def draw_rigs(
         >>> draw_rigs([RigEstimate((320, 96), K, K, T_right_cam)]).shape
         (424, 320, 3)
     """
-    pictures = [_draw_rig(rig) for rig in rigs]
+    pictures = []
+    for rig in rigs:
+        offset = rig.rows[:, 3] - rig.detector.bias * rig.rows[:, 2]
+        pictures.append(_titled(str(rig), draw_disparity_field(rig.field, rig.rows[:, :2], offset)))
     width = max(picture.shape[1] for picture in pictures)
     padded = [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in pictures]
     return np.concatenate(padded)
 
 
-def _draw_rig(rig: RigEstimate) -> Picture:
-    offset = rig.rows[:, 3] - rig.detector.bias * rig.rows[:, 2]
-    return titled(str(rig), draw_disparity_field(rig.field, rig.rows[:, :2], offset))
+def draw_disparity_field(
+    field: DisparityField,
+    uv_left: Tensor,  # (P, 2) pixels of the data
+    bias_px: Tensor,  # (P,) measured minus true disparity there
+) -> Picture:  # (3 * (H + title), W, 3) RGB
+    """Three panels, blue negative, white zero, red positive: the field, the data before, the data after.
+
+    The field is shown as it is used, continued beyond the hull of the data (grey polygon) by its nearest value.
+    """
+    values, after = _field_values(field), bias_px - field.bias(uv_left)
+    most = max(float(np.abs(values).max()), float(bias_px.abs().quantile(0.9)) if len(bias_px) else 0.0)
+    limit = max(0.5, math.ceil(2 * most) / 2)
+    panels = [_titled(f"measured - true disparity [px], colours +-{limit:g}", _field_panel(field, values, limit))]
+    for name, data in (("before", bias_px), ("after", after)):
+        panels.append(_titled(_summary(name, data), _data_panel(field, uv_left, data, limit)))
+    return np.concatenate(panels)
+
+
+def _field_values(field: DisparityField) -> NDArray[np.float64]:
+    """The field at every fourth pixel, brought to full size; it is smooth."""
+    width, height = field.size_wh
+    u = torch.linspace(0, width - 1, max(width // 4, 2), dtype=torch.float64)
+    v = torch.linspace(0, height - 1, max(height // 4, 2), dtype=torch.float64)
+    uv = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+    coarse = field.to(device="cpu", dtype=torch.float64).bias(uv).numpy()
+    return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float64)
+
+
+def _field_panel(field: DisparityField, values: NDArray[np.float64], limit: float) -> Picture:
+    panel = blue_white_red(values, limit).astype(np.uint8)
+    first, last = (math.floor(float(x) / _CONTOUR_STEP_PX) for x in (values.min(), values.max()))
+    for step in range(first + 1, last + 1):
+        level = step * _CONTOUR_STEP_PX
+        outlines, _ = cv2.findContours((values >= level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        for outline in outlines:
+            _draw_contour(panel, outline[:, 0], level)
+    return _with_hull(panel, field)
+
+
+def _draw_contour(panel: Picture, outline: NDArray[Any], level: float) -> None:
+    """The outline less the parts that only follow the picture's border, with its level written in the middle."""
+    height, width = panel.shape[:2]
+    points = outline[((outline > 0) & (outline < np.array([width - 1, height - 1]))).all(axis=1)]
+    panel[points[:, 1], points[:, 0]] = 0
+    room = points[(points[:, 0] < width - 60) & (points[:, 1] > 16)]
+    if len(room) > 40:
+        place = room[len(room) // 2].tolist()
+        cv2.putText(panel, f"{level:.2f}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, BLACK, 1, cv2.LINE_AA)
+
+
+def _data_panel(field: DisparityField, uv_left: Tensor, values_px: Tensor, limit: float) -> Picture:
+    width, height = field.size_wh
+    panel = np.full((height, width, 3), 225, np.uint8)
+    colours = blue_white_red(values_px.double().cpu().numpy(), limit).tolist()
+    radius = _DOT_RADIUS_PX if len(values_px) > _FEW else _DOT_RADIUS_OF_FEW_PX
+    for place, colour in zip(uv_left.round().long().cpu().tolist(), colours, strict=True):
+        cv2.circle(panel, place, radius, colour, -1)
+    return _with_hull(panel, field)
+
+
+def _with_hull(panel: Picture, field: DisparityField) -> Picture:
+    corners = field.hull_uv.round().int().cpu().numpy()[:, None]
+    cv2.polylines(panel, [corners], True, (150, 150, 150), 2, cv2.LINE_AA)
+    return panel
+
+
+def _titled(title: str, panel: Picture) -> Picture:
+    """The panel with a line of text above it."""
+    bar = np.full((_TITLE_HEIGHT_PX, panel.shape[1], 3), 255, np.uint8)
+    cv2.putText(bar, title, (8, 23), cv2.FONT_HERSHEY_SIMPLEX, 0.6, BLACK, 1, cv2.LINE_AA)
+    return np.concatenate([bar, panel])
+
+
+def _summary(name: str, values_px: Tensor) -> str:
+    if len(values_px) == 0:
+        return f"{name}: no data"
+    median = values_px.median()
+    spread = float((values_px - median).abs().median())
+    return f"{name}: {len(values_px)} points, median {float(median):+.3f} px, MAD {spread:.3f} px"

@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 from helpers.report_runs import FinishedRun, finished_run
 
-from directshape_torch.config_files import load_config
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.report.make_report import make_report, map_settings
+from directshape_torch.report.make_report import make_report
 from directshape_torch.report.page_data import unpacked
-from directshape_torch.report.residual_maps import MapSettings
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
@@ -255,9 +253,6 @@ def test_results_of_other_lines_are_refused(run: FinishedRun, tmp_path: Path) ->
         make_report(RunFolder(out), tmp_path / "page.html")
 
 
-def test_settings_of_maps_are_those_of_the_run(run: FinishedRun, tmp_path: Path) -> None:
-    words = ["stages=[{contour_width_px: 2.0}, {contour_width_px: 0.7}]", "photometric.brightness=none"]
-    config = load_config(None, [*words, "silhouette.probability_floor=0.02"])
-    assert map_settings(config) == MapSettings(0.7, 0.02, matches_brightness=False)
+def test_a_negative_number_of_frames(run: FinishedRun, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="most_frames"):
         make_report(run.folder(), tmp_path / "page.html", most_frames=-1)

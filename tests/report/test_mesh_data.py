@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from directshape_torch.report.drawn_cars import decoded_mesh
 from directshape_torch.report.page_data import mesh_data, packed, unpacked
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.drawn_car import decoded_car
 
 
 @settings(max_examples=50)
@@ -26,7 +26,7 @@ def test_a_triangle_by_hand() -> None:
 
 def test_a_car_is_small() -> None:
     prior = PCAShapePrior.load_bundled()
-    mesh = decoded_mesh(prior, np.zeros(prior.num_codes))
-    data = mesh_data(mesh.vertices_obj, mesh.faces)
-    assert np.abs(unpacked(data["vertices"]).reshape(3, -1).T / 1000 - mesh.vertices_obj).max() <= 0.0005 + 1e-9
+    mesh = decoded_car(prior, np.zeros(prior.num_codes))
+    data = mesh_data(mesh.vertices, mesh.faces)
+    assert np.abs(unpacked(data["vertices"]).reshape(3, -1).T / 1000 - mesh.vertices).max() <= 0.0005 + 1e-9
     assert len(data["vertices"]) + len(data["faces"]) < 25_000

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from directshape_torch.files.text_files import Line
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
 from directshape_torch.io.run_folder import FrameRecord, FrameResult
-from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, as_json, car_gains, car_rows, choose_frames
+from directshape_torch.report.car_rows import CarRow, car_gains, car_rows, choose_frames
 
 
 def car(x: float, u: float, line: int = 1, occluded: int = 0) -> KittiObject:
@@ -60,13 +60,6 @@ def test_status_of_a_later_version_is_no_refined_one() -> None:
 def row(frame: int, **changes: object) -> CarRow:
     plain = car_rows(frame, result(car(1, 100)))[0]
     return replace(plain, **changes)  # type: ignore[arg-type]
-
-
-def test_json_has_the_columns() -> None:
-    values = dict(zip(CAR_COLUMNS, as_json(row(2, iou_after=0.5)), strict=True))
-    assert values["frame"] == 2
-    assert values["iou_after"] == 0.5
-    assert values["track"] == "000031"
 
 
 def test_gains_are_of_one_kind() -> None:

@@ -63,7 +63,7 @@ def test_contour_has_no_line_along_the_border_of_the_picture() -> None:
 def test_enlarged_window_projects_to_the_same_things() -> None:
     image = np.zeros((81, 101, 3), np.uint8)
     image[35, 55] = 255
-    view = View.of_window(image, K, (50, 30, 60, 40), 4.0)
+    view = View(image, K).part((50, 30, 60, 40), 4.0)
     assert view.picture.shape == (40, 40, 3)
     # The point that is seen at pixel (55, 35): offset (5, -5) px at 10 m.
     point = np.array([[0.5, -0.5, 10.0]])
@@ -76,7 +76,7 @@ def test_enlarged_window_projects_to_the_same_things() -> None:
 
 
 def test_window_beyond_the_image_is_black() -> None:
-    view = View.of_window(np.full((10, 10, 3), 200, np.uint8), K, (-5, -5, 15, 15), 1.0)
+    view = View(np.full((10, 10, 3), 200, np.uint8), K).part((-5, -5, 15, 15), 1.0)
     assert view.picture.shape == (20, 20, 3)
     assert (view.picture[5:15, 5:15] == 200).all()
     assert view.picture.sum() == 200 * 100 * 3

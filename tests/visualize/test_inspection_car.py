@@ -20,8 +20,8 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.drawing import Surface, View, silhouette_mask
 from directshape_torch.visualize.inspection.car_view import CarView
 from directshape_torch.visualize.inspection.course_figures import animation_frames, costs_of_car, distance_course
-from directshape_torch.visualize.inspection.residual_figure import car_residuals
-from directshape_torch.visualize.inspection.sampling_figure import sampled_pixels_of
+from directshape_torch.visualize.inspection.pixel_residuals import car_residuals
+from directshape_torch.visualize.inspection.still_figures import sampled_pixels_of
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 _CAR = 1
@@ -144,7 +144,7 @@ def test_footprint_is_the_box_of_the_result(view: CarView) -> None:
     corners = torch.tensor([[length, 0, width], [length, 0, -width], [-length, 0, -width], [-length, 0, width]]) / 2
     expected = (corners @ T_cam_box[:3, :3].T + T_cam_box[:3, 3])[:, [0, 2]]
     # The refined car leans with the ground by a degree or two, the box of a result file does not.
-    np.testing.assert_allclose(view.footprint(len(view.trace) - 1), expected, atol=0.06)
+    np.testing.assert_allclose(view.footprints[-1], expected, atol=0.06)
 
 
 def test_distances_begin_at_the_input(view: CarView) -> None:

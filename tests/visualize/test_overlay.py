@@ -8,9 +8,10 @@ import torch
 
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.visualize.birds_eye import Footprint, birds_eye_picture
-from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, Surface
+from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, Surface, View
+from directshape_torch.visualize.drawn_car import DrawnCar
 from directshape_torch.visualize.ground_grid import ground_grid
-from directshape_torch.visualize.overlay import DrawnCar, overlay_picture
+from directshape_torch.visualize.overlay import overlay_picture
 
 K = np.array([[700.0, 0.0, 500.0], [0.0, 700.0, 150.0], [0.0, 0.0, 1.0]])
 # Two triangles a face would do as well for pictures: the outline is that of the convex hull.
@@ -23,21 +24,21 @@ def corners(x: float, z: float) -> Array:
     return found
 
 
-def car(x: float, z: float, label: str = "1", *, is_refined: bool = True) -> DrawnCar:
+def car(x: float, z: float, line: int = 1, status: str = "converged") -> DrawnCar:
     points = corners(x, z)
-    return DrawnCar(points, Surface(points, FACES), label, "12.0 m  converged", is_refined)
+    return DrawnCar(np.eye(4), points, np.zeros(0), Surface(points, FACES), line, status)
 
 
 def has_colour(picture: Picture, colour: tuple[int, int, int]) -> bool:
     return bool((np.abs(picture.astype(int) - colour).max(axis=-1) < 30).any())
 
 
-def image(height: int = 300, width: int = 1000) -> Picture:
-    return np.full((height, width, 3), 90, np.uint8)
+def image(height: int = 300, width: int = 1000) -> View:
+    return View(np.full((height, width, 3), 90, np.uint8), K)
 
 
 def test_rows_show_before_and_after() -> None:
-    picture = overlay_picture(image(), K, [car(0, 12)], [car(0.5, 13)], [corners(0.4, 13)])
+    picture = overlay_picture(image(), [car(0, 12)], [car(0.5, 13)], [corners(0.4, 13)])
     before, after, birds_eye = picture[30:300, :1000], picture[330:600, :1000], picture[:, 1000:]
     assert has_colour(before, ORANGE)
     assert not has_colour(before, BLUE)
@@ -49,26 +50,26 @@ def test_rows_show_before_and_after() -> None:
 
 
 def test_cars_that_were_not_refined_are_grey() -> None:
-    picture = overlay_picture(image(), K, [car(0, 12)], [car(0, 12, is_refined=False)])
+    picture = overlay_picture(image(), [car(0, 12)], [car(0, 12, status="no_mask")])
     assert has_colour(picture[330:600, :1000], GREY)
     assert not has_colour(picture[330:600, :1000], BLUE)
 
 
 @pytest.mark.parametrize("z", [-8.0, 0.5, 400.0])
 def test_cars_in_odd_places_do_not_break_the_picture(z: float) -> None:
-    picture = overlay_picture(image(), K, [car(0, z), car(0, 12, "2")], [car(0, z), car(0, 12, "2")])
+    picture = overlay_picture(image(), [car(0, z), car(0, 12, 2)], [car(0, z), car(0, 12, 2)])
     assert has_colour(picture[30:300, :1000], ORANGE)
 
 
 def test_no_cars_and_small_images() -> None:
-    picture = overlay_picture(image(60, 80), K, [], [])
+    picture = overlay_picture(image(60, 80), [], [])
     # The image is enlarged so that text can be read beside it.
     assert picture.shape == (2 * 750, 1000 + 560, 3)
 
 
 def test_many_cars_wrap_into_rows_of_the_width_of_the_image() -> None:
-    cars = [car(0.5 * k - 4, 15 + k, str(k)) for k in range(14)]
-    picture = overlay_picture(image(), K, cars, cars)
+    cars = [car(0.5 * k - 4, 15 + k, k) for k in range(14)]
+    picture = overlay_picture(image(), cars, cars)
     assert picture.shape[1] == 1560
     assert picture.shape[0] > 600 + 2 * 300
 

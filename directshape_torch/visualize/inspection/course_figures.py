@@ -14,7 +14,6 @@ from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.visualize.drawing import Picture
 from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
 from directshape_torch.visualize.inspection.panels import (
-    MASK_INK,
     draw_footprint,
     draw_lines,
     iteration_inks,
@@ -52,9 +51,9 @@ def animation_frames(view: CarView) -> list[Picture]:
     *images, above, costs = panels
     for axes, side in zip(images, SIDES, strict=True):
         show_crop(axes, view.image(side), view.window(side), side)
-        draw_lines(axes, view.mask_lines(side), MASK_INK, linewidth=1.2, linestyle=":")
+        draw_lines(axes, view.mask_lines(side), "white", linewidth=1.2, linestyle=":")
     figure.suptitle(view.title, fontsize=9)
-    show_birds_eye(above, view, [view.footprint(k) for k in view.steps])
+    show_birds_eye(above, view, view.footprints[view.steps])
     _draw_cost_curves(costs, view)
     # The parts find their places once: they would dance if every picture were laid out anew.
     figure_picture(figure)
@@ -70,8 +69,8 @@ def _frame(figure: Any, panels: Sequence[Any], view: CarView, place: int) -> Pic
     for axes, side in zip(images, SIDES, strict=True):
         draw_lines(axes, view.contours(side, number), inks[place], linewidth=2.0)
     for earlier in range(place):
-        draw_footprint(above, view.footprint(view.steps[earlier]), inks[earlier], linewidth=0.5)
-    draw_footprint(above, view.footprint(number), inks[place], linewidth=2.0)
+        draw_footprint(above, view.footprints[view.steps[earlier]], inks[earlier], linewidth=0.5)
+    draw_footprint(above, view.footprints[number], inks[place], linewidth=2.0)
     costs.axvline(number, color="crimson", linewidth=1.0)
     picture = figure_picture(figure)
     for axes, count in known:
@@ -101,10 +100,8 @@ def distance_course(view: CarView) -> NDArray[np.float64]:
 
     From the input's own, where there is no truth.
     """
-    reference = view.centre_cam(0)
-    if view.truth_corners_cam is not None:
-        reference = footprint_of_corners(view.truth_corners_cam).mean(axis=0)
-    return np.array([np.linalg.norm(view.centre_cam(k) - reference) for k in range(len(view.trace))])
+    true = view.footprints[0] if view.truth_corners_cam is None else footprint_of_corners(view.truth_corners_cam)
+    return np.asarray(np.linalg.norm((view.footprints - true).mean(axis=1), axis=1))
 
 
 def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) -> None:
@@ -123,7 +120,7 @@ def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) ->
     left, right = figure.subfigures(1, 2, width_ratios=[4, 1.1])
     axes = left.subplots(2, 4, width_ratios=[1.1, 1, 1, 1])
     views = dict(zip(_INKS, (silhouettes, full), strict=True))
-    all_footprints = [v.footprint(k) for v in views.values() for k in v.steps]
+    all_footprints = [box for v in views.values() for box in v.footprints[v.steps]]
     for row, (name, view) in zip(axes, views.items(), strict=True):
         _draw_from_above(row[0], name, view, all_footprints)
         _draw_contours(row[1:], view)
@@ -136,7 +133,7 @@ def _draw_from_above(axes: Any, name: str, view: CarView, others: list[Any]) -> 
     show_birds_eye(axes, view, others)
     names = {view.steps[0]: "input", view.steps[-1]: "last iteration"}
     for number, ink in zip(view.steps, iteration_inks(len(view.steps)), strict=True):
-        draw_footprint(axes, view.footprint(number), ink, names.get(number), linewidth=1.1)
+        draw_footprint(axes, view.footprints[number], ink, names.get(number), linewidth=1.1)
     axes.set_title(name, fontsize=10, color=_INKS[name])
 
 
@@ -145,7 +142,7 @@ def _draw_contours(row: Any, view: CarView) -> None:
     for axes, place in zip(row, three_places(len(view.steps)), strict=True):
         title = f"iteration {view.steps[place]}"
         show_crop(axes, view.image("left"), view.window("left"), title)
-        draw_lines(axes, view.mask_lines("left"), MASK_INK, "mask", linewidth=1.3, linestyle=":")
+        draw_lines(axes, view.mask_lines("left"), "white", "mask", linewidth=1.3, linestyle=":")
         draw_lines(axes, view.contours("left", view.steps[place]), inks[place], linewidth=1.8)
 
 

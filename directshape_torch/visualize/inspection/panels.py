@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.visualize.drawing import Picture
-from directshape_torch.visualize.inspection.car_view import CarView, Window, footprint_of_corners
+from directshape_torch.visualize.drawing import Picture, Window
+from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
 
 Array = NDArray[np.float64]
 Ink = Any  # whatever matplotlib takes for a colour
 
-TRUTH_INK, MASK_INK = "limegreen", "white"
 _BIRDS_EYE_MARGIN_M = 0.7
 
 
@@ -51,24 +50,15 @@ def draw_footprint(axes: Any, corners: Array, ink: Ink, label: str | None = None
     axes.plot(stroke[:, 0], stroke[:, 1], color=ink, **style)
 
 
-def show_birds_eye(axes: Any, view: CarView, others: Sequence[Array] = ()) -> None:
-    """Axes over the ground around a car, with the true box where it is known.
-
-    Args:
-        axes: of matplotlib.
-        view: the car.
-        others: (4, 2) further footprints that must fit in.
-    """
-    footprints = [view.footprint(k) for k in (0, len(view.trace) - 1)]
-    footprints += [footprint_of_corners(view.detector_corners_cam), *others]
+def show_birds_eye(axes: Any, view: CarView, others: Iterable[Array]) -> None:
+    """Ground around a car, with the true box where it is known; other footprints (4, 2) must fit in."""
+    shown = [*view.footprints[[0, -1]], footprint_of_corners(view.detector_corners_cam), *others]
     if view.truth_corners_cam is not None:
-        footprints.append(footprint_of_corners(view.truth_corners_cam))
-    corners = np.concatenate(footprints)
+        shown.append(footprint_of_corners(view.truth_corners_cam))
+        draw_footprint(axes, shown[-1], "limegreen", "ground truth", linewidth=2.5)
+    corners = np.concatenate(shown)
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     half = np.ptp(corners, axis=0).max() / 2 + _BIRDS_EYE_MARGIN_M
-    if view.truth_corners_cam is not None:
-        truth = footprint_of_corners(view.truth_corners_cam)
-        draw_footprint(axes, truth, TRUTH_INK, "ground truth", linewidth=2.5)
     axes.set_aspect("equal")
     axes.set(xlim=middle[0] + np.array([-half, half]), ylim=middle[1] + np.array([-half, half]))
     axes.set(xlabel="x [m]", ylabel="z [m]")

@@ -1,0 +1,147 @@
+"""Cars as they are drawn, before and after a refinement: the one form for pictures, pages and animations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from directshape_torch.files.mesh_files import T_GLTF_CAM, read_mesh
+from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.io.kitti_labels import KittiObject, box_corners_cam, poses_cam
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.result import RefinementResult
+from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.status import Status
+from directshape_torch.visualize.drawing import BLUE, GREY, Array, Colour, Surface
+
+
+@dataclass(frozen=True)
+class DrawnCar:
+    """A car in one state, in the left camera frame."""
+
+    T_cam_obj: Array  # (4, 4) of the shape
+    corners_cam: Array  # (8, 3) of its box, in the order of `box_corners`, metres
+    code: Array  # (K,) of the shape
+    mesh: Surface | None  # the shape in its object frame, or None where no prior is at hand
+    line: int  # of the detection file
+    status: str = ""  # how its refinement ended; of a state before it nothing
+
+    @property
+    def surface(self) -> Surface | None:
+        """The shape where it is."""
+        return None if self.mesh is None else self.mesh.moved(self.T_cam_obj)
+
+    @property
+    def distance_m(self) -> float:
+        """Depth of the middle of its box."""
+        return float(self.corners_cam[:, 2].mean())
+
+    @property
+    def colour(self) -> Colour:
+        """Of the state after a refinement."""
+        return BLUE if is_refined(self.status) else GREY
+
+
+def is_refined(status: str) -> bool:
+    """Whether a status is one of a refined state; one of a later version is taken for none."""
+    return status in Status.__members__ and Status[status].is_refined
+
+
+def drawn_cars(loaded: LoadedFrame, result: RefinementResult) -> tuple[list[DrawnCar], list[DrawnCar]]:
+    """The cars of a refined frame before and after."""
+    t_cam_ref, boxes = loaded.frame.camera.t_cam_ref[0], result.boxes()
+    before = cars_before(loaded.detected_objects, t_cam_ref, mean_car(result.prior), result.code.shape[1])
+    corners = corners_cam(boxes.location_ref, boxes.rotation_y, boxes.dimensions_hwl, t_cam_ref)
+    T_cam_obj, codes = (x.detach().cpu().numpy() for x in (result.T_cam_obj, result.code))
+    statuses = [status.name for status in result.status]
+    lines = [one.line_number for one in loaded.detected_objects]
+    return before, cars_after(lines, statuses, T_cam_obj, codes, corners, before, result.prior)
+
+
+def corners_cam(location_ref: Tensor, rotation_y: Tensor, hwl: Tensor, t_cam_ref: Tensor) -> Array:
+    """Corners (B, 8, 3) of the boxes of a result in the left camera frame, `x_cam = x_ref + t_cam_ref`."""
+    location_ref, rotation_y, hwl, t_cam_ref = (
+        x.detach().double().cpu() for x in (location_ref, rotation_y, hwl, t_cam_ref)
+    )
+    return np.asarray(box_corners(pose_from_kitti(location_ref + t_cam_ref, rotation_y), hwl))
+
+
+def cars_before(
+    objects: Sequence[KittiObject],
+    t_cam_ref: Tensor,  # (3,)
+    mean: Surface | None,
+    num_codes: int,
+) -> list[DrawnCar]:
+    """The mean shape at the place of each detection, with the detection's box."""
+    T_cam_obj = poses_cam(objects, t_cam_ref.double().cpu()).numpy()
+    corners, code = box_corners_cam(objects, t_cam_ref.cpu()).numpy(), np.zeros(num_codes)
+    return [
+        DrawnCar(T, box, code, mean, one.line_number) for T, box, one in zip(T_cam_obj, corners, objects, strict=True)
+    ]
+
+
+def cars_after(
+    lines: Sequence[int],
+    statuses: Sequence[str],
+    T_cam_obj: Array,  # (B, 4, 4)
+    codes: Array,  # (B, K)
+    corners: Array,  # (B, 8, 3) of their boxes, left camera frame
+    before: Sequence[DrawnCar] | None,
+    prior: ShapePrior | None,
+    mesh_files: Sequence[Path | None] | None = None,
+) -> list[DrawnCar]:
+    """The refined shapes with the boxes of the result; cars that were not refined stay as they were.
+
+    Args:
+        lines, statuses, T_cam_obj, codes, corners: what the refinement left of B cars.
+        before: the cars as they were, or None where nobody knows.
+        prior: gives the shapes; None takes those of the files.
+        mesh_files: of each car, in its place in the left camera frame, where one was saved.
+
+    Raises:
+        DataFormatError: a file is no readable mesh.
+    """
+    cars = []
+    for car, status in enumerate(statuses):
+        if not is_refined(status) and before is not None:
+            cars.append(replace(before[car], status=status))
+            continue
+        T, code, mesh = T_cam_obj[car].astype(np.float64), codes[car].astype(np.float64), None
+        if prior is not None:
+            mesh = decoded_car(prior, code)
+        elif mesh_files is not None and (file := mesh_files[car]) is not None:
+            mesh = _saved_car(file, T)
+        cars.append(DrawnCar(T, corners[car], code, mesh, lines[car], status))
+    return cars
+
+
+def mean_car(prior: ShapePrior) -> Surface:
+    """The mean shape in its object frame."""
+    return decoded_car(prior, prior.initial_code(1)[0].cpu().numpy())
+
+
+def decoded_car(prior: ShapePrior, code: Array) -> Surface:
+    """The shape of a code (K,) in its object frame."""
+    codes = torch.from_numpy(np.asarray(code, dtype=np.float64))[None].to(prior.origin)
+    mesh = sdf_to_mesh(prior.values(codes)[0], prior.origin, prior.spacing_m)
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def _saved_car(path: Path, T_cam_obj: Array) -> Surface:
+    """The shape of a mesh file of a run, taken back from the camera to the object frame."""
+    vertices_cam, faces = read_mesh(path, cure="refine the frame again")
+    if path.suffix == ".glb":
+        vertices_cam = vertices_cam @ T_GLTF_CAM[:3, :3]
+    return Surface((vertices_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3], faces)
+
+
+def true_corners(labels: Sequence[KittiObject] | None, classes: Sequence[str], t_cam_ref: Tensor) -> list[Array]:
+    """Corners (8, 3) of each labelled box of the refined classes."""
+    chosen = [label for label in labels or () if label.type in classes and label.has_box_3d]
+    return list(box_corners_cam(chosen, t_cam_ref.cpu()).numpy())
