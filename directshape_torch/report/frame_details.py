@@ -94,8 +94,10 @@ def _cars_after(
     result: FrameResult, t_cam_ref: Tensor, before: Sequence[DrawnCar] | None, prior: ShapePrior | None
 ) -> list[DrawnCar]:
     shapes = result.shapes
-    boxes = (torch.from_numpy(x) for x in (shapes.boxes_location_ref, shapes.boxes_rotation_y, shapes.boxes_hwl))
-    lines, corners = shapes.input_lines.tolist(), corners_cam(*boxes, t_cam_ref)
+    location_ref, rotation_y, hwl = (
+        torch.from_numpy(x) for x in (shapes.boxes_location_ref, shapes.boxes_rotation_y, shapes.boxes_hwl)
+    )
+    lines, corners = shapes.input_lines.tolist(), corners_cam(location_ref, rotation_y, hwl, t_cam_ref)
     states = (lines, shapes.statuses, shapes.T_cam_obj, shapes.codes, corners)
     return cars_after(*states, before, prior, result.mesh_files)
 
