@@ -15,7 +15,7 @@ from directshape_torch.batch.frame_groups import FrameGroup
 from directshape_torch.batch.frame_outputs import failed_entry, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.run_log import OutputLostError
-from directshape_torch.batch.timing import CallTiming, RunTimings, peak_device_memory_mb, peak_memory_mb
+from directshape_torch.batch.run_summary import CallTiming, RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig

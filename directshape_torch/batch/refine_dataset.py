@@ -18,8 +18,7 @@ from directshape_torch.batch.group_refinement import GroupReport, RunJob, limite
 from directshape_torch.batch.options import RefineOptions, RunObserver, WorkerOptions
 from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
 from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
-from directshape_torch.batch.run_summary import RunSummary, find_warnings
-from directshape_torch.batch.timing import RunTimings, write_timings
+from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
 from directshape_torch.batch.workers import GroupDispatch, LocalWorkers, ThisProcess, Workers
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError

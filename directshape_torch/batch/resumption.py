@@ -10,12 +10,12 @@ from functools import partial
 from pathlib import Path
 
 from directshape_torch.errors import DataFormatError, ResumeError
-from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import (
     done_frames,
     frame_entry,
     overlay_path,
+    read_done,
     read_record,
     result_path,
     shapes_path,
@@ -27,7 +27,6 @@ from directshape_torch.io.run_manifest import (
     RunManifest,
     check_mapping,
     check_resume,
-    hash_bytes,
     hash_files,
     read_manifest,
     write_manifest,
@@ -105,16 +104,7 @@ class EarlierResults:
     def entry(self, frame_id: str) -> FrameEntry | None:
         """That of a frame which has all outputs of this run, and nobody has removed or changed them since."""
         with suppress(DataFormatError):
-            path = shapes_path(self.out_dir, frame_id)
-            shapes = read_shapes(path)
-            record = read_record(path, shapes)
-            if record.run == self.manifest.hash and set(self.outputs) <= set(record.outputs):
-                files = record.files_of(self.outputs)
-                is_whole = f"data/{frame_id}.txt" in files
-                if is_whole and all(
-                    hash_bytes(read_bytes(self.out_dir / name)) == sha256 for name, sha256 in files.items()
-                ):
-                    return frame_entry(shapes, record)
+            return frame_entry(*read_done(self.out_dir, frame_id, self.manifest.hash, self.outputs))
         return None
 
     def write(self) -> None:

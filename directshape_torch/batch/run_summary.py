@@ -1,14 +1,167 @@
-"""How a run over a data set ended, over all of its frames."""
+"""How a run over a data set ended: frames, cars and warnings, and how long the calls took."""
 
 from __future__ import annotations
 
+import sys
+import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from directshape_torch.batch.timing import RunTimings, device_name, peak_memory_mb
+import torch
+
+from directshape_torch.compile import num_forms
+from directshape_torch.files.atomic_files import write_json
 from directshape_torch.status import Status
+
+TIMINGS_SCHEMA_VERSION = 1
+
+
+@dataclass(frozen=True)
+class CallTiming:
+    """One call of the refiner, reading and writing not included.
+
+    Attributes:
+        frame_ids: its frames.
+        num_cars: its cars.
+        refine_s: seconds that it took.
+        compiled: functions that were compiled or loaded in it.
+    """
+
+    frame_ids: tuple[str, ...]
+    num_cars: int
+    refine_s: float
+    compiled: int = 0
+
+
+@dataclass
+class RunTimings:
+    """All calls of a run, in order.
+
+    Attributes:
+        device: where the refiner ran.
+        calls: one entry a call.
+        workers: processes that refined side by side.
+        threads: of each.
+        cpu_s: seconds that processors spent on the frames, in all workers, reading and writing included.
+        wall_s: seconds from the first frame to the last, reading and writing included.
+        peak_mb: the largest resident memory of any of these processes, MB, where the system tells.
+        peak_device_mb: the largest memory of tensors on a graphics card, MB.
+    """
+
+    device: torch.device
+    calls: list[CallTiming] = field(default_factory=list)
+    workers: int = 1
+    threads: int = field(default_factory=torch.get_num_threads)
+    cpu_s: float = 0.0
+    wall_s: float = 0.0
+    peak_mb: float | None = None
+    peak_device_mb: float | None = None
+
+    @contextmanager
+    def measure(self, frame_ids: Sequence[str], num_cars: int) -> Iterator[None]:
+        """Time the body as one call; waits for the device before and after."""
+        _wait_for(self.device)
+        start, forms = time.perf_counter(), num_forms()
+        yield
+        _wait_for(self.device)
+        seconds = time.perf_counter() - start
+        self.calls.append(CallTiming(tuple(frame_ids), num_cars, seconds, num_forms() - forms))
+
+    def add(self, calls: Sequence[CallTiming], peak_mb: float | None, peak_device_mb: float | None) -> None:
+        """Take in what a worker says."""
+        self.calls += calls
+        self.peak_mb = _larger(self.peak_mb, peak_mb)
+        self.peak_device_mb = _larger(self.peak_device_mb, peak_device_mb)
+
+    @property
+    def num_frames(self) -> int:
+        return sum(len(call.frame_ids) for call in self.calls)
+
+    @property
+    def num_cars(self) -> int:
+        return sum(call.num_cars for call in self.calls)
+
+    @property
+    def refine_s(self) -> float:
+        return sum(call.refine_s for call in self.calls)
+
+    @property
+    def ms_per_car(self) -> float | None:
+        """Mean over the cars of all calls, or None where there was none."""
+        return 1000 * self.refine_s / self.num_cars if self.num_cars else None
+
+    @property
+    def ms_per_frame(self) -> float | None:
+        """Mean over the frames of all calls, or None where there was none."""
+        return 1000 * self.refine_s / self.num_frames if self.num_frames else None
+
+
+def write_timings(path: Path, timings: RunTimings) -> None:
+    """Write `timings.json` (schema 1): a file of its own, so that every other file is the same in every run."""
+    content = {
+        "schema_version": TIMINGS_SCHEMA_VERSION,
+        "device": device_name(timings.device),
+        "workers": timings.workers,
+        "threads": timings.threads,
+        "peak_memory_mb": timings.peak_mb,
+        "peak_device_memory_mb": timings.peak_device_mb,
+        "wall_s": _rounded(timings.wall_s),
+        "cpu_s": _rounded(timings.cpu_s),
+        "ms_per_car": _rounded(timings.ms_per_car),
+        "ms_per_frame": _rounded(timings.ms_per_frame),
+        "calls": [
+            {"frames": list(call.frame_ids), "cars": call.num_cars, "refine_ms": _rounded(1000 * call.refine_s)}
+            for call in timings.calls
+        ],
+    }
+    write_json(path, content)
+
+
+def device_name(device: torch.device) -> str:
+    """ "cpu", or the name of the graphics card."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+
+
+def peak_memory_mb() -> float | None:
+    """The largest resident memory of the process so far, MB, or None where the system does not tell."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # The program's name stands there, maybe cut within a character.
+        lines = status.read_text(errors="replace").splitlines()
+        # Not what `getrusage` says: there a new process begins with the peak of the one that started it.
+        kib = next((line.split()[1] for line in lines if line.startswith("VmHWM:")), None)
+        if kib is not None:
+            return round(int(kib) / 2**10, 1)
+    try:
+        import resource
+    except ImportError:  # only Unix has it
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    # macOS counts in bytes, others in KiB.
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
+
+
+def peak_device_memory_mb(device: torch.device) -> float | None:
+    """The largest memory of tensors on a graphics card so far, MB, or None on the CPU."""
+    return round(torch.cuda.max_memory_allocated(device) / 2**20, 1) if device.type == "cuda" else None
+
+
+def _wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _larger(first: float | None, second: float | None) -> float | None:
+    known = [value for value in (first, second) if value is not None]
+    return max(known) if known else None
+
+
+def _rounded(number: float | None) -> float | None:
+    return None if number is None else round(number, 3)
 
 
 @dataclass(frozen=True)

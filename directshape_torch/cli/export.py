@@ -11,9 +11,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from directshape_torch.cli.options import mask_source
+from directshape_torch.cli.options import add_run_inputs, dataset_of_run, has_detections, mask_source, prior_of_run
 from directshape_torch.cli.progress import ProgressBar
-from directshape_torch.cli.run_inputs import add_run_inputs, dataset_of_run, has_detections, prior_of_run
 from directshape_torch.errors import InputError
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.frame_source import ExportInputs

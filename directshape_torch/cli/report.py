@@ -12,8 +12,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from directshape_torch.cli.options import add_run_inputs, dataset_of_run, has_detections, prior_of_run
 from directshape_torch.cli.progress import ProgressBar
-from directshape_torch.cli.run_inputs import add_run_inputs, dataset_of_run, has_detections, prior_of_run
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.report.make_report import make_report
 

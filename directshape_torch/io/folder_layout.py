@@ -19,7 +19,6 @@ from directshape_torch.io.coco_segmentation import decode_segmentation
 from directshape_torch.io.folder_json import FolderFrame, FolderObject, FolderRig, read_frame, read_rig
 from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
-from directshape_torch.io.ground_plane_files import upright_plane
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import (
     SIDES,
@@ -30,7 +29,7 @@ from directshape_torch.io.instance_masks import (
     instance_of,
     read_soft_mask,
 )
-from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
+from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
 from directshape_torch.io.mask_files import COCO_CAR_IDS
 from directshape_torch.numerics.checks import is_no_rotation

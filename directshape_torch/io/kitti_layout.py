@@ -17,10 +17,9 @@ from directshape_torch.io.frame_layout import (
     first_existing,
     image_stems,
 )
-from directshape_torch.io.ground_plane_files import read_plane
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_of_frame
-from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_velo_to_cam
+from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_plane, read_velo_to_cam
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.mask_files import mask_source
 from directshape_torch.io.motion_files import of_line, read_poses, read_times

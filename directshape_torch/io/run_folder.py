@@ -113,6 +113,33 @@ def read_record(path: Path, shapes: ShapeArrays) -> FrameRecord:
     return record
 
 
+def read_done(
+    out_dir: Path, frame_id: str, run: str, outputs: Iterable[str] = ("data",)
+) -> tuple[ShapeArrays, FrameRecord]:
+    """The shapes of a frame that is done, and what its files were made of.
+
+    Args:
+        out_dir: the output folder.
+        frame_id: the frame.
+        run: hash of the manifest.
+        outputs: kinds of files that must be there with the bytes that were written.
+
+    Raises:
+        DataFormatError: a file is missing, damaged, changed, of another frame or of another run.
+    """
+    path = shapes_path(out_dir, frame_id)
+    shapes = read_shapes(path)
+    record = read_record(path, shapes)
+    if record.run != run:
+        raise DataFormatError(path, f"was made with other settings than {summary_path(out_dir)}", cure=_AGAIN)
+    if missing := set(outputs) - set(record.outputs):
+        raise DataFormatError(path, f"was written without {min(missing)}", cure=_AGAIN)
+    for name in (f"data/{frame_id}.txt", *record.files_of(outputs)):
+        if record.files.get(name) != hash_bytes(read_bytes(out_dir / name)):
+            raise DataFormatError(out_dir / name, f"has been changed, or does not belong to {path}", cure=_AGAIN)
+    return shapes, record
+
+
 def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
     """What `summary.json` says of a frame that is done."""
     return {
@@ -246,21 +273,12 @@ class RunFolder:
             raise DataFormatError(summary_path(self.path), f"config.refiner: {error}") from error
 
     def read(self, frame_id: str) -> FrameResult:
-        """The results of a frame that is done.
-
-        Raises:
-            DataFormatError: a file is missing or damaged, or does not belong to the other, or to this run.
-        """
-        path = shapes_path(self.path, frame_id)
-        shapes = read_shapes(path)
-        record, text = read_record(path, shapes), result_path(self.path, frame_id)
-        if record.run != self.manifest.hash:
-            raise DataFormatError(path, f"was made with other settings than {summary_path(self.path)}", cure=_AGAIN)
-        if record.files.get(f"data/{text.name}") != hash_bytes(read_bytes(text)):
-            raise DataFormatError(text, f"has been changed, or does not belong to {path}", cure=_AGAIN)
+        """The results of a frame that is done; raises as `read_done`."""
+        shapes, record = read_done(self.path, frame_id, self.manifest.hash)
+        text = result_path(self.path, frame_id)
         lines = tuple(read_objects(text))
         if not set(shapes.input_lines.tolist()) <= {line.line_number for line in lines}:
-            raise DataFormatError(text, f"lacks lines of {path}", cure=_AGAIN)
+            raise DataFormatError(text, f"lacks lines of {shapes_path(self.path, frame_id)}", cure=_AGAIN)
         names = record.files_of(("meshes_ply", "meshes_glb"))
         # "meshes/NNNNNN_LINE.ply"; a frame's name may hold an underscore too.
         saved = {Path(name).stem.rpartition("_")[2]: self.path / name for name in names}

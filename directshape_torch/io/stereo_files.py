@@ -14,17 +14,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.errors import DirectShapeError, InputError
-from directshape_torch.files.names import check_frame_id
+from directshape_torch.errors import DirectShapeError, InputError, shown
+from directshape_torch.files.names import is_frame_id
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import MatchingSummary, build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
-from directshape_torch.io.ground_plane_files import plane_ref_to_cam
 from directshape_torch.io.image_files import read_disparity, read_pair
 from directshape_torch.io.instance_masks import MaskSource
-from directshape_torch.io.kitti_calibration import camera_of_rig, to_stereo_camera
+from directshape_torch.io.kitti_calibration import camera_of_rig, plane_ref_to_cam, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import GroundSource, LoadedFrame
 from directshape_torch.io.track_association import associate
@@ -224,7 +223,9 @@ class FileStereoDataset:
             where = f"detection file {wanted_file} in {self.detections_dir}" if split is None else f"frame in {split}"
             raise InputError("frames", f"at least one {where}", "none")
         for frame_id in known:
-            check_frame_id("frames" if split is None else f"{split}, frames", frame_id)
+            if not is_frame_id(frame_id):
+                where = "frames" if split is None else f"{split}, frames"
+                raise InputError(where, "names without folders", shown(frame_id), "rename the files")
         return tuple(known)
 
     def _disparity(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:

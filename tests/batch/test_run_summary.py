@@ -12,9 +12,17 @@ from typing import Any
 import pytest
 import torch
 
-from directshape_torch.batch import timing
-from directshape_torch.batch.run_summary import RunSummary, count_statuses, find_warnings, format_summary
-from directshape_torch.batch.timing import CallTiming, RunTimings, peak_memory_mb, write_timings
+from directshape_torch.batch import run_summary
+from directshape_torch.batch.run_summary import (
+    CallTiming,
+    RunSummary,
+    RunTimings,
+    count_statuses,
+    find_warnings,
+    format_summary,
+    peak_memory_mb,
+    write_timings,
+)
 
 
 def done(**statuses: int) -> dict[str, Any]:
@@ -74,7 +82,7 @@ def test_report(forms: int, compiling: str) -> None:
 
 def test_a_call_counts_what_was_compiled_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
     forms = iter((5, 8, 8, 8))
-    monkeypatch.setattr(timing, "num_forms", lambda: next(forms))
+    monkeypatch.setattr(run_summary, "num_forms", lambda: next(forms))
     run = RunTimings(torch.device("cpu"))
     for frame in ("000000", "000001"):
         with run.measure((frame,), 2):

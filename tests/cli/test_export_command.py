@@ -87,20 +87,6 @@ def test_wrong_use_is_named(
     assert message in capsys.readouterr().err
 
 
-def test_plain_coco_files_lend_the_same_colours(finished: FinishedRun, tmp_path: Path) -> None:
-    entries = [
-        {**{key: value for key, value in entry.items() if key != "image"}, "image_id": int(path.stem)}
-        for path in sorted((finished.root / "masks").iterdir())
-        for entry in json.loads(path.read_text())
-        if entry["image"] == "left"
-    ]
-    (tmp_path / "left.json").write_text(json.dumps(entries))
-    data = ("--format", "ply", "--data", finished.root)
-    assert main(command(finished, tmp_path / "a", *data, "--masks", finished.root / "masks")) == 0
-    assert main(command(finished, tmp_path / "b", *data, "--masks-left", tmp_path / "left.json")) == 0
-    assert contents(tmp_path / "a") == contents(tmp_path / "b")
-
-
 @pytest.mark.parametrize(
     ("words", "purpose"), [(("points",), "stereo points"), (("rerun", "--iterations"), "--iterations")]
 )

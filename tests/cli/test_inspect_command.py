@@ -9,12 +9,10 @@ import cv2
 import pytest
 from PIL import Image
 
-from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.cli.inspect_cars import inspect_frame, silhouette_trace
+from directshape_torch.cli.demo import DEMO_FOLDER, demo_dataset
+from directshape_torch.cli.inspect_cars import silhouette_trace
 from directshape_torch.cli.main import main
 from directshape_torch.config_files import load_config
-from directshape_torch.errors import InputError
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 
 _PICTURES = ("sampling", "residuals", "drift")
@@ -48,7 +46,7 @@ def test_without_matplotlib_nothing_is_refined_first(
 
 @pytest.mark.parametrize("setting", ["method=geometric", "photometric.weight=0", "silhouette.weight=0"])
 def test_without_both_of_the_papers_terms_there_is_no_drift(setting: str) -> None:
-    data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
+    data = demo_dataset()
     refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", setting]))
     assert silhouette_trace(refiner, data.load("000000")) is None
 
@@ -82,14 +80,3 @@ def test_cars_that_cannot_be_refined_are_named_and_passed_by(
     assert main(words) == 0
     assert capsys.readouterr().out.count("not refined, too_few_pixels") == 6
     assert [path.name for path in tmp_path.iterdir()] == ["000000.png"]
-
-
-def test_the_only_car_of_a_frame_may_fail_unless_it_was_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
-    refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", "sampling.min_usable_pixels=100000"]))
-    inspect_frame(data.load("000000"), refiner, [1], tmp_path)
-    assert "car 2: not refined, too_few_pixels" in capsys.readouterr().out
-    with pytest.raises(InputError, match="too_few_pixels"):
-        inspect_frame(data.load("000000"), refiner, [1], tmp_path, must_refine=True)

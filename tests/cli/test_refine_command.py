@@ -51,12 +51,6 @@ def test_reports_cars_statuses_time_and_memory(
     assert sum(call["cars"] for call in timings["calls"]) == 4
 
 
-def test_settings_have_names(source: Path, tmp_path: Path) -> None:
-    assert main(command(source, tmp_path, "--config", "paper")) == 0
-    settings = json.loads((tmp_path / "summary.json").read_text())["config"]["refiner"]
-    assert settings["silhouette"]["form"] == "product"
-
-
 def test_failed_frames_are_exit_code_1_and_named(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -112,25 +106,6 @@ def test_masks_are_needed_in_one_form(source: Path, tmp_path: Path, capsys: pyte
     assert "--masks: expected either a folder" in capsys.readouterr().err
     assert main(command(source, tmp_path, "--masks-left", "x.json")) == 2
     assert "got both" in capsys.readouterr().err
-
-
-def test_unknown_key_names_the_nearest(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command(source, tmp_path, "--set", "silhouette.wieght=3")) == 2
-    assert "unknown key silhouette.wieght; the nearest known one is silhouette.weight" in capsys.readouterr().err
-    assert not (tmp_path / "summary.json").exists()
-
-
-def test_a_prior_of_the_wrong_shape_is_named(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import numpy as np
-
-    with np.load(source / "prior.npz") as file:
-        arrays = dict(file)
-    arrays["basis"] = arrays["basis"][:-1]
-    np.savez(tmp_path / "bad.npz", **arrays)
-    assert main([*command(source, tmp_path / "out"), "--prior", str(tmp_path / "bad.npz")]) == 2
-    message = capsys.readouterr().err
-    assert "bad.npz" in message
-    assert "basis" in message
 
 
 def test_stereo_bias_is_used_and_hashed(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,8 +26,7 @@ from directshape_torch.geometry import box3d, se3
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.geometry.projection import project, warp_to_right
 from directshape_torch.image.grey_levels import grey_levels, halve
-from directshape_torch.io.ground_plane_files import plane_ref_to_cam, read_plane
-from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
+from directshape_torch.io.kitti_calibration import KittiCalibration, plane_ref_to_cam, read_plane, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import write_result_text
 from directshape_torch.refiner import DirectShapeRefiner

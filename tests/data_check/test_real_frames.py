@@ -17,7 +17,6 @@ pytestmark = pytest.mark.skipif(DATA is None, reason="DIRECTSHAPE_DATA is not se
 @pytest.mark.parametrize(
     ("layout", "root", "detections", "masks"),
     [
-        ("kitti", "rendered", "rendered/detections/stereo", "rendered/training/masks"),
         ("kitti", "rendered", "rendered/detections/mono", "rendered/masks_degraded"),
         ("kitti", "kitti", "kitti/detections/noisy_stereo", "kitti/training/masks"),
         ("tracking", "kitti/tracking/0005", "kitti/tracking/0005/detections/pointrcnn", "kitti/tracking/0005"),

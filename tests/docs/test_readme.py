@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.geometry.box_formats import poses_to_boxes
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -18,9 +17,7 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 def tensors_of_the_bundled_frame() -> dict[str, object]:
     """What a detector would give, by the names of the README."""
-    loaded = KittiStereoDataset(
-        DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", DEMO_FOLDER / "training" / "masks"
-    ).load("000000")
+    loaded = demo_dataset().load("000000")
     frame, found = loaded.frame, loaded.detections
     return {
         "K": frame.camera.K_left[0],

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from directshape_torch import DirectShapeRefiner
-from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.cli.demo import demo_dataset
 
 EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "behind_a_detector.py"
 
@@ -19,8 +18,7 @@ EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "behind_a_detector.
 def test_example_gives_what_the_batch_program_gives(capsys: pytest.CaptureFixture[str]) -> None:
     found, result = runpy.run_path(str(EXAMPLE))["main"]()
     assert capsys.readouterr().out.count("\ncar ") == len(found.score) - 1
-    masks = DEMO_FOLDER / "training" / "masks"
-    loaded = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", masks).load("000000")
+    loaded = demo_dataset().load("000000")
     # The example knows no instances but the detector's own.
     expected = DirectShapeRefiner()(loaded.frame, replace(loaded.detections, occluders=None))
     assert result.status == expected.status

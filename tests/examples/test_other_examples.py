@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from directshape_torch import DirectShapeRefiner, PCAShapePrior
-from directshape_torch.cli.demo import DEMO_FOLDER
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.status import Status
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -29,8 +28,7 @@ def test_kitti_files_gives_a_line_for_each_car(tmp_path: Path) -> None:
 
 def test_coco_masks_are_matched_to_their_boxes(tmp_path: Path) -> None:
     result = example("coco_masks")["main"](tmp_path)
-    masks = DEMO_FOLDER / "training" / "masks"
-    loaded = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections" / "noisy_stereo", masks).load("000000")
+    loaded = demo_dataset().load("000000")
     expected = DirectShapeRefiner()(loaded.frame, loaded.detections)
     # The network of the example is less sure of its masks and knows only those of cars with boxes.
     torch.testing.assert_close(result.T_cam_obj, expected.T_cam_obj, atol=0.05, rtol=0)

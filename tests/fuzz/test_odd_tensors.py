@@ -77,7 +77,7 @@ def test_each_odd_value_for_what_is_no_tensor(name: str) -> None:
 # More of them, and what they cost: scripts/fuzz.py.
 @pytest.mark.parametrize("name", list(calls()))
 @given(chance=st.randoms(use_true_random=False))
-@settings(max_examples=25, suppress_health_check=list(HealthCheck))
+@settings(max_examples=12, suppress_health_check=list(HealthCheck))
 def test_odd_values_are_refused_or_taken(name: str, chance: random.Random) -> None:
     odd = odd_call(chance, name)
     with suppress(DirectShapeError):

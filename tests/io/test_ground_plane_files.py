@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.io.ground_plane_files import read_plane
+from directshape_torch.io.kitti_calibration import read_plane
 
 HEADER = "# Plane\nWidth 4\nHeight 1\n"
 

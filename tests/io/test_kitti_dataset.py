@@ -269,10 +269,6 @@ def test_frames_split_and_order(root: Path) -> None:
         dataset(root, split=split, frames=[4])
 
 
-def test_detections_without_a_folder_data(root: Path) -> None:
-    assert KittiStereoDataset(root, root / "detections" / "data").load("000003").refined_rows == (0, -1, -1, 1)
-
-
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -358,13 +354,6 @@ def test_collate_keeps_standard_deviations_and_what_no_frame_knows_is_infinite(r
     assert joined is not None
     assert torch.equal(joined, torch.cat([sigma, torch.full((count, 4), torch.inf)]))
     assert collate([loaded, loaded])[1].pose_sigma is None
-
-
-def test_collate_of_one_frame_changes_nothing(root: Path) -> None:
-    loaded = dataset(root).load("000000")
-    frame, detections = collate([loaded])
-    assert torch.equal(frame.images_right, loaded.frame.images_right)
-    assert torch.equal(detections.T_cam_obj, loaded.detections.T_cam_obj)
 
 
 def test_collate_refuses_nothing_and_mixed_fields(root: Path) -> None:

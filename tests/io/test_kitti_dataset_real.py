@@ -59,9 +59,7 @@ def test_json_and_png_masks_of_the_same_frames_agree() -> None:
 
 @pytest.mark.parametrize(("detections", "masks", "num_left", "num_both"), [
     ("gt", "training/masks", 117, 116),
-    ("stereo", "training/masks", 107, 106),
     ("stereo", "masks_degraded", 99, 96),
-    ("mono", "masks_degraded", 97, 95),
 ])  # fmt: skip
 def test_rendered_frames(detections: str, masks: str, num_left: int, num_both: int) -> None:
     loaded = load_all("rendered", detections, masks)
@@ -69,14 +67,6 @@ def test_rendered_frames(detections: str, masks: str, num_left: int, num_both: i
     assert with_left_mask(loaded) == num_left
     assert len(pairs(loaded)) == num_both
     assert all(left == right for left, right in pairs(loaded))
-
-
-def test_exact_masks_and_boxes_pair_with_their_own_label() -> None:
-    """Line k of these detections is car k of the scene, whose instance id is 1000 + k, counted from 1."""
-    for frame in load_all("rendered", "gt", "training/masks"):
-        expected = [1001 + row for row in frame.row_of_detection]
-        for found in (frame.matching.instance_left, frame.matching.instance_right):
-            assert [a == b or a == -1 for a, b in zip(found, expected, strict=True)] == [True] * len(expected)
 
 
 def test_ground_of_a_real_stereo_pair_is_near_the_plane_of_its_file() -> None:

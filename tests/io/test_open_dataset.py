@@ -59,11 +59,6 @@ def assert_same(dataset: StereoDataset, frame_id: str, expected: LoadedFrame) ->
         assert path.is_file(), role
 
 
-def test_kitti(kitti: Path, expected: LoadedFrame) -> None:
-    dataset = open_dataset("kitti", kitti, kitti / "detections", kitti / "masks", dtype=torch.float64)
-    assert_same(dataset, "000001", expected)
-
-
 def test_one_raw_drive(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
     drive = write_raw(kitti, tmp_path, FRAMES)
     detections, masks = renamed(kitti, tmp_path, ("0000000000", "0000000001"))

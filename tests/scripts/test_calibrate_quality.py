@@ -14,11 +14,11 @@ from quality_calibration import fit, noise, observations, report
 from quality_calibration.bend import Bend
 
 import directshape_torch
+from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.figures.trust_model import load_trust_model
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import polynomial_basis
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimate
 
@@ -140,7 +140,7 @@ def test_a_bent_image_has_the_disparities_and_rows_of_the_bend() -> None:
 
 
 def test_runs_learn_of_rig_and_detector_before_they_refine() -> None:
-    dataset = KittiStereoDataset(DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks")
+    dataset = demo_dataset()
     seen: list[RigEstimate] = []
 
     def refiner(rig: RigEstimate) -> DirectShapeRefiner:

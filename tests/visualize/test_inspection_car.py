@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.observation.packing import pack_pixels
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.drawing import Surface, View, silhouette_mask
@@ -29,7 +28,7 @@ _CAR = 1
 
 @pytest.fixture(scope="module")
 def view() -> CarView:
-    data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
+    data = demo_dataset()
     loaded = data.load(data.frame_ids[0])
     refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off"]))
     return CarView(loaded, trace_refinement(refiner, loaded.frame, loaded.detections), _CAR)

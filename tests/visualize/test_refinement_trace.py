@@ -7,10 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.config_files import load_config
 from directshape_torch.geometry import se3
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
@@ -21,7 +20,7 @@ _SEARCH = "search.disparity_offsets_px=[-2,2]"
 
 @pytest.fixture(scope="module")
 def demo_frame() -> LoadedFrame:
-    data = KittiStereoDataset(DEMO_FOLDER, DEMO_FOLDER / "detections/noisy_stereo", DEMO_FOLDER / "training/masks")
+    data = demo_dataset()
     return data.load(data.frame_ids[0])
 
 
