@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.shape_error import Points, ShapeError, shape_error
 from directshape_torch.geometry import se3
@@ -22,6 +21,7 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.image_files import read_disparity, read_single_channel
 from directshape_torch.io.instance_masks import MaskSource, match_masks
 from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.refinement.ray_cast import cast
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 

@@ -1,1 +1,1 @@
-"""The refinement of the cars of a call: their problem, cars by themselves and in tracks, and what comes out."""
+"""The refinement of the cars of a call: their problem, by themselves and in tracks, and what is said of the end."""

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.projection import warp_to_right
 from directshape_torch.image.grey_levels import grey_levels
 from directshape_torch.image.interpolate import bilinear_at
+from directshape_torch.refinement.ray_cast import cast
 from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState

@@ -9,10 +9,10 @@ from helpers.derivatives import central_differences, moved, tangent_of
 from helpers.problems import DEFAULT, begun_stage, figures_at
 from helpers.synthetic_scene import Street, cached_street
 
-from directshape_torch.diagnosis.observability import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.refinement.observability import covariance_of, covariance_xyz_yaw, without_offset
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior

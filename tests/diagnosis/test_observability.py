@@ -13,7 +13,6 @@ from helpers.problems import DEFAULT, begun_stage, figures_at
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, street
 from torch import Tensor
 
-from directshape_torch.diagnosis.observability import observability_of, quantities_jacobian
 from directshape_torch.figures.observability import (
     CAR_QUANTITIES,
     HEADING_LEVER_M,
@@ -23,6 +22,7 @@ from directshape_torch.figures.observability import (
 )
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
+from directshape_torch.refinement.observability import observability_of, quantities_jacobian
 from directshape_torch.terms.cars import CarState
 
 LENGTH, DEPTH, WIDTH = (CAR_QUANTITIES.index(name) for name in ("length", "depth", "width"))

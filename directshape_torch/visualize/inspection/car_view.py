@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from directshape_torch.diagnosis.ray_cast import cast
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
@@ -21,6 +20,7 @@ from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.occlusion import Side
 from directshape_torch.observation.packing import car_regions, residual_offsets
 from directshape_torch.observation.refinable import without_empty_masks
+from directshape_torch.refinement.ray_cast import cast
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
