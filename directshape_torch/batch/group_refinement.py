@@ -74,12 +74,8 @@ class GroupReport:
     stopped: str | None = None
 
 
-@dataclass(frozen=True)
-class _Ready:
-    """A frame that was read, with the hashes of its files."""
-
-    loaded: LoadedFrame
-    inputs: dict[str, str]
+# A frame that was read, with the hashes of its files.
+_Ready = tuple[LoadedFrame, dict[str, str]]
 
 
 def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
@@ -123,7 +119,7 @@ class _GroupStep:
         """Why these frames cannot be refined together, or None where each of them has ended."""
         try:
             batch = [ready for ready in map(self._read, frame_ids) if ready is not None]
-            parts = split_by_rig([ready.loaded for ready in batch])
+            parts = split_by_rig([loaded for loaded, _ in batch])
             results = [self._call([batch[k] for k in part]) for part in parts]
         except _STOPS_THE_RUN:
             raise
@@ -136,15 +132,16 @@ class _GroupStep:
 
     def _write_all(self, batch: Sequence[_Ready], result: RefinementResult) -> None:
         first_row = 0
-        for ready in batch:
-            if ready.loaded.frame_id in self.group.wanted:
-                self._write(ready, result[first_row : first_row + len(ready.loaded.detections)])
-            first_row += len(ready.loaded.detections)
+        for loaded, inputs in batch:
+            end_row = first_row + len(loaded.detections)
+            if loaded.frame_id in self.group.wanted:
+                self._write(loaded, inputs, result[first_row:end_row])
+            first_row = end_row
 
     def _read(self, frame_id: str) -> _Ready | None:
         try:
             inputs = hash_files(self.job.dataset.input_files(frame_id))
-            return _Ready(self.job.dataset.load(frame_id), inputs)
+            return self.job.dataset.load(frame_id), inputs
         except _STOPS_THE_RUN:
             raise
         except (DirectShapeError, OSError) as error:
@@ -153,7 +150,7 @@ class _GroupStep:
 
     def _call(self, batch: Sequence[_Ready]) -> RefinementResult:
         prior = self.job.refiner.prior.origin
-        frames, detections = collate([ready.loaded for ready in batch])
+        frames, detections = collate([loaded for loaded, _ in batch])
         frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
         timings = RunTimings(prior.device, self.report.calls)
         # Said anew before each call, so that it does not matter which calls this process had before.
@@ -161,12 +158,10 @@ class _GroupStep:
             result: RefinementResult = self.job.refiner(frames, detections)
         return result
 
-    def _write(self, ready: _Ready, result: RefinementResult) -> None:
-        loaded, job = ready.loaded, self.job
+    def _write(self, loaded: LoadedFrame, inputs: dict[str, str], result: RefinementResult) -> None:
+        job = self.job
         try:
-            entry = write_frame_outputs(
-                job.out_dir, loaded, result, job.run, job.prior_sha256, ready.inputs, job.options
-            )
+            entry = write_frame_outputs(job.out_dir, loaded, result, job.run, job.prior_sha256, inputs, job.options)
         except _STOPS_THE_RUN:
             raise
         except (DirectShapeError, OSError) as error:
@@ -185,27 +180,19 @@ class _GroupStep:
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
-    """That number of threads while the body runs; None leaves them."""
+    """That number of threads of PyTorch and OpenCV while the body runs; None leaves them."""
     import cv2
 
     before = torch.get_num_threads(), cv2.getNumThreads()
-    limit_threads(threads)
+    if threads is not None:
+        torch.set_num_threads(threads)
+        cv2.setNumThreads(threads)
     try:
         yield
     finally:
         if threads is not None:
             torch.set_num_threads(before[0])
             cv2.setNumThreads(before[1])
-
-
-def limit_threads(threads: int | None) -> None:
-    """Set the number of threads of PyTorch and OpenCV in this process; None leaves them."""
-    if threads is None:
-        return
-    import cv2
-
-    torch.set_num_threads(threads)
-    cv2.setNumThreads(threads)
 
 
 def _reason(error: Exception) -> str:

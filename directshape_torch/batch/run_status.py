@@ -12,6 +12,7 @@ from directshape_torch.errors import DataFormatError
 
 # Frames of which the rate is: enough for a mean, few enough to follow a change of load.
 _RECENT_FRAMES = 200
+_SHOWN_FAILURES = 10
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def _rate(run: LogContents, all_times: Sequence[float], now: float | None) -> fl
     return count / (end - start) if end > start else None
 
 
-def format_status(status: RunStatus, now: float | None = None, num_failures: int = 10) -> str:
+def format_status(status: RunStatus, now: float | None = None) -> str:
     """A few lines for people."""
     now = time.time() if now is None else now
     lines = [f"run      {_state_text(status)}", _frames_text(status)]
@@ -111,10 +112,10 @@ def format_status(status: RunStatus, now: float | None = None, num_failures: int
         lines.append(f"rate     {status.frames_per_s:.2f} frames/s{left}")
     if status.last_frame_at is not None and status.state in ("running", "killed"):
         lines.append(f"latest   {_duration(max(0.0, now - status.last_frame_at))} ago")
-    for frame_id in sorted(status.failed)[:num_failures]:
+    for frame_id in sorted(status.failed)[:_SHOWN_FAILURES]:
         lines.append(f"failed   {frame_id}: {status.failed[frame_id]}")
-    if len(status.failed) > num_failures:
-        lines.append(f"failed   .. and {len(status.failed) - num_failures} more")
+    if len(status.failed) > _SHOWN_FAILURES:
+        lines.append(f"failed   .. and {len(status.failed) - _SHOWN_FAILURES} more")
     return "\n".join(lines)
 
 

@@ -9,13 +9,14 @@ import signal
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Protocol
 
 from directshape_torch.batch.frame_groups import FrameGroup
-from directshape_torch.batch.group_refinement import GroupReport, RunJob, limit_threads, refine_group
+from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads, refine_group
 from directshape_torch.errors import DirectShapeError
 
 # So many deaths before anything was ever finished are not the fault of single frames.
@@ -224,14 +225,11 @@ def _work(pipe: Connection, threads: int | None) -> None:
     # Ctrl-C reaches the whole group of processes; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    limit_threads(threads)
-    try:
+    with suppress(*_PIPE_ENDED), limited_threads(threads):
         job = _loaded(pipe.recv_bytes())
         while True:
             group = pipe.recv()
             pipe.send(job if isinstance(job, str) else refine_group(job, group))
-    except _PIPE_ENDED:
-        return
 
 
 def _loaded(content: bytes) -> RunJob | str:

@@ -31,12 +31,10 @@ from directshape_torch.io.instance_masks import (
 )
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
-from directshape_torch.io.mask_files import COCO_CAR_IDS
 from directshape_torch.numerics.checks import is_no_rotation
 from directshape_torch.scene_check.image_boxes import project_boxes
 
 _CAR = "Car"
-_OTHER_CATEGORY = 0
 # KITTI's numbers for what a line does not have.
 _NO_BOX_3D = "-1 -1 -1 -1000 -1000 -1000 -10"
 
@@ -198,10 +196,9 @@ class FolderMasks:
             probability: Any = read_soft_mask(self.root / mask, size_hw)
         else:
             probability = decode_segmentation(path, f"mask_{side} of objects[{index}]", mask, size_hw)
-        category = min(COCO_CAR_IDS) if is_car else _OTHER_CATEGORY
         box = entry.box_2d if side == "left" else None
         box = box and (box[0], box[1], box[2], box[3])  # JSON has lists
-        return instance_of(side, index, category, probability, is_car=is_car, box=box, score=entry.score)
+        return instance_of(side, index, probability, is_car=is_car, box=box, score=entry.score)
 
 
 def mask_of(entry: FolderObject, side: Side) -> Any:

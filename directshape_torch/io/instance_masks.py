@@ -38,8 +38,7 @@ class InstanceMask:
     Attributes:
         side: the image, "left" or "right".
         instance_id: its number in the file; numbers of the two images need not agree.
-        category_id: class number in the file's own numbering.
-        is_car: whether that class may be matched to a car.
+        is_car: whether it may be matched to a car.
         box: the file's 2D box (u_min, v_min, u_max, v_max), else that of the mask, pixels.
         mask_box: the smallest box around the mask, whole pixels, both ends belonging to it.
         probability: (H, W), bool or float32 foreground probability in [0, 1].
@@ -49,7 +48,6 @@ class InstanceMask:
 
     side: Side
     instance_id: int
-    category_id: int
     is_car: bool
     box: tuple[float, float, float, float]
     mask_box: tuple[float, float, float, float]
@@ -61,7 +59,6 @@ class InstanceMask:
 def instance_of(
     side: Side,
     instance_id: int,
-    category_id: int,
     probability: NDArray[np.bool_] | NDArray[np.float32],
     *,
     is_car: bool,
@@ -73,7 +70,7 @@ def instance_of(
     mask_box = tight_box(probability)
     if mask_box is None:  # an empty mask says nothing about a car
         return None
-    return InstanceMask(side, instance_id, category_id, is_car, box or mask_box, mask_box, probability, score, track_id)
+    return InstanceMask(side, instance_id, is_car, box or mask_box, mask_box, probability, score, track_id)
 
 
 class MaskSource(Protocol):
@@ -155,9 +152,8 @@ class MaskMatches:
 
 def match_one_to_one(
     overlap: NDArray[np.float64],  # (B, M)
-    min_overlap: float = MIN_OVERLAP,
 ) -> MaskMatches:
-    """The assignment of largest total overlap (Hungarian) that uses pairs of at least `min_overlap` only.
+    """The assignment of largest total overlap (Hungarian) that uses pairs of at least 0.3 only.
 
     Examples:
         >>> match_one_to_one(np.array([[0.9, 0.8], [0.7, 0.1]])).mask_of_detection.tolist()
@@ -165,7 +161,7 @@ def match_one_to_one(
     """
     from scipy.optimize import linear_sum_assignment
 
-    allowed = np.where(overlap >= min_overlap, overlap, 0.0)
+    allowed = np.where(overlap >= MIN_OVERLAP, overlap, 0.0)
     rows, columns = linear_sum_assignment(allowed, maximize=True)
     used = allowed[rows, columns] > 0
     index = np.full(len(overlap), -1, dtype=np.int64)
@@ -179,8 +175,6 @@ def match_masks(
     boxes_2d: NDArray[np.float64],  # (B, 4) in the image of the masks, pixels
     masks: Sequence[InstanceMask],
     further_boxes_2d: NDArray[np.float64] | None = None,  # (B, 4) a second opinion, NaN where there is none
-    eligible: Sequence[bool] | None = None,
-    min_overlap: float = MIN_OVERLAP,
 ) -> MaskMatches:
     """Match masks of one image to 2D boxes, by the larger of the overlaps with the file's box and the mask's own.
 
@@ -191,8 +185,6 @@ def match_masks(
         boxes_2d: where each detection is expected.
         masks: instances of one side.
         further_boxes_2d: another expectation for each detection; the larger overlap counts.
-        eligible: which masks may be matched; default those of cars.
-        min_overlap: pairs below are never made.
     """
     file_boxes, mask_boxes = (
         np.array([getattr(mask, name) for mask in masks], dtype=np.float64).reshape(-1, 4)
@@ -200,22 +192,16 @@ def match_masks(
     )
     expected = [boxes_2d] if further_boxes_2d is None else [boxes_2d, further_boxes_2d]
     overlaps = [np.nan_to_num(box_iou(a, b)) for a in expected for b in (file_boxes, mask_boxes)]
-    overlap = np.maximum.reduce(overlaps)
-    allowed = [mask.is_car for mask in masks] if eligible is None else eligible
-    overlap[:, ~np.array(allowed, dtype=bool)] = 0.0
-    return match_one_to_one(overlap, min_overlap)
+    return match_one_to_one(np.maximum.reduce(overlaps))
 
 
-def without_duplicates(masks: Sequence[InstanceMask], matched: Iterable[int]) -> list[int]:
-    """Indices of the masks that belong to no detection and are no second mask of a matched car.
-
-    Args:
-        masks: instances of one side.
-        matched: indices of those that belong to a detection.
-    """
-    taken = {int(index) for index in matched}
-    rest = [index for index in range(len(masks)) if index not in taken]
-    return [i for i in rest if not any(_mask_iou(masks[i], masks[k]) > DUPLICATE_MASK_IOU for k in taken)]
+def without_duplicates(masks: Sequence[InstanceMask], matched: Sequence[InstanceMask]) -> list[InstanceMask]:
+    """Those of some masks that belong to no detection which are no second mask of a matched car."""
+    return [
+        mask
+        for mask in masks
+        if not any(mask.side == k.side and _mask_iou(mask, k) > DUPLICATE_MASK_IOU for k in matched)
+    ]
 
 
 def _mask_iou(a: InstanceMask, b: InstanceMask) -> float:

@@ -112,7 +112,7 @@ class InstancePngMasks:
             if category in (0, _MOTS_IGNORE_CLASS):
                 continue
             track = value % _IDS_PER_CLASS if self.folders == _TRACKING_FOLDERS else -1
-            found = instance_of(side, value, category, ids == value, is_car=category in self.car_ids, track_id=track)
+            found = instance_of(side, value, ids == value, is_car=category in self.car_ids, track_id=track)
             if found is not None:
                 yield found
 
@@ -167,7 +167,7 @@ class CocoFileMasks:
         return self._by_frame[side]
 
 
-def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> FrameJsonMasks | InstancePngMasks:
+def mask_source(directory: Path | str) -> FrameJsonMasks | InstancePngMasks:
     """The reader that fits a folder of masks: instance PNG if it holds `instance_2` (or `instance_02`), else one json
     a frame.
 
@@ -179,8 +179,8 @@ def mask_source(directory: Path | str, car_ids: Iterable[int] | None = None) -> 
         raise DataFormatError(directory, "is not a folder of masks", cure="give the folder of NNNNNN.json files")
     for folders in (("instance_2", "instance_3"), _TRACKING_FOLDERS):
         if (directory / folders[0]).is_dir():
-            return InstancePngMasks(directory, PNG_CAR_IDS if car_ids is None else frozenset(car_ids), folders)
-    return FrameJsonMasks(directory, COCO_CAR_IDS if car_ids is None else frozenset(car_ids))
+            return InstancePngMasks(directory, folders=folders)
+    return FrameJsonMasks(directory)
 
 
 def read_coco_list(path: Path) -> list[Mapping[str, Any]]:
@@ -213,13 +213,11 @@ def _from_coco(
     if tight_box(probability) is None:  # whatever else its entry says
         return None
     try:
-        category = int(entry["category_id"])
         return instance_of(
             side,
             int(entry.get("instance_id", index)),
-            category,
             probability,
-            is_car=category in car_ids,
+            is_car=int(entry["category_id"]) in car_ids,
             box=_file_box(entry),
             score=_finite(entry.get("score", 1.0)),
         )

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.frame_detections import MatchingSummary
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.scene import Detections, FrameBatch
 
@@ -24,7 +23,6 @@ class LoadedFrame:
         input_objects: every line of the detection file, in its order.
         refined_rows: for each input line the index of its detection, or -1 for lines to copy as they are.
         labels: the ground truth, or None where there is no label file.
-        matching: which masks were found for the detections, for reports.
         sequence: whose frames the tracks of the detections go through; see `StereoDataset.sequence_of`.
     """
 
@@ -33,7 +31,6 @@ class LoadedFrame:
     input_objects: list[KittiObject]
     refined_rows: tuple[int, ...]
     labels: list[KittiObject] | None
-    matching: MatchingSummary
     sequence: str | None = None
 
     @property

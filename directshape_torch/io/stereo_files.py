@@ -19,7 +19,7 @@ from directshape_torch.files.names import is_frame_id
 from directshape_torch.files.text_files import read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.frame_detections import MatchingSummary, build_detections
+from directshape_torch.io.frame_detections import build_detections
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
 from directshape_torch.io.image_files import read_disparity, read_pair
 from directshape_torch.io.instance_masks import MaskSource
@@ -137,11 +137,11 @@ class FileStereoDataset:
         objects = self.objects(frame_id)
         masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
         given = self.layout.given_masks(frame_id) if self._own_masks else None
-        detections, rows, matching = build_detections(objects, masks, camera, (height, width), self.classes, given)
+        detections, rows, mask_tracks = build_detections(objects, masks, camera, (height, width), self.classes, given)
         if self.tracks:
-            detections = replace(detections, track_id=self._track_id(frame_id, rows, matching))
+            detections = replace(detections, track_id=self._track_id(frame_id, rows, mask_tracks))
         sequence = self.sequence_of(frame_id)
-        return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), matching, sequence)
+        return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), sequence)
 
     def changed(
         self, *, ground: GroundSource, disparity_field: DisparityField | Sequence[DisparityField] | None
@@ -181,10 +181,10 @@ class FileStereoDataset:
             files |= {f"masks_{index}": path for index, path in enumerate(self.masks.files(frame_id))}
         return files
 
-    def _track_id(self, frame_id: str, rows: tuple[int, ...], matching: MatchingSummary) -> Tensor:
+    def _track_id(self, frame_id: str, rows: tuple[int, ...], mask_tracks: tuple[int, ...]) -> Tensor:
         """(B,) of the detections: by the masks, else by the detections themselves."""
-        if any(track >= 0 for track in matching.track_left):
-            return torch.tensor(matching.track_left)
+        if any(track >= 0 for track in mask_tracks):
+            return torch.tensor(mask_tracks)
         sequence = self.sequence_of(frame_id)
         if sequence not in self._tracks:
             self._tracks[sequence] = self._tracks_of(sequence)

@@ -16,7 +16,6 @@ from directshape_torch.figures.observability import Observability
 from directshape_torch.figures.quality import FitQuality
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.frame_detections import MatchingSummary
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
@@ -78,7 +77,7 @@ def loaded_frame(objects: list[KittiObject], rows: tuple[int, ...], frame_id: st
         none,
         none,
     )
-    return LoadedFrame(frame, detections, objects, rows, None, MatchingSummary((), (), (), ()))
+    return LoadedFrame(frame, detections, objects, rows, None)
 
 
 def result(statuses: list[Status]) -> RefinementResult:

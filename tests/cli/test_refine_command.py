@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.kitti_folder import write_data_set
 
 from directshape_torch.cli.main import main
 from directshape_torch.cli.options import find_device
@@ -20,23 +19,14 @@ from directshape_torch.rig.rig_file import save_field
 QUICK = ("--set", "stages=[{max_iterations: 2}]")
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root, ("000000", "000001"))
-    return root
-
-
 def command(root: Path, out: Path, *extra: str, masks: bool = True) -> list[str]:
     words = ["refine", "--data", root, "--detections", root / "detections", "--out", out, "--prior", root / "prior.npz"]
     words += ["--masks", root / "masks"] if masks else []
     return [*map(str, words), "--device", "cpu", *QUICK, *extra]
 
 
-def test_reports_cars_statuses_time_and_memory(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(command(source, tmp_path, "--meshes", "glb", "--overlays")) == 0
+def test_reports_cars_statuses_time_and_memory(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(kitti, tmp_path, "--meshes", "glb", "--overlays")) == 0
     out = capsys.readouterr().out
     assert "frames   2 done, 0 failed" in out
     assert "cars     4: " in out
@@ -52,9 +42,9 @@ def test_reports_cars_statuses_time_and_memory(
 
 
 def test_failed_frames_are_exit_code_1_and_named(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = Path(shutil.copytree(source, tmp_path / "kitti"))
+    root = Path(shutil.copytree(kitti, tmp_path / "kitti"))
     image = root / "training" / "image_2" / "000000.png"
     image.write_bytes(image.read_bytes()[:500])
     assert main(command(root, tmp_path / "out")) == 1
@@ -65,51 +55,51 @@ def test_failed_frames_are_exit_code_1_and_named(
 
 
 def test_a_second_run_resumes_and_another_setting_is_named(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(command(source, tmp_path)) == 0
-    assert main(command(source, tmp_path)) == 0
+    assert main(command(kitti, tmp_path)) == 0
+    assert main(command(kitti, tmp_path)) == 0
     assert "2 done, 2 of them in an earlier run" in capsys.readouterr().out
-    assert main(command(source, tmp_path, "--set", "photometric.weight=2")) == 2
+    assert main(command(kitti, tmp_path, "--set", "photometric.weight=2")) == 2
     assert "refiner.photometric.weight' was 1.0, now is 2.0" in capsys.readouterr().err
 
 
-def test_frames_and_split_choose(source: Path, tmp_path: Path) -> None:
-    assert main(command(source, tmp_path / "a", "--frames", "1")) == 0
+def test_frames_and_split_choose(kitti: Path, tmp_path: Path) -> None:
+    assert main(command(kitti, tmp_path / "a", "--frames", "1")) == 0
     assert [path.name for path in (tmp_path / "a" / "data").iterdir()] == ["000001.txt"]
     (tmp_path / "split.txt").write_text("000000\n")
-    assert main(command(source, tmp_path / "b", "--split", str(tmp_path / "split.txt"))) == 0
+    assert main(command(kitti, tmp_path / "b", "--split", str(tmp_path / "split.txt"))) == 0
     assert [path.name for path in (tmp_path / "b" / "data").iterdir()] == ["000000.txt"]
 
 
-def test_plain_coco_files_give_the_same_results(source: Path, tmp_path: Path) -> None:
+def test_plain_coco_files_give_the_same_results(kitti: Path, tmp_path: Path) -> None:
     files = {}
     for side in ("left", "right"):
         entries = [
             {**{key: value for key, value in entry.items() if key != "image"}, "image_id": int(path.stem)}
-            for path in sorted((source / "masks").iterdir())
+            for path in sorted((kitti / "masks").iterdir())
             for entry in json.loads(path.read_text())
             if entry["image"] == side
         ]
         files[side] = tmp_path / f"{side}.json"
         files[side].write_text(json.dumps(entries))
-    assert main(command(source, tmp_path / "a")) == 0
+    assert main(command(kitti, tmp_path / "a")) == 0
     options = ("--masks-left", str(files["left"]), "--masks-right", str(files["right"]))
-    assert main(command(source, tmp_path / "b", *options, masks=False)) == 0
+    assert main(command(kitti, tmp_path / "b", *options, masks=False)) == 0
     for frame_id in ("000000", "000001"):
         name = f"data/{frame_id}.txt"
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-def test_masks_are_needed_in_one_form(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command(source, tmp_path, masks=False)) == 2
+def test_masks_are_needed_in_one_form(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(kitti, tmp_path, masks=False)) == 2
     assert "--masks: expected either a folder" in capsys.readouterr().err
-    assert main(command(source, tmp_path, "--masks-left", "x.json")) == 2
+    assert main(command(kitti, tmp_path, "--masks-left", "x.json")) == 2
     assert "got both" in capsys.readouterr().err
 
 
-def test_stereo_bias_is_used_and_hashed(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    dataset = KittiStereoDataset(source, source / "detections", dtype=torch.float64)
+def test_stereo_bias_is_used_and_hashed(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dataset = KittiStereoDataset(kitti, kitti / "detections", dtype=torch.float64)
     camera = dataset.load("000000").frame.camera
     coefficients = torch.zeros(10, dtype=torch.float64)
     coefficients[0] = -0.8
@@ -117,26 +107,26 @@ def test_stereo_bias_is_used_and_hashed(source: Path, tmp_path: Path, capsys: py
     rig = {"K_left": camera.K_left[0], "K_right": camera.K_right[0], "T_right_cam": camera.T_right_cam[0]}
     field = DisparityField(coefficients=coefficients, hull_uv=hull, size_wh=(160, 120), **rig)
     save_field(field, tmp_path / "bias.json")
-    assert main(command(source, tmp_path / "without")) == 0
-    assert main(command(source, tmp_path / "with", "--rig", str(tmp_path / "bias.json"))) == 0
+    assert main(command(kitti, tmp_path / "without")) == 0
+    assert main(command(kitti, tmp_path / "with", "--rig", str(tmp_path / "bias.json"))) == 0
     name = "data/000000.txt"
     assert (tmp_path / "with" / name).read_text() != (tmp_path / "without" / name).read_text()
-    assert main(command(source, tmp_path / "with")) == 2
+    assert main(command(kitti, tmp_path / "with")) == 2
     assert "sha256 of 'stereo_bias'" in capsys.readouterr().err
 
 
 def test_threads_are_those_asked_for_one_by_default(
-    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
         for words, threads in (((), 1), (("--threads", "2", "--fresh"), 2)):
-            assert main(command(source, tmp_path, *words)) == 0
+            assert main(command(kitti, tmp_path, *words)) == 0
             assert json.loads((tmp_path / "timings.json").read_text())["threads"] == threads
     finally:
         torch.set_num_threads(before)
-    assert main(command(source, tmp_path, "--threads", "0")) == 2
+    assert main(command(kitti, tmp_path, "--threads", "0")) == 2
     assert "threads: expected at least 1, got 0" in capsys.readouterr().err
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.kitti_folder import write_data_set
 from helpers.layouts import write_folder
 
 from directshape_torch.cli.main import main
@@ -156,13 +155,6 @@ def test_distances_tell_the_baseline_from_the_boxes() -> None:
     assert "the baseline is wrong: divide it by 1.50" in of_baseline.cure
     assert "against the boxes" in check_distances(ratios(0.6, 0.62))[0].cure
     assert "focal length" in check_distances(ratios(1.5, 0.7))[0].cure
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("kitti")
-    write_data_set(root, ("000000", "000001"))
-    return root
 
 
 def test_a_damaged_frame_of_a_folder_is_one_finding_and_hides_no_other(kitti: Path, tmp_path: Path) -> None:

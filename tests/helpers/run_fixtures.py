@@ -18,6 +18,14 @@ def shared_kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="session")
+def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with frames 000000 and 000001 alone."""
+    root = tmp_path_factory.mktemp("kitti")
+    write_data_set(root, ("000000", "000001"))
+    return root
+
+
 @pytest.fixture
 def kitti_copy(shared_kitti: Path, tmp_path: Path) -> Path:
     """A copy of it that a test may damage."""

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
+from helpers.matched_masks import instances
 
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.stereo_dataset import LoadedFrame
@@ -16,41 +17,38 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def load_all(data: str, detections: str, masks: str) -> list[LoadedFrame]:
+def load_all(data: str, detections: str, masks: str) -> tuple[KittiStereoDataset, list[LoadedFrame]]:
     root = Path(os.environ["DIRECTSHAPE_DATA"])
     frames = KittiStereoDataset(root / data, root / data / "detections" / detections, root / data / masks)
-    return [frames.load(frame_id) for frame_id in frames.frame_ids]
+    return frames, [frames.load(frame_id) for frame_id in frames.frame_ids]
 
 
 def with_left_mask(loaded: list[LoadedFrame]) -> int:
     return sum(int(frame.detections.has_mask_left.sum()) for frame in loaded)
 
 
-def pairs(loaded: list[LoadedFrame]) -> list[tuple[int, int]]:
+def pairs(dataset: KittiStereoDataset, loaded: list[LoadedFrame]) -> list[tuple[int, int]]:
     """Instance ids of cars matched in both images; in these data the ids of the two images agree."""
-    return [
-        (left, right)
-        for frame in loaded
-        for left, right in zip(frame.matching.instance_left, frame.matching.instance_right, strict=True)
-        if left >= 0 and right >= 0
-    ]
+    found = [pair for frame in loaded for pair in zip(*instances(dataset, frame), strict=True)]
+    return [(left, right) for left, right in found if left >= 0 and right >= 0]
 
 
 def test_kitti_frames_with_simulated_stereo_detections() -> None:
-    loaded = load_all("kitti", "noisy_stereo", "training/masks")
+    dataset, loaded = load_all("kitti", "noisy_stereo", "training/masks")
     assert len(loaded) == 18
     assert {source for frame in loaded for source in frame.frame.ground.source} == {"file"}
     # All cars have a mask but the four of 000274 that, as the data's notes say, no 2D detector found.
     missing = [frame.frame_id for frame in loaded for found in frame.detections.has_mask_left.tolist() if not found]
     assert missing == ["000274"] * 4
     assert sum(len(frame.detections) for frame in loaded) == 54
-    assert len(pairs(loaded)) == 50
-    assert all(left == right for left, right in pairs(loaded))
+    both = pairs(dataset, loaded)
+    assert len(both) == 50
+    assert all(left == right for left, right in both)
 
 
 def test_json_and_png_masks_of_the_same_frames_agree() -> None:
-    from_json = load_all("kitti", "pointrcnn", "training/masks")
-    from_png = load_all("kitti", "pointrcnn", "training")
+    _, from_json = load_all("kitti", "pointrcnn", "training/masks")
+    _, from_png = load_all("kitti", "pointrcnn", "training")
     assert with_left_mask(from_json) == with_left_mask(from_png) == 37
     for a, b in zip(from_json, from_png, strict=True):
         assert a.detections.mask_left.equal(b.detections.mask_left)
@@ -62,11 +60,12 @@ def test_json_and_png_masks_of_the_same_frames_agree() -> None:
     ("stereo", "masks_degraded", 99, 96),
 ])  # fmt: skip
 def test_rendered_frames(detections: str, masks: str, num_left: int, num_both: int) -> None:
-    loaded = load_all("rendered", detections, masks)
+    dataset, loaded = load_all("rendered", detections, masks)
     assert len(loaded) == 24
     assert with_left_mask(loaded) == num_left
-    assert len(pairs(loaded)) == num_both
-    assert all(left == right for left, right in pairs(loaded))
+    both = pairs(dataset, loaded)
+    assert len(both) == num_both
+    assert all(left == right for left, right in both)
 
 
 def test_ground_of_a_real_stereo_pair_is_near_the_plane_of_its_file() -> None:

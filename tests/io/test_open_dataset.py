@@ -20,6 +20,7 @@ from helpers.layouts import (
     write_sequence,
     write_stereo2015,
 )
+from helpers.matched_masks import instances
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -136,14 +137,15 @@ def test_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
     dataset = open_dataset("folder", tmp_path, dtype=torch.float64)
     assert dataset.frame_ids == FRAMES
     assert_same(dataset, "000001", expected)
-    assert dataset.load("000001").matching.instance_left == (0, 2)
+    assert instances(dataset, dataset.load("000001"))[0] == [0, 2]
     assert open_dataset("folder", tmp_path, frames=[1]).frame_ids == ("000001",)
 
 
 def test_masks_of_a_folder_may_come_from_elsewhere(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
     write_folder(kitti, tmp_path, FRAMES)
     dataset = open_dataset("folder", tmp_path, masks=kitti / "masks", dtype=torch.float64)
-    assert dataset.load("000001").matching.instance_left == expected.matching.instance_left
+    assert instances(dataset, dataset.load("000001"))[0] == [0, 1]
+    torch.testing.assert_close(dataset.load("000001").detections.mask_left, expected.detections.mask_left)
 
 
 def test_a_mask_stays_with_its_object_wherever_it_is(kitti: Path, tmp_path: Path) -> None:
@@ -155,8 +157,9 @@ def test_a_mask_stays_with_its_object_wherever_it_is(kitti: Path, tmp_path: Path
     for side in ("mask_left", "mask_right"):
         first[side], second[side] = second[side], first[side]
     path.write_text(json.dumps(content))
-    swapped, as_before = (open_dataset("folder", tmp_path).load(frame_id) for frame_id in FRAMES)
-    assert swapped.matching.instance_left == (0, 2)
+    folder = open_dataset("folder", tmp_path)
+    swapped, as_before = (folder.load(frame_id) for frame_id in FRAMES)
+    assert instances(folder, swapped)[0] == [0, 2]
     assert torch.equal(swapped.detections.mask_left, as_before.detections.mask_left.flip(0))
 
 

@@ -1,0 +1,22 @@
+"""Which instance of a mask file each detection of a frame got."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_files import FileStereoDataset
+
+
+def instances(dataset: FileStereoDataset, loaded: LoadedFrame) -> tuple[list[int], list[int]]:
+    """Numbers of the file for the left and for the right image, -1 for none."""
+    height, width = loaded.frame.sizes[0].tolist()
+    masks = [] if dataset.masks is None else dataset.masks.read(loaded.frame_id, (height, width))
+
+    def number(side: str, probability: np.ndarray) -> int:
+        same = (m for m in masks if m.side == side and np.array_equal(m.probability, probability))
+        return next((mask.instance_id for mask in same), -1)
+
+    found = loaded.detections
+    left, right = found.mask_left.float().numpy(), found.mask_right.float().numpy()
+    return [number("left", mask) for mask in left], [number("right", mask) for mask in right]
