@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.io.run_folder import FrameResult, ResultObject
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.errors import InputError
+from directshape_torch.export.frame_source import Exporter, FrameSource
+from directshape_torch.files.atomic_files import write_json
+from directshape_torch.io.run_folder import ResultObject, RunFolder
 
 # Omni3D's order of the eight corners, in units of half (length, height, width) along x, y (down), z of the object.
 _CORNERS = np.array(
@@ -20,65 +23,56 @@ _UNKNOWN = -1
 KITTI_TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
 """Category ids are places in this list, from 1; types that a detector adds come after them."""
 
+_INFO = {
+    "id": "0",
+    "source": 0,
+    "name": "directshape",
+    "split": "refined",
+    "version": "1",
+    "url": "",
+    "coordinates": "left colour camera: x right, y down, z forward, metres; whole numbers are pixel centres",
+}
 
-class Coco3dDataset:
-    """Collects frames; `content` is the dictionary of the JSON file."""
 
-    def __init__(self) -> None:
+class Coco3dExporter(Exporter):
+    """Collects the frames of a run, and writes them at the end."""
+
+    def __init__(self, path: Path, run: RunFolder) -> None:
+        self.path, self.image_ids = path, image_numbers(run.frame_ids)
         self.category_ids = {name: number for number, name in enumerate(KITTI_TYPES, start=1)}
         self.images: list[dict[str, Any]] = []
         self.annotations: list[dict[str, Any]] = []
 
-    def add(self, frame: FrameResult, loaded: LoadedFrame, image_id: int, file_path: str) -> None:
-        """Add a frame.
-
-        Args:
-            frame: its boxes.
-            loaded: its calibration and the size of its left image.
-            image_id: a number of its own.
-            file_path: of the left image, as the file shall name it.
-        """
-        height, width = loaded.frame.sizes[0].tolist()
-        K_left = loaded.frame.camera.K_left[0].double().numpy()
-        t_cam_ref = loaded.frame.camera.t_cam_ref[0].double().numpy()
-        self.images.append(
-            {
-                "id": image_id,
-                "dataset_id": 0,
-                "width": width,
-                "height": height,
-                "file_path": file_path,
-                "K": K_left.tolist(),
-                "src_90_rotate": 0,
-                "src_flagged": False,
-            }
-        )
-        for one in frame.objects:
-            ids = {"id": len(self.annotations) + 1, "image_id": image_id}
-            category = {"category_id": self._category_id(one.line.type), "category_name": one.line.type.lower()}
+    def add(self, source: FrameSource) -> None:
+        frame = source.with_images("the sizes and intrinsics that coco3d lists").frame
+        height, width = frame.sizes[0].tolist()
+        K_left, t_cam_ref = (x[0].double().numpy() for x in (frame.camera.K_left, frame.camera.t_cam_ref))
+        image = {"id": self.image_ids[source.frame_id], "dataset_id": 0, "width": width, "height": height}
+        fixed = {"K": K_left.tolist(), "src_90_rotate": 0, "src_flagged": False}
+        self.images.append({**image, "file_path": _image_path(source), **fixed})
+        for one in source.refined.objects:
+            name = one.line.type
+            category_id = self.category_ids.setdefault(name, len(self.category_ids) + 1)
+            ids = {"id": len(self.annotations) + 1, "image_id": image["id"], "category_id": category_id}
             box = _box_fields(one, one.centre_ref + t_cam_ref, K_left, (width, height))
-            self.annotations.append({**ids, **category, **_detection_fields(one), **box})
+            self.annotations.append({**ids, "category_name": name.lower(), **_detection_fields(one), **box})
 
-    def _category_id(self, name: str) -> int:
-        return self.category_ids.setdefault(name, len(self.category_ids) + 1)
-
-    @property
-    def content(self) -> dict[str, Any]:
-        """What the file holds."""
-        info = {
-            "id": "0",
-            "source": 0,
-            "name": "directshape",
-            "split": "refined",
-            "version": "1",
-            "url": "",
-            "coordinates": "left colour camera: x right, y down, z forward, metres; whole numbers are pixel centres",
-        }
+    def finish(self) -> None:
         categories = [
             {"id": number, "name": name.lower(), "supercategory": "object"}
             for name, number in self.category_ids.items()
         ]
-        return {"info": info, "images": self.images, "categories": categories, "annotations": self.annotations}
+        content = {"info": _INFO, "images": self.images, "categories": categories, "annotations": self.annotations}
+        write_json(self.path, content)
+
+
+def _image_path(source: FrameSource) -> str:
+    """The left image, from the root of the data set where that is known."""
+    dataset, root = source.inputs.dataset, source.inputs.data_root
+    if dataset is None:
+        raise InputError("--data", "the data set of the run, for the names of its images", "nothing")
+    path = dataset.input_files(source.frame_id)["image_left"]
+    return path.name if root is None or not path.is_relative_to(root) else path.relative_to(root).as_posix()
 
 
 def _detection_fields(one: ResultObject) -> dict[str, Any]:
@@ -107,7 +101,11 @@ def _box_fields(
     height, width, length = one.hwl.tolist()
     corners_cam = centre_cam + 0.5 * (_CORNERS * [length, height, width]) @ one.R_ref_obj.T
     is_behind = bool((corners_cam[:, 2] <= 0).any())
-    projected, truncated = _projected_boxes(corners_cam, K_left, size_wh)
+    projected = cut = np.full((2, 2), _UNKNOWN)
+    if not is_behind:
+        uv = (corners_cam @ K_left.T)[:, :2] / corners_cam[:, 2:]
+        projected = np.array([uv.min(axis=0), uv.max(axis=0)])
+        cut = projected.clip(0, np.array(size_wh) - 1)
     return {
         "valid3D": True,
         "center_cam": centre_cam.tolist(),
@@ -115,20 +113,9 @@ def _box_fields(
         "R_cam": one.R_ref_obj.tolist(),
         "bbox3D_cam": corners_cam.tolist(),
         "behind_camera": is_behind,
-        "bbox2D_proj": [_UNKNOWN] * 4 if is_behind else projected,
-        "bbox2D_trunc": [_UNKNOWN] * 4 if is_behind else truncated,
+        "bbox2D_proj": projected.ravel().tolist(),
+        "bbox2D_trunc": cut.ravel().tolist(),
     }
-
-
-def _projected_boxes(
-    corners_cam: NDArray[np.float64], K_left: NDArray[np.float64], size_wh: tuple[int, int]
-) -> tuple[list[float], list[float]]:
-    """The 2D box of the projected corners, as it is and cut off at the borders of the image; meaningless behind."""
-    depth = np.where(corners_cam[:, 2:] > 0, corners_cam[:, 2:], 1.0)
-    uv = (corners_cam @ K_left.T)[:, :2] / depth
-    whole = np.array([uv.min(axis=0), uv.max(axis=0)])
-    cut = whole.clip(0, np.array(size_wh) - 1)
-    return whole.ravel().tolist(), cut.ravel().tolist()
 
 
 def image_numbers(frame_ids: Sequence[str]) -> dict[str, int]:

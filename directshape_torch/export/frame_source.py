@@ -70,29 +70,16 @@ class FrameSource:
             raise InputError("--data", f"the data set of the run, for {purpose}", "nothing")
         return self.loaded
 
-    def image_path(self) -> str:
-        """The left image, from the root of the data set where that is known."""
-        dataset = self.inputs.dataset
-        if dataset is None:
-            raise InputError("--data", "the data set of the run, for the names of its images", "nothing")
-        path, root = dataset.input_files(self.frame_id)["image_left"], self.inputs.data_root
-        return path.name if root is None or not path.is_relative_to(root) else path.relative_to(root).as_posix()
-
     @cached_property
     def painted(self) -> PaintedFrame:
-        """Surfaces with colours."""
-        return PaintedFrame(self.refined, self.prior, self.loaded, self.inputs.mirror)
-
-    @property
-    def prior(self) -> ShapePrior:
-        """The shapes that the codes of the run belong to.
+        """Surfaces with colours.
 
         Raises:
-            InputError: it was not given.
+            InputError: the shapes of the run were not given.
         """
         if self.inputs.prior is None:
             raise InputError("--prior", "the shape prior of the run", "nothing")
-        return self.inputs.prior
+        return PaintedFrame(self.refined, self.inputs.prior, self.loaded, self.inputs.mirror)
 
 
 class Exporter:

@@ -70,12 +70,12 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
     scene = trimesh.Scene(metadata={"frame_id": painted.frame.frame_id, "vertices": "left camera frame, metres"})
     for index, one in enumerate(painted.objects):
         mesh, paint = painted.mesh(index, finer=True)
-        mesh.metadata.update(car_extras(one, painted.frame))
+        mesh.metadata.update(_extras(one, painted.frame))
         _add(scene, f"car_{one.line.line_number}", mesh, paint)
     if loaded is not None:
         ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
-        count = len(ground.vertices)
-        _add(scene, "ground", ground, Paint(np.full((count, 3), _GREY_OF_GROUND, np.uint8), np.zeros(count, np.uint8)))
+        grey = np.full((len(ground.vertices), 3), _GREY_OF_GROUND, np.uint8)
+        _add(scene, "ground", ground, Paint(grey, np.zeros(len(grey), np.uint8)))
     return _glb(scene)
 
 
@@ -105,17 +105,14 @@ class _MovingCar:
         one, frame = painted.objects[index], painted.frame
         mesh, paint = painted.mesh(index, finer=True)
         mesh.apply_transform(np.linalg.inv(self.T_cam_obj[frame.frame_id]))
-        mesh.metadata.update(car_extras(one, frame))
+        mesh.metadata.update(_extras(one, frame))
         scene = trimesh.Scene(metadata={"frame_ids": list(self.T_cam_obj), "vertices": "object frame, metres"})
         place: Callable[..., None] = scene.graph.update
         place(frame_to=_CAMERA, matrix=T_GLTF_CAM)
         _add(scene, _CAR, mesh, paint, _CAMERA)
         numbers = image_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
-        seconds = _SECONDS_A_FRAME * np.array(list(numbers.values()))
-        return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], self._poses()))
-
-    def _poses(self) -> NDArray[np.float64]:
-        return np.stack(list(self.T_cam_obj.values()))
+        seconds, poses = _SECONDS_A_FRAME * np.array(list(numbers.values())), np.stack(list(self.T_cam_obj.values()))
+        return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], poses))
 
 
 def _animate(
@@ -154,7 +151,7 @@ def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: s
     return len(tree["accessors"]) - 1
 
 
-def car_extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
+def _extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
     """What is said of a car beside its surface, for `extras`."""
     return {
         "frame_id": frame.frame_id,

@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
+from directshape_torch.export.frame_source import FrameSource
+from directshape_torch.files.atomic_files import write_bytes, write_json
+from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.run_folder import COPIED, FrameResult
+from directshape_torch.io.run_folder import COPIED, FrameResult, result_path
 
-KITTI_JSON_SCHEMA_VERSION = 1
 _FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 
 
-def kitti_json(frame: FrameResult) -> dict[str, Any]:
-    """All lines of the result file of a frame by the names of their columns, and how sure the refinement is."""
-    return {
+def write_kitti(folder: Path, source: FrameSource) -> None:
+    """`kitti/data/NNNNNN.txt`, the result file byte for byte, and all its lines as `kitti/json/NNNNNN.json`."""
+    frame, frame_id = source.refined, source.frame_id
+    write_bytes(folder / "kitti" / "data" / f"{frame_id}.txt", read_bytes(result_path(source.run.path, frame_id)))
+    content = {
         "schema": "directshape kitti results",
-        "schema_version": KITTI_JSON_SCHEMA_VERSION,
-        "frame_id": frame.frame_id,
+        "schema_version": 1,
+        "frame_id": frame_id,
         "coordinates": _FRAME,
         "objects": [{**_columns(line), **_refinement(frame, line)} for line in frame.lines],
     }
+    write_json(folder / "kitti" / "json" / f"{frame_id}.json", content)
 
 
 def _columns(line: KittiObject) -> dict[str, Any]:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from directshape_torch.config import PointCloudConfig
 from directshape_torch.evaluation.shape_truth import EstimatedCar
 from directshape_torch.export.visible_surface import FrameView, Points
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.observation.car_points import car_points
 from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.visualize.drawing import picture_of
+from directshape_torch.stereo_matching.disparity import with_disparity
+from directshape_torch.visualize.drawing import View
 
 if TYPE_CHECKING:
     import trimesh
@@ -32,34 +35,14 @@ _MOST_SUBDIVISIONS = 2
 # How far from the mirrored place a seen point may lie to lend its colour; about an edge of the mesh.
 _MIRROR_REACH_M = 0.12
 _SEED = 0
+_ALL_POINTS = 10_000_000
 
 
-@dataclass(frozen=True)
-class Paint:
-    """Colours of N surface points.
+class Paint(NamedTuple):
+    """Colours of N surface points."""
 
-    Attributes:
-        rgb: (N, 3) uint8, sRGB.
-        source: (N,) uint8: 2 seen in the image, 1 mirrored by the car's plane of symmetry, 0 neutral grey.
-    """
-
-    rgb: NDArray[np.uint8]
-    source: NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class SurfaceSamples:
-    """N points spread evenly by area over the whole closed surface of a car.
-
-    Attributes:
-        points_cam: (N, 3) metres, left camera frame.
-        normals_cam: (N, 3) outward, of the mesh's triangles.
-        paint: their colours.
-    """
-
-    points_cam: Points
-    normals_cam: Points
-    paint: Paint
+    rgb: NDArray[np.uint8]  # (N, 3) sRGB
+    source: NDArray[np.uint8]  # (N,) 2 seen in the image, 1 mirrored by the car's plane of symmetry, 0 neutral grey
 
 
 class PaintedFrame:
@@ -73,14 +56,17 @@ class PaintedFrame:
     """
 
     def __init__(self, frame: FrameResult, prior: ShapePrior, loaded: LoadedFrame | None, mirror: bool = True) -> None:
-        self.frame, self.prior, self.mirror = frame, prior, mirror
-        self.objects = frame.refined_cars
-        shapes = frame.shapes
+        self.frame, self.prior, self.loaded, self.mirror = frame, prior, loaded, mirror
+        self.objects, shapes = frame.refined_cars, frame.shapes
         self.cars = [
             EstimatedCar(prior, torch.from_numpy(shapes.codes[o.car]), torch.from_numpy(shapes.T_cam_obj[o.car]))
             for o in self.objects
         ]
-        self.view = None if loaded is None else frame_view(frame, loaded, self.cars)
+        self.view = None
+        if loaded is not None:
+            image, masks = View.of_frame(loaded.frame), _masks_of_lines(loaded)
+            of_cars = [masks.get(one.line.line_number) for one in self.objects]
+            self.view = FrameView(image.picture, image.K, self.cars, of_cars)
 
     def mesh(self, index: int, finer: bool = False) -> tuple[trimesh.Trimesh, Paint]:
         """Surface of the refined car `index` in the left camera frame, and the colours of its vertices.
@@ -92,18 +78,46 @@ class PaintedFrame:
         mesh = self._mesh(index)
         if finer and self.view is not None:
             mesh = _subdivided(mesh, self.view)
-        return mesh, self.paint(index, mesh.vertices, mesh.vertex_normals)
+        return mesh, self._paint(index, mesh.vertices, mesh.vertex_normals)
 
-    def samples(self, index: int, count: int) -> SurfaceSamples:
-        """`count` points of the surface of the refined car `index`, always the same ones."""
+    def samples(self, index: int, count: int) -> tuple[Points, Points, Paint]:
+        """Points spread evenly by area over the whole surface of the refined car `index`, always the same ones.
+
+        Returns:
+            Points (count, 3), metres, left camera frame; outward normals of their triangles (count, 3); colours.
+        """
         from trimesh.sample import sample_surface
 
         mesh = self._mesh(index)
         points, faces = sample_surface(mesh, count, seed=_SEED)[:2]
         points_cam, normals_cam = np.asarray(points, dtype=np.float64), np.asarray(mesh.face_normals[faces])
-        return SurfaceSamples(points_cam, normals_cam, self.paint(index, points_cam, normals_cam))
+        return points_cam, normals_cam, self._paint(index, points_cam, normals_cam)
 
-    def paint(self, index: int, points_cam: Points, normals_cam: Points) -> Paint:
+    def stereo_points(self) -> dict[int, tuple[Points, NDArray[np.uint8]]]:
+        """What dense stereo measures on each car, by its line number: points (N, 3), metres, and colours (N, 3).
+
+        A car's pixels are those of its left mask, of its 2D box where it has none; kept are those above the ground and
+        near the car, as the point cloud methods of the refinement take them. The rig's bias is taken off where it is
+        known.
+        """
+        if self.loaded is None or self.view is None:
+            return {}
+        every_point = replace(PointCloudConfig(), max_points=_ALL_POINTS)
+        samples = car_points(with_disparity(self.loaded.frame), self.loaded.detections, every_point)
+        rows, points_cam = samples.object_index.numpy(), samples.points_cam.double().numpy()
+        found = {}
+        for row, detected in enumerate(self.loaded.detected_objects):
+            own = points_cam[rows == row]
+            if len(own):
+                found[detected.line_number] = own, self.view.colours(own)
+        return found
+
+    def _mesh(self, index: int) -> trimesh.Trimesh:
+        car = self.cars[index]
+        values = self.prior.values(car.code[None].to(self.prior.origin))[0]
+        return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, car.T_cam_obj)
+
+    def _paint(self, index: int, points_cam: Points, normals_cam: Points) -> Paint:
         """Colours of points on the surface of a car; see `FrameView.is_seen`."""
         paint = Paint(np.full((len(points_cam), 3), NEUTRAL_RGB, dtype=np.uint8), np.zeros(len(points_cam), np.uint8))
         if self.view is None:
@@ -112,31 +126,12 @@ class PaintedFrame:
         paint.rgb[seen] = self.view.colours(points_cam[seen])
         paint.source[seen] = SEEN
         if self.mirror:
-            _mirror(paint, self._to_object(index, points_cam))
+            T_cam_obj = self.cars[index].T_cam_obj.double().numpy()
+            _mirror(paint, (points_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3])
         return paint
 
-    def _mesh(self, index: int) -> trimesh.Trimesh:
-        car = self.cars[index]
-        values = self.prior.values(car.code[None].to(self.prior.origin))[0]
-        return sdf_to_mesh(values, self.prior.origin, self.prior.spacing_m, car.T_cam_obj)
 
-    def _to_object(self, index: int, points_cam: Points) -> Points:
-        T_cam_obj = self.cars[index].T_cam_obj.double().numpy()
-        return np.asarray((points_cam - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3])
-
-
-def frame_view(frame: FrameResult, loaded: LoadedFrame, cars: list[EstimatedCar]) -> FrameView:
-    """The left image of a frame with its refined cars and the masks that were found for them."""
-    masks = masks_of_lines(loaded)
-    return FrameView(
-        picture_of(loaded.frame.images_left[0]),
-        loaded.frame.camera.K_left[0].double().cpu().numpy(),
-        cars,
-        [masks.get(one.line.line_number) for one in frame.refined_cars],
-    )
-
-
-def masks_of_lines(loaded: LoadedFrame) -> Mapping[int, NDArray[np.bool_]]:
+def _masks_of_lines(loaded: LoadedFrame) -> dict[int, NDArray[np.bool_]]:
     """The left mask (H, W) of each line that has one, without its outermost pixels, which also show what is beside."""
     import cv2
 

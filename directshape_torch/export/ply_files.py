@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.export.painted_cars import Paint
+from directshape_torch.export.frame_source import FrameSource
 from directshape_torch.export.visible_surface import Points
-
-if TYPE_CHECKING:
-    import trimesh
+from directshape_torch.files.atomic_files import write_bytes
 
 _HEADER = "ply\nformat binary_little_endian 1.0\ncomment left camera frame: x right, y down, z forward, metres\n"
 
 
-def mesh_ply(mesh: trimesh.Trimesh, paint: Paint) -> bytes:
-    """A car's surface with normals, sRGB colours and `color_source` (see `Paint`) at its vertices."""
+def write_ply(folder: Path, source: FrameSource) -> None:
+    """`ply/NNNNNN_LINE.ply`: the surface of each refined car, with normals, sRGB and `color_source` (see `Paint`)."""
     from trimesh.exchange.ply import export_ply
     from trimesh.visual import ColorVisuals
 
-    opaque = np.full((len(paint.rgb), 1), 255, dtype=np.uint8)
-    mesh.visual = ColorVisuals(mesh, vertex_colors=np.concatenate([paint.rgb, opaque], axis=1))
-    mesh.vertex_attributes["color_source"] = paint.source
-    content: bytes = export_ply(mesh, vertex_normal=True)
-    return content
+    for index, one in enumerate(source.painted.objects):
+        mesh, paint = source.painted.mesh(index)
+        opaque = np.full((len(paint.rgb), 1), 255, dtype=np.uint8)
+        mesh.visual = ColorVisuals(mesh, vertex_colors=np.concatenate([paint.rgb, opaque], axis=1))
+        mesh.vertex_attributes["color_source"] = paint.source
+        content: bytes = export_ply(mesh, vertex_normal=True)
+        write_bytes(folder / "ply" / f"{source.frame_id}_{one.line.line_number}.ply", content)
+
+
+def write_points(folder: Path, source: FrameSource) -> None:
+    """`points/NNNNNN_LINE.ply` of each refined car, and beside it `.._stereo.ply` where stereo saw any."""
+    painted, measured = source.painted, source.painted.stereo_points()
+    for index, one in enumerate(painted.objects):
+        stem = folder / "points" / f"{source.frame_id}_{one.line.line_number}"
+        points_cam, normals_cam, paint = painted.samples(index, source.inputs.points_per_car)
+        write_bytes(f"{stem}.ply", points_ply(points_cam, paint.rgb, normals_cam, paint.source))
+        if one.line.line_number in measured:
+            write_bytes(f"{stem}_stereo.ply", points_ply(*measured[one.line.line_number]))
 
 
 def points_ply(

@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import MissingDependencyError
 
-FRAME, ITERATION = "frame", "iteration"
-"""The timelines: numbers of frames; iterations of all frames, one after another."""
+if TYPE_CHECKING:
+    import trimesh
 
+# The timelines: numbers of frames; iterations of all frames, one after another.
+_FRAME, _ITERATION = "frame", "iteration"
 _STATES_PER_SECOND = 3.0
 
 
@@ -56,7 +58,7 @@ class RerunStream:
     def at(self, frame: int | None = None, iteration: int | None = None) -> None:
         """What is logged from here on belongs to these places of the two timelines, or to none of theirs."""
         self._stream.reset_time()
-        for timeline, place in ((FRAME, frame), (ITERATION, iteration)):
+        for timeline, place in ((_FRAME, frame), (_ITERATION, iteration)):
             if place is not None:
                 self._stream.set_time(timeline, sequence=place)
 
@@ -71,21 +73,19 @@ class RerunStream:
     def log_mesh(
         self,
         entity: str,
-        vertices_cam: NDArray[Any],
-        faces: NDArray[Any],
-        normals: NDArray[Any] | None = None,
+        mesh: trimesh.Trimesh,
         colours: NDArray[np.uint8] | None = None,
         colour: tuple[int, int, int] | None = None,
     ) -> None:
         """Triangles with a colour for each vertex, or one for all."""
-        mesh = self.rr.Mesh3D(
-            vertex_positions=np.asarray(vertices_cam, dtype=np.float32),
-            triangle_indices=np.asarray(faces, dtype=np.uint32),
-            vertex_normals=None if normals is None else np.asarray(normals, dtype=np.float32),
+        made = self.rr.Mesh3D(
+            vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
+            triangle_indices=np.asarray(mesh.faces, dtype=np.uint32),
+            vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float32),
             vertex_colors=colours,
             albedo_factor=None if colour is None else [*colour, 255],
         )
-        self.log(entity, mesh)
+        self.log(entity, made)
 
     def log_boxes(
         self,
@@ -111,19 +111,14 @@ class RerunStream:
         )
         self.log(entity, boxes)
 
-    def close(self) -> None:
-        """Write the end and move the file to its place."""
-        self._end()
-        os.replace(self._temporary, self.path)
-
-    def abandon(self) -> None:
-        """Leave no file behind."""
-        self._end()
-        self._temporary.unlink(missing_ok=True)
-
-    def _end(self) -> None:
+    def close(self, keep: bool = True) -> None:
+        """Write the end and move the file to its place, or leave none behind."""
         self._stream.flush()
         self._stream.disconnect()
+        if keep:
+            os.replace(self._temporary, self.path)
+        else:
+            self._temporary.unlink(missing_ok=True)
 
 
 def _blueprint(size_wh: tuple[int, int], with_iterations: bool) -> Any:
@@ -150,7 +145,7 @@ def _blueprint(size_wh: tuple[int, int], with_iterations: bool) -> Any:
         views.append(seen_right)
     # Above and behind the camera, so that the street lies ahead.
     eye = rrb.EyeControls3D(position=[-7.0, -8.0, -9.0], look_target=[1.0, 1.0, 14.0], eye_up=[0.0, -1.0, 0.0])
-    timeline = ITERATION if with_iterations else FRAME
+    timeline = _ITERATION if with_iterations else _FRAME
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Spatial3DView(origin="world", name="3D", eye_controls=eye), rrb.Vertical(*views)),
         rrb.TimePanel(timeline=timeline, fps=_STATES_PER_SECOND, play_state="paused"),

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.evaluation.shape_truth import EstimatedCar
+from directshape_torch.visualize.drawing import Array
 
 Points = NDArray[np.float64]
 
@@ -21,19 +22,12 @@ _LEAST_RAY_COSINE = 0.2
 
 @dataclass(frozen=True)
 class FrameView:
-    """The left image of a frame and the refined cars that it shows.
+    """The left image of a frame and the refined cars that it shows."""
 
-    Attributes:
-        image: (H, W, 3) RGB uint8.
-        K_left: (3, 3) pixels.
-        cars: the refined cars, which hide themselves and one another.
-        masks: for each of them the left pixels (H, W) that are known to show it, or None where nothing is known.
-    """
-
-    image: NDArray[np.uint8]
-    K_left: NDArray[np.float64]
-    cars: Sequence[EstimatedCar]
-    masks: Sequence[NDArray[np.bool_] | None]
+    image: NDArray[np.uint8]  # (H, W, 3) RGB
+    K_left: Array  # (3, 3) pixels
+    cars: Sequence[EstimatedCar]  # which hide themselves and one another
+    masks: Sequence[NDArray[np.bool_] | None]  # (H, W) left pixels known to show each car, None where nothing is known
 
     def is_seen(
         self,
@@ -44,10 +38,13 @@ class FrameView:
         """Which points the camera sees: turned towards it, in the image, on the car's mask, and hidden by no car."""
         distance = np.linalg.norm(points_cam, axis=1)
         cosine = -(points_cam * normals_cam).sum(axis=1) / np.maximum(distance, 1e-9)
+        height, width = self.image.shape[:2]
+        uv, mask = self._project(points_cam), self.masks[car]
         seen = (cosine > _LEAST_RAY_COSINE) & (points_cam[:, 2] > 0)
-        uv = self.project(points_cam)
-        seen &= self._in_image(uv)
-        seen[seen] = self._on_mask(car, uv[seen])
+        seen &= ((uv >= 0) & (uv <= np.array([width - 1, height - 1]))).all(axis=1)
+        if mask is not None:
+            column, row = np.rint(uv[seen]).astype(np.int64).T
+            seen[seen] = mask[row, column]
         for other in (car, *(row for row in range(len(self.cars)) if row != car)):
             rows = np.flatnonzero(seen)
             depth = self.cars[other].points_at_pixels(uv[rows], torch.from_numpy(self.K_left))[:, 2]
@@ -57,28 +54,14 @@ class FrameView:
 
     def colours(self, points_cam: Points) -> NDArray[np.uint8]:
         """The image's colours (N, 3) at the points, sRGB, between the four nearest pixels."""
-        height, width = self.image.shape[:2]
-        uv = self.project(points_cam).clip(0, [width - 1, height - 1])
-        u, v = np.minimum(uv, [max(width - 2, 0), max(height - 2, 0)]).astype(np.int64).T
-        du, dv = (uv - np.stack([u, v], axis=1)).T[:, :, None]
-        right, below = np.minimum(u + 1, width - 1), np.minimum(v + 1, height - 1)
-        above = (1 - du) * self.image[v, u] + du * self.image[v, right]
-        beneath = (1 - du) * self.image[below, u] + du * self.image[below, right]
-        return np.asarray(np.rint((1 - dv) * above + dv * beneath).astype(np.uint8))
+        from scipy.ndimage import map_coordinates
 
-    def project(self, points_cam: Points) -> NDArray[np.float64]:
+        at = self._project(points_cam).T[::-1]
+        channels = [map_coordinates(self.image[..., k], at, np.float64, order=1, mode="nearest") for k in range(3)]
+        return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+
+    def _project(self, points_cam: Points) -> NDArray[np.float64]:
         """Pixels (N, 2) of points; meaningless behind the camera."""
         homogeneous = points_cam @ self.K_left.T
         depth = homogeneous[:, 2:]
         return np.asarray(homogeneous[:, :2] / np.where(depth > 0, depth, 1.0))
-
-    def _in_image(self, uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-        height, width = self.image.shape[:2]
-        return np.asarray((uv >= 0).all(axis=1) & (uv <= np.array([width - 1, height - 1])).all(axis=1))
-
-    def _on_mask(self, car: int, uv: NDArray[np.float64]) -> NDArray[np.bool_]:
-        mask = self.masks[car]
-        if mask is None:
-            return np.ones(len(uv), dtype=bool)
-        column, row = np.rint(uv).astype(np.int64).T
-        return np.asarray(mask[row, column])
