@@ -25,25 +25,15 @@ _DEPTH_BINS_M = (0.0, 10.0, 20.0, 30.0, 45.0, float("inf"))
 
 @dataclass(frozen=True)
 class ComparedCar:
-    """One detection with its label, before and after.
+    """One detection with its label, before and after."""
 
-    Attributes:
-        frame_id: the frame.
-        detection_line: line of both result files, from 1.
-        label_line: line of the label file, from 1.
-        depth_m: of the label's box along the optical axis, metres.
-        height_px: of the label's 2D box.
-        score: the detector's, or None.
-        before, after: errors of the two boxes.
-    """
-
-    frame_id: str
-    detection_line: int
-    label_line: int
-    depth_m: float
-    height_px: float
-    score: float | None
-    before: CarErrors
+    frame_id: str  # the frame
+    detection_line: int  # line of both result files, from 1
+    label_line: int  # line of the label file, from 1
+    depth_m: float  # of the label's box along the optical axis, metres
+    height_px: float  # of the label's 2D box
+    score: float | None  # the detector's, or None
+    before: CarErrors  # errors of the two boxes
     after: CarErrors
 
 
@@ -70,40 +60,24 @@ METRICS = (
 
 @dataclass(frozen=True)
 class GroupSummary:
-    """Figures of a group of detections.
+    """Figures of a group of detections."""
 
-    Attributes:
-        name: of the group.
-        num_detections: n, detections compared.
-        metrics: by `Metric.key`; empty for an empty group.
-        worse_share: share of detections whose BEV IoU fell by more than 0.05; None for an empty group.
-    """
-
-    name: str
-    num_detections: int
-    metrics: dict[str, MetricSummary]
-    worse_share: Estimate | None
+    name: str  # of the group
+    num_detections: int  # n, detections compared
+    metrics: dict[str, MetricSummary]  # by `Metric.key`; empty for an empty group
+    worse_share: Estimate | None  # share of detections whose BEV IoU fell by more than 0.05; None for an empty group
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Everything `compare_results` finds.
+    """Everything `compare_results` finds."""
 
-    Attributes:
-        cars: every counted label with a detection, in the order of frames and detection lines.
-        overall: figures over detections.
-        by_depth: figures for bins of the label's depth.
-        num_frames: frames compared.
-        num_labels_counted: labels that count, found by a detection or not.
-        num_filtered_out: found labels whose detection had no mask, where only those with one count.
-    """
-
-    cars: tuple[ComparedCar, ...]
-    overall: GroupSummary
-    by_depth: tuple[GroupSummary, ...]
-    num_frames: int
-    num_labels_counted: int
-    num_filtered_out: int
+    cars: tuple[ComparedCar, ...]  # every counted label with a detection, in the order of frames and detection lines
+    overall: GroupSummary  # figures over detections
+    by_depth: tuple[GroupSummary, ...]  # figures for bins of the label's depth
+    num_frames: int  # frames compared
+    num_labels_counted: int  # labels that count, found by a detection or not
+    num_filtered_out: int  # found labels whose detection had no mask, where only those with one count
 
 
 def compare_results(

@@ -25,66 +25,40 @@ from directshape_torch.shape.shape_prior import ShapePrior
 
 @dataclass(frozen=True)
 class EvaluatedCar:
-    """One label with a detection and a true surface.
+    """One label with a detection and a true surface."""
 
-    Attributes:
-        frame_id: the frame.
-        detection_line, label_line: lines of their files, from 1.
-        status: how the refinement of the car ended.
-        depth_m: of the label's box along the optical axis, metres.
-        segment: which pixels of the left image are the car's.
-        before: errors of the mean shape at the pose of the detection.
-        after: errors of the refined shape.
-    """
-
-    frame_id: str
-    detection_line: int
+    frame_id: str  # the frame
+    detection_line: int  # lines of their files, from 1
     label_line: int
-    status: str
-    depth_m: float
-    segment: str
-    before: ShapeError
-    after: ShapeError
+    status: str  # how the refinement of the car ended
+    depth_m: float  # of the label's box along the optical axis, metres
+    segment: str  # which pixels of the left image are the car's
+    before: ShapeError  # errors of the mean shape at the pose of the detection
+    after: ShapeError  # errors of the refined shape
 
 
 @dataclass(frozen=True)
 class ShapeCurve:
-    """One metric over tau: its mean over cars.
+    """One metric over tau: its mean over cars."""
 
-    Attributes:
-        metric: "completeness", "accuracy", "f1" (shares) or "rmse_m" (metres).
-        taus_m: (T,) metres.
-        num_cars: (T,) cars in the mean: all, or for RMSE those with a matched point both before and after.
-        summaries: (T,) before, after and change; None where there is no such car.
-    """
-
-    metric: str
-    taus_m: tuple[float, ...]
+    metric: str  # "completeness", "accuracy", "f1" (shares) or "rmse_m" (metres)
+    taus_m: tuple[float, ...]  # (T,) metres
+    # (T,) cars in the mean: all, or for RMSE those with a matched point both before and after.
     num_cars: tuple[int, ...]
-    summaries: tuple[MetricSummary | None, ...]
+    summaries: tuple[MetricSummary | None, ...]  # (T,) before, after and change; None where there is no such car
 
 
 @dataclass(frozen=True)
 class ShapeScores:
-    """Everything `evaluate_shapes` finds.
+    """Everything `evaluate_shapes` finds."""
 
-    Attributes:
-        cars: in the order of frames and detection lines.
-        curves: one for each of `METRICS`.
-        num_frames: frames evaluated.
-        num_labels_counted: labels that count in these frames.
-        num_without_truth: of these, labels without a true surface: no mask, or no known depth in it.
-        num_without_detection: of the others, labels that no detection was refined for.
-        mean_num_true: true points a car, mean.
-    """
-
-    cars: tuple[EvaluatedCar, ...]
-    curves: tuple[ShapeCurve, ...]
-    num_frames: int
-    num_labels_counted: int
-    num_without_truth: int
-    num_without_detection: int
-    mean_num_true: float
+    cars: tuple[EvaluatedCar, ...]  # in the order of frames and detection lines
+    curves: tuple[ShapeCurve, ...]  # one for each of `METRICS`
+    num_frames: int  # frames evaluated
+    num_labels_counted: int  # labels that count in these frames
+    num_without_truth: int  # of these, labels without a true surface: no mask, or no known depth in it
+    num_without_detection: int  # of the others, labels that no detection was refined for
+    mean_num_true: float  # true points a car, mean
 
 
 METRICS = ("completeness", "accuracy", "f1", "rmse_m")

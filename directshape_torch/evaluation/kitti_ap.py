@@ -20,50 +20,32 @@ ObjectsByFrame = Mapping[str, Sequence[KittiObject]]
 
 @dataclass(frozen=True)
 class ApScore:
-    """Scores of one metric at one overlap and difficulty, in percent.
+    """Scores of one metric at one overlap and difficulty, in percent."""
 
-    Attributes:
-        metric: 2d (image boxes), bev (bird's-eye view) or 3d.
-        minimum_iou: a detection is right if it overlaps its label by more than this.
-        difficulty: easy, moderate or hard.
-        num_labels: labels that count.
-        ap_r11, ap_r40: average precision over 11 and over 40 recall points.
-        ap_area: area under the same curve over its true recalls; for sets of fewer than 41 labels, where the devkit's
-            recall points cannot all be reached and both figures above fall short.
-        aos_r11, aos_r40: average orientation similarity, of 2d alone; None where the results carry no alpha.
-        curve: what the figures are made of.
-    """
-
-    metric: Metric
-    minimum_iou: float
-    difficulty: str
-    num_labels: int
-    ap_r11: float
+    metric: Metric  # 2d (image boxes), bev (bird's-eye view) or 3d
+    minimum_iou: float  # a detection is right if it overlaps its label by more than this
+    difficulty: str  # easy, moderate or hard
+    num_labels: int  # labels that count
+    ap_r11: float  # average precision over 11 and over 40 recall points
     ap_r40: float
+    # Area under the same curve over its true recalls; for sets of fewer than 41 labels, where the devkit's recall
+    # points cannot all be reached and both figures above fall short.
     ap_area: float
-    aos_r11: float | None
+    aos_r11: float | None  # average orientation similarity, of 2d alone; None where the results carry no alpha
     aos_r40: float | None
-    curve: Curve
+    curve: Curve  # what the figures are made of
 
 
 @dataclass(frozen=True)
 class KittiScores:
-    """Everything `evaluate_kitti` finds.
+    """Everything `evaluate_kitti` finds."""
 
-    Attributes:
-        object_type: the class.
-        num_frames: frames evaluated.
-        num_frames_without_results: those of them that have no results; their labels are missed.
-        num_result_frames_unused: frames that have results and are not evaluated.
-        num_detections: detections of the class in the evaluated frames.
-        scores: for every metric, overlap and difficulty; bev and 3d are left out where no detection has a 3D box.
-    """
-
-    object_type: str
-    num_frames: int
-    num_frames_without_results: int
-    num_result_frames_unused: int
-    num_detections: int
+    object_type: str  # the class
+    num_frames: int  # frames evaluated
+    num_frames_without_results: int  # those of them that have no results; their labels are missed
+    num_result_frames_unused: int  # frames that have results and are not evaluated
+    num_detections: int  # detections of the class in the evaluated frames
+    # For every metric, overlap and difficulty; bev and 3d are left out where no detection has a 3D box.
     scores: tuple[ApScore, ...]
 
     def score(self, metric: str, minimum_iou: float, difficulty: str) -> ApScore:

@@ -19,19 +19,12 @@ _MINIMUM_IOU_2D = 0.3
 
 @dataclass(frozen=True)
 class CountedLabels:
-    """Which labels a comparison counts: the class, and what can fairly be asked of an image.
+    """Which labels a comparison counts: the class, and what can fairly be asked of an image."""
 
-    Attributes:
-        types: class names.
-        minimum_height_px: of the 2D box.
-        maximum_occluded: KITTI's level, 0 visible, 1 partly, 2 largely occluded.
-        maximum_truncated: share of the object outside the image.
-    """
-
-    types: tuple[str, ...] = ("Car",)
-    minimum_height_px: float = 25.0
-    maximum_occluded: int = 1
-    maximum_truncated: float = 0.5
+    types: tuple[str, ...] = ("Car",)  # class names
+    minimum_height_px: float = 25.0  # of the 2D box
+    maximum_occluded: int = 1  # KITTI's level, 0 visible, 1 partly, 2 largely occluded
+    maximum_truncated: float = 0.5  # share of the object outside the image
 
     def counts(self, label: KittiObject) -> bool:
         """Whether a label counts."""

@@ -16,26 +16,19 @@ from directshape_torch.shape.shape_prior import ShapePrior
 
 @dataclass(frozen=True)
 class ExportInputs:
-    """What an export may use beside the run itself.
+    """What an export may use beside the run itself."""
 
-    Attributes:
-        prior: the shapes of the run; None: exports without surfaces.
-        dataset: images, calibrations, masks and detections of the run's frames; None: exports without colours, and
-            none that need an image.
-        data_root: folder that names of images begin in, where a file lists them.
-        has_detections: whether the detections of that data set are those of the run; else its results stand for them.
-        refiner: repeats the refinement, for the iterations in a recording; then the detections must be the run's.
-        mirror: colour what the image does not show by the other side of the car.
-        points_per_car: points spread over a surface.
-    """
-
-    prior: ShapePrior | None = None
+    prior: ShapePrior | None = None  # the shapes of the run; None: exports without surfaces
+    # Images, calibrations, masks and detections of the run's frames; None: exports without colours, and none that need
+    # an image.
     dataset: StereoDataset | None = None
-    data_root: Path | None = None
+    data_root: Path | None = None  # folder that names of images begin in, where a file lists them
+    # Whether the detections of that data set are those of the run; else its results stand for them.
     has_detections: bool = False
+    # Repeats the refinement, for the iterations in a recording; then the detections must be the run's.
     refiner: DirectShapeRefiner | None = None
-    mirror: bool = True
-    points_per_car: int = 10_000
+    mirror: bool = True  # colour what the image does not show by the other side of the car
+    points_per_car: int = 10_000  # points spread over a surface
 
     def __post_init__(self) -> None:
         if self.points_per_car < 1:

@@ -19,16 +19,11 @@ _WORDS = {"image_left": "left image", "image_right": "right image", "ground_plan
 
 @dataclass
 class InputReader:
-    """Reads inputs of the frames of a run and keeps in mind what it could not use.
+    """Reads inputs of the frames of a run and keeps in mind what it could not use."""
 
-    Attributes:
-        dataset: the frames of the run, or None where nobody said where they lie.
-        has_detections: whether its detections are those that went in; else others stand in for them.
-        problems: what is wrong, and with which frames.
-    """
-
-    dataset: FileStereoDataset | None = None
-    has_detections: bool = False
+    dataset: FileStereoDataset | None = None  # the frames of the run, or None where nobody said where they lie
+    has_detections: bool = False  # whether its detections are those that went in; else others stand in for them
+    # What is wrong, and with which frames.
     problems: defaultdict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
 
     def detections(self, result: FrameResult) -> list[KittiObject] | None:

@@ -26,21 +26,13 @@ _LEAST_DEPTH_M = 15.0
 
 @dataclass(frozen=True)
 class Footprint:
-    """One box of the view from above.
+    """One box of the view from above."""
 
-    Attributes:
-        corners_cam: (8, 3) in the order of `box_corners`: the first two are at the front.
-        colour: of its outline.
-        thickness: of its outline, pixels.
-        label: text beside it, or "".
-        is_framed: whether the picture is made large enough to show it.
-    """
-
-    corners_cam: Array
-    colour: Colour
-    thickness: int = 1
-    label: str = ""
-    is_framed: bool = True
+    corners_cam: Array  # (8, 3) in the order of `box_corners`: the first two are at the front
+    colour: Colour  # of its outline
+    thickness: int = 1  # of its outline, pixels
+    label: str = ""  # text beside it, or ""
+    is_framed: bool = True  # whether the picture is made large enough to show it
 
 
 @dataclass(frozen=True)

@@ -25,28 +25,21 @@ from directshape_torch.terms.cars import CarBatch, CarState
 
 @dataclass(frozen=True)
 class RefinementTrace:
-    """All states that the cars of a call went through, N + 1 of B cars; the input is the first.
+    """All states that the cars of a call went through, N + 1 of B cars; the input is the first."""
 
-    Attributes:
-        result: of the refiner. Where it gives a car its input back, the trace still shows what was tried.
-        states: (N + 1) states of all B cars. A car that is done, or never took part, keeps its state.
-        stage: (N + 1) number of the stage that led to each state; -1 for the input and the start of a search.
-        accepted: (N + 1, B) bool: the step to this state was taken.
-        costs: (N + 1, B, T) of each term, all at the pixel sets and sharpness of the final stage, so that they can be
-            compared; NaN for cars that did not take part.
-        rows: (R,) numbers of the cars that took part among the B cars, ascending.
-        last_stage: of these R cars, whose settings the costs have.
-        pixels: of these R cars.
-    """
-
+    # Of the refiner. Where it gives a car its input back, the trace still shows what was tried.
     result: RefinementResult
+    # (N + 1) states of all B cars. A car that is done, or never took part, keeps its state.
     states: tuple[CarState, ...]
+    # (N + 1) number of the stage that led to each state; -1 for the input and the start of a search.
     stage: tuple[int, ...]
-    accepted: Tensor
+    accepted: Tensor  # (N + 1, B) bool: the step to this state was taken
+    # (N + 1, B, T) of each term, all at the pixel sets and sharpness of the final stage, so that they can be compared;
+    # NaN for cars that did not take part.
     costs: Tensor
-    rows: Tensor
-    last_stage: CarStage
-    pixels: Observation
+    rows: Tensor  # (R,) numbers of the cars that took part among the B cars, ascending
+    last_stage: CarStage  # of these R cars, whose settings the costs have
+    pixels: Observation  # of these R cars
 
     def __len__(self) -> int:
         return len(self.states)
