@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.report_runs import FinishedRun, finished_run
+from helpers.finished_run import FinishedRun, finished_run
 
 from directshape_torch.cli.main import main
 

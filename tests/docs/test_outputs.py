@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from helpers.finished_run import FinishedRun, make_run
+from helpers.finished_run import FinishedRun, finished_run
 
 from directshape_torch.cli.export import _FORMATS
 from directshape_torch.cli.main import make_parser
@@ -21,7 +21,7 @@ TEXT = (Path(__file__).parent.parent.parent / "docs" / "outputs.md").read_text(e
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    return make_run(tmp_path_factory.mktemp("run"))
+    return finished_run(tmp_path_factory.mktemp("run"))
 
 
 def test_every_format_has_a_row() -> None:

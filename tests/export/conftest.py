@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from helpers.finished_run import FinishedRun, make_run
+from helpers.finished_run import FinishedRun, finished_run
 
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    return make_run(tmp_path_factory.mktemp("finished"))
+    return finished_run(tmp_path_factory.mktemp("finished"))

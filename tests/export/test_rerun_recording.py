@@ -75,7 +75,7 @@ def by_place(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def refiner_of(run: FinishedRun) -> DirectShapeRefiner:
-    config = config_from_mapping(RefinerConfig, run.folder.setting("refiner"))
+    config = config_from_mapping(RefinerConfig, run.folder().setting("refiner"))
     return DirectShapeRefiner(PCAShapePrior.load(run.root / "prior.npz"), config)
 
 
@@ -83,7 +83,7 @@ def refiner_of(run: FinishedRun) -> DirectShapeRefiner:
 def path(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rerun") / "sub" / "recording.rrd"
     inputs = replace(finished.inputs(), has_detections=True, refiner=refiner_of(finished))
-    export_run(finished.folder, path.parent, ["rerun"], inputs)
+    export_run(finished.folder(), path.parent, ["rerun"], inputs)
     assert [file.name for file in path.parent.iterdir()] == ["recording.rrd"]
     return path
 
@@ -180,7 +180,7 @@ def test_frames_show_the_refined_surfaces_with_the_colours_of_the_image(
     finished: FinishedRun, recording: Recording
 ) -> None:
     inputs = finished.inputs()
-    painted = PaintedFrame(finished.folder.read("000001"), finished.prior, inputs.dataset.load("000001"))  # type: ignore[union-attr]
+    painted = PaintedFrame(finished.folder().read("000001"), finished.prior, inputs.dataset.load("000001"))  # type: ignore[union-attr]
     for index, one in enumerate(painted.objects):
         mesh, paint = painted.mesh(index)
         entity = f"/world/cars/{one.line.line_number}"
@@ -248,7 +248,7 @@ def test_residuals_lie_on_their_cars_and_shrink(finished: FinishedRun, recording
 
 
 def test_without_a_refiner_there_are_frames_alone(finished: FinishedRun, tmp_path: Path) -> None:
-    export_run(finished.folder, tmp_path, ["rerun"], finished.inputs())
+    export_run(finished.folder(), tmp_path, ["rerun"], finished.inputs())
     recording = Recording(tmp_path / "recording.rrd")
     assert {place[1] for places in recording.rows.values() for place in places} == {None}
     assert {place[0] for place in recording.of("/world/cam/image", "blob")} == {0, 1}
@@ -272,7 +272,7 @@ def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -
     (root / "training" / "image_2" / "000001.png").write_bytes(b"no image")
     dataset = KittiStereoDataset(root, root / "detections", root / "masks")
     with pytest.raises(DataFormatError, match="000001"):
-        export_run(finished.folder, tmp_path / "out", ["rerun"], replace(finished.inputs(), dataset=dataset))
+        export_run(finished.folder(), tmp_path / "out", ["rerun"], replace(finished.inputs(), dataset=dataset))
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -286,11 +286,6 @@ def test_an_end_that_fails_leaves_nothing_half_written(
         export_run(RunFolder(finished.out, [0]), tmp_path, formats, finished.inputs())
     left = {path.name for path in tmp_path.iterdir()}
     assert left == ({"coco3d.json", "recording.rrd"} if recording_first else {"coco3d.json"})
-
-
-def test_without_images_there_is_no_recording(finished: FinishedRun, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--data: expected the data set of the run"):
-        export_run(finished.folder, tmp_path, ["rerun"], finished.inputs(with_images=False))
 
 
 def test_iterations_need_the_detections_of_the_run(finished: FinishedRun) -> None:
@@ -310,4 +305,4 @@ def test_without_rerun_the_error_says_what_to_install(
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingDependencyError, match=r"pip install 'directshape_torch\[viewer\]'"):
-        export_run(finished.folder, tmp_path, ["rerun"], finished.inputs())
+        export_run(finished.folder(), tmp_path, ["rerun"], finished.inputs())

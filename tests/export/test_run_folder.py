@@ -15,7 +15,7 @@ from directshape_torch.status import Status
 
 
 def test_objects_are_the_lines_with_boxes(finished: FinishedRun) -> None:
-    frame = finished.folder.read("000000")
+    frame = finished.folder().read("000000")
     assert [one.line.type for one in frame.objects] == ["Car", "Pedestrian", "Car"]
     assert [one.car for one in frame.objects] == [0, -1, 1]
     assert frame.objects[1].status == COPIED
@@ -28,7 +28,7 @@ def test_objects_are_the_lines_with_boxes(finished: FinishedRun) -> None:
 
 
 def test_the_centre_is_half_a_height_above_the_bottom(finished: FinishedRun) -> None:
-    pedestrian = finished.folder.read("000000").objects[1]
+    pedestrian = finished.folder().read("000000").objects[1]
     # Pedestrian .. 1.80 0.60 0.60 -4.00 1.65 9.00 0.10, and y points down.
     np.testing.assert_allclose(pedestrian.centre_ref, [-4.0, 0.75, 9.0], atol=1e-12)
     np.testing.assert_allclose(pedestrian.R_ref_obj[:, 0], [np.cos(0.1), 0, -np.sin(0.1)], atol=1e-12)
@@ -40,8 +40,8 @@ def test_frames_are_named_in_any_way(finished: FinishedRun, wanted: list[str | i
 
 
 def test_all_finished_frames_are_the_default(finished: FinishedRun) -> None:
-    assert finished.folder.frame_ids == FRAMES
-    assert finished.folder.classes == ("Car",)
+    assert finished.folder().frame_ids == FRAMES
+    assert finished.folder().classes == ("Car",)
 
 
 def test_unknown_frames_are_named(finished: FinishedRun) -> None:

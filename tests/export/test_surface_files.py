@@ -31,7 +31,7 @@ LINES = (1, 3)
 @pytest.fixture(scope="module")
 def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("surfaces")
-    export_run(finished.folder, folder, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
+    export_run(finished.folder(), folder, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
     return folder
 
 
@@ -141,13 +141,6 @@ def test_glb_stands_upright_and_looks_along_minus_z(exported: Path) -> None:
     assert points[:, 2].max() < 0
 
 
-def test_glb_normals_point_outward(finished: FinishedRun, exported: Path) -> None:
-    file = glb(exported / "glb" / "000000.glb")
-    points, normals = (file.attribute("car_1", one).astype(np.float64) for one in ("POSITION", "NORMAL"))
-    outside = distances(finished, "000000", 0, points + 0.05 * normals)
-    assert (outside > distances(finished, "000000", 0, points)).mean() > 0.999
-
-
 def test_glb_shows_the_image_where_it_is_seen(finished: FinishedRun, exported: Path) -> None:
     file = glb(exported / "glb" / "000000.glb")
     colours = file.attribute("car_1", "COLOR_0")
@@ -171,7 +164,7 @@ def test_mirrored_colours_are_those_of_the_other_side(finished: FinishedRun, exp
     source = file.attribute("car_1", "_COLOR_SOURCE")[:, 0]
     T = state(finished, "000000")["T_cam_obj"][0].astype(np.float64)
     points_obj = (file.attribute("car_1", "POSITION") - T[:3, 3]) @ T[:3, :3]
-    seen, mirrored = np.flatnonzero(source == SEEN), np.flatnonzero(source == MIRRORED)[::37]
+    seen, mirrored = np.flatnonzero(source == SEEN), np.flatnonzero(source == MIRRORED)[::31]
     assert len(mirrored) > 20
     for vertex in mirrored:
         x, y, z = points_obj[vertex]
@@ -299,7 +292,7 @@ def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp
 
 
 def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path) -> None:
-    export_run(finished.folder, tmp_path, ["glb", "ply", "points"], finished.inputs(with_images=False))
+    export_run(finished.folder(), tmp_path, ["glb", "ply", "points"], finished.inputs(with_images=False))
     file = glb(tmp_path / "glb" / "000000.glb")
     assert set(file.nodes) == {"car_1", "car_3"}
     assert (file.attribute("car_1", "_COLOR_SOURCE") == NEUTRAL).all()
@@ -310,13 +303,13 @@ def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path
 
 
 def test_unseen_parts_stay_grey_where_mirroring_is_off(finished: FinishedRun, tmp_path: Path) -> None:
-    export_run(finished.folder, tmp_path, ["ply"], finished.inputs(mirror=False))
+    export_run(finished.folder(), tmp_path, ["ply"], finished.inputs(mirror=False))
     vertex = PlyData.read(str(tmp_path / "ply" / "000000_1.ply"))["vertex"]
     assert set(np.unique(vertex["color_source"])) == {NEUTRAL, SEEN}
 
 
 def test_equal_runs_give_equal_bytes(finished: FinishedRun, exported: Path, tmp_path: Path) -> None:
-    export_run(finished.folder, tmp_path, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
+    export_run(finished.folder(), tmp_path, ["glb", "ply", "points"], finished.inputs(points_per_car=3000))
     names = sorted(path.relative_to(exported) for path in exported.rglob("*.*"))
     assert len(names) > 10
     for name in names:

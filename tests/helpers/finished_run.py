@@ -1,54 +1,78 @@
-"""A small finished run: two frames of two ellipsoid cars and a pedestrian, refined for a few iterations."""
+"""A small finished run: frames and classes of any name, each with two ellipsoid cars and a pedestrian."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from directshape_torch.cli.main import main
+from directshape_torch.batch.options import MeshFormat, RefineOptions
+from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.config_files import load_config
 from directshape_torch.export.frame_source import ExportInputs
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.kitti_folder import write_data_set
 
 FRAMES = ("000000", "000001")
+# The model of trust does not know toys that have not converged.
+FEW_STEPS = (
+    "stages=[{contour_width_px: 0.5, image_level: 0, max_iterations: 4}]",
+    "acceptance.min_probability_better=0",
+)
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The data set, the output folder, and the shapes that both are made of."""
+    """A data set in KITTI's layout, and the folder of its refinement."""
 
     root: Path
     out: Path
-    prior: PCAShapePrior
-
-    def inputs(self, with_images: bool = True, **options: object) -> ExportInputs:
-        """What an export may use."""
-        dataset = KittiStereoDataset(self.root, self.root / "detections", self.root / "masks") if with_images else None
-        return ExportInputs(PCAShapePrior.load(self.root / "prior.npz"), dataset, self.root, **options)  # type: ignore[arg-type]
 
     @property
-    def folder(self) -> RunFolder:
-        """The run as exports read it."""
-        return RunFolder(self.out)
+    def prior(self) -> PCAShapePrior:
+        return PCAShapePrior.load(self.root / "prior.npz")
+
+    @property
+    def dataset(self) -> KittiStereoDataset:
+        return dataset_of(self.root, self.folder().classes)
+
+    def folder(self, *frames: str) -> RunFolder:
+        return RunFolder(self.out, frames or None)
+
+    def inputs(self, with_images: bool = True, **options: Any) -> ExportInputs:
+        """What an export may use."""
+        return ExportInputs(self.prior, self.dataset if with_images else None, self.root, **options)
 
 
-def make_run(folder: Path) -> FinishedRun:
+def dataset_of(root: Path, classes: tuple[str, ...] = ("Car",)) -> KittiStereoDataset:
+    return KittiStereoDataset(root, root / "detections", root / "masks", classes=classes)
+
+
+def refined(
+    root: Path, out: Path, classes: tuple[str, ...] = ("Car",), meshes: MeshFormat | None = None
+) -> FinishedRun:
+    """Refine a data set, a few iterations a car."""
+    refiner = DirectShapeRefiner(PCAShapePrior.load(root / "prior.npz"), load_config(None, FEW_STEPS))
+    refine_dataset(dataset_of(root, classes), refiner, out, RefineOptions(meshes=meshes))
+    return FinishedRun(root, out)
+
+
+def finished_run(
+    folder: Path,
+    frame_ids: tuple[str, ...] = FRAMES,
+    *,
+    out_name: str = "out",
+    car_type: str = "Car",
+    meshes: MeshFormat | None = None,
+) -> FinishedRun:
     """Write a data set to `folder/kitti` and refine it to `folder/out`."""
-    root, out = folder / "kitti", folder / "out"
-    root.mkdir()
-    prior = write_data_set(root, FRAMES)
-    words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks", "--out", out]
-    options = [
-        "--prior",
-        root / "prior.npz",
-        "--device",
-        "cpu",
-        "--rig",
-        "none",
-        "--set",
-        "stages=[{max_iterations: 6}]",
-    ]
-    assert main([str(word) for word in (*words, *options)]) == 0
-    return FinishedRun(root, out, prior)
+    root = folder / "kitti"
+    root.mkdir(parents=True)
+    write_data_set(root, frame_ids)
+    if car_type != "Car":
+        for path in (*(root / "detections" / "data").glob("*.txt"), *(root / "training" / "label_2").glob("*.txt")):
+            path.write_text(path.read_text().replace("Car ", f"{car_type} "))
+    return refined(root, folder / out_name, (car_type,), meshes)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from helpers.browser import chromium, console_problems, requested_urls, screenshot_of, set_viewport
-from helpers.report_runs import finished_run
+from helpers.finished_run import finished_run
 from helpers.synthetic_scene import cached_street
 
 from directshape_torch.files.atomic_files import write_png
