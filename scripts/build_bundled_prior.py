@@ -21,7 +21,8 @@ from tqdm import tqdm
 
 from directshape_torch.shape.kernel_pca_prior import KernelPCAShapePrior
 from directshape_torch.shape.mesh_to_sdf import GridSpec
-from directshape_torch.shape.parametric_cars import car_sdf, sample_car
+from directshape_torch.shape.parametric_cars import car_sdf
+from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PriorProvenance
 

@@ -22,12 +22,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from command_line import run_command
-from quality_calibration.fit import cross_validated, fit_head, fit_sigmas, in_view
+from quality_calibration.fit import calibrated, cross_validated, fit_head, fit_sigmas, in_view
 from quality_calibration.noise import LEVELS
 from quality_calibration.observations import WORSE_BY, Array, Observations, observe_dataset, observe_noisy
 from quality_calibration.report import (
@@ -42,7 +41,6 @@ from quality_calibration.report import (
 from directshape_torch.cli.options import frame_id_of
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.config_files import load_config
-from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.figures.trust_model import TrustModel
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner, KnownRig
@@ -99,29 +97,17 @@ BETTER = (
 NOT_WORSE = ("relative_decrease", "turned", "log_sigma_yaw", "mask_misfit_left", "log_profile_fall_before")
 
 
-class HeadColumns(NamedTuple):
-    """The columns of evidence that the two heads read."""
-
-    better: tuple[str, ...] = BETTER
-    not_worse: tuple[str, ...] = NOT_WORSE
-
-
-DEFAULT_COLUMNS = HeadColumns()
-
-
-def fitted(cars: Observations, provenance: dict[str, object], read: HeadColumns = DEFAULT_COLUMNS) -> TrustModel:
+def fitted(cars: Observations, provenance: dict[str, object]) -> TrustModel:
     """The model of some cars."""
-    scales = fit_sigmas(*in_view(cars))
-    better = fit_head(cars.evidence, cars.is_better, read.better)
-    not_worse = fit_head(cars.evidence, ~cars.is_worse, read.not_worse)
-    return TrustModel(better, not_worse, scales.factors, scales.floors, provenance)
+    better = fit_head(cars.evidence, cars.is_better, BETTER)
+    not_worse = fit_head(cars.evidence, ~cars.is_worse, NOT_WORSE)
+    return TrustModel(better, not_worse, *fit_sigmas(*in_view(cars)), provenance)
 
 
 def predictions(model: TrustModel, cars: Observations) -> Array:
     """Both probabilities and the four calibrated sigmas, (N, 6)."""
     evidence = torch.from_numpy(cars.evidence)
-    _, raw = in_view(cars)
-    sigmas = np.sqrt((np.array(model.sigma_factors) * raw) ** 2 + np.array(model.sigma_floors) ** 2)
+    sigmas = calibrated(in_view(cars)[1], model.sigma_factors, model.sigma_floors)
     return np.column_stack([model.better(evidence).numpy(), model.not_worse(evidence).numpy(), sigmas])
 
 
@@ -149,9 +135,8 @@ def run(args: argparse.Namespace) -> None:
     torch.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
     cars = development_cars(args)
-    read = HeadColumns(tuple(args.better), tuple(args.not_worse))
-    model = fitted(cars, _provenance(cars, args.set), read)
-    held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}, read), test))
+    model = fitted(cars, _provenance(cars, args.set))
+    held_out = cross_validated(cars, lambda train, test: predictions(fitted(train, {}), test))
     everything, usual, *levels = levels_of(judged("rendered, all", cars, held_out), "rendered")
     groups = [everything, usual, *levels, *judged_others(args, model)]
     model.save(args.model or args.out / "trust_model.json")
@@ -202,9 +187,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--model", type=Path, metavar="FILE", help="default OUT/trust_model.json")
-    head = {"nargs": "+", "choices": EVIDENCE_NAMES, "metavar": "COLUMN"}
-    parser.add_argument("--better", default=BETTER, help="evidence for it; default the bundled model's", **head)
-    parser.add_argument("--not-worse", default=NOT_WORSE, help="the same", **head)
     parser.add_argument(
         "--set", nargs="+", default=[], metavar="KEY=VALUE", help="other settings than those of the default"
     )

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jacobian_mutants.mutants import Mutant, mutants_of
-from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError
+from jacobian_mutants.runner import Outcome, UnmutatedFailureError, run_mutants
 from jacobian_mutants.targets import TARGETS, Target, reason_for
 from tqdm import tqdm
 
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         tests_of = {name: target.tests for name, target in targets.items()}
         try:
-            outcomes = MutationRunner(ROOT, options.processes).run(mutants, tests_of, finished)
+            outcomes = run_mutants(ROOT, mutants, tests_of, options.processes, finished)
         except UnmutatedFailureError as error:
             print(error, file=sys.stderr)
             return 2

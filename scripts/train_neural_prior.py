@@ -23,7 +23,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from directshape_torch.shape.neural_prior import NeuralShapePrior
-from directshape_torch.shape.parametric_cars import car_mesh, car_sdf, sample_car
+from directshape_torch.shape.parametric_cars import car_mesh, car_sdf
+from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_fit import training_codes
 from directshape_torch.shape.pca_prior import PriorProvenance
 from directshape_torch.shape.sdf_grid import zero_level_extents

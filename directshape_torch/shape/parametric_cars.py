@@ -12,34 +12,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from directshape_torch.errors import InputError
-from directshape_torch.shape.parametric_cars_types import BODY_TYPES, CarParameters, sample_car
+from directshape_torch.shape.parametric_cars_types import CarParameters
 
 if TYPE_CHECKING:
     import trimesh
     from scipy.spatial import cKDTree
 
-__all__ = [
-    "BODY_TYPES",
-    "GLASS",
-    "LIGHT",
-    "PAINT",
-    "PART_NAMES",
-    "PLATE",
-    "RIM",
-    "TRIM",
-    "TYRE",
-    "CarParameters",
-    "car_mesh",
-    "car_part_labels",
-    "car_sdf",
-    "sample_car",
-]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 PAINT, GLASS, TYRE, RIM, LIGHT, PLATE, TRIM = range(7)
-PART_NAMES: tuple[str, ...] = ("paint", "glass", "tyre", "rim", "light", "plate", "trim")
 _SURFACE_SPACING_M = 0.04
 
 _TABLE_SPACING_M = 0.02
@@ -198,6 +180,7 @@ def car_mesh(parameters: CarParameters, spacing_m: float = 0.03) -> trimesh.Trim
         InputError: spacing not within 5 mm to 0.2 m.
 
     Examples:
+        >>> from directshape_torch.shape.parametric_cars_types import sample_car
         >>> mesh = car_mesh(sample_car(3, "city"), spacing_m=0.08)
         >>> bool(mesh.is_watertight), bool(mesh.volume > 3.0)
         (True, True)
@@ -217,6 +200,7 @@ def car_sdf(parameters: CarParameters, points_obj: Array) -> Array:
     they are right to a few millimetres; the solid's implicit function is no distance where its parts are bent.
 
     Examples:
+        >>> from directshape_torch.shape.parametric_cars_types import sample_car
         >>> car = sample_car(3, "city")
         >>> bool(car_sdf(car, np.array([[0.0, -0.6, 0.0]]))[0] < -0.2)
         True
@@ -268,13 +252,13 @@ def car_part_labels(car: CarParameters, points_obj: Array) -> NDArray[np.int64]:
         points_obj: (N, 3) object frame (x forward, y down, ground at y = 0), metres.
 
     Returns:
-        (N,) of `PAINT, GLASS, TYRE, RIM, LIGHT, PLATE, TRIM`; `PART_NAMES[label]` is the word.
+        (N,) of `PAINT, GLASS, TYRE, RIM, LIGHT, PLATE, TRIM`.
 
     Examples:
-        >>> from directshape_torch.shape.parametric_cars import sample_car
+        >>> from directshape_torch.shape.parametric_cars_types import sample_car
         >>> car = sample_car(0, "saloon")
-        >>> PART_NAMES[car_part_labels(car, np.array([[0.5 * car.length, -0.02 - car.ground_clearance, 0.0]]))[0]]
-        'trim'
+        >>> bool(car_part_labels(car, np.array([[0.5 * car.length, -0.02 - car.ground_clearance, 0.0]]))[0] == TRIM)
+        True
     """
     x, height, side = points_obj[:, 0], -points_obj[:, 1], np.abs(points_obj[:, 2])
     labels = np.full(len(points_obj), PAINT, dtype=np.int64)

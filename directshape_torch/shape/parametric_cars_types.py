@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,147 +13,102 @@ from directshape_torch.errors import InputError
 
 @dataclass(frozen=True)
 class CarParameters:
-    """Measures of one car. Lengths in metres; `*_u` are distances behind the front end, `*_height` above the ground.
+    """Measures of one car. Lengths in metres; `*_u` are distances behind the front end, `*_height` above the ground."""
 
-    Attributes:
-        body_type: one of `BODY_TYPES`.
-        length, width, height: outer measures, without mirrors.
-        ground_clearance: height of the underbody between the axles.
-        bumper_clearance_front, bumper_clearance_rear: height of the lower edge of the bumpers.
-        wheelbase, front_axle_u: position of the wheels.
-        wheel_radius, wheel_width: tyre measures.
-        nose_height: height of the bonnet's leading edge.
-        nose_setback: how far that edge lies behind the bumper.
-        bonnet_bulge: height of the bonnet's arc over its chord.
-        cowl_u, cowl_height: foot of the windscreen.
-        roof_front_u, roof_front_drop: top of the windscreen, and how far it lies below the roof's highest point.
-        roof_peak_u: highest point of the roof.
-        roof_rear_u, roof_rear_drop: rear end of the roof, and how far it lies below the highest point.
-        rear_glass_base_u, rear_glass_base_height: foot of the rear window.
-        tail_height, tail_setback: upper rear edge of the boot or tailgate, and how far it lies before the rear end.
-        belt_height: lower edge of the side windows.
-        tumblehome: inward lean of the side windows, metres per metre of height.
-        sill_tuck: how far the body sides draw in from the belt to the sill.
-        taper_front, taper_rear: share of the half width that the plan view loses towards the ends.
-        bow_front, bow_rear: how far the corners lie behind the middle of the bumper, plan view.
-        roof_crown: how far roof and bonnet fall from the middle towards the sides.
-        edge_radius: rounding of the edges between the sides and roof, bonnet and ends.
-    """
-
-    body_type: str
-    length: float
+    body_type: str  # one of `BODY_TYPES`
+    length: float  # outer measures, without mirrors
     width: float
     height: float
-    ground_clearance: float
-    bumper_clearance_front: float
+    ground_clearance: float  # of the underbody between the axles
+    bumper_clearance_front: float  # height of the lower edge of the bumpers
     bumper_clearance_rear: float
     wheelbase: float
     front_axle_u: float
-    wheel_radius: float
+    wheel_radius: float  # of the tyres
     wheel_width: float
-    nose_height: float
-    nose_setback: float
-    bonnet_bulge: float
-    cowl_u: float
+    nose_height: float  # of the bonnet's leading edge
+    nose_setback: float  # by which that edge lies behind the bumper
+    bonnet_bulge: float  # height of the bonnet's arc over its chord
+    cowl_u: float  # foot of the windscreen
     cowl_height: float
-    roof_front_u: float
-    roof_front_drop: float
-    roof_peak_u: float
-    roof_rear_u: float
-    roof_rear_drop: float
-    rear_glass_base_u: float
+    roof_front_u: float  # top of the windscreen
+    roof_front_drop: float  # by which it lies below the roof's highest point
+    roof_peak_u: float  # highest point of the roof
+    roof_rear_u: float  # rear end of the roof
+    roof_rear_drop: float  # by which it lies below the highest point
+    rear_glass_base_u: float  # foot of the rear window
     rear_glass_base_height: float
-    tail_height: float
-    tail_setback: float
-    belt_height: float
-    tumblehome: float
-    sill_tuck: float
-    taper_front: float
+    tail_height: float  # upper rear edge of the boot or tailgate
+    tail_setback: float  # by which it lies before the rear end
+    belt_height: float  # lower edge of the side windows
+    tumblehome: float  # inward lean of the side windows, metres per metre of height
+    sill_tuck: float  # by which the body sides draw in from the belt to the sill
+    taper_front: float  # share of the half width that the plan view loses towards the ends
     taper_rear: float
-    bow_front: float
+    bow_front: float  # by which the corners lie behind the middle of the bumper, plan view
     bow_rear: float
-    roof_crown: float
-    edge_radius: float
+    roof_crown: float  # by which roof and bonnet fall from the middle towards the sides
+    edge_radius: float  # of the edges between the sides and roof, bonnet and ends
 
     def as_dict(self) -> dict[str, float | str]:
         """All measures by name, for a file."""
         return asdict(self)
 
 
-@dataclass(frozen=True)
-class BodyTypeStatistics:
-    """How one body type is shaped; pairs are (mean, standard deviation).
-
-    Positions are shares of the length, heights (but the drops, in metres) are shares of the height.
-    """
-
-    share: float
-    length: tuple[float, float]
-    width: tuple[float, float]
-    height: tuple[float, float]
-    clearance: float
-    front_axle: tuple[float, float]
-    wheelbase: tuple[float, float]
-    wheel_radius: tuple[float, float]
-    nose_height: tuple[float, float]
-    cowl: tuple[float, float]
-    cowl_height: tuple[float, float]
-    roof_front: tuple[float, float]
-    roof_rear: tuple[float, float]
-    roof_rear_drop: tuple[float, float]
-    rear_glass_base: tuple[float, float]
-    rear_glass_base_height: tuple[float, float]
-    tail_height: tuple[float, float]
-    tumblehome: tuple[float, float]
-
-
+# Columns of the table below, mean and standard deviation each but `share` and `clearance`. Positions are shares of the
+# length, heights (but the drop, in metres) are shares of the height.
+_COLUMNS = (
+    "share", "length", "width", "height", "clearance", "front_axle", "wheelbase", "wheel_radius", "nose_height", "cowl",
+    "cowl_height", "roof_front", "roof_rear", "roof_rear_drop", "rear_glass_base", "rear_glass_base_height",
+    "tail_height", "tumblehome",
+)  # fmt: skip
 # Typical measures of passenger cars of each class, adjusted by hand to how the resulting prior fits real cars; no
 # single model. The shares make the mixture's length, width and height those of KITTI's labelled cars (3.88, 1.63,
 # 1.53 m).
-_STATISTICS: Mapping[str, BodyTypeStatistics] = {
-    "city": BodyTypeStatistics(
+_STATISTICS: Mapping[str, tuple[Any, ...]] = {
+    "city": (
         0.16, (3.28, 0.14), (1.49, 0.09), (1.47, 0.05), 0.19,
         (0.200, 0.012), (0.665, 0.020), (0.280, 0.012), (0.52, 0.04),
         (0.235, 0.035), (0.675, 0.03), (0.455, 0.03), (0.875, 0.03), (0.04, 0.025),
         (0.965, 0.012), (0.64, 0.04), (0.58, 0.06), (0.36, 0.08),
     ),
-    "hatchback": BodyTypeStatistics(
+    "hatchback": (
         0.28, (3.72, 0.19), (1.60, 0.07), (1.47, 0.06), 0.19,
         (0.205, 0.012), (0.640, 0.018), (0.298, 0.014), (0.51, 0.04),
         (0.280, 0.025), (0.665, 0.025), (0.470, 0.025), (0.860, 0.04), (0.05, 0.03),
         (0.950, 0.020), (0.65, 0.04), (0.60, 0.06), (0.42, 0.08),
     ),
-    "saloon": BodyTypeStatistics(
+    "saloon": (
         0.12, (4.24, 0.23), (1.66, 0.07), (1.43, 0.05), 0.18,
         (0.195, 0.012), (0.595, 0.018), (0.310, 0.014), (0.51, 0.04),
         (0.300, 0.025), (0.665, 0.025), (0.445, 0.025), (0.705, 0.030), (0.035, 0.02),
         (0.835, 0.025), (0.71, 0.03), (0.68, 0.03), (0.46, 0.08),
     ),
-    "estate": BodyTypeStatistics(
+    "estate": (
         0.10, (4.25, 0.21), (1.66, 0.07), (1.47, 0.05), 0.18,
         (0.195, 0.012), (0.595, 0.018), (0.310, 0.014), (0.50, 0.04),
         (0.290, 0.025), (0.655, 0.025), (0.450, 0.025), (0.915, 0.025), (0.04, 0.025),
         (0.965, 0.012), (0.64, 0.04), (0.58, 0.06), (0.42, 0.08),
     ),
-    "suv": BodyTypeStatistics(
+    "suv": (
         0.11, (4.00, 0.30), (1.72, 0.08), (1.69, 0.07), 0.25,
         (0.195, 0.012), (0.605, 0.015), (0.350, 0.018), (0.57, 0.04),
         (0.270, 0.025), (0.665, 0.020), (0.430, 0.025), (0.915, 0.03), (0.04, 0.025),
         (0.970, 0.012), (0.64, 0.04), (0.59, 0.05), (0.30, 0.08),
     ),
-    "van": BodyTypeStatistics(
+    "van": (
         0.15, (3.80, 0.40), (1.68, 0.08), (1.76, 0.09), 0.20,
         (0.200, 0.012), (0.635, 0.020), (0.310, 0.014), (0.50, 0.04),
         (0.195, 0.045), (0.610, 0.030), (0.400, 0.03), (0.940, 0.025), (0.035, 0.02),
         (0.975, 0.010), (0.60, 0.04), (0.53, 0.05), (0.21, 0.08),
     ),
-    "coupe": BodyTypeStatistics(
+    "coupe": (
         0.06, (3.98, 0.23), (1.65, 0.07), (1.33, 0.05), 0.16,
         (0.200, 0.012), (0.600, 0.018), (0.305, 0.014), (0.52, 0.04),
         (0.330, 0.025), (0.670, 0.025), (0.475, 0.025), (0.670, 0.035), (0.035, 0.02),
         (0.855, 0.035), (0.71, 0.04), (0.67, 0.04), (0.50, 0.08),
     ),
-    "pickup": BodyTypeStatistics(
+    "pickup": (
         0.02, (4.90, 0.20), (1.75, 0.06), (1.72, 0.06), 0.24,
         (0.180, 0.012), (0.610, 0.015), (0.350, 0.018), (0.56, 0.04),
         (0.270, 0.020), (0.640, 0.020), (0.395, 0.020), (0.620, 0.030), (0.035, 0.02),
@@ -181,27 +137,27 @@ def sample_car(seed: int | np.random.Generator, body_type: str | None = None) ->
     """
     rng = np.random.default_rng(seed)
     if body_type is None:
-        shares = np.array([statistics.share for statistics in _STATISTICS.values()])
+        shares = np.array([row[0] for row in _STATISTICS.values()])
         body_type = str(rng.choice(BODY_TYPES, p=shares / shares.sum()))
     if body_type not in _STATISTICS:
         raise InputError("body_type", f"one of {', '.join(BODY_TYPES)}", repr(body_type))
-    return _draw(rng, body_type, _STATISTICS[body_type])
+    return _draw(rng, body_type, dict(zip(_COLUMNS, _STATISTICS[body_type], strict=True)))
 
 
-def _draw(rng: np.random.Generator, body_type: str, s: BodyTypeStatistics) -> CarParameters:
-    def draw(mean_and_deviation: tuple[float, float]) -> float:
-        mean, deviation = mean_and_deviation
+def _draw(rng: np.random.Generator, body_type: str, statistics: Mapping[str, Any]) -> CarParameters:
+    def draw(name: str) -> float:
+        mean, deviation = statistics[name]
         # Cut at two deviations: a rare extreme car would spoil the principal components.
         return float(mean + deviation * np.clip(rng.standard_normal(), -2.0, 2.0))
 
     def uniform(low: float, high: float) -> float:
         return float(rng.uniform(low, high))
 
-    length, width, height = draw(s.length), draw(s.width), draw(s.height)
-    cowl_height = height * draw(s.cowl_height)
-    roof_front, roof_rear = draw(s.roof_front), draw(s.roof_rear)
-    rear_glass_base_height = height * draw(s.rear_glass_base_height)
-    clearance = s.clearance + uniform(-0.04, 0.06)
+    length, width, height = draw("length"), draw("width"), draw("height")
+    cowl_height = height * draw("cowl_height")
+    roof_front, roof_rear = draw("roof_front"), draw("roof_rear")
+    rear_glass_base_height = height * draw("rear_glass_base_height")
+    clearance = statistics["clearance"] + uniform(-0.04, 0.06)
     return CarParameters(
         body_type=body_type,
         length=length,
@@ -210,26 +166,26 @@ def _draw(rng: np.random.Generator, body_type: str, s: BodyTypeStatistics) -> Ca
         ground_clearance=clearance,
         bumper_clearance_front=clearance + uniform(-0.02, 0.08),
         bumper_clearance_rear=clearance + uniform(0.03, 0.20),
-        wheelbase=length * draw(s.wheelbase),
-        front_axle_u=length * draw(s.front_axle),
-        wheel_radius=draw(s.wheel_radius),
+        wheelbase=length * draw("wheelbase"),
+        front_axle_u=length * draw("front_axle"),
+        wheel_radius=draw("wheel_radius"),
         wheel_width=uniform(0.17, 0.23),
-        nose_height=height * draw(s.nose_height),
+        nose_height=height * draw("nose_height"),
         nose_setback=uniform(0.06, 0.20),
         bonnet_bulge=uniform(0.01, 0.06),
-        cowl_u=length * draw(s.cowl),
+        cowl_u=length * draw("cowl"),
         cowl_height=cowl_height,
         roof_front_u=length * roof_front,
         roof_front_drop=uniform(0.01, 0.07) * (roof_rear - roof_front) / 0.4,
         roof_peak_u=length * (roof_front + uniform(0.2, 0.7) * (roof_rear - roof_front)),
         roof_rear_u=length * roof_rear,
-        roof_rear_drop=max(draw(s.roof_rear_drop), 0.01),
-        rear_glass_base_u=length * draw(s.rear_glass_base),
+        roof_rear_drop=max(draw("roof_rear_drop"), 0.01),
+        rear_glass_base_u=length * draw("rear_glass_base"),
         rear_glass_base_height=rear_glass_base_height,
-        tail_height=min(height * draw(s.tail_height), rear_glass_base_height),
+        tail_height=min(height * draw("tail_height"), rear_glass_base_height),
         tail_setback=uniform(0.03, 0.16),
         belt_height=cowl_height + uniform(-0.06, 0.03),
-        tumblehome=max(draw(s.tumblehome), 0.08),
+        tumblehome=max(draw("tumblehome"), 0.08),
         sill_tuck=uniform(0.02, 0.09),
         taper_front=uniform(0.03, 0.16),
         taper_rear=uniform(0.02, 0.18),

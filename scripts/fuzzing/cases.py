@@ -22,8 +22,8 @@ from directshape_torch.errors import DirectShapeError
 BUDGET_BYTES = 2**31
 _NO_MEMORY = ("allocate memory", "not enough memory", "insufficient memory", "cannot allocate")
 
-Case = Callable[[random.Random], tuple[str, bool]]
-"""Does one case: its name, and whether all is finite that must be."""
+Case = Callable[[random.Random], tuple[str, Callable[[], bool]]]
+"""Draws one case: its name, and what does it and says whether all is finite that must be."""
 
 
 def serve(kind: str) -> None:
@@ -45,27 +45,16 @@ def serve(kind: str) -> None:
 
 def answer(case: Case, seed: int) -> dict[str, object]:
     """How a case ended, and where it was raised what should not have been."""
-    name, outcome, said = "", "accepted", ""
+    name, act = case(random.Random(seed))
+    outcome, said = "accepted", ""
     try:
-        name, is_finite = case(random.Random(seed))
-        outcome = "accepted" if is_finite else "silent NaN"
-    except CaseError as failed:
-        name, error = failed.name, failed.error
-        if isinstance(error, DirectShapeError):
-            outcome = "refused"
-        elif isinstance(error, MemoryError) or any(word in str(error).lower() for word in _NO_MEMORY):
-            outcome, said = "over memory", _where(error)
-        else:
-            outcome, said = "foreign exception", _where(error)
+        outcome = "accepted" if act() else "silent NaN"
+    except DirectShapeError:
+        outcome = "refused"
+    except Exception as error:
+        is_memory = isinstance(error, MemoryError) or any(word in str(error).lower() for word in _NO_MEMORY)
+        outcome, said = "over memory" if is_memory else "foreign exception", _where(error)
     return {"seed": seed, "name": name, "outcome": outcome, "said": said}
-
-
-class CaseError(Exception):
-    """A case raised."""
-
-    def __init__(self, name: str, error: Exception) -> None:
-        super().__init__(name)
-        self.name, self.error = name, error
 
 
 def _odd_calls() -> Case:
@@ -73,12 +62,9 @@ def _odd_calls() -> Case:
 
     calls()
 
-    def case(chance: random.Random) -> tuple[str, bool]:
+    def case(chance: random.Random) -> tuple[str, Callable[[], bool]]:
         odd = odd_call(chance)
-        try:
-            return odd.name, odd.outcome()
-        except Exception as error:
-            raise CaseError(odd.name, error) from error
+        return odd.name, odd.outcome
 
     return case
 
@@ -94,17 +80,20 @@ def _damaged_files(folder: Path) -> Case:
     for sample in whole.values():
         sample.read()
 
-    def case(chance: random.Random) -> tuple[str, bool]:
+    def case(chance: random.Random) -> tuple[str, Callable[[], bool]]:
         name = chance.choice(list(whole))
         sample = whole[name]
-        sample.path.write_bytes(damaged(contents[name], sample.path.name, chance))
-        try:
-            sample.read()
-        except Exception as error:
-            raise CaseError(name, error) from error
-        finally:
-            sample.path.write_bytes(contents[name])
-        return name, True
+        content = damaged(contents[name], sample.path.name, chance)
+
+        def read() -> bool:
+            sample.path.write_bytes(content)
+            try:
+                sample.read()
+            finally:
+                sample.path.write_bytes(contents[name])
+            return True
+
+        return name, read
 
     return case
 

@@ -14,15 +14,14 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing.connection import Connection
 from pathlib import Path
 from types import CodeType, FunctionType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import pytest
 
@@ -46,11 +45,11 @@ class Outcome:
     error: str  # first line of what the test reported: a wrong number, or a crash
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """Mutants of one file that the same tests must catch; what a collecting process gets."""
 
-    root: str
+    root: Path
+    target: str
     tests: tuple[str, ...]
     source: bytes  # of the file without a mutation
     mutants: tuple[Mutant, ...]
@@ -60,83 +59,60 @@ class UnmutatedFailureError(Exception):
     """The tests named for a target fail, or could not be run, without any mutation."""
 
 
-class MutationRunner:
-    """Runs mutants of a tree.
+def run_mutants(
+    root: Path,
+    mutants: Sequence[tuple[str, Mutant]],
+    tests_of: Mapping[str, tuple[str, ...]],
+    processes: int,
+    finished: Callable[[Outcome], None],
+) -> list[Outcome]:
+    """Outcomes in the order of `mutants` (target, mutant); also checks that the tests pass unmutated.
 
     Args:
         root: the tree that holds the sources and `tests`.
+        mutants: targets and their mutants.
+        tests_of: the tests named for a target.
         processes: how many mutants run at once.
+        finished: told of each outcome.
+
+    Raises:
+        UnmutatedFailureError: the tests of a target fail without a mutation.
     """
-
-    def __init__(self, root: Path, processes: int = 2) -> None:
-        self.root, self.processes = root, processes
-        # Before the server of processes starts: its children inherit it.
-        os.environ.setdefault("OMP_NUM_THREADS", "1")
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(list(_PRELOADED))
-
-    def run(
-        self,
-        mutants: Sequence[tuple[str, Mutant]],
-        tests_of: dict[str, tuple[str, ...]],
-        finished: Callable[[Outcome], None],
-    ) -> list[Outcome]:
-        """Outcomes in the order of `mutants` (target, mutant); also checks that the tests pass unmutated.
-
-        Raises:
-            UnmutatedFailureError: the tests of a target fail without a mutation.
-        """
-        chunks: list[tuple[str, list[Mutant]]] = []
-        for target in dict.fromkeys(target for target, _ in mutants):
-            own = [mutant for name, mutant in mutants if name == target]
-            chunks += [(target, own[i : i + _CHUNK]) for i in range(0, len(own), _CHUNK)]
-        with ThreadPoolExecutor(self.processes) as pool:
-            try:
-                done = pool.map(lambda chunk: self._run_chunk(chunk[0], chunk[1], tests_of[chunk[0]], finished), chunks)
-                return [outcome for outcomes in done for outcome in outcomes]
-            except UnmutatedFailureError:
-                pool.shutdown(cancel_futures=True)
-                raise
-
-    def _run_chunk(
-        self, target: str, mutants: list[Mutant], tests: tuple[str, ...], finished: Callable[[Outcome], None]
-    ) -> list[Outcome]:
-        source = (self.root / mutants[0].path).read_bytes()
-        job = Job(str(self.root), tests, source, tuple(mutants))
-        receiver, sender = self._context.Pipe(duplex=False)
-        process = self._context.Process(target=_collect_and_fork, args=(job, sender))
-        process.start()
-        sender.close()
-        verdict, test, error = _received(receiver)
-        if verdict != "survived":
-            raise UnmutatedFailureError(f"{target}: {test or 'tests'} without a mutation: {error or verdict}")
-        outcomes = []
-        for mutant in mutants:
-            outcomes.append(Outcome(mutant, target, *_received(receiver)))
-            finished(outcomes[-1])
-        process.join()
-        return outcomes
+    jobs = []
+    for target in dict.fromkeys(target for target, _ in mutants):
+        own = [mutant for name, mutant in mutants if name == target]
+        source = (root / own[0].path).read_bytes()
+        chunks = (tuple(own[i : i + _CHUNK]) for i in range(0, len(own), _CHUNK))
+        jobs += [Job(root, target, tests_of[target], source, chunk) for chunk in chunks]
+    # Before the server of processes starts: its children inherit it.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(_PRELOADED))
+    outcomes: list[Outcome] = []
+    # A process for each job, for modules stay imported.
+    with ProcessPoolExecutor(processes, mp_context=context, max_tasks_per_child=1) as pool:
+        try:
+            for part in pool.map(_collect_and_fork, jobs):
+                outcomes += part
+                for outcome in part:
+                    finished(outcome)
+        except UnmutatedFailureError:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return outcomes
 
 
-def _received(receiver: Connection) -> tuple[Verdict, str, str]:
-    try:
-        answer: tuple[Verdict, str, str] = receiver.recv()
-    except EOFError:
-        return "no verdict", "", "the process that runs the tests ended"
-    return answer
-
-
-def _collect_and_fork(job: Job, sender: Connection) -> None:
-    """In a process of its own: sends the verdict of a job's tests without a mutation, then one for each mutant."""
+def _collect_and_fork(job: Job) -> list[Outcome]:
+    """In a process of its own: runs the tests without a mutation, then once for each mutant."""
     os.chdir(job.root)
-    plugin = ForkedTests(job, sender)
+    plugin = ForkedTests(job)
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         options = ["-q", f"--rootdir={job.root}", "-W", "ignore::pytest.PytestAssertRewriteWarning"]
         options += [option for name in ("cacheprovider", "xdist") for option in ("-p", f"no:{name}")]
         pytest.main([*options, *job.tests], plugins=[plugin])
-    if plugin.collection_error:
-        sender.send(("no verdict", "", plugin.collection_error))
-    sender.close()
+    if plugin.trouble:
+        raise UnmutatedFailureError(f"{job.target}: {plugin.trouble}")
+    return plugin.outcomes
 
 
 # A mutant may loop for ever; the slowest named tests take seconds, on a busy machine a minute.
@@ -144,18 +120,18 @@ TIMEOUT_S = 240.0
 
 
 class ForkedTests:
-    """Sends (verdict, failed test, its error) for the unmutated code where asked for, then for each mutant."""
+    """A plugin of pytest: the outcomes of a job's mutants, or the trouble that there is without a mutation."""
 
-    def __init__(self, job: Job, sender: Connection) -> None:
-        self._job, self._sender = job, sender
+    def __init__(self, job: Job) -> None:
+        self._job, self.outcomes = job, list[Outcome]()
         self._failed = self._error = ""
-        self.collection_error = "pytest ended before it had collected the tests"
+        self.trouble = "pytest ended before it had collected the tests"
         # The tree must win over an installed package.
-        sys.path.insert(0, job.root)
+        sys.path.insert(0, str(job.root))
 
     def pytest_collectreport(self, report: Any) -> None:
         if report.failed:
-            self.collection_error = f"{report.nodeid} cannot be imported: {_first_line(report)}"
+            self.trouble = f"{report.nodeid} cannot be imported: {_first_line(report)}"
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         if report.failed and not self._failed:
@@ -164,15 +140,14 @@ class ForkedTests:
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
         if session.testsfailed or not session.items:
             return True
-        self.collection_error = ""
         # Once without a mutation: it must pass, and leaves imports and rendered scenes in memory for the forks.
-        self._sender.send(self._run(session))
-        if self._failed:
-            return True
-        # A fork need not look for garbage in what is loaded by now, nor copy it by doing so.
-        gc.freeze()
-        for mutant in self._job.mutants:
-            self._sender.send(self._verdict(session, mutant))
+        verdict, test, error = self._run(session)
+        self.trouble = "" if verdict == "survived" else f"{test} without a mutation: {error}"
+        if not self.trouble:
+            # A fork need not look for garbage in what is loaded by now, nor copy it by doing so.
+            gc.freeze()
+            for mutant in self._job.mutants:
+                self.outcomes.append(Outcome(mutant, self._job.target, *self._verdict(session, mutant)))
         return True
 
     def _verdict(self, session: pytest.Session, mutant: Mutant) -> tuple[Verdict, str, str]:
@@ -197,7 +172,7 @@ class ForkedTests:
 
     def _run_mutated(self, session: pytest.Session, mutant: Mutant) -> tuple[Verdict, str, str]:
         try:
-            put_into_effect(mutant, self._job.source, Path(self._job.root))
+            put_into_effect(mutant, self._job.source, self._job.root)
         except (LookupError, ValueError) as error:
             return "no verdict", "", str(error)
         return self._run(session)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,30 +50,20 @@ def cross_validated(
     observations: Observations, fit_and_predict: Callable[[Observations, Observations], Array], num_folds: int = 12
 ) -> Array:
     """Predictions (N, ...) for each car from a fit that has seen no car of its group (frame)."""
-    groups = sorted(set(observations.group.tolist()))
-    fold_of = {group: index % num_folds for index, group in enumerate(groups)}
-    fold = np.array([fold_of[group] for group in observations.group.tolist()])
-    predictions: Array | None = None
-    for index in range(min(num_folds, len(groups))):
+    fold = np.unique(observations.group, return_inverse=True)[1] % num_folds
+    parts, places = [], []
+    for index in np.unique(fold):
         held = fold == index
-        part = fit_and_predict(observations.where(~held), observations.where(held))
-        if predictions is None:
-            predictions = np.full((len(observations), *part.shape[1:]), np.nan)
-        predictions[held] = part
-    assert predictions is not None
-    return predictions
+        parts.append(fit_and_predict(observations.where(~held), observations.where(held)))
+        places.append(np.flatnonzero(held))
+    return np.asarray(np.concatenate(parts)[np.argsort(np.concatenate(places))])
 
 
-@dataclass(frozen=True)
-class SigmaScales:
+class SigmaScales(NamedTuple):
     """`sigma^2 = (factor * raw)^2 + floor^2` along the ray, across it, vertically and of the heading."""
 
-    factors: tuple[float, float, float, float]
-    floors: tuple[float, float, float, float]
-
-    def __call__(self, raw: Array) -> Array:
-        """Calibrated sigmas (N, 4)."""
-        return np.asarray(np.sqrt((np.array(self.factors) * raw) ** 2 + np.array(self.floors) ** 2))
+    factors: tuple[float, ...]
+    floors: tuple[float, ...]
 
 
 def fit_sigmas(errors: Array, raw: Array) -> SigmaScales:
@@ -82,8 +72,12 @@ def fit_sigmas(errors: Array, raw: Array) -> SigmaScales:
     Of those that do, the floor is taken with the highest likelihood under Student's t of 4 degrees of freedom.
     """
     pairs = [_fit_sigma(np.abs(errors[:, i]), raw[:, i]) for i in range(4)]
-    factors, floors = zip(*pairs, strict=True)
-    return SigmaScales(factors, floors)
+    return SigmaScales(*zip(*pairs, strict=True))
+
+
+def calibrated(raw: Array, factors: Sequence[float], floors: Sequence[float]) -> Array:
+    """Sigmas (N, 4) in true units."""
+    return np.asarray(np.sqrt((np.array(factors) * raw) ** 2 + np.array(floors) ** 2))
 
 
 def _fit_sigma(error: Array, raw: Array) -> tuple[float, float]:

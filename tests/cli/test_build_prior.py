@@ -6,7 +6,8 @@ import pytest
 from directshape_torch.cli import build_prior
 from directshape_torch.cli.main import make_parser
 from directshape_torch.errors import InputError
-from directshape_torch.shape.parametric_cars import car_mesh, sample_car
+from directshape_torch.shape.parametric_cars import car_mesh
+from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 

@@ -64,7 +64,7 @@ def test_factors_and_floors_of_the_sigmas_are_recovered() -> None:
     scales = fit.fit_sigmas(errors, raw)
     np.testing.assert_allclose(scales.factors, FACTORS, rtol=0.15)
     np.testing.assert_allclose(scales.floors, FLOORS, rtol=0.25)
-    one, two = report.coverage(errors, scales(raw))
+    one, two = report.coverage(errors, fit.calibrated(raw, *scales))
     np.testing.assert_allclose(one, 0.683, atol=0.02)
     np.testing.assert_allclose(two, 0.954, atol=0.02)
 
@@ -163,16 +163,9 @@ def test_cars_that_are_kept_make_model_and_report(tmp_path: Path) -> None:
     arguments += ["--other", "kitti", "noisy", "m", "--out"]
     model = tmp_path / "model.json"
     assert calibrate_quality.main([*arguments, str(tmp_path / "out"), "--model", str(model)]) == 0
-    assert load_trust_model(model).provenance["cars"] == 480
+    made = load_trust_model(model)
+    assert (made.provenance["cars"], made.better.columns) == (480, calibrate_quality.BETTER)
     text = (tmp_path / "out" / "report.md").read_text()
     assert text.count("| rendered, all | ") == 5
     assert "| rendered, all | 480 | " in text
     assert "| kitti noisy | 48 | " in text
-
-
-def test_heads_read_the_columns_that_are_named() -> None:
-    read = calibrate_quality.HeadColumns(("log_profile_sigma", "turned"), ("outside_basin",))
-    model = calibrate_quality.fitted(simulated(600), {}, read)
-    assert model.better.columns == ("log_profile_sigma", "turned")
-    assert model.not_worse.columns == ("outside_basin",)
-    assert calibrate_quality.fitted(simulated(600), {}).better.columns == calibrate_quality.BETTER

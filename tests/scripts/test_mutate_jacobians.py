@@ -8,7 +8,7 @@ from pathlib import Path
 import mutate_jacobians
 import pytest
 from jacobian_mutants.mutants import Mutant, mutants_of
-from jacobian_mutants.runner import MutationRunner, Outcome, UnmutatedFailureError, function_of
+from jacobian_mutants.runner import Outcome, UnmutatedFailureError, function_of, run_mutants
 from jacobian_mutants.targets import EQUIVALENTS, TARGETS, Target, reason_for
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -108,8 +108,7 @@ def small_tree(tmp_path: Path) -> tuple[Path, Target]:
 def _run(root: Path, target: Target) -> tuple[list[Outcome], list[Mutant]]:
     mutants = mutants_of(target.path, (root / target.path).read_bytes(), target.functions)
     seen: list[Mutant] = []
-    runner = MutationRunner(root, processes=1)
-    outcomes = runner.run([("t", m) for m in mutants], {"t": target.tests}, lambda o: seen.append(o.mutant))
+    outcomes = run_mutants(root, [("t", m) for m in mutants], {"t": target.tests}, 1, lambda o: seen.append(o.mutant))
     return outcomes, seen
 
 

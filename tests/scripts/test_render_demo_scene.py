@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import render_demo_scene
 import torch
-from demo_scene import camera, car_surfaces, frame_files, labels, layout, motion, sensor, surfaces
+from demo_scene import camera, car_surfaces, frame_files, labels, layout, motion, surfaces
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_layout import tracking_layout
@@ -85,37 +85,6 @@ def test_label_of_a_known_box(scene: layout.SceneLayout) -> None:
     assert label.box_2d[3] == pytest.approx(172.854 + 721.5377 * 1.65 / 8.1)
 
 
-def test_truncation_is_the_share_of_the_box_outside(scene: layout.SceneLayout) -> None:
-    level = camera.CameraPose(1.65, 0.0, 0.0)
-    # A flat target at z = 10 from u = -c to c' : half of its width lies left of the picture.
-    middle = -camera.K[0, 2] * 10.0 / camera.K[0, 0]
-    car = layout.PlacedCar(scene.cars[0].parameters, layout.pose_on_road(middle, 10.0, -0.5 * np.pi), (0, 0, 0), 0.0)
-    label = labels.true_label(level, car, layout.box_corners_obj(1e-9, 2.0, 1.0), visible_share=1.0)
-    assert label.truncated == pytest.approx(0.5, abs=1e-6)
-    assert label.box_2d[0] == 0.0
-
-
-def test_detection_noise_has_the_stated_size() -> None:
-    truth = labels.CarLabel(0.0, 0, (500, 170, 600, 230), (1.5, 1.6, 3.9), (0.0, 1.5, 20.0), 0.3)
-    rng = np.random.default_rng(0)
-    draws = [labels.noisy_detection(rng, truth, labels.StereoNoise()) for _ in range(4000)]
-    location = np.array([d.location_ref for d in draws])
-    np.testing.assert_allclose(location.mean(axis=0), [0.0, 1.5, 20.0], atol=0.03)
-    np.testing.assert_allclose(location[:, 0].std(), 0.12, rtol=0.05)
-    np.testing.assert_allclose(location[:, 2].std(), 0.5, rtol=0.05)
-    yaw = np.array([d.rotation_y for d in draws])
-    np.testing.assert_allclose(np.degrees(yaw.std()), 5.0, rtol=0.05)
-    sizes = np.array([d.dimensions_hwl for d in draws])
-    np.testing.assert_allclose(sizes.mean(axis=0), [1.53, 1.63, 3.88], rtol=0.01)
-
-
-def test_lines_have_kittis_columns() -> None:
-    label = labels.CarLabel(0.1, 1, (1.0, 2.0, 3.0, 4.0), (1.5, 1.6, 3.9), (-1.0, 1.6, 10.0), 1.57)
-    assert labels.label_line(label) == "Car 0.10 1 1.67 1.00 2.00 3.00 4.00 1.50 1.60 3.90 -1.00 1.60 10.00 1.57"
-    assert labels.result_line(label, 0.9).split()[1:3] == ["-1", "-1"]
-    assert len(labels.result_line(label, 0.9).split()) == 16
-
-
 def test_car_parts_cover_the_whole_mesh(scene: layout.SceneLayout) -> None:
     car = scene.cars[0]
     model = car_surfaces.car_model(car, spacing_m=0.08)
@@ -176,30 +145,6 @@ def test_a_sequence_has_the_files_of_the_tracking_benchmark(tmp_path: Path) -> N
     )
     origin = [camera.transform(each.camera.T_cam_road, np.zeros((1, 3))) - camera.T_CAM_REF for each in layouts]
     np.testing.assert_allclose(camera.transform(T_first_second, origin[1]), origin[0], atol=1e-9)
-
-
-def test_masks_round_trip() -> None:
-    from pycocotools import mask as coco
-
-    instance = np.full((6, 9), -1)
-    instance[1:4, 2:5] = 0
-    instance[2:6, 6:8] = 2
-    entries = frame_files.mask_entries(instance, "left")
-    assert [entry["instance_id"] for entry in entries] == [1001, 1003]
-    assert entries[0]["bbox"] == [2.0, 1.0, 3.0, 3.0]
-    decoded = coco.decode(json.loads(json.dumps(entries[1]["segmentation"])))
-    np.testing.assert_array_equal(decoded.astype(bool), instance == 2)
-
-
-def test_developing_is_seeded_and_monotonic() -> None:
-    ramp = np.repeat(np.linspace(0.0, 2.0, 64)[None, :, None], 40, axis=0).repeat(3, axis=2)
-    first, second = (sensor.develop(np.random.default_rng(5), ramp, 1.0, 1.0) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    columns = first.mean(axis=(0, 2))
-    assert (np.diff(columns) > -1.0).all()
-    # The lens blur lets a little of the next column in.
-    assert columns[0] < 12
-    assert columns[-1] > 240
 
 
 def test_bundled_frame_is_complete_and_small() -> None:
