@@ -11,16 +11,13 @@ on to the root of the gradient, as the implicit modes need it. All is float64.
     python scripts/check_backward.py --out backward
     python scripts/check_backward.py --scene street --option default "silhouette.form=product" --mode implicit
 
-Written: `backward.csv`, a line for each option, mode, input and car, and the table of docs/backward.md, `backward.md`.
+Printed, and written as `backward.md`: the table of docs/backward.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
-import csv
-import io
-import itertools
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -256,26 +253,12 @@ def as_markdown(rows: Sequence[Row]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def as_csv(rows: Sequence[Row]) -> str:
-    """A line for each pair."""
-    file = io.StringIO()
-    writer = csv.writer(file)
-    writer.writerow(("option", "mode", "input", "car", "gradient", "difference", "smaller_difference", "smooth"))
-    for row, (mode, found) in ((one, each) for one in rows for each in one.gradients.items()):
-        if found is not None:
-            for number, car in itertools.product(range(len(found)), range(found.shape[1])):
-                values = (float(x[number, car]) for x in (found, row.numeric, row.numeric_smaller))
-                writer.writerow((row.option, mode, INPUTS[number], car, *values, bool(row.smooth[number, car])))
-    return file.getvalue()
-
-
 def run(args: argparse.Namespace) -> None:
     """Study, print, write."""
     scene = SCENES[args.scene](args.cars)
     rows = study(scene, args.option, args.mode, lambda line: print(line, file=sys.stderr))
     print(as_markdown(rows), end="")
     if args.out is not None:
-        write_text(args.out / "backward.csv", as_csv(rows))
         write_text(args.out / "backward.md", as_markdown(rows))
 
 
@@ -286,7 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--mode", nargs="+", default=list(MODES), choices=MODES, help="default all")
     parser.add_argument("--scene", choices=tuple(SCENES), default="bundled", help="default bundled")
     parser.add_argument("--cars", type=int, default=2, metavar="N", help="of the scene (default 2)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="for backward.csv and backward.md")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="for backward.md")
     torch.set_num_threads(1)
     return run_command(parser, run, arguments)
 

@@ -16,6 +16,7 @@ from directshape_torch.scene import Detections, FrameBatch, boxes_around
 from directshape_torch.scene_check.image_boxes import box_iou
 
 Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
 Floats = NDArray[np.float64]
 
 
@@ -86,34 +87,28 @@ def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameE
 def _frame_evidence(
     frames: FrameBatch, d: Detections, number: int, rows: NDArray[np.int64], size_hw: tuple[int, int]
 ) -> FrameEvidence:
-    camera = _camera_of(frames.camera, number)
     chosen = torch.from_numpy(rows).to(d.T_cam_obj.device)
-    masks = {side: _masks_of(d, side, chosen, size_hw) for side in ("left", "right")}
-    around = {side: boxes_around(each).double().cpu().numpy() for side, each in masks.items()}
+    masks = {side: _masks_of(d, side, chosen, size_hw) for side in SIDES}
+    around = {side: boxes_around(masks[side]).double().cpu().numpy() for side in SIDES}
+    has = {side: np.isfinite(around[side]).all(axis=1) for side in SIDES}
     T = d.T_cam_obj.index_select(0, chosen)
-    unknown = np.full(len(rows), np.nan)
     boxes = CarBoxes(
         _array(T[:, :3, 3]),
         _array(d.dimensions_hwl.index_select(0, chosen)),
         _array(rotation_y_from_pose(T)),
-        unknown,
+        np.full(len(rows), np.nan),
         _array(d.box_2d.index_select(0, chosen)),
     )
-    left = around["left"]
+    left = list(zip(around["left"], masks["left"].cpu().numpy(), has["left"], strict=True))
     return FrameEvidence(
         frame_id=frames.frame_ids[number],
         boxes=boxes,
-        mask_boxes={"left": left, "right": around["right"]},
-        overlap={
-            "left": box_iou(boxes.box_2d, left).diagonal(),
-            "right": box_iou(boxes.box_2d, around["right"]).diagonal(),
-        },
-        num_masks={"left": int(_has(left).sum()), "right": int(_has(around["right"]).sum())},
-        seen=tuple(box[None] if known else box[None][:0] for box, known in zip(left, _has(left), strict=True)),
-        masks=tuple(
-            mask.cpu().numpy() if known else None for mask, known in zip(masks["left"], _has(left), strict=True)
-        ),
-        camera=camera,
+        mask_boxes=around,
+        overlap={side: box_iou(boxes.box_2d, around[side]).diagonal() for side in SIDES},
+        num_masks={side: int(has[side].sum()) for side in SIDES},
+        seen=tuple(box[None][: int(known)] for box, _, known in left),
+        masks=tuple(mask if known else None for _, mask, known in left),
+        camera=_camera_of(frames.camera, number),
         size_hw=size_hw,
         has_masks=True,
     )
@@ -136,10 +131,6 @@ def _masks_of(d: Detections, side: str, rows: Tensor, size_hw: tuple[int, int]) 
     present = getattr(d, f"has_mask_{side}").index_select(0, rows)
     inside = masks if masks.dtype == torch.bool else masks > 0.5
     return torch.logical_and(inside, present[:, None, None])
-
-
-def _has(boxes: Floats) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(boxes).all(axis=1))
 
 
 def _array(tensor: Tensor) -> Floats:

@@ -14,10 +14,9 @@ from directshape_torch.scene_check.conventions import (
     project_conventions,
     score_conventions,
 )
-from directshape_torch.scene_check.finding import Finding, found
+from directshape_torch.scene_check.finding import Finding, found, of_cars
 from directshape_torch.scene_check.image_boxes import box_iou
 
-ALL_FRAMES = "all frames"
 # Mean overlap that another convention must gain for boxes to be taken as written in it: with the observation angles,
 # and without them for many and for few cars. Intact sets gain nothing, single frames of two to six cars up to 0.05.
 MIN_GAIN, MIN_GAIN_IMAGE, MIN_GAIN_OF_FEW = 0.08, 0.06, 0.12
@@ -91,7 +90,7 @@ def _deviations(scores: ConventionScores, best: int) -> list[Finding]:
         shares = scores.angle_share[best], scores.angle_share[0]
         if scores.has_angles and shares[0] > shares[1]:
             measured += f", alpha agrees in {shares[0]:.0%} instead of {shares[1]:.0%}"
-        where = f"{ALL_FRAMES}, {scores.overlap.shape[1]} cars"
+        where = of_cars(scores.overlap.shape[1])
         findings.append(found(check, where, measured, expected=expected, cure=cure))
     return findings
 
@@ -100,14 +99,14 @@ def _unexplained(overlap: float, scores: ConventionScores) -> Finding:
     measured = (
         f"projected boxes overlap 2D boxes and masks by {overlap:.2f} in the mean, and no known convention does better"
     )
-    return found("box_projection", f"{ALL_FRAMES}, {scores.overlap.shape[1]} cars", measured, limit=MIN_OVERLAP)
+    return found("box_projection", of_cars(scores.overlap.shape[1]), measured, limit=MIN_OVERLAP)
 
 
 def _check_lengths(frames: Sequence[FrameEvidence]) -> list[Finding]:
     hwl = np.concatenate([frame.boxes.hwl for frame in frames])
     height, width, _ = np.median(hwl, axis=0)
     longest = float(np.median(hwl.max(axis=1)))
-    where, (low, high) = f"{ALL_FRAMES}, {len(hwl)} cars", LENGTHS_M
+    where, (low, high) = of_cars(len(hwl)), LENGTHS_M
     if not low < longest < high:
         return [
             found("box_units", where, f"the longest side of a box is {longest:.3g} in the median", low=low, high=high)
@@ -122,7 +121,7 @@ def _check_turns(frames: Sequence[FrameEvidence]) -> list[Finding]:
     yaw = np.concatenate([frame.boxes.rotation_y for frame in frames])
     if np.abs(yaw).max() <= _ONE_TURN:
         return []
-    return [found("box_yaw", f"{ALL_FRAMES}, {len(yaw)} cars", f"rotation_y reaches {np.abs(yaw).max():.1f}")]
+    return [found("box_yaw", of_cars(len(yaw)), f"rotation_y reaches {np.abs(yaw).max():.1f}")]
 
 
 def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
@@ -141,7 +140,7 @@ def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
         f"projected 3D boxes overlap 2D boxes by {np.mean(as_corners):.2f}, "
         f"and by {np.mean(as_size):.2f} when these are read as x y width height"
     )
-    return [found("box_2d", f"{ALL_FRAMES}, {len(as_corners)} cars", measured)]
+    return [found("box_2d", of_cars(len(as_corners)), measured)]
 
 
 def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
@@ -153,7 +152,7 @@ def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
     return [
         found(
             "box_2d",
-            f"{ALL_FRAMES}, {len(boxes)} cars",
+            of_cars(len(boxes)),
             f"{empty} 2D boxes end before they begin",
             severity="error" if 2 * empty > len(boxes) else "warning",
             expected="u_min v_min u_max v_max, pixels, with u_min < u_max and v_min < v_max",

@@ -37,30 +37,34 @@ def check_calibration(
         where: named in the findings.
     """
     findings = []
-    for name, K in cameras.items():
-        if size_hw is not None:
-            findings += _check_intrinsics(K, size_hw, f"{where}, {name}")
-    return findings + _check_baseline(baseline_m, where)
+    if size_hw is not None:
+        findings = [f for name, K in cameras.items() for f in _check_intrinsics(K, size_hw, f"{where}, {name}")]
+    if baseline_m <= 0:
+        measured = f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one"
+        return [*findings, found("baseline_sign", where, measured)]
+    low, high = BASELINES_M
+    if baseline_m < low or baseline_m > high:  # neither of NaN
+        findings.append(found("baseline_length", where, f"baseline {baseline_m:.4g} m", low=low, high=high))
+    return findings
 
 
 def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: str) -> list[Finding]:
     height, width = size_hw
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    if not FOCAL_SHARES[0] * width < fx < FOCAL_SHARES[1] * width:
-        return [_focal(fx, width, where)]
+    low, high = (share * width for share in FOCAL_SHARES)
+    if not low < fx < high:
+        cure = "check the order of the numbers and whether images were resized"
+        if 0 < fx < low:
+            cure = (
+                "divide a focal length in millimetres by the size of a pixel (mm); or were the intrinsics normalised?"
+            )
+        measured = f"fx = {fx:.4g} px for images {width} px wide"
+        expected = f"between {low:.0f} and {high:.0f} px (15 to 150 degrees of view)"
+        return [found("focal_length", where, measured, expected=expected, cure=cure)]
     findings = []
     if abs(fx / fy - 1) > ASPECT_TOLERANCE:
         findings.append(found("focal_length", where, f"fx = {fx:.1f}, fy = {fy:.1f} px"))
     return findings + _check_centre((cx, cy), (width, height), where)
-
-
-def _focal(fx: float, width: int, where: str) -> Finding:
-    low, high = (share * width for share in FOCAL_SHARES)
-    cure = "check the order of the numbers and whether images were resized"
-    if 0 < fx < low:
-        cure = "divide a focal length in millimetres by the size of a pixel (mm); or were the intrinsics normalised?"
-    expected = f"between {low:.0f} and {high:.0f} px (15 to 150 degrees of view)"
-    return found("focal_length", where, f"fx = {fx:.4g} px for images {width} px wide", expected=expected, cure=cure)
 
 
 def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:
@@ -74,13 +78,3 @@ def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: 
     cure = f"K is of images {across:.2f} times as large: multiply fx, fy, cx and cy by {1 / across:.2f}"
     measured = f"({centre[0]:.1f}, {centre[1]:.1f}) in images of {size_wh[0]} x {size_wh[1]} pixels"
     return [found("principal_point", where, measured, severity=severity, cure=cure if resized else "")]
-
-
-def _check_baseline(baseline_m: float, where: str) -> list[Finding]:
-    if baseline_m <= 0:
-        measured = f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one"
-        return [found("baseline_sign", where, measured)]
-    low, high = BASELINES_M
-    if low <= baseline_m <= high or np.isnan(baseline_m):
-        return []
-    return [found("baseline_length", where, f"baseline {baseline_m:.4g} m", low=low, high=high)]

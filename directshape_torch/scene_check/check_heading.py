@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import BoxConvention, project_conventions
-from directshape_torch.scene_check.finding import Finding, found
+from directshape_torch.scene_check.finding import Finding, found, of_cars
 from directshape_torch.scene_check.image_boxes import box_iou
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
@@ -60,7 +60,7 @@ def check_heading(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 def _finding(num_cars: int, measured: str, cure: str) -> Finding:
     expected = "rotation_y in radians, 0 where the car drives along +x, -pi/2 where it drives along +z"
-    where = f"all frames, {num_cars} cars"
+    where = of_cars(num_cars)
     return found("box_yaw", where, f"outlines of cars {measured}", expected=expected, cure=cure)
 
 

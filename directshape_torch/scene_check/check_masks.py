@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence, Side
+from directshape_torch.scene_check.car_evidence import SIDES, Floats, FrameEvidence, Side
 from directshape_torch.scene_check.conventions import BoxConvention, project_conventions
-from directshape_torch.scene_check.finding import Finding, Severity, found
+from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
 from directshape_torch.scene_check.image_boxes import box_iou
 
 # Mean overlap of masks and 2D boxes, over as many pairs as there could be.
@@ -26,17 +26,26 @@ def check_masks(frames: Sequence[FrameEvidence]) -> list[Finding]:
     frames = [frame for frame in frames if frame.has_masks and len(frame.boxes)]
     if not frames:
         return []
-    counts = {side: sum(frame.num_masks[side] for frame in frames) for side in ("left", "right")}
-    if not counts["left"]:
-        return [_none(counts["left"], counts["right"], sum(len(frame.boxes) for frame in frames))]
-    left, right = _mean_overlap(frames, "left"), _mean_overlap(frames, "right")
+    num_left, num_right = (sum(frame.num_masks[side] for frame in frames) for side in SIDES)
+    if not num_left:
+        num_cars = sum(len(frame.boxes) for frame in frames)
+        severity: Severity = "warning" if num_right else "error" if num_cars >= MIN_PAIRS else "note"
+        measured = f"{num_left} masks of cars in the left images, {num_right} in the right ones"
+        return [found("no_masks", of_cars(num_cars), measured, severity=severity)]
+    left, right = (_mean_overlap(frames, side) for side in SIDES)
     if right > max(left + MIN_SWAP_GAIN, OVERLAP_WARNING) or _are_crossed(frames):
         measured = (
-            "the left boxes fit the right masks better, or cars lie farther right in the right masks than in the left "
-            "ones"
+            "the left boxes fit the right masks better, or cars lie farther right in the right masks "
+            "than in the left ones"
         )
         return [found("masks_swapped", "all frames", measured)]
-    return _check_overlap(left, frames)
+    if left <= OVERLAP_WARNING:
+        enough = sum(_pairs(frame) for frame in frames) >= MIN_PAIRS
+        return [_mismatch("error" if left < OVERLAP_ERROR and enough else "warning", "all frames", left)]
+    # Single frames whose masks are those of another, among others that are right.
+    overlaps = {frame.frame_id: _mean_overlap([frame], "left") for frame in frames if _pairs(frame) > 1}
+    wrong = {frame_id: overlap for frame_id, overlap in overlaps.items() if overlap < OVERLAP_ERROR}
+    return [_mismatch("warning", f"frame {frame_id}", overlap) for frame_id, overlap in wrong.items()]
 
 
 def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[Finding]:
@@ -70,7 +79,7 @@ def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[F
         return []
     measured = f"masks {words}: then 3D boxes overlap them by {overlap:.2f} instead of {as_given:.2f}"
     expected = "the mask of each car where its box is"
-    return [found("masks_elsewhere", f"all frames, {len(boxes)} cars", measured, expected=expected, cure=cure)]
+    return [found("masks_elsewhere", of_cars(len(boxes)), measured, expected=expected, cure=cure)]
 
 
 def _pairs_of(frame: FrameEvidence) -> tuple[Floats, Floats]:
@@ -111,24 +120,6 @@ def _mean_overlap(frames: Sequence[FrameEvidence], side: Side) -> float:
     return overlap / max(1, sum(_pairs(frame, side) for frame in frames))
 
 
-def _check_overlap(overlap: float, frames: Sequence[FrameEvidence]) -> list[Finding]:
-    if overlap > OVERLAP_WARNING:
-        return _check_frames(frames)
-    enough = sum(_pairs(frame) for frame in frames) >= MIN_PAIRS
-    severity: Severity = "error" if overlap < OVERLAP_ERROR and enough else "warning"
-    return [_mismatch(severity, "all frames", overlap)]
-
-
-def _check_frames(frames: Sequence[FrameEvidence]) -> list[Finding]:
-    """Single frames whose masks are those of another, among others that are right."""
-    overlaps = {frame.frame_id: _mean_overlap([frame], "left") for frame in frames if _pairs(frame) > 1}
-    return [
-        _mismatch("warning", f"frame {frame_id}", overlap)
-        for frame_id, overlap in overlaps.items()
-        if overlap < OVERLAP_ERROR
-    ]
-
-
 def _pairs(frame: FrameEvidence, side: Side = "left") -> int:
     return min(len(frame.boxes), frame.num_masks[side])
 
@@ -136,9 +127,3 @@ def _pairs(frame: FrameEvidence, side: Side = "left") -> int:
 def _mismatch(severity: Severity, where: str, overlap: float) -> Finding:
     measured = f"masks and 2D boxes of cars overlap by {overlap:.2f} in the mean"
     return found("masks_elsewhere", where, measured, severity=severity, limit=OVERLAP_WARNING)
-
-
-def _none(num_left: int, num_right: int, num_cars: int) -> Finding:
-    severity: Severity = "warning" if num_left + num_right else "error" if num_cars >= MIN_PAIRS else "note"
-    measured = f"{num_left} masks of cars in the left images, {num_right} in the right ones"
-    return found("no_masks", f"all frames, {num_cars} cars", measured, severity=severity)

@@ -40,9 +40,10 @@ def check_images(
     """What feature matches of two images (H, W, 3) show; the camera, where it is known, says where they should be."""
     matches = match_pair(left, right)
     if len(matches) < FEW_MATCHES:
-        mirrored = check_mirrored(matches, match_pair(left, mirror(right)), where)
-        if mirrored:
-            return mirrored
+        mirrored = match_pair(left, np.ascontiguousarray(right[:, ::-1]))
+        if len(mirrored) >= max(MIN_MATCHES, 3 * len(matches)):
+            measured = f"{len(mirrored)} features match the mirrored right image, {len(matches)} the image as it is"
+            return [found("image_mirrored", where, measured)]
     return check_pair(matches, camera, (left.shape[0], left.shape[1]), where)
 
 
@@ -63,26 +64,14 @@ def check_pair(
     if len(matches) < MIN_MATCHES or len(matches) < MIN_INLIER_SHARE * matches.num_candidates:
         measured = f"{len(matches)} of {matches.num_candidates} feature matches obey a common geometry"
         return [found("different_scenes", where, measured, share=MIN_INLIER_SHARE)]
-    disparity = _disparity(matches, camera)
+    # Freed of the difference of the principal points.
+    shift = 0.0 if camera is None else float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
+    disparity = np.asarray(matches.uv_left[:, 0] - matches.uv_right[:, 0] - shift)
     if float(np.median(np.hypot(disparity, matches.vertical))) < SAME_IMAGE_PX:
         return [found("same_image", where, "matched points have the same place in both images")]
-    return _check_side(disparity, where) + _check_rows(
-        matches, _row_residual(matches, disparity, camera), size_hw, where
-    )
-
-
-def check_mirrored(matches: PairMatches, with_mirrored: PairMatches, where: str) -> list[Finding]:
-    """Whether far more features match the mirrored right image than the right image as it is."""
-    if len(with_mirrored) < max(MIN_MATCHES, 3 * len(matches)):
-        return []
-    measured = f"{len(with_mirrored)} features match the mirrored right image, {len(matches)} the image as it is"
-    return [found("image_mirrored", where, measured)]
-
-
-def _disparity(matches: PairMatches, camera: StereoCamera | None) -> NDArray[np.float64]:
-    """(N,) `u_left - u_right`, freed of the difference of the principal points."""
-    shift = 0.0 if camera is None else float(camera.K_left[0, 0, 2] - camera.K_right[0, 0, 2])
-    return np.asarray(matches.uv_left[:, 0] - matches.uv_right[:, 0] - shift)
+    negative, rows = float(np.mean(disparity < -1.0)), _row_residual(matches, disparity, camera)
+    sides = [swapped(where, negative, float(np.median(disparity)))] if negative > MAX_NEGATIVE_SHARE else []
+    return sides + _check_rows(matches, rows, size_hw, where)
 
 
 def _row_residual(
@@ -95,13 +84,6 @@ def _row_residual(
     # t_y / z with z = fx b / disparity.
     expected = K_right[1, 2] - K_left[1, 2] + disparity * (K_right[1, 1] / K_right[0, 0]) * (t[1] / -t[0])
     return np.asarray(matches.vertical - expected)
-
-
-def _check_side(disparity: NDArray[np.float64], where: str) -> list[Finding]:
-    negative = float(np.mean(disparity < -1.0))
-    if negative <= MAX_NEGATIVE_SHARE:
-        return []
-    return [swapped(where, negative, float(np.median(disparity)))]
 
 
 def _check_rows(
@@ -190,11 +172,6 @@ def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches
     uv_left, uv_right = points[0][pairs[:, 0]], points[1][pairs[:, 1]]
     keep = _epipolar_inliers(uv_left, uv_right)
     return PairMatches(uv_left[keep], uv_right[keep], len(pairs), min(map(len, points)))
-
-
-def mirror(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image with left and right exchanged."""
-    return np.ascontiguousarray(image[:, ::-1])
 
 
 def _best(descriptors: NDArray[np.float32], others: NDArray[np.float32]) -> dict[int, int]:

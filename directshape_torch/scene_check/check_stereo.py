@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
-from directshape_torch.scene_check.finding import Finding, Severity, found
+from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
 
 # The visible surface lies before the centre by about a third of the box's depth.
 _SURFACE_SHARE = 0.33
@@ -114,9 +114,7 @@ def check_swapped(cars: Sequence[StereoCars]) -> list[Finding]:
     disparity = np.concatenate([car.disparity for car in cars]) if cars else np.empty(0)
     if len(disparity) < _FEWEST_SWAPPED or np.mean(disparity < -1.0) < 0.7:
         return []
-    return [
-        swapped(f"all frames, {len(disparity)} cars", float(np.mean(disparity < -1.0)), float(np.median(disparity)))
-    ]
+    return [swapped(of_cars(len(disparity)), float(np.mean(disparity < -1.0)), float(np.median(disparity)))]
 
 
 def swapped(where: str, negative: float, median: float) -> Finding:

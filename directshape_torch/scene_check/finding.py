@@ -214,6 +214,11 @@ MISTAKES: dict[str, Mistake] = {
 }
 
 
+def of_cars(count: int) -> str:
+    """Where a finding about all cars is."""
+    return f"all frames, {count} cars"
+
+
 def found(
     check: str,
     where: str,

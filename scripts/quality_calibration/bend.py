@@ -37,10 +37,6 @@ class Bend:
         largest = (polynomial_basis(_pixels(size_wh), size_wh) @ drawn).abs().amax(dim=0)
         return cls(drawn * torch.tensor([largest_px, rows_px], dtype=torch.float64) / largest, size_wh)
 
-    def offset(self, uv_right: Tensor) -> Tensor:
-        """Measured less true disparity (N,) where the right image shows the pixels (N, 2)."""
-        return polynomial_basis(uv_right, self.size_wh) @ self.coefficients[:, 0]
-
     def image(self, image: NDArray[Any], interpolation: int = cv2.INTER_LANCZOS4) -> NDArray[Any]:
         """A right image (H, W) or (H, W, 3) as this rig would show it."""
         return cv2.remap(image, *self._maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
