@@ -46,16 +46,6 @@ def test_both_halves_of_a_car_are_the_same() -> None:
     torch.testing.assert_close(left.gradient, right.gradient * mirror)
 
 
-def test_dimensions_need_no_symmetric_matrix() -> None:
-    prior = small_prior()
-    prior.dimensions_quadratic_hwl[2] = torch.tensor([[0.1, 0.3], [0.0, 0.2]])
-    prior.dimensions_linear_hwl[2] = torch.tensor([0.5, -0.5])
-    at = prior.dimensions_and_derivative(torch.tensor([[1.0, 2.0]], dtype=torch.float64))
-    # 0.5 - 1 + 0.1 + 0.3 * 1 * 2 + 0.2 * 4, and its derivatives 0.5 + 0.2 + 0.6 and -0.5 + 0.3 + 0.8.
-    assert at.hwl[0, 2].item() == pytest.approx(1.0)
-    torch.testing.assert_close(at.J_hwl_code[0, 2], torch.tensor([1.3, 0.6], dtype=torch.float64))
-
-
 def test_points_beyond_one_part_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     prior = small_prior()
     shape = prior.bind(torch.randn(3, 2, dtype=torch.float64))

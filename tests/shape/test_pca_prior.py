@@ -3,14 +3,11 @@ import pytest
 import torch
 from helpers.host_traffic import host_traffic
 from helpers.priors import first_components
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.shape.pca_fit import fit_pca
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 from directshape_torch.shape.sdf_grid import zero_level_extents
-from directshape_torch.shape.shape_prior import ShapePrior
 
 MADE = PriorProvenance("a test", "Apache-2.0", 40)
 SPACING_M = 0.2
@@ -44,13 +41,8 @@ def prior(samples) -> PCAShapePrior:
     return fit_pca(samples, ORIGIN, SPACING_M, 4, MADE)
 
 
-def test_implements_the_protocol(prior):
-    assert isinstance(prior, ShapePrior)
-    assert prior.num_codes == 4
+def test_bounds_are_computed_without_the_host_once_their_sizes_are_known(prior):
     torch.testing.assert_close(prior.bounds_obj[1], torch.tensor([2.0, 0.4, 1.0], dtype=torch.float64))
-
-
-def test_bounds_are_computed_without_the_host(prior):
     assert host_traffic(lambda: prior.bounds_obj).found == []
 
 
@@ -75,18 +67,6 @@ def test_codes_of_the_training_samples_are_white(samples):
     )
 
 
-def test_reconstruction_improves_with_each_component_and_is_exact_with_all():
-    few = box_samples(6)
-    errors = []
-    for k in (1, 3, 5):
-        prior = fit_pca(few, ORIGIN, SPACING_M, k, MADE, surface_band_m=None)
-        basis = prior.basis.reshape(-1, k)
-        target = (few - prior.mean).flatten(1).T
-        errors.append(float((basis @ torch.linalg.lstsq(basis, target).solution - target).abs().max()))
-    assert errors[0] > errors[1] > errors[2]
-    assert errors[2] < 1e-9
-
-
 def test_positive_first_code_makes_the_car_larger(prior):
     code = prior.initial_code(2)
     code[:, 0] = torch.tensor([-1.0, 1.0])
@@ -101,16 +81,6 @@ def test_linear_dimensions_follow_the_zero_level(prior):
     torch.testing.assert_close(prior.dimensions_hwl(code), measured, atol=0.06, rtol=0)
 
 
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_values_are_linear_in_the_code(prior, seed):
-    generator = torch.Generator().manual_seed(seed)
-    code = torch.randn(2, prior.num_codes, generator=generator, dtype=torch.float64)
-    code = code / code.norm(dim=1, keepdim=True) * 3.0
-    values = prior.values(code)
-    torch.testing.assert_close(prior.values(code.mean(0, keepdim=True))[0], values.mean(0))
-
-
 def test_bind_agrees_with_the_sum_over_components(prior):
     code = torch.tensor([[0.5, -1.0, 0.2, 0.1]], dtype=torch.float64)
     node = torch.tensor([4, 6, 3])
@@ -118,14 +88,6 @@ def test_bind_agrees_with_the_sum_over_components(prior):
     expected = prior.mean[4, 6, 3] + (prior.basis[4, 6, 3] * code[0]).sum()
     torch.testing.assert_close(prior.bind(code).value(point[None], torch.tensor([0]))[0], expected)
     assert prior.values(prior.initial_code(0)).shape == (0, *SHAPE)
-
-
-def test_fewer_codes(prior):
-    short = first_components(prior, 2)
-    code = torch.tensor([[0.3, -0.8]], dtype=torch.float64)
-    padded = torch.cat([code, torch.zeros(1, 2, dtype=torch.float64)], dim=1)
-    torch.testing.assert_close(short.values(code), prior.values(padded))
-    torch.testing.assert_close(short.dimensions_hwl(code), prior.dimensions_hwl(padded))
 
 
 def test_state_dict_and_dtype(prior, samples):
@@ -193,11 +155,6 @@ def test_fit_refuses_samples_that_make_no_prior(samples):
         fit_pca(samples.where(samples > -0.3, torch.nan), ORIGIN, SPACING_M, 2, MADE)
     with pytest.raises(InputError, match="without surface"):
         fit_pca(samples.abs() + 0.1, ORIGIN, SPACING_M, 2, MADE)
-
-
-def test_wrong_code_shape(prior):
-    with pytest.raises(InputError, match="code: expected shape"):
-        prior.values(torch.zeros(1, 3, dtype=torch.float64))
 
 
 def test_bundled_prior_is_a_car():

@@ -132,11 +132,3 @@ def test_the_points_of_some_objects() -> None:
 def test_frames_without_disparity_are_an_error() -> None:
     with pytest.raises(InputError, match=r"frames\.disparity: expected a disparity map of each frame, got None"):
         points_of(disparity=None)
-
-
-def test_a_disparity_of_another_size_or_type_is_an_error() -> None:
-    frames = measured_street()[1].frames
-    with pytest.raises(InputError, match=r"disparity: expected shape \(1, 120, 160\)"):
-        replace(frames, disparity=torch.zeros(1, 120, 161, dtype=torch.float64))
-    with pytest.raises(InputError, match="disparity: expected the dtype of images_left"):
-        replace(frames, disparity=torch.zeros(1, 120, 160))
