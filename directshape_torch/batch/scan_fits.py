@@ -9,15 +9,12 @@ import numpy as np
 import torch
 
 from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
-from directshape_torch.errors import InputError
 from directshape_torch.files import atomic_files
 from directshape_torch.geometry.box_formats import poses_to_boxes
-from directshape_torch.io.kitti_calibration import to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.result_files import write_result_text
 from directshape_torch.io.run_folder import mesh_path, result_path, shapes_path
 from directshape_torch.io.stereo_files import FileStereoDataset
-from directshape_torch.io.velodyne import read_scan
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
@@ -50,11 +47,7 @@ def fit_scan(dataset: FileStereoDataset, frame_id: str, prior: ShapePrior | None
         InputError: a data set without scans.
         DataFormatError: a file is missing or damaged.
     """
-    if dataset.lidar_dir is None:
-        raise InputError("dataset", "one with LiDAR scans", "none", "open it with lidar_dir=..")
-    calibration = dataset.layout.lidar_calibration(frame_id)
-    camera = to_stereo_camera([calibration], dtype=torch.float64)
-    points = read_scan(dataset.layout.lidar_files(dataset.lidar_dir, frame_id)["lidar"], calibration, camera)
+    points, camera = dataset.scan(frame_id)
     objects = dataset.objects(frame_id)
     rows = [row for row, each in enumerate(objects) if each.type in dataset.classes and each.has_box_3d]
     chosen = [objects[row] for row in rows]
@@ -75,17 +68,8 @@ def write_scan_fit(out_dir: Path, scan: ScanFit) -> None:
     lines = torch.cat(columns, dim=1).tolist()
     changed = {row: lines[car] for car, row in enumerate(scan.rows) if refined[car]}
     write_result_text(result_path(out_dir, scan.frame_id), scan.objects, changed)
-    arrays = {
-        "T_cam_obj": cars.T_cam_obj,
-        "codes": cars.code,
-        "num_points": scan.fit.num_points,
-        "distances_before_m": scan.fit.distance_before_m,
-        "distances_after_m": scan.fit.distance_after_m,
-        "input_lines": torch.tensor([scan.objects[row].line_number for row in scan.rows], dtype=torch.int64),
-    }
-    statuses = np.array([status.name for status in cars.status], dtype=np.str_)
-    content = {**{name: each.numpy() for name, each in arrays.items()}, "statuses": statuses}
-    atomic_files.write_npz(shapes_path(out_dir, scan.frame_id), content)
+    numbers = np.array([scan.objects[row].line_number for row in scan.rows], dtype=np.int64)
+    atomic_files.write_npz(shapes_path(out_dir, scan.frame_id), scan.fit.arrays("cam", input_lines=numbers))
     for car, row in enumerate(scan.rows):
         if refined[car]:
             path = mesh_path(out_dir, scan.frame_id, scan.objects[row].line_number, "ply")

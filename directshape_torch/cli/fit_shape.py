@@ -100,15 +100,7 @@ def _fit_cloud(args: argparse.Namespace) -> int:
     fitted = cars.to_boxes(args.convention, T_cam_boxes=torch.eye(4, dtype=boxes.dtype))
     (args.out / "meshes").mkdir(parents=True, exist_ok=True)
     write_text(args.out / "boxes.txt", "".join(" ".join(f"{x:.4f}" for x in box) + "\n" for box in fitted.tolist()))
-    arrays = {
-        "T_points_obj": cars.T_cam_obj,
-        "codes": cars.code,
-        "num_points": fit.num_points,
-        "distances_before_m": fit.distance_before_m,
-        "distances_after_m": fit.distance_after_m,
-    }
-    statuses = np.array([status.name for status in cars.status], dtype=np.str_)
-    write_npz(args.out / "shapes.npz", {**{name: each.numpy() for name, each in arrays.items()}, "statuses": statuses})
+    write_npz(args.out / "shapes.npz", fit.arrays("points"))
     for row, status in enumerate(cars.status):
         before, after = float(fit.distance_before_m[row]), float(fit.distance_after_m[row])
         print(f"car {row}: {int(fit.num_points[row])} points, {before:.3f} -> {after:.3f} m, {status.name}")

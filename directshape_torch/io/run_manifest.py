@@ -1,10 +1,5 @@
 """`summary.json` of a run (schema 2): what made its results, and how each frame ended, so that a run can resume.
 
-    {"schema_version": 2, "package_version": "0.1.0",
-     "config": {..},                      every setting of the run
-     "sha256": {"prior": .., ..},         of the files that serve all frames
-     "frames": {"000107": {"state": "done" | "failed", "reason": .., ..}, ..}}
-
 Nothing in it depends on the time, the machine or where the files lie.
 """
 

@@ -143,6 +143,21 @@ class FileStereoDataset:
         sequence = self.sequence_of(frame_id)
         return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), sequence)
 
+    def scan(self, frame_id: str) -> tuple[Tensor, StereoCamera]:
+        """All points (P, 3) of the LiDAR scan of a frame in its left camera, metres, float64, and that camera.
+
+        The camera has no disparity field: a scan has no part in the rig's error.
+
+        Raises:
+            DataFormatError: the scan is missing or damaged, or the calibration does not say where the scanner is.
+            InputError: the data set was opened without scans.
+        """
+        if self.lidar_dir is None:
+            raise InputError("dataset", "one with LiDAR scans", "none", "open it with lidar_dir=..")
+        calibration = self.layout.lidar_calibration(frame_id)
+        camera = to_stereo_camera([calibration], dtype=torch.float64)
+        return read_scan(self.layout.lidar_files(self.lidar_dir, frame_id)["lidar"], calibration, camera), camera
+
     def changed(
         self, *, ground: GroundSource, disparity_field: DisparityField | Sequence[DisparityField] | None
     ) -> Self:
@@ -237,10 +252,7 @@ class FileStereoDataset:
     def _points(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
         if self.lidar_dir is None:
             return None
-        # Of a camera without a disparity field: a scan has no part in the rig's error.
-        calibration = self.layout.lidar_calibration(frame_id)
-        camera = to_stereo_camera([calibration], dtype=torch.float64)
-        points = read_scan(self.layout.lidar_files(self.lidar_dir, frame_id)["lidar"], calibration, camera)
+        points, camera = self.scan(frame_id)
         return in_image(points, size_hw, camera)[None].to(self.dtype)
 
     def _motion(self, frame_id: str, camera: StereoCamera) -> tuple[Tensor | None, Tensor | None]:

@@ -10,7 +10,6 @@ import pytest
 from helpers.finished_run import FinishedRun, finished_run
 
 from directshape_torch.cli.export import _FORMATS
-from directshape_torch.cli.main import make_parser
 from directshape_torch.export.coco3d_file import KITTI_TYPES
 from directshape_torch.export.export_run import ExportFormat
 from directshape_torch.export.nuscenes_file import DETECTION_NAMES
@@ -28,14 +27,6 @@ def test_every_format_has_a_row() -> None:
     assert get_args(ExportFormat) == _FORMATS
     table = TEXT[TEXT.index("| `--format` |") : TEXT.index("`cam` is the left")]
     assert tuple(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == _FORMATS
-
-
-def test_options_are_those_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        make_parser().parse_args(["export", "--help"])
-    known = set(re.findall(r"--[a-z][a-z-]+", capsys.readouterr().out)) - {"--help", "--format", "--out", "--frames"}
-    table = TEXT[TEXT.index("| option | |") : TEXT.index("## Surfaces")]
-    assert set(re.findall(r"--[a-z][a-z-]+", table)) == known
 
 
 def test_names_are_those_of_the_code() -> None:
