@@ -124,3 +124,18 @@ def test_another_rigs_field_is_refused(
     words = ("--format", "points", "--data", finished.root, "--rig", tmp_path / "bias.json")
     assert main(command(finished, tmp_path / "out", *words)) == 2
     assert "--rig: expected the disparity fields that the run was made with, got others in" in capsys.readouterr().err
+
+
+def test_a_recording_has_the_iterations_and_needs_the_inputs_of_the_run(
+    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rerun", reason="the extra `viewer` is not installed")
+    from rerun.chunk import RrdReader
+
+    root = finished.root
+    words = command(finished, tmp_path, "--format", "rerun", "--iterations", "--frames", "0", "--data", root)
+    assert main(words) == 2
+    assert "--detections: expected that of the run, for --iterations, got nothing" in capsys.readouterr().err
+    assert main([*words, "--detections", str(root / "detections"), "--masks", str(root / "masks")]) == 0
+    found = {chunk.entity_path for chunk in RrdReader(str(tmp_path / "recording.rrd")).stream()}
+    assert {"/world/cars/1", "/world/cars/3", "/terms/000000/1/photometric", "/world/boxes/before"} <= found

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
+from test_refine_command import command
 
 from directshape_torch.cli.main import main
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -49,9 +50,7 @@ def scans(source: Path, tmp_path: Path) -> Path:
 
 
 def refine(root: Path, out: Path, *extra: object) -> int:
-    words = ["refine", "--data", root, "--detections", root / "detections", "--out", out, "--prior", root / "prior.npz"]
-    words += ["--masks", root / "masks", "--device", "cpu", "--set", "stages=[{max_iterations: 2}]", *extra]
-    return main([str(word) for word in words])
+    return main(command(root, out, *map(str, extra)))
 
 
 def test_scans_are_read_in_the_left_camera_and_batched(source: Path) -> None:

@@ -1,15 +1,17 @@
-"""Figures of matplotlib: equal ones give equal bytes, and without matplotlib the message says how to get it."""
+"""Figures and animations: equal ones give equal bytes, and what is missing is named with how to get it."""
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from directshape_torch.errors import MissingDependencyError
-from directshape_torch.io.figure_files import check_figures, figure_png, new_figure
+from directshape_torch.errors import InputError, MissingDependencyError
+from directshape_torch.io.figure_files import check_figures, figure_picture, figure_png, new_figure, write_animation
 
 
 def _png(last_value: float) -> bytes:
@@ -36,3 +38,46 @@ def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
         new_figure(4, 2, "a test")
     with pytest.raises(MissingDependencyError, match=r"^a command needs .*pip install 'directshape_torch\[plot\]'"):
         check_figures("a command")
+
+
+_RED, _BLUE = (np.full((12, 20, 3), colour, np.uint8) for colour in ((255, 0, 0), (0, 0, 255)))
+
+
+def test_animation_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.gif"
+    write_animation(path, [_RED, _BLUE, _RED], [0.1, 0.2, 1.5])
+    with Image.open(path) as animation:
+        assert (animation.n_frames, animation.size, animation.info["loop"]) == (3, (20, 12), 0)
+        for number, (picture, milliseconds) in enumerate(zip((_RED, _BLUE, _RED), (100, 200, 1500), strict=True)):
+            animation.seek(number)
+            assert animation.info["duration"] == milliseconds
+            np.testing.assert_allclose(np.asarray(animation.convert("RGB")), picture, atol=8)
+
+
+def test_equal_animations_have_equal_bytes(tmp_path: Path) -> None:
+    for name in ("a.gif", "b.gif"):
+        write_animation(tmp_path / name, [_RED, _BLUE], [0.1, 0.1])
+    assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("frames", "seconds", "name"),
+    [([], [], "frames"), ([_RED, _BLUE[:5]], [1, 1], "frames"), ([_RED, _BLUE], [1], "seconds")],
+)
+def test_what_is_no_animation(frames: list[np.ndarray], seconds: list[float], name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=name):
+        write_animation(tmp_path / "a.gif", frames, seconds)
+
+
+def test_without_pillow_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(MissingDependencyError, match=r"pillow.*directshape_torch\[plot\]"):
+        write_animation(tmp_path / "a.gif", [_RED], [1.0])
+
+
+def test_picture_of_a_figure_shows_it() -> None:
+    figure = new_figure(2, 1, "a test")
+    figure.set_facecolor("red")
+    picture = figure_picture(figure)
+    assert picture.shape == (80, 160, 3)
+    assert (picture == (255, 0, 0)).all()

@@ -1,14 +1,15 @@
-"""Calibration files: layouts, hand-derived offsets, and complaints that name the line."""
+"""Calibration and plane files: layouts, hand-derived offsets, signs, and complaints that name the line."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
+from directshape_torch.io.kitti_calibration import read_calibration, read_plane, to_stereo_camera
 
 # The projections of KITTI's first recording day.
 P2 = "721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884"
@@ -83,3 +84,26 @@ def test_flipped_baseline_names_the_file(tmp_path: Path) -> None:
 def test_no_frames() -> None:
     with pytest.raises(InputError, match="calibrations: expected at least one frame"):
         to_stereo_camera([])
+
+
+HEADER = "# Plane\nWidth 4\nHeight 1\n"
+
+
+@pytest.mark.parametrize("line", ["0 -1 0 1.65", "0 1 0 -1.65", "0 2 0 -3.3"])
+def test_normal_is_flipped_up_and_of_unit_length(tmp_path: Path, line: str) -> None:
+    np.testing.assert_allclose(read_plane(write(tmp_path, HEADER + line)), [0, -1, 0, 1.65])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        (HEADER + "0 -1 0", r"line 4: expected 4 finite numbers, got 3: '0 -1 0'"),
+        (HEADER, r"line 3: expected 4 numbers .*Height.*: 'Height 1'"),
+        (HEADER + "0 0 1 1.65", r"line 4: the normal is not near the vertical y axis"),
+        (HEADER + "0 0 0 0", r"line 4: the normal is not near the vertical y axis"),
+    ],
+)
+def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(DataFormatError, match=message):
+        read_plane(write(tmp_path, text))
