@@ -48,7 +48,7 @@ class DatasetOptions(TypedDict, total=False):
 
 
 class FileStereoDataset:
-    """Frames whose files a layout finds; a `StereoDataset`.
+    """Frames with detections and masks, whose files a layout finds.
 
     Args:
         layout: where the parts of a frame are.
@@ -118,6 +118,11 @@ class FileStereoDataset:
         return len(self.frame_ids)
 
     def load(self, frame_id: str) -> LoadedFrame:
+        """Read everything of one frame.
+
+        Raises:
+            DataFormatError: a file is missing or damaged; names file and reason.
+        """
         left, right = read_pair(*self.layout.images(frame_id))
         height, width = left.shape[:2]
         camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, (width, height), self.dtype)
@@ -167,15 +172,19 @@ class FileStereoDataset:
         return other
 
     def objects(self, frame_id: str) -> list[KittiObject]:
+        """The detections of a frame alone, without its images."""
         return self.layout.objects(frame_id)
 
     def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence through which the tracks of a frame go, "" where there is but one; None: it has no tracks."""
         return self.layout.sequence_of(frame_id) if self.tracks else None
 
     def detection_path(self, frame_id: str) -> Path:
+        """The file that holds the detections of a frame."""
         return self.layout.detection_path(frame_id)
 
     def input_files(self, frame_id: str) -> dict[str, Path]:
+        """The files that `load` reads for a frame and that bear on its result, by their role."""
         left, right = self.layout.images(frame_id)
         files = {
             "image_left": left,

@@ -25,7 +25,8 @@ from helpers.matched_masks import instances
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
-from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_files import FileStereoDataset
 
 FRAMES = ("000000", "000001")
 
@@ -43,7 +44,7 @@ def renamed(kitti: Path, to: Path, names: tuple[str, ...]) -> tuple[Path, Path]:
     return to / "detections", to / "masks"
 
 
-def assert_same(dataset: StereoDataset, frame_id: str, expected: LoadedFrame) -> None:
+def assert_same(dataset: FileStereoDataset, frame_id: str, expected: LoadedFrame) -> None:
     """Also for a copy as other processes get it."""
     dataset = pickle.loads(pickle.dumps(dataset))
     loaded = dataset.load(frame_id)
