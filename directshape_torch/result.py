@@ -17,8 +17,7 @@ from torch import Tensor, nn
 from directshape_torch.errors import InputError, MissingDependencyError, shown
 from directshape_torch.figures.disparity_profile import DisparityProfile
 from directshape_torch.figures.observability import Observability
-from directshape_torch.figures.quality import FitQuality
-from directshape_torch.figures.trust_model import bundled_trust_model
+from directshape_torch.figures.quality import FitQuality, bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
 from directshape_torch.numerics.checks import check_alike

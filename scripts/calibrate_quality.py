@@ -41,7 +41,7 @@ from quality_calibration.report import (
 from directshape_torch.cli.options import frame_id_of
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.config_files import load_config
-from directshape_torch.figures.trust_model import TrustModel
+from directshape_torch.figures.quality import TrustModel
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.refiner import DirectShapeRefiner, KnownRig
 from directshape_torch.rig.estimate import RigEstimates

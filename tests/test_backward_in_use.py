@@ -115,7 +115,7 @@ def test_a_misspelt_term_is_an_error_that_lists_the_names(inputs: StreetInputs) 
 def test_wrong_weights_are_errors_and_one_that_is_no_number_is_a_matter_of_its_car(inputs: StreetInputs) -> None:
     refiner = DirectShapeRefiner(inputs.prior, with_mode("unroll", DEFAULT))
     arguments = (inputs.scene.frames, inputs.detections)
-    with pytest.raises(InputError, match=r"term_weights\['height'\]: expected factors .*, got -0.5 for car 1"):
+    with pytest.raises(InputError, match=r"term_weights\['height'\]: expected factors .*, got -0.5 in row 1"):
         refiner(*arguments, {"height": torch.tensor([1.0, -0.5], dtype=torch.float64)})
     with pytest.raises(InputError, match=r"term_weights\['height'\]: expected a tensor of shape \(2,\), got float"):
         refiner(*arguments, {"height": 2.0})

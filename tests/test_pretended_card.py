@@ -27,11 +27,8 @@ _COMPARED = [
     "other residuals and priors, every step",
     "search",
     "point cloud",
-    "point cloud and images",
     "implicit gradients",
-    "unrolled gradients",
     "neural prior",
-    "tracks",
     "tracks, unrolled gradients",
 ]
 

@@ -56,22 +56,14 @@ def assert_same(a: RefinementResult, b: RefinementResult, tolerance: float = 1e-
     torch.testing.assert_close(a.covariance, b.covariance, rtol=1e-6, atol=1e-12)
 
 
-def rows(result: RefinementResult, index: list[int]) -> RefinementResult:
-    names = (
-        "T_cam_obj", "code", "status_code", "iterations", "cost_before", "cost_after",
-        "covariance", "covariance_xyz_yaw", "cost_history", "t_cam_ref", "input_dimensions_hwl",
-    )  # fmt: skip
-    return replace(result, **{name: getattr(result, name)[index] for name in names})
-
-
 @pytest.mark.parametrize("config", [DEFAULT, PAPER, SEARCH], ids=["default", "paper", "search"])
 def test_a_batch_of_frames_equals_a_loop_over_them(config: RefinerConfig) -> None:
     """Frames of different sizes: padding with arbitrary values must change nothing either."""
     frames, detections, parts = two_frames()
     batch = refiner(config)(frames, detections)
     first, second = (refiner(config)(*part) for part in parts)
-    assert_same(rows(batch, [0, 1]), first)
-    assert_same(rows(batch, [2]), second)
+    assert_same(batch[[0, 1]], first)
+    assert_same(batch[[2]], second)
 
 
 def test_the_car_of_the_small_street_is_cut_off_by_the_border() -> None:
@@ -88,7 +80,7 @@ def test_a_batch_of_cars_equals_a_loop_over_them() -> None:
     batch = refiner(config)(scene.frames, detections)
     for i in range(2):
         alone = refiner(config)(scene.frames, select(detections, torch.tensor([i])))
-        assert_same(rows(batch, [i]), alone)
+        assert_same(batch[[i]], alone)
 
 
 @pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0], [1, 2, 0]])
@@ -96,7 +88,7 @@ def test_permuting_cars_permutes_results(order: list[int]) -> None:
     frames, detections, _ = two_frames()
     expected = refiner()(frames, detections)
     permuted = refiner()(frames, select(detections, torch.tensor(order)))
-    assert_same(permuted, rows(expected, order))
+    assert_same(permuted, expected[order])
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

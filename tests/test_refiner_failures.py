@@ -50,14 +50,7 @@ def with_third(change: Callable[[Detections], Detections]) -> tuple[FrameBatch, 
     frames, detections = base()
     third = select(detections, torch.tensor([1]))
     third = change(replace(third, mask_left=0 * third.mask_left, mask_right=0 * third.mask_right))
-    rows = {
-        name: torch.cat([getattr(detections, name), getattr(third, name)])
-        for name in (
-            "frame_index", "T_cam_obj", "dimensions_hwl", "box_2d", "score",
-            "mask_left", "mask_right", "has_mask_left", "has_mask_right",
-        )
-    }  # fmt: skip
-    return frames, replace(detections, **rows)
+    return frames, joined_cars([detections, third])
 
 
 def assert_others_unchanged(result: RefinementResult) -> None:

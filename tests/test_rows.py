@@ -142,3 +142,9 @@ def test_intervals_by_hand() -> None:
     torch.testing.assert_close(found.near[[0, 2, 3], 0], torch.tensor([3.0, 8.2, 0.0]).double())
     torch.testing.assert_close(found.far[[0, 2, 3], 0], torch.tensor([7.1, 11.8, 2.1]).double())
     assert torch.isfinite(found.near).all()
+
+
+def test_no_blocks_at_all() -> None:
+    sums = CarSums.of(torch.zeros(0, dtype=torch.long), 2)
+    assert sums.sum(torch.zeros(0)).tolist() == [0.0, 0.0]
+    assert sums.sum(torch.zeros(0, 3, 2), torch.zeros(0)).equal(torch.zeros(2, 3, 2))

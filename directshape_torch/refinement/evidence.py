@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from directshape_torch.figures.disparity_profile import DisparityProfile
-from directshape_torch.figures.quality import EVIDENCE_NAMES, FitQuality
-from directshape_torch.figures.trust_model import bundled_trust_model
+from directshape_torch.figures.quality import EVIDENCE_NAMES, FitQuality, bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
 from directshape_torch.numerics.tensors import constant_like

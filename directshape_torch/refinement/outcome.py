@@ -10,8 +10,7 @@ from torch import Tensor
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.figures.disparity_profile import DisparityProfile
 from directshape_torch.figures.observability import Observability
-from directshape_torch.figures.quality import FitQuality
-from directshape_torch.figures.trust_model import bundled_trust_model
+from directshape_torch.figures.quality import FitQuality, bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import CarRecord, placed
 from directshape_torch.refinement.disparity_profile import disparity_profile

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.figures.quality import EVIDENCE_NAMES
-from directshape_torch.figures.trust_model import LogisticHead
+from directshape_torch.figures.quality import EVIDENCE_NAMES, LogisticHead
 from quality_calibration.observations import Array, Observations
 
 # Median of |x| of a standard normal variable.

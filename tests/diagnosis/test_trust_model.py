@@ -12,8 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.figures.quality import EVIDENCE_NAMES
-from directshape_torch.figures.trust_model import LogisticHead, TrustModel, bundled_trust_model, load_trust_model
+from directshape_torch.figures.quality import (
+    EVIDENCE_NAMES,
+    LogisticHead,
+    TrustModel,
+    bundled_trust_model,
+    load_trust_model,
+)
 
 HEAD = LogisticHead(("log_depth", "turned"), (0.5, 0.1), (2.0, 0.05), (1.0, -2.0), 0.25)
 MODEL = TrustModel(HEAD, HEAD, (2.0, 3.0, 1.0, 0.5), (0.1, 0.2, 0.0, 0.01), {"made_by": "a test"})

@@ -25,7 +25,7 @@ from directshape_torch import load_config
 from directshape_torch.batch.run_status import format_status, read_status
 from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.errors import MeshError
-from directshape_torch.figures.trust_model import load_trust_model
+from directshape_torch.figures.quality import load_trust_model
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import read_disparity

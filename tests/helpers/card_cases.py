@@ -56,10 +56,11 @@ SETTINGS: dict[str, RefinerConfig] = {
     ),
     "search": replace(DEFAULT, search=replace(DEFAULT.search, disparity_offsets_px=(-1.0, 1.0))),
     "point cloud": replace(DEFAULT, method="geometric"),
-    "point cloud and images": replace(DEFAULT, method="combined"),
     "implicit gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="implicit")),
-    "unrolled gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="unroll")),
 }
+
+# Of views of tracks as well as of cars by themselves.
+UNROLLED = replace(DEFAULT, backward=replace(DEFAULT.backward, mode="unroll"))
 
 
 def compare(config: RefinerConfig, prior: ShapePrior | None = None, tracks: bool = False) -> dict[str, float]:
@@ -179,8 +180,7 @@ def demo() -> dict[str, list[str]]:
 CASES: dict[str, Callable[[], Any]] = {
     **{name: lambda config=config: compare(config) for name, config in SETTINGS.items()},  # type: ignore[misc]
     "neural prior": lambda: compare(DEFAULT, prior_of("neural")),
-    "tracks": lambda: compare(_SHIPPED, tracks=True),
-    "tracks, unrolled gradients": lambda: compare(SETTINGS["unrolled gradients"], tracks=True),
+    "tracks, unrolled gradients": lambda: compare(UNROLLED, tracks=True),
     "waits of blocks": waits_of_blocks,
     "waits of blocks of tracks": lambda: waits_of_blocks(tracks=True),
     "the card itself": waits_of_nothing,

@@ -15,8 +15,7 @@ from quality_calibration.bend import Bend
 
 import directshape_torch
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.figures.quality import EVIDENCE_NAMES
-from directshape_torch.figures.trust_model import load_trust_model
+from directshape_torch.figures.quality import EVIDENCE_NAMES, load_trust_model
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.refiner import DirectShapeRefiner

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
 import torch.autograd.forward_ad as fwAD
 from torch import Tensor
 
-from directshape_torch.shape import sdf_grid
 from directshape_torch.shape.sdf_grid import GridShape
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
@@ -207,26 +204,6 @@ def test_differentiation_needs_no_gradient_mode(by: str) -> None:
         else:
             _, tangent = torch.func.jvp(lambda x: shape.value(x, index), (points,), (along,))
     torch.testing.assert_close(tangent, expected, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("differentiable", [True, False])
-def test_the_shorter_form_is_for_what_nobody_differentiates(
-    differentiable: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    def of(lookup: Callable[..., Any]) -> Callable[..., Any]:
-        def noted(field: object, points_obj: Tensor, index: Tensor, constant: bool) -> Any:
-            asked.append(constant)
-            return lookup(field, points_obj, index, constant)
-
-        return noted
-
-    monkeypatch.setattr(sdf_grid, "derivatives_at", of(sdf_grid.derivatives_at))
-    shape, index = random_shape(), torch.zeros(3, dtype=torch.long)
-    with torch.set_grad_enabled(differentiable):
-        shape.value_and_derivatives(points_inside(3), index)
-    assert asked == [not differentiable]
 
 
 def test_the_gradient_can_be_traced() -> None:

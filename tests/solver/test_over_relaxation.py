@@ -174,22 +174,6 @@ def test_uphill_steps_that_are_taken_are_followed_by_plain_ones() -> None:
     torch.testing.assert_close(result.state.x, torch.ones(1, 1, dtype=torch.float64), rtol=0, atol=1e-2)
 
 
-@pytest.mark.parametrize("block", [1, 3, 100])
-def test_compaction_changes_nothing(block: int) -> None:
-    points = torch.randn(8, 9, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    reference, result = (
-        minimise(
-            GeometricMedians(points, [StageConfig(1.0, 0, 60, over_relaxation=FACTOR)]),
-            zeros(8, 2),
-            replace(DAMPED, block_iterations=length, cost_tolerance=1e-6, step_tolerance=0.0),
-        )
-        for length in (1000, block)
-    )
-    assert len(set(reference.iterations.tolist())) > 1
-    assert torch.equal(result.iterations, reference.iterations)
-    torch.testing.assert_close(result.state.x, reference.state.x, rtol=0, atol=1e-13)
-
-
 def test_rounds_of_the_point_cloud_method_take_plain_steps() -> None:
     assert {stage.over_relaxation for stage in method_stages(load_config("default"))} == {FACTOR}
     assert {stage.over_relaxation for stage in method_stages(load_config("default", ["method=geometric"]))} == {1.0}
