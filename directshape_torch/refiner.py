@@ -33,7 +33,7 @@ from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
 
 if TYPE_CHECKING:
-    from directshape_torch.observation.car_points import PointSamples
+    from directshape_torch.terms.car_points import PointSamples
 
 
 class KnownRig(Protocol):
@@ -169,7 +169,8 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
         seen = self._observe(frames, detections)
-        failure = refusals(frames, detections, seen.pixels, seen.points, self.config)
+        num_points = None if seen.points is None else seen.points.counts
+        failure = refusals(frames, detections, seen.pixels, num_points, self.config)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
         cars = self._cars(frames, detections).of_cars(usable)
@@ -217,8 +218,8 @@ class DirectShapeRefiner(nn.Module):
         pixels = pack_pixels(frames, detections, self.config.sampling, extents)
         if self.config.method in ("direct", "box_alignment"):
             return _Seen(pixels, None)
-        from directshape_torch.observation.car_points import car_points
         from directshape_torch.stereo_matching.disparity import with_disparity
+        from directshape_torch.terms.car_points import car_points
 
         matched = with_disparity(frames, needed=detections.frame_index)
         return _Seen(pixels, car_points(matched, detections, self.config.point_cloud))

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
 from directshape_torch.errors import InputError
-from directshape_torch.observation.car_points import car_points
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.rows import Blocks
 from directshape_torch.scene import Detections
 from directshape_torch.status import Status
+from directshape_torch.terms.car_points import car_points
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.priors import PriorResidual, PriorTerm, height_prior

@@ -14,13 +14,13 @@ from directshape_torch.geometry import se3
 from directshape_torch.laboratory.regimes import Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
-from directshape_torch.observation.car_points import PointSamples
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.silhouette import contour_zeta
 from directshape_torch.terms.term import Linear, Sight, Term, linear_of

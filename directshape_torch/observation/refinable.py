@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from copy import copy
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -21,9 +20,6 @@ from directshape_torch.observation.packing import Observation
 from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
-
-if TYPE_CHECKING:
-    from directshape_torch.observation.car_points import PointSamples
 
 # A car whose origin is nearer than this is at the camera: its silhouette is not a projection any more.
 _MIN_DEPTH_M = 1.0
@@ -137,7 +133,7 @@ def without_empty_masks(detections: Detections, extents: SceneExtents | None = N
 
 
 def refusals(
-    frames: FrameBatch, detections: Detections, pixels: Observation, points: PointSamples | None, config: RefinerConfig
+    frames: FrameBatch, detections: Detections, pixels: Observation, num_points: Tensor | None, config: RefinerConfig
 ) -> Tensor:
     """For each car the code (B,) of the status that forbids its refinement, or -1.
 
@@ -145,15 +141,15 @@ def refusals(
         frames: F frames.
         detections: B cars.
         pixels: packed pixels of all cars.
-        points: their stereo points; None for methods without.
+        num_points: (B,) of their stereo points; None for methods without.
         config: method and least numbers.
     """
     T = detections.T_cam_obj
     finite = T.isfinite().all(-1).all(-1)
     upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
     in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
-    if config.method == "geometric" and points is not None:
-        lacking = [(points.counts < config.point_cloud.min_points, Status.too_few_points)]
+    if config.method == "geometric" and num_points is not None:
+        lacking = [(num_points < config.point_cloud.min_points, Status.too_few_points)]
     else:
         lacking = _lacking_pixels(pixels, config.sampling.min_usable_pixels)
     code = torch.full((len(detections),), -1, device=T.device)

@@ -28,7 +28,7 @@ from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Sil
 from directshape_torch.terms.term import Term
 
 if TYPE_CHECKING:
-    from directshape_torch.observation.car_points import PointSamples
+    from directshape_torch.terms.car_points import PointSamples
 
 # Those of "point_cloud" hold for the methods with points, the first two for the others.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -30,13 +30,15 @@ from directshape_torch.depth import (
 )
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import cross
-from directshape_torch.observation.packing import PixelSamples
 from directshape_torch.rows import Blocks, CarSums, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.term import Linear, Sight, Where
+
+if TYPE_CHECKING:
+    from directshape_torch.observation.packing import PixelSamples
 
 # Of zeta, per metre.
 ZETA_BOUNDS = (4.0, 400.0)
