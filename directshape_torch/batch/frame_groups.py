@@ -9,14 +9,10 @@ from itertools import groupby
 
 @dataclass(frozen=True)
 class FrameGroup:
-    """Frames of one call of the refiner.
+    """Frames of one call of the refiner."""
 
-    Attributes:
-        frame_ids: all of them; the last digits of a result depend on its company.
-        wanted: those whose files are to be written; the others are finished already, or another call writes them.
-    """
-
-    frame_ids: tuple[str, ...]
+    frame_ids: tuple[str, ...]  # all of them; the last digits of a result depend on its company
+    # Those whose files are to be written; the others are finished already, or another call writes them.
     wanted: frozenset[str]
 
     def without(self, finished: Collection[str]) -> FrameGroup:

@@ -31,48 +31,32 @@ _STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)
 
 @dataclass(frozen=True)
 class RunJob:
-    """All that a process needs for its share of a run.
-
-    Attributes:
-        dataset: the frames.
-        refiner: on its device.
-        out_dir: the output folder.
-        options: kinds of outputs.
-        run, prior_sha256: hashes of the manifest and of the shape prior.
-        expected_cars: about how many the whole run has, from which every process draws the same conclusion whether to
-            compile.
-    """
+    """All that a process needs for its share of a run."""
 
     dataset: FileStereoDataset
     refiner: DirectShapeRefiner
     out_dir: Path
-    options: RefineOptions
+    options: RefineOptions  # kinds of outputs
+    # Hashes of the manifest and of the shape prior.
     run: str
     prior_sha256: str
+    # About how many the whole run has, from which every process draws the same conclusion whether to compile.
     expected_cars: int
 
 
 @dataclass
 class GroupReport:
-    """What became of a group.
+    """What became of a group."""
 
-    Attributes:
-        ends: what `summary.json` says of its frames, in the order in which they ended.
-        calls: of the refiner.
-        num_halved: calls that did not work and were tried again with half of the frames.
-        cpu_s: time that the processor spent on it, reading and writing included, whatever else the machine did.
-        peak_memory_mb: of the process so far, where the system tells.
-        peak_device_memory_mb: of the graphics card so far.
-        stopped: why no other frame could be refined either, or None.
-    """
-
+    # What `summary.json` says of its frames, in the order in which they ended.
     ends: dict[str, FrameEntry] = field(default_factory=dict)
-    calls: list[CallTiming] = field(default_factory=list)
-    num_halved: int = 0
+    calls: list[CallTiming] = field(default_factory=list)  # of the refiner
+    num_halved: int = 0  # calls that did not work and were tried again with half of the frames
+    # Time that the processor spent on it, reading and writing included, whatever else the machine did.
     cpu_s: float = 0.0
-    peak_memory_mb: float | None = None
-    peak_device_memory_mb: float | None = None
-    stopped: str | None = None
+    peak_memory_mb: float | None = None  # of the process so far, where the system tells
+    peak_device_memory_mb: float | None = None  # of the graphics card so far
+    stopped: str | None = None  # why no other frame could be refined either, or None
 
 
 # A frame that was read, with the hashes of its files.

@@ -62,25 +62,19 @@ def _versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class RunBeginning:
-    """The first line.
+    """The first line."""
 
-    Attributes:
-        work: who works: "where" ("this process" or "processes"), "workers", "threads" of
-            each, "device", "batch_frames", "outputs".
-        num_frames: of the data set.
-        host, pid: the process that was started by the user.
-        started_at: seconds since 1970, like all times.
-        machine: operating system and processor.
-        versions: of Python and of the packages that compute.
-    """
-
+    # Who works: "where" ("this process" or "processes"), "workers", "threads" of each, "device", "batch_frames",
+    # "outputs".
     work: Mapping[str, Any]
-    num_frames: int
+    num_frames: int  # of the data set
+    # The process that was started by the user.
     host: str = field(default_factory=platform.node)
     pid: int = field(default_factory=os.getpid)
-    started_at: float = field(default_factory=time.time)
+    started_at: float = field(default_factory=time.time)  # seconds since 1970, like all times
+    # Operating system and processor.
     machine: str = field(default_factory=lambda: f"{platform.system()} {platform.machine()}")
-    versions: Mapping[str, str] = field(default_factory=_versions)
+    versions: Mapping[str, str] = field(default_factory=_versions)  # of Python and of the packages that compute
 
     @property
     def is_alive(self) -> bool | None:
@@ -132,19 +126,12 @@ class RunEnd:
 
 @dataclass(frozen=True)
 class LogContents:
-    """What a log says of the latest run.
+    """What a log says of the latest run."""
 
-    Attributes:
-        beginning: its first line.
-        frames: the ends of frames so far, by name.
-        refining: after the check of what earlier runs left, or None.
-        end: or None; a run that was killed says nothing.
-    """
-
-    beginning: RunBeginning
-    frames: Mapping[str, FrameLine]
-    refining: Refining | None
-    end: RunEnd | None
+    beginning: RunBeginning  # its first line
+    frames: Mapping[str, FrameLine]  # the ends of frames so far, by name
+    refining: Refining | None  # after the check of what earlier runs left, or None
+    end: RunEnd | None  # or None; a run that was killed says nothing
 
 
 class RunLog:

@@ -17,33 +17,19 @@ _SHOWN_FAILURES = 10
 
 @dataclass(frozen=True)
 class RunStatus:
-    """The latest run into a folder.
+    """The latest run into a folder."""
 
-    Attributes:
-        state: "checking", "running", "finished", "stopped", or "killed": the run ended without saying so.
-        owner: the process that runs, in words, or None.
-        work: who works, see `RunBeginning`.
-        num_frames: of the data set.
-        num_done: frames done, those of earlier runs included.
-        num_resumed: these.
-        failed: frames that failed, with the reason.
-        frames_per_s: at present, or None where too few have ended.
-        seconds_left: at this rate, or None where nobody knows.
-        last_frame_at: when a frame last ended, seconds since 1970, or None.
-        reason: why a stopped run was stopped, or None.
-    """
-
-    state: str
-    owner: str | None
-    work: Mapping[str, object]
-    num_frames: int
-    num_done: int
-    num_resumed: int
-    failed: Mapping[str, str]
-    frames_per_s: float | None
-    seconds_left: float | None
-    last_frame_at: float | None
-    reason: str | None
+    state: str  # "checking", "running", "finished", "stopped", or "killed": the run ended without saying so
+    owner: str | None  # the process that runs, in words, or None
+    work: Mapping[str, object]  # who works, see `RunBeginning`
+    num_frames: int  # of the data set
+    num_done: int  # frames done, those of earlier runs included
+    num_resumed: int  # these
+    failed: Mapping[str, str]  # frames that failed, with the reason
+    frames_per_s: float | None  # at present, or None where too few have ended
+    seconds_left: float | None  # at this rate, or None where nobody knows
+    last_frame_at: float | None  # when a frame last ended, seconds since 1970, or None
+    reason: str | None  # why a stopped run was stopped, or None
 
     @property
     def num_left(self) -> int:

@@ -22,44 +22,26 @@ TIMINGS_SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class CallTiming:
-    """One call of the refiner, reading and writing not included.
+    """One call of the refiner, reading and writing not included."""
 
-    Attributes:
-        frame_ids: its frames.
-        num_cars: its cars.
-        refine_s: seconds that it took.
-        compiled: functions that were compiled or loaded in it.
-    """
-
-    frame_ids: tuple[str, ...]
-    num_cars: int
-    refine_s: float
-    compiled: int = 0
+    frame_ids: tuple[str, ...]  # its frames
+    num_cars: int  # its cars
+    refine_s: float  # seconds that it took
+    compiled: int = 0  # functions that were compiled or loaded in it
 
 
 @dataclass
 class RunTimings:
-    """All calls of a run, in order.
+    """All calls of a run, in order."""
 
-    Attributes:
-        device: where the refiner ran.
-        calls: one entry a call.
-        workers: processes that refined side by side.
-        threads: of each.
-        cpu_s: seconds that processors spent on the frames, in all workers, reading and writing included.
-        wall_s: seconds from the first frame to the last, reading and writing included.
-        peak_mb: the largest resident memory of any of these processes, MB, where the system tells.
-        peak_device_mb: the largest memory of tensors on a graphics card, MB.
-    """
-
-    device: torch.device
-    calls: list[CallTiming] = field(default_factory=list)
-    workers: int = 1
-    threads: int = field(default_factory=torch.get_num_threads)
-    cpu_s: float = 0.0
-    wall_s: float = 0.0
-    peak_mb: float | None = None
-    peak_device_mb: float | None = None
+    device: torch.device  # where the refiner ran
+    calls: list[CallTiming] = field(default_factory=list)  # one entry a call
+    workers: int = 1  # processes that refined side by side
+    threads: int = field(default_factory=torch.get_num_threads)  # of each
+    cpu_s: float = 0.0  # seconds that processors spent on the frames, in all workers, reading and writing included
+    wall_s: float = 0.0  # seconds from the first frame to the last, reading and writing included
+    peak_mb: float | None = None  # the largest resident memory of any of these processes, MB, where the system tells
+    peak_device_mb: float | None = None  # the largest memory of tensors on a graphics card, MB
 
     @contextmanager
     def measure(self, frame_ids: Sequence[str], num_cars: int) -> Iterator[None]:
@@ -166,21 +148,13 @@ def _rounded(number: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Outcome of `refine_dataset`.
+    """Outcome of `refine_dataset`."""
 
-    Attributes:
-        frames: for each frame of the data set its entry of `summary.json`.
-        resumed: frames that an earlier run had finished.
-        failed: frames that could not be refined, with the reason.
-        warnings: things that look wrong though nothing failed.
-        timings: of the calls of this run.
-    """
-
-    frames: Mapping[str, Mapping[str, Any]]
-    resumed: tuple[str, ...]
-    failed: Mapping[str, str]
-    warnings: tuple[str, ...]
-    timings: RunTimings
+    frames: Mapping[str, Mapping[str, Any]]  # for each frame of the data set its entry of `summary.json`
+    resumed: tuple[str, ...]  # frames that an earlier run had finished
+    failed: Mapping[str, str]  # frames that could not be refined, with the reason
+    warnings: tuple[str, ...]  # things that look wrong though nothing failed
+    timings: RunTimings  # of the calls of this run
 
     @property
     def num_cars(self) -> int:

@@ -20,19 +20,12 @@ from directshape_torch.shape.shape_prior import ShapePrior
 
 @dataclass(frozen=True)
 class ScanFit:
-    """The cars of a frame, fitted to its scan.
-
-    Attributes:
-        frame_id: the frame.
-        objects: all lines of its file of boxes.
-        rows: N numbers, which of them were fitted.
-        fit: of these, in the left camera frame.
-    """
+    """The cars of a frame, fitted to its scan."""
 
     frame_id: str
-    objects: list[KittiObject]
-    rows: list[int]
-    fit: ShapeFit
+    objects: list[KittiObject]  # all lines of its file of boxes
+    rows: list[int]  # N numbers, which of them were fitted
+    fit: ShapeFit  # of these, in the left camera frame
 
 
 def fit_scan(dataset: FileStereoDataset, frame_id: str, prior: ShapePrior | None = None) -> ScanFit:

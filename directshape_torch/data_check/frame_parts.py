@@ -26,23 +26,14 @@ _Part = TypeVar("_Part")
 
 @dataclass(frozen=True)
 class FrameParts:
-    """What could be read of a frame; None where it could not.
-
-    Attributes:
-        frame_id: its name.
-        pair: left and right image (H, W, 3), RGB, of one size.
-        calibration: the two projections.
-        camera: the same, where it is that of a stereo pair.
-        objects: detections of the refined classes with a 3D box.
-        masks: instances of both images.
-    """
+    """What could be read of a frame; None where it could not."""
 
     frame_id: str
-    pair: Pair | None
-    calibration: KittiCalibration | None
-    camera: StereoCamera | None
-    objects: list[KittiObject]
-    masks: list[InstanceMask] | None
+    pair: Pair | None  # left and right image (H, W, 3), RGB, of one size
+    calibration: KittiCalibration | None  # the two projections
+    camera: StereoCamera | None  # the same, where it is that of a stereo pair
+    objects: list[KittiObject]  # detections of the refined classes with a 3D box
+    masks: list[InstanceMask] | None  # instances of both images
 
     @property
     def size_hw(self) -> tuple[int, int] | None:

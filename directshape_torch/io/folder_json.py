@@ -23,22 +23,15 @@ _BOX_KEYS = ("dimensions_hwl_m", "bottom_center_m", "rotation_y_rad")
 
 @dataclass(frozen=True)
 class FolderRig:
-    """`rig.json`: the rectified pair.
+    """`rig.json`: the rectified pair."""
 
-    Attributes:
-        image_size_wh: pixels.
-        K_left, K_right: intrinsics, (3, 3), pixels; `K_right` None: as the left ones.
-        baseline_m: of the cameras, or
-        t_right_cam_m: `x_right = x_cam + t_right_cam_m`.
-        comment: whatever its owner says.
-    """
-
-    image_size_wh: tuple[int, int]
+    image_size_wh: tuple[int, int]  # pixels
+    # Intrinsics, (3, 3), pixels; `K_right` None: as the left ones.
     K_left: tuple[_Triple, _Triple, _Triple]
     K_right: tuple[_Triple, _Triple, _Triple] | None = None
-    baseline_m: float | None = None
-    t_right_cam_m: _Triple | None = None
-    comment: Any = None
+    baseline_m: float | None = None  # of the cameras, or
+    t_right_cam_m: _Triple | None = None  # `x_right = x_cam + t_right_cam_m`
+    comment: Any = None  # whatever its owner says
 
     def projections(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """P2 and P3 (3, 4), with the left camera's frame as `ref`."""
@@ -50,49 +43,32 @@ class FolderRig:
 
 @dataclass(frozen=True)
 class FolderObject:
-    """One entry of `objects` or `labels` of a frame; without any of the box's three keys it has no 3D box.
+    """One entry of `objects` or `labels` of a frame; without any of the box's three keys it has no 3D box."""
 
-    Attributes:
-        object_class: such as "Car"; "class" in the file.
-        score: the detector's.
-        box_2d: (u_min, v_min, u_max, v_max) in the left image, pixels, or None.
-        dimensions_hwl_m: height, width, length.
-        bottom_center_m: of the box.
-        rotation_y_rad: heading as in KITTI.
-        mask_left, mask_right: the path of a PNG, a COCO segmentation, or None.
-        track_id: number of the car over the frames, -1 where there is none.
-    """
-
-    object_class: str
-    score: float = 1.0
+    object_class: str  # such as "Car"; "class" in the file
+    score: float = 1.0  # the detector's
+    # (u_min, v_min, u_max, v_max) in the left image, pixels, or None.
     box_2d: tuple[float, float, float, float] | None = None
-    dimensions_hwl_m: _Triple | None = None
-    bottom_center_m: _Triple | None = None
-    rotation_y_rad: float | None = None
+    dimensions_hwl_m: _Triple | None = None  # height, width, length
+    bottom_center_m: _Triple | None = None  # of the box
+    rotation_y_rad: float | None = None  # heading as in KITTI
+    # The path of a PNG, a COCO segmentation, or None.
     mask_left: Any = None
     mask_right: Any = None
-    track_id: int = -1
+    track_id: int = -1  # number of the car over the frames, -1 where there is none
 
 
 @dataclass(frozen=True)
 class FolderFrame:
-    """`frames/ID.json`.
+    """`frames/ID.json`."""
 
-    Attributes:
-        objects: detections, and other instances that may hide them.
-        labels: the ground truth, or None.
-        ground_plane: (a, b, c, d), a x + b y + c z + d = 0 in the left camera frame, or None.
-        time_s: when it was taken, seconds from any beginning that keeps them small, or None.
-        T_world_cam: pose of the left camera in a world that all frames share, or None.
-        comment: whatever its owner says.
-    """
-
-    objects: Sequence[FolderObject]
-    labels: Sequence[FolderObject] | None = None
-    ground_plane: _Row | None = None
-    time_s: float | None = None
+    objects: Sequence[FolderObject]  # detections, and other instances that may hide them
+    labels: Sequence[FolderObject] | None = None  # the ground truth, or None
+    ground_plane: _Row | None = None  # (a, b, c, d), a x + b y + c z + d = 0 in the left camera frame, or None
+    time_s: float | None = None  # when it was taken, seconds from any beginning that keeps them small, or None
+    # Pose of the left camera in a world that all frames share, or None.
     T_world_cam: tuple[_Row, _Row, _Row, _Row] | None = None
-    comment: Any = None
+    comment: Any = None  # whatever its owner says
 
 
 def read_rig(path: Path) -> FolderRig:

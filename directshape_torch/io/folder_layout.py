@@ -163,15 +163,10 @@ class FolderLayout(FrameLayout):
 
 @dataclass(frozen=True)
 class FolderMasks:
-    """The masks in `frames/ID.json`: the path of an 8-bit PNG from the data's folder, or a COCO segmentation.
+    """The masks in `frames/ID.json`: the path of an 8-bit PNG from the data's folder, or a COCO segmentation."""
 
-    Attributes:
-        root: paths of PNG files start here.
-        frames_dir: folder of the JSON files.
-    """
-
-    root: Path
-    frames_dir: Path
+    root: Path  # paths of PNG files start here
+    frames_dir: Path  # folder of the JSON files
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         path = self.frames_dir / f"{frame_id}.json"

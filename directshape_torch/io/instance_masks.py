@@ -33,26 +33,18 @@ class MaskSizeError(DataFormatError):
 
 @dataclass(frozen=True)
 class InstanceMask:
-    """One instance in one image.
+    """One instance in one image."""
 
-    Attributes:
-        side: the image, "left" or "right".
-        instance_id: its number in the file; numbers of the two images need not agree.
-        is_car: whether it may be matched to a car.
-        box: the file's 2D box (u_min, v_min, u_max, v_max), else that of the mask, pixels.
-        mask_box: the smallest box around the mask, whole pixels, both ends belonging to it.
-        probability: (H, W), bool or float32 foreground probability in [0, 1].
-        score: the segmentation's, 1 where there is none.
-        track_id: number of the car over the frames of its sequence, -1 where `instance_id` is of one frame alone.
-    """
-
-    side: Side
-    instance_id: int
-    is_car: bool
+    side: Side  # the image, "left" or "right"
+    instance_id: int  # its number in the file; numbers of the two images need not agree
+    is_car: bool  # whether it may be matched to a car
+    # The file's 2D box (u_min, v_min, u_max, v_max), else that of the mask, pixels.
     box: tuple[float, float, float, float]
+    # The smallest box around the mask, whole pixels, both ends belonging to it.
     mask_box: tuple[float, float, float, float]
-    probability: NDArray[np.bool_] | NDArray[np.float32]
-    score: float
+    probability: NDArray[np.bool_] | NDArray[np.float32]  # (H, W), bool or float32 foreground probability in [0, 1]
+    score: float  # the segmentation's, 1 where there is none
+    # Number of the car over the frames of its sequence, -1 where `instance_id` is of one frame alone.
     track_id: int = -1
 
 
@@ -139,15 +131,10 @@ def check_size(path: Path, what: str, got_hw: Iterable[int], expected_hw: tuple[
 
 @dataclass(frozen=True)
 class MaskMatches:
-    """Masks of B detections in one image.
+    """Masks of B detections in one image."""
 
-    Attributes:
-        mask_of_detection: (B,) index into the list of masks, -1 for none.
-        overlap: (B,) the overlap of the matched boxes, 0 for none.
-    """
-
-    mask_of_detection: NDArray[np.int64]
-    overlap: NDArray[np.float64]
+    mask_of_detection: NDArray[np.int64]  # (B,) index into the list of masks, -1 for none
+    overlap: NDArray[np.float64]  # (B,) the overlap of the matched boxes, 0 for none
 
 
 def match_one_to_one(

@@ -33,20 +33,14 @@ _LAYOUTS: dict[str, tuple[str, tuple[int, int]]] = {
 
 @dataclass(frozen=True)
 class KittiCalibration:
-    """Matrices of one calibration file, float64.
+    """Matrices of one calibration file, float64."""
 
-    Attributes:
-        path: the file.
-        P2, P3: projections of the left and the right colour camera from the `ref` frame, (3, 4), pixels.
-        R0_rect: camera 0 to rectified camera 0, (3, 3), or None.
-        Tr_velo_to_cam: LiDAR to camera 0, (3, 4), metres, or None.
-    """
-
-    path: Path
+    path: Path  # the file
+    # Projections of the left and the right colour camera from the `ref` frame, (3, 4), pixels.
     P2: NDArray[np.float64]
     P3: NDArray[np.float64]
-    R0_rect: NDArray[np.float64] | None = None
-    Tr_velo_to_cam: NDArray[np.float64] | None = None
+    R0_rect: NDArray[np.float64] | None = None  # camera 0 to rectified camera 0, (3, 3), or None
+    Tr_velo_to_cam: NDArray[np.float64] | None = None  # LiDAR to camera 0, (3, 4), metres, or None
 
 
 def read_calibration(path: Path | str) -> KittiCalibration:

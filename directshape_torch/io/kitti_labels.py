@@ -20,35 +20,20 @@ _NO_LOCATION_M = -1000.0
 
 @dataclass(frozen=True)
 class KittiObject:
-    """One line of a label file (15 columns) or a result file (16 columns, the score last).
+    """One line of a label file (15 columns) or a result file (16 columns, the score last)."""
 
-    Attributes:
-        type: class name, such as "Car".
-        truncated: share of the object outside the image, -1 where unknown.
-        occluded: 0 visible .. 3 unknown, -1 where not given.
-        alpha: observation angle, radians.
-        box_2d: (u_min, v_min, u_max, v_max) in the left image, pixels.
-        hwl: height, width, length, metres.
-        location_ref: bottom centre of the box in the `ref` frame, metres.
-        rotation_y: heading about the y axis of `ref`, radians.
-        score: the detector's, or None in a label.
-        raw_line: the line as it is in the file, without its newline.
-        line_number: from 1.
-        track_id: number of the car over the frames of its sequence, -1 where the file has none.
-    """
-
-    type: str
-    truncated: float
-    occluded: int
-    alpha: float
-    box_2d: tuple[float, float, float, float]
-    hwl: tuple[float, float, float]
-    location_ref: tuple[float, float, float]
-    rotation_y: float
-    score: float | None
-    raw_line: str
-    line_number: int
-    track_id: int = -1
+    type: str  # class name, such as "Car"
+    truncated: float  # share of the object outside the image, -1 where unknown
+    occluded: int  # 0 visible .. 3 unknown, -1 where not given.
+    alpha: float  # observation angle, radians
+    box_2d: tuple[float, float, float, float]  # (u_min, v_min, u_max, v_max) in the left image, pixels
+    hwl: tuple[float, float, float]  # height, width, length, metres
+    location_ref: tuple[float, float, float]  # bottom centre of the box in the `ref` frame, metres
+    rotation_y: float  # heading about the y axis of `ref`, radians
+    score: float | None  # the detector's, or None in a label
+    raw_line: str  # the line as it is in the file, without its newline
+    line_number: int  # from 1
+    track_id: int = -1  # number of the car over the frames of its sequence, -1 where the file has none
 
     @property
     def has_box_3d(self) -> bool:

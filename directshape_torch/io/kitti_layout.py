@@ -32,28 +32,20 @@ class KittiFiles:
 
     In names `{stem}` stands for the frame's name in its sequence, `{sequence}` for the name of that, and `{scene}` for
     what comes before the "_" of a stem. All but images and calibration may be missing.
-
-    Attributes:
-        left, right: images, without ending.
-        calibration: file with P2 and P3, or P_rect_02 and P_rect_03.
-        plane: ground plane.
-        labels: a file a frame, or without `{stem}` one of the tracking benchmark; "": there are none.
-        velo_to_cam: file that places the LiDAR; "": the calibration does.
-        times, trajectory: times and camera poses of a sequence, a line each from frame 0 on; "": there are none.
-        digits: of a frame's number.
-        first: what is added to a number alone; files may leave it out.
     """
 
+    # Images, without ending.
     left: str
     right: str
-    calibration: str
+    calibration: str  # file with P2 and P3, or P_rect_02 and P_rect_03
     plane: str = "planes/{stem}.txt"
-    labels: str = ""
-    velo_to_cam: str = ""
+    labels: str = ""  # a file a frame, or without `{stem}` one of the tracking benchmark; "": there are none
+    velo_to_cam: str = ""  # file that places the LiDAR; "": the calibration does
+    # Times and camera poses of a sequence, a line each from frame 0 on; "": there are none.
     times: str = ""
     trajectory: str = ""
-    digits: int = 6
-    first: str = ""
+    digits: int = 6  # of a frame's number
+    first: str = ""  # what is added to a number alone; files may leave it out
 
 
 OBJECT = KittiFiles("image_2/{stem}", "image_3/{stem}", "calib/{stem}.txt", labels="label_2/{stem}.txt")

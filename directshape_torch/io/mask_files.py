@@ -40,14 +40,10 @@ class FrameJsonMasks:
 
     An entry may carry `soft_probability`, the path (from the folder of the json file) of an 8-bit PNG of the
     foreground probability x 255, which then stands in for the binary mask.
-
-    Attributes:
-        directory: the folder, or the one above a folder `data`.
-        car_ids: category ids that are cars.
     """
 
-    directory: Path
-    car_ids: frozenset[int] = COCO_CAR_IDS
+    directory: Path  # the folder, or the one above a folder `data`
+    car_ids: frozenset[int] = COCO_CAR_IDS  # category ids that are cars
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
         path = self.path(frame_id)
@@ -76,16 +72,12 @@ class InstancePngMasks:
     """Folders `instance_2` (left) and `instance_3` (right, if any) of PNG files with `class * 1000 + instance`.
 
     KITTI MOTS (1 car, 2 pedestrian, 10000 ignored) and Cityscapes (26 car; values below 1000 are not instances).
-
-    Attributes:
-        directory: the folder that holds both, or the left one alone.
-        car_ids: classes that are cars.
-        folders: names of the two; `instance_02` and `instance_03` in the layout of tracking sequences, whose instances
-            are tracks.
     """
 
-    directory: Path
-    car_ids: frozenset[int] = PNG_CAR_IDS
+    directory: Path  # the folder that holds both, or the left one alone
+    car_ids: frozenset[int] = PNG_CAR_IDS  # classes that are cars
+    # Names of the two; `instance_02` and `instance_03` in the layout of tracking sequences, whose instances are
+    # tracks.
     folders: tuple[str, str] = ("instance_2", "instance_3")
 
     def read(self, frame_id: str, size_hw: tuple[int, int]) -> list[InstanceMask]:
@@ -119,16 +111,12 @@ class InstancePngMasks:
 
 @dataclass(frozen=True)
 class CocoFileMasks:
-    """Two plain COCO result files, left and right, with `image_id` = frame number (Detectron2, mmdet).
+    """Two plain COCO result files, left and right, with `image_id` = frame number (Detectron2, mmdet)."""
 
-    Attributes:
-        left, right: the files; either may be None.
-        car_ids: category ids that are cars.
-    """
-
+    # The files; either may be None.
     left: Path | None
     right: Path | None
-    car_ids: frozenset[int] = COCO_CAR_IDS
+    car_ids: frozenset[int] = COCO_CAR_IDS  # category ids that are cars
     _by_frame: dict[Side, dict[int, list[tuple[int, Mapping[str, Any]]]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )

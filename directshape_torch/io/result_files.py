@@ -80,75 +80,55 @@ def shaped(*sizes: str | int) -> dict[str, tuple[str | int, ...]]:
 
 @dataclass(frozen=True)
 class ShapeArrays:
-    """Content of `OUT/shapes/NNNNNN.npz` for the B refined lines of a frame; K codes, D = 6 + K, T terms, P offsets.
-
-    Attributes:
-        frame_id: the frame.
-        prior_sha256: of the shape prior whose codes these are.
-        ground_source: "file", "stereo" or "camera_height".
-        input_lines: (B,) line numbers in the detection file, from 1.
-        tracks: (B,) text, the name of the track of which each car is a view, "" for none.
-        track_parts: (B,) 0 for views that share a shape, 1, 2 .. for the parts of a track that was split, -1 for none.
-        T_cam_obj, T_ref_obj: (B, 4, 4) object to left camera, and to the frame of the labels.
-        boxes_hwl: (B, 3) metres.
-        boxes_location_ref: (B, 3) bottom centres, metres.
-        boxes_rotation_y: (B,) radians.
-        codes: (B, K) standard deviations.
-        covariances: (B, D, D) in the tangent (v, omega, code) of the solver; NaN where there is none.
-        covariances_ref: (B, 4, 4) of (x, y, z, yaw) in `ref`, metres and radians.
-        statuses, messages: (B,) text.
-        term_names: (T,) text.
-        costs_before, costs_after: (B, T) cost of each term.
-        iterations: (B,).
-        has_mask_left: (B,) bool, whether a mask of the left image was matched.
-        mask_iou_left, mask_iou_right: (B,) overlap of the projected shape with its masks; NaN where not refined.
-        photometric_errors_grey: (B,) mean absolute difference of the images, grey levels of 0..255.
-        matched_shares: (B,) share of the photometric pixels that could be compared.
-        probabilities_better, probabilities_not_worse: (B,) calibrated, see `FitQuality`.
-        sigmas_ref: (B, 4) calibrated standard deviations of (x, y, z, yaw) in `ref`, metres and radians.
-        unseen: (B,) text, the direction that the view shows least.
-        unseen_sigmas_m: (B, 7) standard deviations along the principal directions, falling, without priors.
-        unseen_directions: (B, 7, 7) these directions, rows; columns `observability.CAR_QUANTITIES`.
-        profile_offsets_px: (P,) offsets of disparity.
-        profile_costs_before, profile_costs_after: (B, P) photometric cost there, see `DisparityProfile`.
-        made_of: `FrameRecord` as JSON text, by which a run knows its own files; "" outside of a run.
-    """
+    """Content of `OUT/shapes/NNNNNN.npz` for the B refined lines of a frame; K codes, D = 6 + K, T terms, P offsets."""
 
     frame_id: str
-    prior_sha256: str
-    ground_source: str
-    input_lines: NDArray[np.int64] = field(metadata=shaped("B"))
+    prior_sha256: str  # of the shape prior whose codes these are
+    ground_source: str  # "file", "stereo" or "camera_height"
+    input_lines: NDArray[np.int64] = field(metadata=shaped("B"))  # line numbers in the detection file, from 1
+    # Text, the name of the track of which each car is a view, "" for none.
     tracks: tuple[str, ...] = field(metadata=shaped("B"))
+    # 0 for views that share a shape, 1, 2 .. for the parts of a track that was split, -1 for none.
     track_parts: NDArray[np.int64] = field(metadata=shaped("B"))
+    # Object to left camera, and to the frame of the labels.
     T_cam_obj: Floats = field(metadata=shaped("B", 4, 4))
     T_ref_obj: Floats = field(metadata=shaped("B", 4, 4))
-    boxes_hwl: Floats = field(metadata=shaped("B", 3))
-    boxes_location_ref: Floats = field(metadata=shaped("B", 3))
-    boxes_rotation_y: Floats = field(metadata=shaped("B"))
-    codes: Floats = field(metadata=shaped("B", "K"))
+    boxes_hwl: Floats = field(metadata=shaped("B", 3))  # metres
+    boxes_location_ref: Floats = field(metadata=shaped("B", 3))  # bottom centres, metres
+    boxes_rotation_y: Floats = field(metadata=shaped("B"))  # radians
+    codes: Floats = field(metadata=shaped("B", "K"))  # standard deviations
+    # In the tangent (v, omega, code) of the solver; NaN where there is none.
     covariances: Floats = field(metadata=shaped("B", "D", "D"))
-    covariances_ref: Floats = field(metadata=shaped("B", 4, 4))
+    covariances_ref: Floats = field(metadata=shaped("B", 4, 4))  # of (x, y, z, yaw) in `ref`, metres and radians
     statuses: tuple[str, ...] = field(metadata=shaped("B"))
     messages: tuple[str, ...] = field(metadata=shaped("B"))
-    term_names: tuple[str, ...]
+    term_names: tuple[str, ...]  # (T,) text
+    # Cost of each term.
     costs_before: Floats = field(metadata=shaped("B", "T"))
     costs_after: Floats = field(metadata=shaped("B", "T"))
     iterations: NDArray[np.int64] = field(metadata=shaped("B"))
-    has_mask_left: NDArray[np.bool_] = field(metadata=shaped("B"))
+    has_mask_left: NDArray[np.bool_] = field(metadata=shaped("B"))  # bool, whether a mask of the left image was matched
+    # Overlap of the projected shape with its masks; NaN where not refined.
     mask_iou_left: Floats = field(metadata=shaped("B"))
     mask_iou_right: Floats = field(metadata=shaped("B"))
+    # Mean absolute difference of the images, grey levels of 0..255.
     photometric_errors_grey: Floats = field(metadata=shaped("B"))
-    matched_shares: Floats = field(metadata=shaped("B"))
+    matched_shares: Floats = field(metadata=shaped("B"))  # share of the photometric pixels that could be compared
+    # Calibrated, see `FitQuality`.
     probabilities_better: Floats = field(metadata=shaped("B"))
     probabilities_not_worse: Floats = field(metadata=shaped("B"))
+    # Calibrated standard deviations of (x, y, z, yaw) in `ref`, metres and radians.
     sigmas_ref: Floats = field(metadata=shaped("B", 4))
-    unseen: tuple[str, ...] = field(metadata=shaped("B"))
+    unseen: tuple[str, ...] = field(metadata=shaped("B"))  # text, the direction that the view shows least
+    # Standard deviations along the principal directions, falling, without priors.
     unseen_sigmas_m: Floats = field(metadata=shaped("B", 7))
+    # These directions, rows; columns `observability.CAR_QUANTITIES`.
     unseen_directions: Floats = field(metadata=shaped("B", 7, 7))
-    profile_offsets_px: Floats = field(metadata=shaped("P"))
+    profile_offsets_px: Floats = field(metadata=shaped("P"))  # offsets of disparity
+    # Photometric cost there, see `DisparityProfile`.
     profile_costs_before: Floats = field(metadata=shaped("B", "P"))
     profile_costs_after: Floats = field(metadata=shaped("B", "P"))
-    made_of: str = ""
+    made_of: str = ""  # `FrameRecord` as JSON text, by which a run knows its own files; "" outside of a run
 
     def __post_init__(self) -> None:
         last = {"B": self.input_lines.shape, "K": self.codes.shape, "P": self.profile_offsets_px.shape}

@@ -65,23 +65,15 @@ def mesh_path(out_dir: Path | str, frame_id: str, line_number: int, mesh_format:
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """What the files of a frame were made of; `shapes/NNNNNN.npz` carries it.
+    """What the files of a frame were made of; `shapes/NNNNNN.npz` carries it."""
 
-    Attributes:
-        run: hash of the manifest.
-        inputs: sha256 of the files of the data set, by their role.
-        outputs: kinds of files that the frame has: "data", "shapes", "meshes_ply", "meshes_glb", "overlays".
-        files: sha256 of each of them but the one that this stands in, by its path in the output folder.
-        lines: of the detection file.
-        masks_right: cars with a mask in the right image.
-    """
-
-    run: str
-    inputs: Mapping[str, str]
+    run: str  # hash of the manifest
+    inputs: Mapping[str, str]  # sha256 of the files of the data set, by their role
+    # Kinds of files that the frame has: "data", "shapes", "meshes_ply", "meshes_glb", "overlays".
     outputs: Sequence[str]
-    files: Mapping[str, str]
-    lines: int
-    masks_right: int
+    files: Mapping[str, str]  # sha256 of each of them but the one that this stands in, by its path in the output folder
+    lines: int  # of the detection file
+    masks_right: int  # cars with a mask in the right image
 
     def files_of(self, outputs: Iterable[str]) -> dict[str, str]:
         """Those of `files` that belong to some kinds of outputs."""
@@ -155,23 +147,15 @@ def frame_entry(shapes: ShapeArrays, record: FrameRecord) -> FrameEntry:
 
 @dataclass(frozen=True)
 class ResultObject:
-    """One result line with a 3D box, refined or not.
+    """One result line with a 3D box, refined or not."""
 
-    Attributes:
-        line: type, 2D box, score and whatever else the detector said.
-        status: name of the `Status` of a car, or "copied".
-        car: row in the frame's `ShapeArrays`, -1 for lines that are not in it.
-        R_ref_obj: (3, 3) axes of the object (forward, down, left) in `ref`; of a refined car with its tilt.
-        bottom_ref: (3,) bottom centre of the box in `ref`, metres.
-        hwl: (3,) height, width, length, metres.
-    """
-
-    line: KittiObject
-    status: str
-    car: int
+    line: KittiObject  # type, 2D box, score and whatever else the detector said
+    status: str  # name of the `Status` of a car, or "copied"
+    car: int  # row in the frame's `ShapeArrays`, -1 for lines that are not in it
+    # (3, 3) axes of the object (forward, down, left) in `ref`; of a refined car with its tilt.
     R_ref_obj: NDArray[np.float64]
-    bottom_ref: NDArray[np.float64]
-    hwl: NDArray[np.float64]
+    bottom_ref: NDArray[np.float64]  # (3,) bottom centre of the box in `ref`, metres
+    hwl: NDArray[np.float64]  # (3,) height, width, length, metres
 
     @property
     def is_refined(self) -> bool:
@@ -186,21 +170,13 @@ class ResultObject:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What a run left of one frame.
-
-    Attributes:
-        frame_id: the frame.
-        lines: every line of the result file.
-        shapes: states and shapes of its cars.
-        record: what it was made of.
-        mesh_files: the saved mesh of each car, or None.
-    """
+    """What a run left of one frame."""
 
     frame_id: str
-    lines: tuple[KittiObject, ...]
-    shapes: ShapeArrays
-    record: FrameRecord
-    mesh_files: tuple[Path | None, ...] = ()
+    lines: tuple[KittiObject, ...]  # every line of the result file
+    shapes: ShapeArrays  # states and shapes of its cars
+    record: FrameRecord  # what it was made of
+    mesh_files: tuple[Path | None, ...] = ()  # the saved mesh of each car, or None
 
     @property
     def cars(self) -> list[KittiObject]:

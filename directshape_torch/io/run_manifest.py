@@ -58,19 +58,12 @@ class FrameEntry(_FrameState, total=False):
 
 @dataclass(frozen=True)
 class RunManifest:
-    """What a run was made of and how far it came.
+    """What a run was made of and how far it came."""
 
-    Attributes:
-        package_version: of this package.
-        config: every setting that bears on the results, nested as in the configuration file.
-        sha256: hashes of what serves all frames.
-        frames: how each frame ended.
-    """
-
-    package_version: str
-    config: Mapping[str, Any]
-    sha256: SharedHashes
-    frames: dict[str, FrameEntry] = field(default_factory=dict)
+    package_version: str  # of this package
+    config: Mapping[str, Any]  # every setting that bears on the results, nested as in the configuration file
+    sha256: SharedHashes  # hashes of what serves all frames
+    frames: dict[str, FrameEntry] = field(default_factory=dict)  # how each frame ended
 
     @property
     def hash(self) -> str:

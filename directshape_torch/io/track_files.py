@@ -26,40 +26,30 @@ TRACK_SCHEMA_VERSION = 1
 
 @dataclass(frozen=True)
 class TrackArrays:
-    """A car in F frames, K codes, D = 6 + K; each view as its frame's `ShapeArrays` has it.
-
-    Attributes:
-        track: its name.
-        prior_sha256: of the shape prior whose codes these are.
-        code: (K,) its shape, that of the refined view which knows it best; NaN where no view was refined.
-        code_covariance: (K, K) of it.
-        dimensions_hwl: (3,) of that shape, metres.
-        frame_ids: (F,) text, in the order of the frames.
-        input_lines: (F,) line numbers in the detection files, from 1.
-        statuses: (F,) text.
-        parts: (F,) 0 for views that share a shape, 1, 2 .. for later ones that cannot be the same car, -1 for a view
-            that shares with none.
-        T_cam_obj, T_ref_obj: (F, 4, 4) object to left camera, and to the frame of the labels.
-        boxes_hwl, boxes_location_ref: (F, 3), and boxes_rotation_y (F,): the boxes of the result lines.
-        codes: (F, K) one and the same in all views of a call; views that were not trusted keep their own.
-        covariances: (F, D, D) in the tangent (v, omega, code) of the solver; NaN where there is none.
-    """
+    """A car in F frames, K codes, D = 6 + K; each view as its frame's `ShapeArrays` has it."""
 
     track: str
-    prior_sha256: str
+    prior_sha256: str  # of the shape prior whose codes these are
+    # Its shape, that of the refined view which knows it best; NaN where no view was refined.
     code: Floats = field(metadata=shaped("K"))
-    code_covariance: Floats = field(metadata=shaped("K", "K"))
-    dimensions_hwl: Floats = field(metadata=shaped(3))
-    frame_ids: tuple[str, ...] = field(metadata=shaped("F"))
-    input_lines: NDArray[np.int64] = field(metadata=shaped("F"))
-    statuses: tuple[str, ...] = field(metadata=shaped("F"))
+    code_covariance: Floats = field(metadata=shaped("K", "K"))  # of it
+    dimensions_hwl: Floats = field(metadata=shaped(3))  # of that shape, metres
+    frame_ids: tuple[str, ...] = field(metadata=shaped("F"))  # text, in the order of the frames
+    input_lines: NDArray[np.int64] = field(metadata=shaped("F"))  # line numbers in the detection files, from 1
+    statuses: tuple[str, ...] = field(metadata=shaped("F"))  # text
+    # 0 for views that share a shape, 1, 2 .. for later ones that cannot be the same car, -1 for a view that shares
+    # with none.
     parts: NDArray[np.int64] = field(metadata=shaped("F"))
+    # Object to left camera, and to the frame of the labels.
     T_cam_obj: Floats = field(metadata=shaped("F", 4, 4))
     T_ref_obj: Floats = field(metadata=shaped("F", 4, 4))
+    # And boxes_rotation_y (F,): the boxes of the result lines.
     boxes_hwl: Floats = field(metadata=shaped("F", 3))
     boxes_location_ref: Floats = field(metadata=shaped("F", 3))
     boxes_rotation_y: Floats = field(metadata=shaped("F"))
+    # One and the same in all views of a call; views that were not trusted keep their own.
     codes: Floats = field(metadata=shaped("F", "K"))
+    # In the tangent (v, omega, code) of the solver; NaN where there is none.
     covariances: Floats = field(metadata=shaped("F", "D", "D"))
 
     def __post_init__(self) -> None:
