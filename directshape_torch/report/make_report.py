@@ -78,10 +78,10 @@ def make_report(
     detailed = choose_frames(rows, len(run.frame_ids), most_frames)
     mean = None if prior is None else mean_car(prior)
     settings = DetailSettings(run.classes, prior, mean, run.refiner_config())
-    frame = page_frame(f"{run.path.resolve().name}: refined cars")
+    head, foot = page_frame(f"{run.path.resolve().name}: refined cars")
     observer.started([run.frame_ids[number] for number in detailed])
     with replaced_file(page) as content, TextIOWrapper(content, "utf-8", "replace", newline="\n") as file:
-        file.write(frame.head)
+        file.write(head)
         if mean is not None:
             file.write(data_block("mean-mesh", mesh_data(mean.vertices, mean.faces)))
         for number in detailed:
@@ -98,7 +98,7 @@ def make_report(
         file.write(data_block("frames", {"ids": list(run.frame_ids), "detailed": detailed}))
         file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [list(vars(row).values()) for row in rows]}))
         file.write(data_block("run", run_facts(run, run.frame_ids, rows, grounds, notes)))
-        file.write(frame.foot)
+        file.write(foot)
     return ReportOutcome(page, page.stat().st_size, len(run.frame_ids), len(detailed), len(rows), tuple(notes))
 
 

@@ -8,42 +8,16 @@ import html
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from importlib.resources import files
 
 _REPORT = files("directshape_torch") / "assets" / "report"
 _THREE = files("directshape_torch") / "assets" / "vendor" / "three"
 
-# In the order of the page's map of modules; each is imported by its name here.
-_MODULES = (
-    "report/main",
-    "report/dom",
-    "report/data",
-    "report/format",
-    "report/summary",
-    "report/charts",
-    "report/thumbnails",
-    "report/highlights",
-    "report/table",
-    "report/car_dialog",
-    "report/frame_view",
-    "report/frame_picture",
-    "report/mesh",
-    "report/scene3d",
-)
 _CORE_FILE, _CORE_NAME = '"./three.core.min.js"', '"three/core"'
 
 
-@dataclass(frozen=True)
-class PageFrame:
-    """The page without its data: what comes before it and after it."""
-
-    head: str
-    foot: str
-
-
-def page_frame(title: str) -> PageFrame:
-    """The fixed parts of a page.
+def page_frame(title: str) -> tuple[str, str]:
+    """The fixed parts of a page: what comes before its data and after it.
 
     The content security policy names the page's own inline scripts by their hash and lets nothing be loaded: a script
     or handler that came in with the data would not run even if it were not escaped.
@@ -66,7 +40,7 @@ def page_frame(title: str) -> PageFrame:
         "start": start,
     }
     head, foot = (_filled(part, values) for part in _asset("page.html").split("{{data}}"))
-    return PageFrame(head, foot)
+    return head, foot
 
 
 def _filled(template: str, values: Mapping[str, str]) -> str:
@@ -94,11 +68,12 @@ def _modules() -> dict[str, str]:
     )
     if _CORE_FILE not in renderer:
         raise RuntimeError(f"three.module.min.js does not import {_CORE_FILE}: bring page_assets.py up to date")
+    own = sorted(file.name for file in _REPORT.iterdir() if file.name.endswith(".js"))
     sources = {
         "three/core": core,
         "three": renderer.replace(_CORE_FILE, _CORE_NAME),
         "three/orbit-controls": controls,
-        **{name: _asset(f"{name.removeprefix('report/')}.js") for name in _MODULES},
+        **{f"report/{name.removesuffix('.js')}": _asset(name) for name in own},
     }
     return {name: _data_url(source) for name, source in sources.items()}
 

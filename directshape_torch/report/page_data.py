@@ -58,16 +58,11 @@ def packed(numbers: npt.NDArray[np.integer[Any]]) -> str:
     """Whole numbers as text: neighbours of a mesh differ by little, and small differences deflate well.
 
     Examples:
-        >>> unpacked(packed(np.array([3, 5, -70000]))).tolist()
-        [3, 5, -70000]
+        >>> len(packed(np.arange(1000)))
+        40
     """
     differences = np.diff(numbers.astype(np.int64), prepend=0).astype("<i4")
     return base64.b64encode(zlib.compress(differences.tobytes(), 9)).decode("ascii")
-
-
-def unpacked(text: str) -> npt.NDArray[np.int64]:
-    """The numbers of `packed`."""
-    return np.cumsum(np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i4").astype(np.int64))
 
 
 def data_url(picture: Picture, quality: int = _SMALL_QUALITY) -> str:

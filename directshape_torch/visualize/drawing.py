@@ -173,29 +173,17 @@ def draw_box(
     draw_segment(view, corners_cam[:4].mean(axis=0), corners_cam[:2].mean(axis=0), colour)
 
 
-def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour, thickness: int = 1) -> None:
+def draw_segment(view: View, first_cam: Array, second_cam: Array, colour: Colour) -> None:
     """A straight line in space, cut at the near plane."""
-    ends = clip_at_near_plane(first_cam, second_cam)
-    if ends is not None:
-        first, second = _fixed_point(view.project(ends))
-        cv2.line(view.picture, first.tolist(), second.tolist(), colour, thickness, cv2.LINE_AA, _SHIFT)
-
-
-def clip_at_near_plane(first_cam: Array, second_cam: Array) -> Array | None:
-    """The part (2, 3) of a segment that lies in front of the camera, or None.
-
-    Examples:
-        >>> clip_at_near_plane(np.array([0.0, 0.0, -0.7]), np.array([2.0, 0.0, 1.3])).round(6).tolist()
-        [[1.0, 0.0, 0.3], [2.0, 0.0, 1.3]]
-    """
     ends = np.stack([first_cam, second_cam])
     behind = ends[:, 2] < NEAR_PLANE_M
     if behind.all():
-        return None
+        return
     if behind.any():
         share = (NEAR_PLANE_M - ends[0, 2]) / (ends[1, 2] - ends[0, 2])
         ends[int(behind.argmax())] = ends[0] + share * (ends[1] - ends[0])
-    return ends
+    first, second = _fixed_point(view.project(ends))
+    cv2.line(view.picture, first.tolist(), second.tolist(), colour, 1, cv2.LINE_AA, _SHIFT)
 
 
 def draw_polygon(picture: Picture, points_px: Array, colour: Colour, thickness: int = 1) -> None:
@@ -204,36 +192,33 @@ def draw_polygon(picture: Picture, points_px: Array, colour: Colour, thickness: 
 
 
 def draw_text(
-    picture: Picture, text: str, position: tuple[float, float], colour: Colour = WHITE, size: float = 0.45
+    picture: Picture,
+    text: str,
+    position: tuple[float, float],
+    colour: Colour = WHITE,
+    size: float = 0.45,
+    widest_px: float = math.inf,
 ) -> None:
-    """Text with a dark rim, legible on any ground; `position` is its lower left corner."""
+    """Text with a dark rim, legible on any ground, from its lower left corner on; smaller where it is too wide."""
     u, v = round(position[0]), round(position[1])
     # Names of files may hold what is no text, which would end the process.
     drawable = text.encode("utf-8", "replace").decode()
+    size *= min(1.0, widest_px / max(cv2.getTextSize(drawable, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0], 1))
     # The rim is the same text moved about: in OpenCV 5 bolder letters are also wider.
     rim = [(du, dv, BLACK) for du in (-1, 0, 1) for dv in (-1, 0, 1) if du or dv]
     for du, dv, ink in (*rim, (0, 0, colour)):
         cv2.putText(picture, drawable, (u + du, v + dv), cv2.FONT_HERSHEY_SIMPLEX, size, ink, 1, cv2.LINE_AA)
 
 
-def text_size_for(text: str, width_px: float, largest: float) -> float:
-    """The size at which a text is as wide as that at most."""
-    wide = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, largest, 1)[0][0]
-    return largest * min(1.0, width_px / max(wide, 1))
-
-
-def draw_legend(
-    picture: Picture, entries: Sequence[tuple[str, Colour]], position: tuple[int, int], size: float = 0.45
-) -> None:
+def draw_legend(picture: Picture, entries: Sequence[tuple[str, Colour]], position: tuple[int, int]) -> None:
     """Coloured strokes with their meaning, one a line, from the upper left corner on."""
     u, v = position
-    line = round(40 * size)
-    picture[v - 6 : v + line * len(entries) + 6, u - 6 : u + 30 + round(270 * size)] //= 3
+    picture[v - 6 : v + 36 * len(entries) + 6, u - 6 : u + 273] //= 3
     for row, (text, colour) in enumerate(entries):
-        middle = v + line * row + line // 2
+        middle = v + 36 * row + 18
         for ink, thickness in ((BLACK, 5), (colour, 3)):
             cv2.line(picture, (u, middle), (u + 22, middle), ink, thickness, cv2.LINE_AA)
-        draw_text(picture, text, (u + 30, middle + round(11 * size)), WHITE, size)
+        draw_text(picture, text, (u + 30, middle + 10), WHITE, 0.9)
 
 
 def _fixed_point(pixels: Array) -> npt.NDArray[np.int32]:

@@ -22,7 +22,6 @@ from directshape_torch.visualize.drawing import (
     draw_contour,
     draw_legend,
     draw_text,
-    text_size_for,
     window_around,
 )
 from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars, true_corners
@@ -85,7 +84,7 @@ def overlay_picture(
     legend: list[tuple[str, Colour]] = [("before", ORANGE), ("after", BLUE)]
     legend += [("ground truth", GREEN)] if truth_corners_cam else []
     legend += [("not refined", GREY)] if GREY in inks else []
-    draw_legend(right, legend, (12, 10), 0.9)
+    draw_legend(right, legend, (12, 10))
     return np.concatenate([left, right], axis=1)
 
 
@@ -102,7 +101,7 @@ def _image_row(image: View, cars: Sequence[DrawnCar], inks: Sequence[Colour], ti
         if roof[0, 2] > 1:
             u, v = view.project(roof)[0]
             draw_text(view.picture, f"{car.line}", (u - 8, max(v - 8, 22)), ink, 0.9)
-    draw_text(view.picture, title, (8, 32), size=text_size_for(title, view.picture.shape[1] - 16, 1.0))
+    draw_text(view.picture, title, (8, 32), size=1.0, widest_px=view.picture.shape[1] - 16)
     return view.picture
 
 
@@ -160,5 +159,5 @@ def _tile(image: View, before: DrawnCar, after: DrawnCar, height_px: int) -> Pic
     lines, width = (f"{after.line}: {after.distance_m:.1f} m", after.status), pictures[0].shape[1]
     caption = np.full((_CAPTION_LINE_PX * len(lines) + 4, width, 3), _TILE_GROUND, np.uint8)
     for line, text in enumerate(lines):
-        draw_text(caption, text, (3, _CAPTION_LINE_PX * (line + 1) - 5), size=text_size_for(text, width - 6, 0.8))
+        draw_text(caption, text, (3, _CAPTION_LINE_PX * (line + 1) - 5), size=0.8, widest_px=width - 6)
     return np.concatenate([caption, *pictures])

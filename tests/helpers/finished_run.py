@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import base64
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
@@ -76,3 +81,8 @@ def finished_run(
         for path in (*(root / "detections" / "data").glob("*.txt"), *(root / "training" / "label_2").glob("*.txt")):
             path.write_text(path.read_text().replace("Car ", f"{car_type} "))
     return refined(root, folder / out_name, (car_type,), meshes)
+
+
+def unpacked(text: str) -> NDArray[np.int64]:
+    """The numbers of a mesh on a page, as `mesh.js` reads them."""
+    return np.cumsum(np.frombuffer(zlib.decompress(base64.b64decode(text)), "<i4").astype(np.int64))

@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.finished_run import FinishedRun, finished_run, refined
+from helpers.finished_run import FinishedRun, finished_run, refined, unpacked
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.report.make_report import ReportOutcome, make_report
-from directshape_torch.report.page_data import unpacked
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 

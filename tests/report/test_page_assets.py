@@ -1,4 +1,4 @@
-"""The fixed parts of the page: nothing from outside, nothing that runs but what is named, names that stay names."""
+"""Parts of the page: nothing from outside, nothing that runs but what is named, names that stay names, meshes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ import json
 import re
 from importlib.resources import files
 
+import numpy as np
+from helpers.finished_run import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from directshape_torch.report.page_assets import data_block, page_frame
+from directshape_torch.report.page_data import mesh_data, packed
+from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.visualize.drawn_car import mean_car
 
 THREE = files("directshape_torch") / "assets" / "vendor" / "three"
 HOSTILE = '"><script>boom()</script><!-- {{data}} {{style}} \\u2028 </title>'
@@ -32,18 +37,17 @@ def source_of(url: str) -> str:
 
 
 def test_every_import_is_in_the_map() -> None:
-    page = page_frame("a run")
-    modules = {name: source_of(url) for name, url in import_map(page.head).items()}
+    head, foot = page_frame("a run")
+    modules = {name: source_of(url) for name, url in import_map(head).items()}
     for name, source in modules.items():
         without_comments = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
         imported = re.findall(r'(?:\bfrom\s*|\bimport\s*\(?)["\']([^"\']+)["\']', without_comments)
         assert set(imported) <= set(modules), name
-    assert 'import "report/main"' in page.foot
+    assert 'import "report/main"' in foot
 
 
 def test_nothing_is_loaded_from_outside() -> None:
-    page = page_frame("a run")
-    text = page.head + page.foot
+    text = "".join(page_frame("a run"))
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', text)
     assert "@import" not in text
     assert "url(" not in text
@@ -52,8 +56,7 @@ def test_nothing_is_loaded_from_outside() -> None:
 
 
 def test_the_policy_names_what_runs() -> None:
-    page = page_frame("a run")
-    text = page.head + page.foot
+    text = "".join(page_frame("a run"))
     found = re.search(r'Content-Security-Policy" content="([^"]*)"', text)
     assert found is not None
     policy = html.unescape(found[1])
@@ -67,11 +70,11 @@ def test_the_policy_names_what_runs() -> None:
 
 
 def test_a_hostile_title_stays_text() -> None:
-    page = page_frame(HOSTILE)
-    title = re.search(r"<title>(.*?)</title>", page.head, re.DOTALL)
+    head, foot = page_frame(HOSTILE)
+    title = re.search(r"<title>(.*?)</title>", head, re.DOTALL)
     assert title is not None
     assert html.unescape(title[1]) == HOSTILE
-    assert "<script>boom" not in page.head + page.foot
+    assert "<script>boom" not in head + foot
 
 
 @settings(max_examples=25)
@@ -90,3 +93,23 @@ def test_vendored_files_are_those_of_the_list() -> None:
     for name, digest in rows:
         assert hashlib.sha256((THREE / name).read_bytes()).hexdigest() == digest
     assert "MIT License" in (THREE / "LICENSE").read_text()
+
+
+@settings(max_examples=50)
+@given(st.lists(st.integers(-(2**30), 2**30 - 1)))
+def test_numbers_come_back(numbers: list[int]) -> None:
+    assert unpacked(packed(np.array(numbers, dtype=np.int64))).tolist() == numbers
+
+
+def test_a_triangle_by_hand() -> None:
+    data = mesh_data(np.array([[0.0, 0.1, -2.0], [1.2344, 0.0, 0.0], [1.2346, -0.5, 3.0]]), np.array([[2, 0, 1]]))
+    # x of all vertices, then y, then z, in millimetres.
+    assert unpacked(data["vertices"]).tolist() == [0, 1234, 1235, 100, 0, -500, -2000, 0, 3000]
+    assert unpacked(data["faces"]).tolist() == [2, 0, 1]
+
+
+def test_a_car_is_small() -> None:
+    mesh = mean_car(PCAShapePrior.load_bundled())
+    data = mesh_data(mesh.vertices, mesh.faces)
+    assert np.abs(unpacked(data["vertices"]).reshape(3, -1).T / 1000 - mesh.vertices).max() <= 0.0005 + 1e-9
+    assert len(data["vertices"]) + len(data["faces"]) < 25_000

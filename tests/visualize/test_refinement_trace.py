@@ -13,7 +13,8 @@ from directshape_torch.geometry import se3
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
-from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
+from directshape_torch.visualize.inspection.pixel_residuals import car_residuals
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
 _SEARCH = "search.disparity_offsets_px=[-2,2]"
 
@@ -52,6 +53,11 @@ def test_costs_at_the_ends_are_those_of_the_result(trace: RefinementTrace) -> No
     torch.testing.assert_close(trace.costs[-1][refined], result.cost_after[refined], rtol=2e-4, atol=1e-6)
 
 
+def test_a_refinement_without_images_has_no_residuals_of_them(trace: RefinementTrace) -> None:
+    counts = [len(pixels.uv) for pixels in car_residuals(trace, 0)[1]]
+    assert counts == [0, 0, 0] if trace.config.method == "geometric" else min(counts) > 0
+
+
 def test_car_without_pose_takes_no_part(trace: RefinementTrace) -> None:
     assert trace.place_of(0) == -1
     assert trace.place_of(1) == 0
@@ -68,18 +74,13 @@ def test_cars_move_where_a_step_was_accepted_and_nowhere_else(trace: RefinementT
         assert trace.steps_of(car)[-1] == len(trace) - 1
 
 
-def test_number_of_states_is_that_of_the_iterations(trace: RefinementTrace) -> None:
-    iterations = [s for s in trace.stage if s >= 0]
-    assert len(iterations) == trace.result.cost_history.shape[1]
+def test_states_are_those_of_the_iterations_that_cars_took(trace: RefinementTrace) -> None:
+    iterations, took_part = [s for s in trace.stage if s >= 0], trace.result.cost_history.isfinite()
+    assert len(iterations) == took_part.shape[1]
     assert iterations == sorted(iterations)
     assert len(trace.accepted) == len(trace.costs) == len(trace)
-
-
-def test_costs_are_those_of_the_iterations_that_a_car_took(trace: RefinementTrace) -> None:
-    took_part = trace.result.cost_history.isfinite()
     assert torch.equal(took_part.sum(dim=1), trace.result.iterations)
-    first = len(trace) - took_part.shape[1]
-    assert not (trace.accepted[first:].T & ~took_part).any()
+    assert not (trace.accepted[len(trace) - took_part.shape[1] :].T & ~took_part).any()
 
 
 def test_search_adds_the_start_that_it_chose(demo_frame: LoadedFrame) -> None:
@@ -95,11 +96,3 @@ def test_no_cars_at_all(demo_frame: LoadedFrame) -> None:
     trace = trace_refinement(refiner, demo_frame.frame, replace(demo_frame.detections, T_cam_obj=T_cam_obj))
     assert len(trace) == len(trace.costs) == 1
     assert len(trace.rows) == 0
-
-
-def test_without_photometry_leaves_the_refiner_alone() -> None:
-    refiner = DirectShapeRefiner()
-    silhouettes = without_photometry(refiner)
-    assert refiner.config.photometric.weight > 0
-    assert silhouettes.config == replace(refiner.config, photometric=replace(refiner.config.photometric, weight=0.0))
-    assert silhouettes.prior is refiner.prior

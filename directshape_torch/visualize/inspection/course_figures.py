@@ -34,14 +34,9 @@ _SECONDS_A_STEP, _SECONDS_AT_END = 0.35, 2.5
 
 
 def write_iteration_animation(path: Path | str, view: CarView) -> None:
-    """Write the GIF: contour in both images, box from above, and costs, for every state that the car moved to.
-
-    Raises:
-        MissingDependencyError: matplotlib or Pillow is not installed.
-    """
+    """Write the GIF: contour in both images, box from above, and costs, for every state that the car moved to."""
     frames = animation_frames(view)
-    seconds = [_SECONDS_A_STEP] * (len(frames) - 1) + [_SECONDS_AT_END]
-    write_animation(path, frames, seconds)
+    write_animation(path, frames, [_SECONDS_A_STEP] * (len(frames) - 1) + [_SECONDS_AT_END])
 
 
 def animation_frames(view: CarView) -> list[Picture]:
@@ -105,15 +100,9 @@ def distance_course(view: CarView) -> NDArray[np.float64]:
 
 
 def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) -> None:
-    """Write the figure as PNG: a row each, seen from above, then the contours of three states, then the distances.
+    """Write a car refined with all terms beside the same refined without photometry, as PNG.
 
-    Args:
-        path: of the picture.
-        full: a car refined with all terms.
-        silhouettes: the same car refined without photometry.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
+    A row each, seen from above, then the contours of three states; then the distances.
     """
     figure = new_figure(*_DRIFT_INCHES, "drawing the drift")
     figure.suptitle(full.title)
@@ -139,21 +128,13 @@ def _draw_from_above(axes: Any, name: str, view: CarView, others: list[Any]) -> 
 
 def _draw_contours(row: Any, view: CarView) -> None:
     inks = iteration_inks(len(view.steps))
-    for axes, place in zip(row, three_places(len(view.steps)), strict=True):
+    last = len(inks) - 1
+    # The first, an early and the last state: most is done in the first few steps.
+    for axes, place in zip(row, (0, min(max(len(inks) // 4, 1), last), last), strict=True):
         title = f"iteration {view.steps[place]}"
         show_crop(axes, view.image("left"), view.window("left"), title)
         draw_lines(axes, view.mask_lines("left"), "white", "mask", linewidth=1.3, linestyle=":")
         draw_lines(axes, view.contours("left", view.steps[place]), inks[place], linewidth=1.8)
-
-
-def three_places(count: int) -> tuple[int, int, int]:
-    """The first, an early and the last of so many states; most is done in the first few steps.
-
-    Examples:
-        >>> three_places(12), three_places(2)
-        ((0, 3, 11), (0, 1, 1))
-    """
-    return 0, min(max(count // 4, 1), count - 1), count - 1
 
 
 def _draw_legend(figure: Any, all_axes: list[Any]) -> None:

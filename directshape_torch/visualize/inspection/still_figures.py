@@ -65,11 +65,7 @@ def sampled_pixels_of(view: CarView, side: Side) -> SampledPixels:
 
 
 def write_sampling_figure(path: Path | str, view: CarView) -> None:
-    """Write the sampled pixels as PNG, both images side by side.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """Write the sampled pixels as PNG, both images side by side."""
     height_inches = _SAMPLING_INCHES * view.panel_aspect() + _SAMPLING_ROOM_INCHES
     figure = new_figure(2 * _SAMPLING_INCHES, height_inches, "drawing sampled pixels")
     figure.suptitle(view.title)
@@ -86,9 +82,6 @@ def write_residual_figure(path: Path | str, view: CarView) -> None:
     """Write the residuals as PNG: the input above, the end below; the shape's outline is drawn over its residuals.
 
     Lost pixels, those that cannot be compared with the right image, are crosses.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
     """
     height_inches = 2 * _PANEL_INCHES * view.panel_aspect() + _ROOM_INCHES
     figure = new_figure(3 * _PANEL_INCHES + 0.4, height_inches, "drawing residuals")
