@@ -105,17 +105,18 @@ class KittiScene:
         share = self._shared_2d(label[kind == _DONT_CARE], detection[kind == _DONT_CARE], of_detection=True)
         np.maximum.at(self.unlabelled_share, detection[kind == _DONT_CARE], share)
         is_wanted = (kind == self.kind) | (kind == _NEIGHBOUR.get(self.kind, self.kind))
-        self._overlap(label[is_wanted], detection[is_wanted])
+        self.label, self.detection, self.iou = self._overlapping(label[is_wanted], detection[is_wanted])
 
-    def _overlap(self, label: Indices, detection: Indices) -> None:
-        """Keep the pairs that overlap in some way: `label`, `detection`, and `iou` by metric, each (P,)."""
+    def _overlapping(self, label: Indices, detection: Indices) -> tuple[Indices, Indices, dict[Metric, Floats]]:
+        """Of some pairs those that overlap in some way (P,), and how much by metric."""
         in_image, is_near = self._shared_2d(label, detection), self._may_touch(label, detection)
         kept = is_near | (in_image > 0)
-        self.label, self.detection, is_near = label[kept], detection[kept], is_near[kept]
-        boxes = self.labels.box_3d[self.label[is_near]], self.detections.box_3d[self.detection[is_near]]
-        self.iou: dict[Metric, Floats] = {"2d": in_image[kept], "bev": np.zeros(kept.sum()), "3d": np.zeros(kept.sum())}
-        self.iou["bev"][is_near] = bev_iou(*map(bev_boxes, boxes)).numpy()
-        self.iou["3d"][is_near] = iou_3d(*boxes).numpy()
+        label, detection, is_near = label[kept], detection[kept], is_near[kept]
+        boxes = self.labels.box_3d[label[is_near]], self.detections.box_3d[detection[is_near]]
+        iou: dict[Metric, Floats] = {"2d": in_image[kept], "bev": np.zeros(len(label)), "3d": np.zeros(len(label))}
+        iou["bev"][is_near] = bev_iou(*map(bev_boxes, boxes)).numpy()
+        iou["3d"][is_near] = iou_3d(*boxes).numpy()
+        return label, detection, iou
 
     def _shared_2d(self, label: Indices, detection: Indices, of_detection: bool = False) -> Floats:
         """Intersection of image boxes (P,) as continuous areas, over their union or over the detection alone."""

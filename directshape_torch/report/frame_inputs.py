@@ -26,6 +26,10 @@ class InputReader:
     # What is wrong, and with which frames.
     problems: defaultdict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
 
+    def notes(self, num_frames: int) -> list[str]:
+        """What could not be used, as sentences."""
+        return [f"{what} ({len(ids)} of {num_frames} frames)" for what, ids in sorted(self.problems.items())]
+
     def detections(self, result: FrameResult) -> list[KittiObject] | None:
         """All lines that went in."""
         if self.dataset is None or not self.has_detections:

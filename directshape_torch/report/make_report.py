@@ -20,7 +20,7 @@ from directshape_torch.report.frame_details import DetailSettings, FrameMaterial
 from directshape_torch.report.frame_inputs import InputReader
 from directshape_torch.report.page_assets import data_block, page_frame
 from directshape_torch.report.page_data import mesh_data
-from directshape_torch.report.run_facts import problem_notes, run_facts
+from directshape_torch.report.run_facts import run_facts
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawn_car import mean_car
 
@@ -92,12 +92,12 @@ def make_report(
             observer.finished(run.frame_ids[number], None)
         notes = [
             *_notes(run, reader, prior, prior_was_given, len(detailed)),
-            *problem_notes(reader.problems, len(run.frame_ids)),
-            *problem_notes(detail_reader.problems, len(detailed)),
+            *reader.notes(len(run.frame_ids)),
+            *detail_reader.notes(len(detailed)),
         ]
         file.write(data_block("frames", {"ids": list(run.frame_ids), "detailed": detailed}))
         file.write(data_block("cars", {"columns": CAR_COLUMNS, "rows": [list(vars(row).values()) for row in rows]}))
-        file.write(data_block("run", run_facts(run, run.frame_ids, rows, grounds, notes)))
+        file.write(data_block("run", run_facts(run, rows, grounds, notes)))
         file.write(foot)
     return ReportOutcome(page, page.stat().st_size, len(run.frame_ids), len(detailed), len(rows), tuple(notes))
 

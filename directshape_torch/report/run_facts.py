@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +20,17 @@ from directshape_torch.status import Status
 
 def run_facts(
     run: RunFolder,
-    frame_ids: Sequence[str],
-    rows: Sequence[CarRow],
-    grounds: Mapping[str, int],
-    notes: Sequence[str],
+    rows: Sequence[CarRow],  # of all cars
+    grounds: Mapping[str, int],  # number of frames by the source of their ground plane
+    notes: Sequence[str],  # what the reader should know about this page
 ) -> dict[str, Any]:
-    """The facts as JSON.
-
-    Args:
-        run: the output folder.
-        frame_ids: the frames of the page.
-        rows: their cars.
-        grounds: number of frames by the source of their ground plane.
-        notes: what the reader should know about this page.
-    """
+    """The facts as JSON."""
     manifest = run.manifest
     return {
         "name": run.path.resolve().name,
         "package_version": manifest.package_version,
-        "frames_done": len(frame_ids),
-        "failed": {name: why for name, why in manifest.failed.items() if name not in frame_ids},
+        "frames_done": len(run.frame_ids),
+        "failed": {name: why for name, why in manifest.failed.items() if name not in run.frame_ids},
         "cars": len(rows),
         "refined": sum(row.refined for row in rows),
         "statuses": _statuses(rows),
@@ -86,13 +77,3 @@ def _mean_errors(rows: Sequence[CarRow]) -> dict[str, Any] | None:
     ]
     worse = sum(change < -WORSE_BY_BEV_IOU for change in changes) if changes else None
     return {"cars": len(counted), "worse": worse, "worse_by_iou": WORSE_BY_BEV_IOU, **means}
-
-
-def problem_notes(problems: Mapping[str, Collection[str]], num_frames: int) -> list[str]:
-    """What could not be used, as sentences.
-
-    Examples:
-        >>> problem_notes({"left image not found": {"000003", "000004"}}, 5)
-        ['left image not found (2 of 5 frames)']
-    """
-    return [f"{what} ({len(frames)} of {num_frames} frames)" for what, frames in sorted(problems.items())]
