@@ -10,11 +10,9 @@ from typing import Literal
 from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import InputError
-from directshape_torch.export.coco3d_file import Coco3dExporter
+from directshape_torch.export.box_files import Coco3dExporter, NuscenesExporter, write_kitti
 from directshape_torch.export.frame_source import Exporter, ExportInputs, FrameSource
 from directshape_torch.export.gltf_scene import GlbExporter
-from directshape_torch.export.kitti_files import write_kitti
-from directshape_torch.export.nuscenes_file import NuscenesExporter
 from directshape_torch.export.ply_files import write_ply, write_points
 from directshape_torch.export.rerun_recording import RerunExporter
 from directshape_torch.io.run_folder import RunFolder

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.export.coco3d_file import image_numbers
+from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.painted_cars import Paint, PaintedFrame
 from directshape_torch.files.atomic_files import write_bytes

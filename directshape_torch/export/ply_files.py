@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.export.frame_source import FrameSource
-from directshape_torch.export.visible_surface import Points
+from directshape_torch.export.painted_cars import Points
 from directshape_torch.files.atomic_files import write_bytes
 
 _HEADER = "ply\nformat binary_little_endian 1.0\ncomment left camera frame: x right, y down, z forward, metres\n"

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.export.coco3d_file import image_numbers
+from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.export.rerun_stream import RerunStream, import_rerun
 from directshape_torch.geometry import se3

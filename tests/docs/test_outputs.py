@@ -10,9 +10,8 @@ import pytest
 from helpers.finished_run import FinishedRun, finished_run
 
 from directshape_torch.cli.export import _FORMATS
-from directshape_torch.export.coco3d_file import KITTI_TYPES
+from directshape_torch.export.box_files import DETECTION_NAMES, KITTI_TYPES
 from directshape_torch.export.export_run import ExportFormat
-from directshape_torch.export.nuscenes_file import DETECTION_NAMES
 from directshape_torch.export.painted_cars import NEUTRAL_RGB
 
 TEXT = (Path(__file__).parent.parent.parent / "docs" / "outputs.md").read_text(encoding="utf-8")

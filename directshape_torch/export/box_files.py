@@ -1,7 +1,8 @@
-"""Boxes of a run as one JSON file in the manner of COCO with Omni3D's 3D fields."""
+"""Boxes of a run in the files of KITTI, COCO with Omni3D's 3D fields, and nuScenes."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,63 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
 from directshape_torch.export.frame_source import Exporter, FrameSource
-from directshape_torch.files.atomic_files import write_json
-from directshape_torch.io.run_folder import ResultObject, RunFolder
+from directshape_torch.files.atomic_files import write_bytes, write_json
+from directshape_torch.files.read_files import read_bytes
+from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.run_folder import COPIED, FrameResult, ResultObject, RunFolder, result_path
+
+_KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
+
+
+def write_kitti(folder: Path, source: FrameSource) -> None:
+    """`kitti/data/NNNNNN.txt`, the result file byte for byte, and all its lines as `kitti/json/NNNNNN.json`."""
+    frame, frame_id = source.refined, source.frame_id
+    write_bytes(folder / "kitti" / "data" / f"{frame_id}.txt", read_bytes(result_path(source.run.path, frame_id)))
+    content = {
+        "schema": "directshape kitti results",
+        "schema_version": 1,
+        "frame_id": frame_id,
+        "coordinates": _KITTI_FRAME,
+        "objects": [{**_columns(line), **_refinement(frame, line)} for line in frame.lines],
+    }
+    write_json(folder / "kitti" / "json" / f"{frame_id}.json", content)
+
+
+def _columns(line: KittiObject) -> dict[str, Any]:
+    return {
+        "line": line.line_number,
+        "type": line.type,
+        "truncated": line.truncated,
+        "occluded": line.occluded,
+        "alpha": line.alpha,
+        "bbox": list(line.box_2d),
+        "dimensions_hwl": list(line.hwl),
+        "location": list(line.location_ref),
+        "rotation_y": line.rotation_y,
+        "score": line.score,
+    }
+
+
+def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
+    shapes = frame.shapes
+    car = next((car for car, number in enumerate(shapes.input_lines) if number == line.line_number), None)
+    if car is None:
+        return {"status": COPIED}
+    return {
+        "status": shapes.statuses[car],
+        "sigma_xyz_yaw": [_number(value) for value in shapes.sigmas_ref[car]],
+        "probability_better": _number(shapes.probabilities_better[car]),
+        "probability_not_worse": _number(shapes.probabilities_not_worse[car]),
+        "mask_iou_left": _number(shapes.mask_iou_left[car]),
+        "mask_iou_right": _number(shapes.mask_iou_right[car]),
+        "code": [_number(value) for value in shapes.codes[car]],
+    }
+
+
+def _number(value: float) -> float | None:
+    """JSON has no NaN."""
+    return float(value) if math.isfinite(value) else None
+
 
 # Omni3D's order of the eight corners, in units of half (length, height, width) along x, y (down), z of the object.
 _CORNERS = np.array(
@@ -84,7 +140,7 @@ def _detection_fields(one: ResultObject) -> dict[str, Any]:
         "iscrowd": 0,
         "ignore": False,
         "bbox2D_tight": list(one.line.box_2d),
-        "score": 1.0 if one.line.score is None else one.line.score,
+        "score": _score(one),
         "truncation": one.line.truncated,
         "visibility": _UNKNOWN,
         "segmentation_pts": _UNKNOWN,
@@ -116,6 +172,67 @@ def _box_fields(
         "bbox2D_proj": projected.ravel().tolist(),
         "bbox2D_trunc": cut.ravel().tolist(),
     }
+
+
+# nuScenes has ten classes; KITTI's other types (Tram, Misc) have no counterpart.
+DETECTION_NAMES = {
+    "Car": "car",
+    "Van": "car",
+    "Truck": "truck",
+    "Pedestrian": "pedestrian",
+    "Person_sitting": "pedestrian",
+    "Cyclist": "bicycle",
+}
+_MOST_BOXES = 500
+
+# Axes forward, left, up of a vehicle that looks along z of `ref`; the origin stays that of `ref`.
+_R_NUSCENES_REF = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+# nuScenes' boxes have length along x, width along y (left) and height along z (up); ours x, z and -y.
+_R_OBJ_BOX = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+_NUSCENES_FRAME = (
+    "KITTI has no ego or global frame: x forward, y left, z up of the rectified camera 0 (x = z_ref, y = -x_ref, "
+    "z = -y_ref), metres; each frame has its own"
+)
+
+
+class NuscenesExporter(Exporter):
+    """Collects the frames of a run, one sample a frame, its id as token; writes them at the end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.samples: dict[str, list[dict[str, Any]]] = {}
+
+    def add(self, source: FrameSource) -> None:
+        known = [one for one in source.refined.objects if one.line.type in DETECTION_NAMES]
+        best = sorted(known, key=_score, reverse=True)[:_MOST_BOXES]
+        self.samples[source.frame_id] = [_box(source.frame_id, one) for one in best]
+
+    def finish(self) -> None:
+        sensors = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
+        write_json(self.path, {"meta": {**sensors, "coordinates": _NUSCENES_FRAME}, "results": self.samples})
+
+
+def _box(token: str, one: ResultObject) -> dict[str, Any]:
+    from scipy.spatial.transform import Rotation
+
+    height, width, length = one.hwl.tolist()
+    x, y, z, w = Rotation.from_matrix(_R_NUSCENES_REF @ one.R_ref_obj @ _R_OBJ_BOX).as_quat(canonical=True).tolist()
+    return {
+        "sample_token": token,
+        "translation": (_R_NUSCENES_REF @ one.centre_ref).tolist(),
+        "size": [width, length, height],
+        "rotation": [w, x, y, z],
+        # One pair of images shows no motion.
+        "velocity": [0.0, 0.0],
+        "detection_name": DETECTION_NAMES[one.line.type],
+        "detection_score": _score(one),
+        "attribute_name": "",
+    }
+
+
+def _score(one: ResultObject) -> float:
+    return 1.0 if one.line.score is None else one.line.score
 
 
 def image_numbers(frame_ids: Sequence[str]) -> dict[str, int]:
