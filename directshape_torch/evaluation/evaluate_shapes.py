@@ -12,8 +12,7 @@ import torch
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, MetricSummary
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
-from directshape_torch.evaluation.shape_error import ShapeError
-from directshape_torch.evaluation.shape_truth import EstimatedCar, SegmentSource
+from directshape_torch.evaluation.shape_error import EstimatedCar, SegmentSource, ShapeError
 from directshape_torch.io.instance_masks import MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.config import PointCloudConfig
-from directshape_torch.evaluation.shape_truth import EstimatedCar
+from directshape_torch.evaluation.shape_error import EstimatedCar
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.extents import MASK_THRESHOLD

@@ -6,19 +6,19 @@ A frame is its images, masks, boxes, surfaces, ground; an iteration the surfaces
 from __future__ import annotations
 
 import colorsys
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, MissingDependencyError
 from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
-from directshape_torch.export.rerun_stream import RerunStream, import_rerun
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
@@ -34,6 +34,12 @@ from directshape_torch.visualize.inspection.pixel_residuals import CarResiduals,
 from directshape_torch.visualize.inspection.still_figures import WORST_SILHOUETTE
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
 
+if TYPE_CHECKING:
+    import trimesh
+
+# The timelines: numbers of frames; iterations of all frames, one after another.
+_FRAME, _ITERATION = "frame", "iteration"
+_STATES_PER_SECOND = 3.0
 _LEFT, _RIGHT = "world/cam/image", "right/image"
 _RESIDUALS = f"{_LEFT}/silhouette", f"{_RIGHT}/silhouette", f"{_LEFT}/photometric"
 _JPEG_QUALITY = 90
@@ -59,11 +65,11 @@ class RerunExporter(Exporter):
     """
 
     def __init__(self, path: Path, run: RunFolder, with_iterations: bool) -> None:
-        import_rerun()
+        _import_rerun()
         self.path, self.with_iterations = path, with_iterations
         self.numbers = image_numbers(run.frame_ids)
         self.iteration = 0
-        self._stream: RerunStream | None = None
+        self._stream: _Stream | None = None
 
     def add(self, source: FrameSource) -> None:
         """Log a frame; with a refiner also the states that it goes through when it refines the frame again.
@@ -75,7 +81,7 @@ class RerunExporter(Exporter):
         if self._stream is None:
             # The images of the first frame say what the viewer's views are fitted to.
             height, width = loaded.frame.sizes[0].tolist()
-            self._stream = RerunStream(self.path, (width, height), self.with_iterations)
+            self._stream = _Stream(self.path, (width, height), self.with_iterations)
             _log_conventions(self._stream)
         stream, frame, refiner = self._stream, self.numbers[source.frame_id], source.inputs.refiner
         stream.at(frame, None if refiner is None else self.iteration)
@@ -93,9 +99,7 @@ class RerunExporter(Exporter):
         if refiner is not None:
             self._add_iterations(stream, loaded, refiner, frame)
 
-    def _add_iterations(
-        self, stream: RerunStream, loaded: LoadedFrame, refiner: DirectShapeRefiner, frame: int
-    ) -> None:
+    def _add_iterations(self, stream: _Stream, loaded: LoadedFrame, refiner: DirectShapeRefiner, frame: int) -> None:
         device, dtype = refiner.prior.origin.device, refiner.prior.origin.dtype
         trace = trace_refinement(refiner, loaded.frame.to(device, dtype), loaded.detections.to(device, dtype))
         log = _IterationLog(stream, loaded, trace)
@@ -122,7 +126,7 @@ class RerunExporter(Exporter):
             self._stream.close(keep=False)
 
 
-def _log_conventions(stream: RerunStream) -> None:
+def _log_conventions(stream: _Stream) -> None:
     """The world is the left camera frame: x right, y down, z forward, metres. Masks have the numbers of lines."""
     stream.log("world", stream.rr.ViewCoordinates.RDF, static=True)
     classes: list[tuple[int, str, tuple[int, int, int, int]]] = [(0, "no car", (0, 0, 0, 0))]
@@ -134,13 +138,13 @@ def _log_conventions(stream: RerunStream) -> None:
         stream.log(f"{entity}/masks", stream.rr.AnnotationContext(classes), static=True)
 
 
-def _clear_cars(stream: RerunStream) -> None:
+def _clear_cars(stream: _Stream) -> None:
     """Take away what the cars of other frames left at the present places."""
     for entity in ("world/cars", "world/boxes/iteration", *_RESIDUALS):
         stream.log(entity, stream.rr.Clear(recursive=True))
 
 
-def _log_images(stream: RerunStream, loaded: LoadedFrame) -> None:
+def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
     """Both images with the camera, and on them the pixels of each car by the number of its line, 0 for none."""
     import cv2
 
@@ -164,7 +168,7 @@ def _log_images(stream: RerunStream, loaded: LoadedFrame) -> None:
         stream.log(f"{entity}/masks", rr.SegmentationImage(numbers, opacity=_MASK_OPACITY))
 
 
-def _log_boxes(stream: RerunStream, source: FrameSource, loaded: LoadedFrame) -> None:
+def _log_boxes(stream: _Stream, source: FrameSource, loaded: LoadedFrame) -> None:
     """Those that went in, of the truth, and of the result, where grey ones were not refined."""
     t_cam_ref = loaded.frame.camera.t_cam_ref[0].double()
 
@@ -188,7 +192,7 @@ def _log_boxes(stream: RerunStream, source: FrameSource, loaded: LoadedFrame) ->
 class _IterationLog:
     """Logs the states of the cars of one frame."""
 
-    def __init__(self, stream: RerunStream, loaded: LoadedFrame, trace: RefinementTrace) -> None:
+    def __init__(self, stream: _Stream, loaded: LoadedFrame, trace: RefinementTrace) -> None:
         self.stream, self.loaded, self.trace = stream, loaded, trace
         self.cars = [int(row) for row in trace.rows.tolist()]
 
@@ -248,3 +252,136 @@ def _blue_red(values: PixelResiduals) -> NDArray[np.uint8]:
     colours: NDArray[Any] = blue_white_red(values.value, _WORST_GREY_LEVELS).astype(np.uint8)
     colours[values.lost] = _LOST_RGB
     return colours
+
+
+def _import_rerun() -> Any:
+    """The package `rerun`.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+    """
+    try:
+        import rerun
+    except ImportError as error:
+        raise MissingDependencyError("rerun-sdk", "viewer", "a Rerun recording") from error
+    return rerun
+
+
+class _Stream:
+    """Writes a recording beside its place, and moves it there when it is whole.
+
+    Args:
+        path: of the .rrd file; its folder is made where it is missing.
+        size_wh: of the images, which the viewer fits its views to.
+        with_iterations: whether there is a timeline of iterations to look at.
+
+    Raises:
+        MissingDependencyError: Rerun is not installed.
+    """
+
+    def __init__(self, path: Path, size_wh: tuple[int, int], with_iterations: bool = False) -> None:
+        self.rr, self.path = _import_rerun(), path
+        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._stream = self.rr.RecordingStream("directshape", send_properties=False)
+        self._stream.save(self._temporary, default_blueprint=_blueprint(size_wh, with_iterations))
+        # When a line was written says nothing about the refinement.
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+
+    def at(self, frame: int | None = None, iteration: int | None = None) -> None:
+        """What is logged from here on belongs to these places of the two timelines, or to none of theirs."""
+        self._stream.reset_time()
+        for timeline, place in ((_FRAME, frame), (_ITERATION, iteration)):
+            if place is not None:
+                self._stream.set_time(timeline, sequence=place)
+
+    def log(self, entity: str, *archetypes: Any, static: bool = False) -> None:
+        """Log at the present places; `static` for what holds at all times.
+
+        Raises:
+            ValueError: Rerun does not take the data; its own default is a line on stderr.
+        """
+        self._stream.log(entity, *archetypes, static=static, strict=True)
+
+    def log_mesh(
+        self,
+        entity: str,
+        mesh: trimesh.Trimesh,
+        colours: NDArray[np.uint8] | None = None,
+        colour: tuple[int, int, int] | None = None,
+    ) -> None:
+        """Triangles with a colour for each vertex, or one for all."""
+        made = self.rr.Mesh3D(
+            vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
+            triangle_indices=np.asarray(mesh.faces, dtype=np.uint32),
+            vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float32),
+            vertex_colors=colours,
+            albedo_factor=None if colour is None else [*colour, 255],
+        )
+        self.log(entity, made)
+
+    def log_boxes(
+        self,
+        entity: str,
+        T_cam_box: NDArray[np.float64],  # (B, 4, 4) at the middle of the bottom, y down
+        hwl: NDArray[np.float64],  # (B, 3)
+        colours: Sequence[tuple[int, int, int]],
+        labels: Sequence[str],
+    ) -> None:
+        """Boxes with length, height, width along the axes of their objects."""
+        from scipy.spatial.transform import Rotation
+
+        hwl, T_cam_box = hwl.reshape(-1, 3), T_cam_box.reshape(-1, 4, 4)
+        quaternions = Rotation.from_matrix(T_cam_box[:, :3, :3]).as_quat() if len(hwl) else np.zeros((0, 4))
+        boxes = self.rr.Boxes3D(
+            centers=T_cam_box[:, :3, 3] - 0.5 * hwl[:, :1] * T_cam_box[:, :3, 1],
+            half_sizes=0.5 * hwl[:, [2, 0, 1]],
+            quaternions=[self.rr.Quaternion(xyzw=q) for q in quaternions],
+            colors=np.array(colours, dtype=np.uint8).reshape(-1, 3),
+            labels=list(labels),
+            show_labels=False,
+            fill_mode=self.rr.components.FillMode.MajorWireframe,
+        )
+        self.log(entity, boxes)
+
+    def close(self, keep: bool = True) -> None:
+        """Write the end and move the file to its place, or leave none behind."""
+        self._stream.flush()
+        self._stream.disconnect()
+        if keep:
+            os.replace(self._temporary, self.path)
+        else:
+            self._temporary.unlink(missing_ok=True)
+
+
+def _blueprint(size_wh: tuple[int, int], with_iterations: bool) -> Any:
+    """3D view on the left; images on the right, and with iterations residuals and costs."""
+    import rerun.blueprint as rrb
+
+    bounds = rrb.VisualBounds2D(x_range=[0, size_wh[0]], y_range=[0, size_wh[1]])
+    camera, left, right = "world/cam", "world/cam/image", "right/image"
+
+    def image(name: str, origin: str, *contents: str) -> Any:
+        return rrb.Spatial2DView(origin=origin, name=name, contents=list(contents), visual_bounds=bounds)
+
+    views = [image("left: masks and boxes", camera, left, f"{left}/masks", "world/boxes/**")]
+    seen_right = image("right: masks", "right", right, f"{right}/masks")
+    if with_iterations:
+        photometric = image("left: right image less left", left, left, f"{left}/photometric/**")
+        silhouettes = [
+            image(f"{side}: silhouettes", entity, entity, f"{entity}/silhouette/**")
+            for side, entity in (("left", left), ("right", right))
+        ]
+        views += [photometric, rrb.Tabs(*silhouettes, seen_right)]
+        views.append(rrb.TimeSeriesView(origin="cost", name="cost of each car"))
+    else:
+        views.append(seen_right)
+    # Above and behind the camera, so that the street lies ahead.
+    eye = rrb.EyeControls3D(position=[-7.0, -8.0, -9.0], look_target=[1.0, 1.0, 14.0], eye_up=[0.0, -1.0, 0.0])
+    timeline = _ITERATION if with_iterations else _FRAME
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Spatial3DView(origin="world", name="3D", eye_controls=eye), rrb.Vertical(*views)),
+        rrb.TimePanel(timeline=timeline, fps=_STATES_PER_SECOND, play_state="paused"),
+        collapse_panels=True,
+    )

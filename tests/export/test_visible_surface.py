@@ -10,7 +10,7 @@ import torch
 from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
 from numpy.typing import NDArray
 
-from directshape_torch.evaluation.shape_truth import EstimatedCar
+from directshape_torch.evaluation.shape_error import EstimatedCar
 from directshape_torch.export.painted_cars import FrameView
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
