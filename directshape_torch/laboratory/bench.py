@@ -11,7 +11,7 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.depth import closest_of_march, first_hits, march
 from directshape_torch.geometry import se3
-from directshape_torch.laboratory.regimes import Regime, seeded
+from directshape_torch.laboratory.regimes import Draw, Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
@@ -90,7 +90,7 @@ class Bench:
         """Draw states and choose their pixels."""
         config = _settings(regime, pixels_per_car)
         generator = seeded(seed, regime)
-        drawn = regime.draw(scene, prior, num_states, generator)
+        drawn = regime.draw(Draw(scene, prior, num_states, generator))
         frame, detections = scene.frame, drawn.detections
         cars = CarBatch.from_scene(frame, detections)
         observation = pack_pixels(frame, detections, config.sampling)

@@ -6,7 +6,7 @@ import difflib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,14 +22,63 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.cars import CarState, retract
 
 Pixels = Literal["sampled", "contour", "grazing", "grid_border"]
+_GROUND_Y_M = 1.65
 
 
-@dataclass(frozen=True)
-class DrawnStates:
+class DrawnStates(NamedTuple):
     """B states with the detections whose pixels they are judged by."""
 
     detections: Detections
     state: CarState
+
+
+class Draw(NamedTuple):
+    """What states are drawn from, and the ways to draw them."""
+
+    scene: LaboratoryScene
+    prior: PCAShapePrior
+    count: int
+    generator: torch.Generator
+
+    def uniform(self, low: float, high: float) -> Tensor:
+        """One number a state."""
+        return low + (high - low) * torch.rand(self.count, generator=self.generator, dtype=torch.float64)
+
+    def yaw(self) -> Tensor:
+        """Any heading."""
+        return self.uniform(-math.pi, math.pi)
+
+    def disturbed(self, state: CarState, metres: float, degrees: float, sigma: float) -> CarState:
+        """States moved and turned at random, codes with normal deviates added."""
+        count, num_codes = state.code.shape
+        delta = torch.randn(count, 6, generator=self.generator, dtype=torch.float64)
+        delta = delta * torch.tensor([metres] * 3 + [math.radians(degrees)] * 3, dtype=torch.float64)
+        change = sigma * torch.randn(count, num_codes, generator=self.generator, dtype=torch.float64)
+        return retract(state, torch.cat([delta, change], dim=1), max_code=3.0)
+
+    def of_frame(self, T_cam_obj: Tensor, code: Tensor, metres: float, degrees: float, sigma: float) -> DrawnStates:
+        """The detections of the frame, over and over, at states about the given ones of each."""
+        rows = torch.arange(self.count) % len(T_cam_obj)
+        start = CarState.of(se3.inverse(T_cam_obj[rows]), code[rows])
+        detections = select_detections(self.scene.detections, rows)
+        return DrawnStates(detections, self.disturbed(start, metres, degrees, sigma))
+
+    def placed(
+        self, x_m: Tensor, z_m: Tensor, yaw_rad: Tensor, code: Tensor | None = None, disturb: bool = True
+    ) -> DrawnStates:
+        """Cars put somewhere, seen from states a little off."""
+        T_cam_obj = pose_from_kitti(torch.stack([x_m, torch.full_like(x_m, _GROUND_Y_M), z_m], dim=-1), yaw_rad)
+        if code is None:
+            size = (self.count, self.prior.num_codes)
+            code = torch.randn(*size, generator=self.generator, dtype=torch.float64).clamp(-3, 3)
+        detections = place_cars(self.scene, self.prior, T_cam_obj, code)
+        state = CarState.of(se3.inverse(T_cam_obj), code)
+        return DrawnStates(detections, self.disturbed(state, 0.05, 1.0, 0.0) if disturb else state)
+
+    def anywhere(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Place and heading 8 to 25 m ahead."""
+        z = self.uniform(8, 25)
+        return 0.3 * z * self.uniform(-1, 1), z, self.yaw()
 
 
 @dataclass(frozen=True)
@@ -39,7 +88,7 @@ class Regime:
     Attributes:
         name: of the regime.
         explanation: in a few words, for reports.
-        draw: from scene, prior, number of states and generator.
+        draw: the states.
         pixels: which pixels of the cars take part.
         stage: of the settings: 1 is the fine one, 0 has a softer contour and half the image resolution.
         occlusion: whether cars hide one another; cars that were placed each on its own must not.
@@ -47,121 +96,67 @@ class Regime:
 
     name: str
     explanation: str
-    draw: Callable[[LaboratoryScene, PCAShapePrior, int, torch.Generator], DrawnStates]
+    draw: Callable[[Draw], DrawnStates]
     pixels: Pixels = "sampled"
     stage: int = 1
     occlusion: bool = False
 
 
-_GROUND_Y_M = 1.65
+def _typical(d: Draw) -> DrawnStates:
+    detections = d.scene.detections
+    return d.of_frame(detections.T_cam_obj, d.prior.initial_code(len(detections)), 0.15, 2.0, 0.8)
 
 
-def _uniform(generator: torch.Generator, count: int, low: float, high: float) -> Tensor:
-    return low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)
-
-
-def _disturbed(state: CarState, generator: torch.Generator, metres: float, degrees: float, sigma: float) -> CarState:
-    """States moved and turned at random, codes with normal deviates added."""
-    count, num_codes = state.code.shape
-    delta = torch.randn(count, 6, generator=generator, dtype=torch.float64)
-    delta = delta * torch.tensor([metres] * 3 + [math.radians(degrees)] * 3, dtype=torch.float64)
-    change = sigma * torch.randn(count, num_codes, generator=generator, dtype=torch.float64)
-    return retract(state, torch.cat([delta, change], dim=1), max_code=3.0)
-
-
-def _cycled(detections: Detections, count: int) -> Detections:
-    return select_detections(detections, torch.arange(count) % len(detections))
-
-
-def _typical(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
-    detections = _cycled(scene.detections, count)
-    start = CarState.of(se3.inverse(detections.T_cam_obj), prior.initial_code(count))
-    return DrawnStates(detections, _disturbed(start, generator, 0.15, 2.0, 0.8))
-
-
-def _near_optimum(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
+def _near_optimum(d: Draw) -> DrawnStates:
     # Wherever the optimum lies, whether its box is to be trusted is another question.
     every_result = replace(RefinerConfig(), acceptance=AcceptanceConfig(0.0, 0.0))
-    result = DirectShapeRefiner(prior, every_result)(scene.frame, scene.detections)
-    rows = torch.arange(count) % len(scene.detections)
-    refined = CarState.of(se3.inverse(result.T_cam_obj[rows]), result.code[rows])
-    return DrawnStates(_cycled(scene.detections, count), _disturbed(refined, generator, 0.01, 0.1, 0.05))
+    result = DirectShapeRefiner(d.prior, every_result)(d.scene.frame, d.scene.detections)
+    return d.of_frame(result.T_cam_obj, result.code, 0.01, 0.1, 0.05)
 
 
-def _placed(
-    scene: LaboratoryScene,
-    prior: PCAShapePrior,
-    generator: torch.Generator,
-    x_m: Tensor,
-    z_m: Tensor,
-    yaw_rad: Tensor,
-    code: Tensor | None = None,
-    disturb: bool = True,
-) -> DrawnStates:
-    """Cars put somewhere, seen from states a little off."""
-    count = len(x_m)
-    T_cam_obj = pose_from_kitti(torch.stack([x_m, torch.full_like(x_m, _GROUND_Y_M), z_m], dim=-1), yaw_rad)
-    if code is None:
-        code = torch.randn(count, prior.num_codes, generator=generator, dtype=torch.float64).clamp(-3, 3)
-    detections = place_cars(scene, prior, T_cam_obj, code)
-    state = CarState.of(se3.inverse(T_cam_obj), code)
-    if disturb:
-        state = _disturbed(state, generator, 0.05, 1.0, 0.0)
-    return DrawnStates(detections, state)
+def _far(d: Draw) -> DrawnStates:
+    x, yaw = d.uniform(-10, 10), d.yaw()
+    return d.placed(x, torch.full_like(x, 80.0), yaw)
 
 
-def _anywhere(generator: torch.Generator, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    z = _uniform(generator, count, 8, 25)
-    return 0.3 * z * _uniform(generator, count, -1, 1), z, _uniform(generator, count, -math.pi, math.pi)
+def _near(d: Draw) -> DrawnStates:
+    x, yaw = d.uniform(-0.8, 0.8), d.uniform(-0.3, 0.3)
+    return d.placed(x, torch.full_like(x, 3.0), yaw)
 
 
-def _far(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
-    x, yaw = _uniform(generator, count, -10, 10), _uniform(generator, count, -math.pi, math.pi)
-    return _placed(scene, prior, generator, x, torch.full_like(x, 80.0), yaw)
-
-
-def _near(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
-    x, yaw = _uniform(generator, count, -0.8, 0.8), _uniform(generator, count, -0.3, 0.3)
-    return _placed(scene, prior, generator, x, torch.full_like(x, 3.0), yaw)
-
-
-def _cut(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
+def _cut(d: Draw) -> DrawnStates:
     """The middle of the car projects onto the left or right border of the image."""
-    K, width = scene.frame.camera.K_left[0], float(scene.frame.sizes[0, 1])
-    z = _uniform(generator, count, 7, 14)
-    border = torch.where(torch.arange(count) % 2 == 0, 0.0, width - 1.0)
-    x = (border - K[0, 2]) * z / K[0, 0]
-    return _placed(scene, prior, generator, x, z, _uniform(generator, count, -math.pi, math.pi))
+    K, width = d.scene.frame.camera.K_left[0], float(d.scene.frame.sizes[0, 1])
+    z = d.uniform(7, 14)
+    border = torch.where(torch.arange(d.count) % 2 == 0, 0.0, width - 1.0)
+    return d.placed((border - K[0, 2]) * z / K[0, 0], z, d.yaw())
 
 
-def _anywhere_placed(
-    scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator
-) -> DrawnStates:
-    return _placed(scene, prior, generator, *_anywhere(generator, count))
+def _anywhere(d: Draw) -> DrawnStates:
+    return d.placed(*d.anywhere())
 
 
-def _with_offset(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
-    drawn = _anywhere_placed(scene, prior, count, generator)
-    detections = replace(drawn.detections, offset_sigma_px=torch.full((count,), 0.5, dtype=torch.float64))
-    return DrawnStates(detections, drawn.state._replace(offset_px=_uniform(generator, count, -1, 1)[:, None]))
+def _with_offset(d: Draw) -> DrawnStates:
+    drawn = _anywhere(d)
+    detections = replace(drawn.detections, offset_sigma_px=torch.full((d.count,), 0.5, dtype=torch.float64))
+    return DrawnStates(detections, drawn.state._replace(offset_px=d.uniform(-1, 1)[:, None]))
 
 
-def _with_code(size: float) -> Callable[..., DrawnStates]:
-    def draw(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
-        sign = torch.randint(0, 2, (count, prior.num_codes), generator=generator) * 2 - 1
-        place = _anywhere(generator, count)
-        return _placed(scene, prior, generator, *place, code=size * sign.double())
+def _with_code(size: float) -> Callable[[Draw], DrawnStates]:
+    def draw(d: Draw) -> DrawnStates:
+        sign = torch.randint(0, 2, (d.count, d.prior.num_codes), generator=d.generator) * 2 - 1
+        return d.placed(*d.anywhere(), code=size * sign.double())
 
     return draw
 
 
-def _with_yaw(*yaws: float) -> Callable[..., DrawnStates]:
+def _with_yaw(*yaws: float) -> Callable[[Draw], DrawnStates]:
     """Exact rotations, with no disturbance: the states where closed forms divide by an angle or lose the axis."""
 
-    def draw(scene: LaboratoryScene, prior: PCAShapePrior, count: int, generator: torch.Generator) -> DrawnStates:
-        x, z, _ = _anywhere(generator, count)
-        yaw = torch.tensor(yaws, dtype=torch.float64)[torch.arange(count) % len(yaws)]
-        return _placed(scene, prior, generator, x, z, yaw, disturb=False)
+    def draw(d: Draw) -> DrawnStates:
+        x, z, _ = d.anywhere()
+        yaw = torch.tensor(yaws, dtype=torch.float64)[torch.arange(d.count) % len(yaws)]
+        return d.placed(x, z, yaw, disturb=False)
 
     return draw
 
@@ -174,14 +169,14 @@ REGIMES: Mapping[str, Regime] = {
         Regime("far_80m", "80 m away", _far, stage=0),
         Regime("near_3m", "3 m away", _near),
         Regime("image_border", "cut in half by the left or right image border", _cut),
-        Regime("grazing", "rays within 72 to 90 deg of the surface normal", _anywhere_placed, pixels="grazing"),
-        Regime("contour", "pixels on the soft contour, zeta sdf within 3", _anywhere_placed, pixels="contour"),
+        Regime("grazing", "rays within 72 to 90 deg of the surface normal", _anywhere, pixels="grazing"),
+        Regime("contour", "pixels on the soft contour, zeta sdf within 3", _anywhere, pixels="contour"),
         Regime("identity_rotation", "rotation the identity, and 1e-7 rad off", _with_yaw(0.0, 1e-7)),
         Regime("near_pi_rotation", "rotation by pi, and 1e-7 and 1e-3 rad less",
                _with_yaw(math.pi, math.pi - 1e-7, math.pi - 1e-3)),
         Regime("code_zero", "the mean shape", _with_code(0.0)),
         Regime("code_three_sigma", "all components of the code at +-3", _with_code(3.0)),
-        Regime("grid_border", "points within a cell of the border of the shape's grid", _anywhere_placed,
+        Regime("grid_border", "points within a cell of the border of the shape's grid", _anywhere,
                pixels="grid_border", stage=0),
         Regime("disparity_offset", "the rig's disparity off by an unknown of up to 1 px", _with_offset),
     )
@@ -216,6 +211,3 @@ def checked_name(what: str, name: str, known: list[str]) -> str:
 def seeded(seed: int, regime: Regime) -> torch.Generator:
     """A generator of a regime of its own: what is drawn does not depend on which other regimes are."""
     return torch.Generator().manual_seed(seed * 1000 + list(REGIMES).index(regime.name))
-
-
-__all__ = ["REGIMES", "DrawnStates", "Regime", "checked_name", "regimes_named", "seeded"]

@@ -1,4 +1,7 @@
-"""Data sets in KITTI's layout, broken on purpose: each way with the findings that must name it."""
+"""Data sets in KITTI's layout, broken on purpose: each way with the findings that must name it.
+
+Mistakes in the numbers themselves are in `scripts/scene_mistakes.py`; here are those of files, and some of each kind.
+"""
 
 from __future__ import annotations
 
@@ -63,10 +66,9 @@ def _images(change: Callable[[Image, Image], tuple[Image, Image]]) -> Callable[[
     return apply
 
 
-def _warp(image: Image, degrees: float = 0.0, scale: float = 1.0, down: float = 0.0) -> Image:
+def _turned(image: Image, degrees: float) -> Image:
     height, width = image.shape[:2]
-    matrix = cv2.getRotationMatrix2D((width / 2, height / 2), degrees, scale)
-    matrix[1, 2] += down
+    matrix = cv2.getRotationMatrix2D((width / 2, height / 2), degrees, 1.0)
     return np.asarray(cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_REFLECT), dtype=np.uint8)
 
 
@@ -94,24 +96,6 @@ def _scale_baseline(factor: float) -> Callable[[NDArray[Any], NDArray[Any]], Non
 
 def _swap_projections(P2: NDArray[Any], P3: NDArray[Any]) -> None:
     P2[:], P3[:] = P3.copy(), P2.copy()
-
-
-def _scale_rows(factor: float, rows: slice = slice(0, 2), columns: slice = slice(0, 3)) -> Callable[..., None]:
-    def change(P2: NDArray[Any], P3: NDArray[Any]) -> None:
-        for P in (P2, P3):
-            P[rows, columns] *= factor
-
-    return change
-
-
-def _move_centre(P2: NDArray[Any], P3: NDArray[Any]) -> None:
-    for P in (P2, P3):
-        P[0, 2] += 5000
-
-
-def _focal_in_mm(P2: NDArray[Any], P3: NDArray[Any]) -> None:
-    for P in (P2, P3):
-        P[0, 0] = P[1, 1] = 4.0
 
 
 def _boxes(change: Callable[[Row], None]) -> Callable[[Path], None]:
@@ -204,11 +188,6 @@ def _other_side(entry: dict[str, Any], mask: NDArray[Any]) -> NDArray[Any]:
     return mask
 
 
-def _half_size(entry: dict[str, Any], mask: NDArray[Any]) -> NDArray[Any]:
-    del entry
-    return np.ascontiguousarray(mask[::2, ::2])
-
-
 def _moved(entry: dict[str, Any], mask: NDArray[Any]) -> NDArray[Any]:
     del entry
     return np.roll(mask, mask.shape[1] // 3, axis=1)
@@ -243,8 +222,6 @@ def _break(apply: Callable[[Path], None], *checks: str) -> Break:
 BREAKS: dict[str, Break] = {
     "left and right images swapped": _break(_images(lambda left, right: (right, left)), "images_swapped"),
     "both images mirrored": _break(_images(lambda left, right: (left[:, ::-1], right[:, ::-1])), "images_swapped"),
-    "left image given twice": _break(_images(lambda left, _: (left, left)), "same_image"),
-    "right image mirrored": _break(_images(lambda left, right: (left, right[:, ::-1])), "image_mirrored"),
     "right image of another place": _break(
         _images(lambda left, _: (left, np.random.default_rng(0).permuted(left[::-1], axis=1))),
         "different_scenes",
@@ -253,38 +230,19 @@ BREAKS: dict[str, Break] = {
     "right image of other pixels": _break(
         _images(lambda left, right: (left, right[: right.shape[0] // 2])), "image_size"
     ),
-    "right image 2 px lower": _break(_images(lambda left, right: (left, _warp(right, down=2.0))), "not_rectified"),
     "right image turned by 0.3 degrees": _break(
-        _images(lambda left, right: (left, _warp(right, degrees=0.3))), "not_rectified"
-    ),
-    "right image enlarged by 1 percent": _break(
-        _images(lambda left, right: (left, _warp(right, scale=1.01))), "not_rectified"
+        _images(lambda left, right: (left, _turned(right, 0.3))), "not_rectified"
     ),
     "baseline of the other sign": _break(_projections(_scale_baseline(-1.0)), "baseline_sign"),
     "P2 and P3 swapped": _break(_projections(_swap_projections), "baseline_sign"),
-    "baseline in centimetres": _break(_projections(_scale_baseline(100.0)), "baseline_length"),
     "baseline not times focal length": _break(_projections(_scale_baseline(1 / 720)), "baseline_length"),
     "baseline 1.5 times too long": _break(_projections(_scale_baseline(1.5)), "distance_scale"),
-    "baseline 0.6 times too short": _break(_projections(_scale_baseline(0.6)), "distance_scale"),
-    "focal length in millimetres": _break(_projections(_focal_in_mm), "focal_length"),
-    "intrinsics of half the size": _break(_projections(_scale_rows(0.5)), "principal_point"),
-    "intrinsics of twice the size": _break(_projections(_scale_rows(2.0)), "principal_point"),
-    "principal point outside": _break(_projections(_move_centre), "principal_point"),
-    "fy half of fx": _break(_projections(_scale_rows(0.5, slice(1, 2))), "focal_length"),
     "box centre for bottom": _break(_boxes(_centre), "box_origin"),
     "x to the left": _break(_boxes(_location(lambda x, y, z: (-x, y, z))), "box_axes"),
-    "y up": _break(_boxes(_location(lambda x, y, z: (x, -y, z))), "box_axes"),
-    "LiDAR's axes": _break(_boxes(_location(lambda x, y, z: (z, -x, -y))), "box_axes"),
-    "z up, y forward": _break(_boxes(_location(lambda x, y, z: (x, z, -y))), "box_axes"),
     "yaw of the other sign": _break(_boxes(_yaw(lambda yaw: -yaw)), "box_yaw"),
-    "yaw off by 90 degrees": _break(_boxes(_yaw(lambda yaw: yaw - math.pi / 2)), "box_yaw"),
     "yaw in degrees": _break(_boxes(_yaw(math.degrees)), "box_yaw"),
-    "yaw of a LiDAR": _break(_boxes(_yaw(lambda yaw: -yaw - math.pi / 2)), "box_yaw"),
     "order l w h": _break(_boxes(_order(2, 1, 0)), "box_order"),
-    "order l h w": _break(_boxes(_order(2, 0, 1)), "box_order"),
-    "order h l w": _break(_boxes(_order(0, 2, 1)), "box_order"),
     "order w h l": _break(_boxes(_order(1, 0, 2)), "box_order"),
-    "order w l h": _break(_boxes(_order(1, 2, 0)), "box_order"),
     "centre, order w l h and LiDAR's yaw": _break(_boxes(_nuscenes), "box_origin", "box_order", "box_yaw"),
     "centimetres": _break(_boxes(_scaled(100.0)), "box_units"),
     "2D boxes as x y width height": _break(_boxes(_corner_and_size), "box_2d"),
@@ -293,7 +251,6 @@ BREAKS: dict[str, Break] = {
     ),
     "classes in lower case": _break(_boxes(_lower_case), "no_cars"),
     "masks of the other side": _break(_masks(_other_side), "masks_swapped"),
-    "masks of half the size": _break(_masks(_half_size), "mask_size"),
     "masks of other images": _break(_masks(_moved), "masks_elsewhere"),
     "masks of another category": _break(_masks(_category), "no_masks"),
     "missing right image": _break(_remove("training/image_3"), "missing_files"),

@@ -91,7 +91,9 @@ def _without_masks(scene: LaboratoryScene) -> LaboratoryScene:
 
 def test_states_without_pixels_are_counted_and_do_not_crash() -> None:
     said: list[str] = []
-    plan = StudyPlan(regimes=tuple(regimes_named(["typical"])), num_states=2, pixels_per_car=4)
+    plan = StudyPlan(
+        ("photometric", "shape"), regimes=tuple(regimes_named(["typical"])), num_states=2, pixels_per_car=4
+    )
     prior = PCAShapePrior.load_bundled().double()
     study = run_study(_without_masks(load_scene()), prior, plan, said.append)
     assert study.states_without_pixels == {"typical": 2}
