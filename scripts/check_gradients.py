@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and run; 0: all bounds hold, 1: one is broken, 2: wrong use."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--states", type=int, default=6, metavar="N", help="states in each regime (default 6)")
+    parser.add_argument("--states", type=int, default=3, metavar="N", help="states in each regime (default 3)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="for jacobians.csv and summary.md")
     parser.add_argument(
         "--term", nargs="+", metavar="NAME", help="terms and factors, default all; module:factory for one of your own"
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--masks", type=Path, metavar="DIR", help="default ROOT/training/masks")
     parser.add_argument("--prior", type=Path, metavar="FILE", help="default the bundled shape prior")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--pixels", type=int, default=64, metavar="N", help="pixels per car and side (default 64)")
+    parser.add_argument("--pixels", type=int, default=24, metavar="N", help="pixels per car and side (default 24)")
     parser.add_argument("--second", action=argparse.BooleanOptionalAction, default=True, help="second derivatives too")
     torch.set_num_threads(1)  # the operations are small, and threads would spin
     return run_command(parser, run, arguments)

@@ -35,9 +35,9 @@ class StudyPlan:
     subjects: tuple[str, ...] = SUBJECT_NAMES
     own_terms: tuple[TermFactory, ...] = ()
     regimes: tuple[Regime, ...] = field(default_factory=lambda: tuple(regimes_named(None)))
-    num_states: int = 6
+    num_states: int = 3
     seed: int = 0
-    pixels_per_car: int = 64
+    pixels_per_car: int = 24
     second: bool = True
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.shape.sdf_grid import GridField, GridShape, derivatives_at, value_at
+from directshape_torch.shape.sdf_grid import GridShape, derivatives_at, value_at
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
 COUNTS, SPACING = (6, 5, 4), 0.4
@@ -78,7 +78,15 @@ def test_the_code_derivative_of_constant_lookups_is_that_of_the_values() -> None
         torch.testing.assert_close(J[:, k], expected, rtol=0, atol=1e-12)
 
 
-def test_fields_without_objects() -> None:
-    shape = shape_of(0)
-    nothing = GridField(*shape.field)
-    assert value_at(nothing, points(0), torch.zeros(0, dtype=torch.long)).shape == (0,)
+@pytest.mark.parametrize("constant", [True, False])
+def test_points_that_are_not_finite_disturb_no_others(constant: bool) -> None:
+    shape, at = shape_of(2), points(6)
+    index = torch.tensor([0, 1, 0, 1, 0, 1])
+    clean = derivatives_at(shape.field, at, index, constant)
+    at[:, 2], at[1, 4] = torch.nan, torch.inf
+    broken = derivatives_at(shape.field, at, index, constant)
+    fine = torch.tensor([0, 1, 3, 5])
+    assert broken.value[2].isnan()
+    assert torch.equal(broken.value[fine], clean.value[fine])
+    assert torch.equal(broken.gradient[:, fine], clean.gradient[:, fine])
+    assert torch.equal(broken.J_value_code[fine], clean.J_value_code[fine])

@@ -63,16 +63,6 @@ def test_value_and_code_derivative_against_a_slow_loop(where: str) -> None:
     torch.testing.assert_close(shape.value(points, index), at.value, rtol=1e-14, atol=1e-14)
 
 
-def test_grid_sample_agrees() -> None:
-    shape, points = random_shape(1), points_inside(50)
-    # grid_sample wants (z, y, x) of the last, middle and first axis in [-1, 1] and centres of the outer nodes at +-1.
-    normalised = (2 * (points - ORIGIN) / (LAST - ORIGIN) - 1).flip(-1)
-    expected = torch.nn.functional.grid_sample(
-        shape.values[:, None], normalised[None, :, None, None], align_corners=True
-    )
-    torch.testing.assert_close(shape.value(points, torch.zeros(50, dtype=torch.long)), expected.flatten())
-
-
 @pytest.mark.parametrize("where", ["inside", "outside"])
 def test_gradient_is_the_derivative_of_the_value(where: str) -> None:
     shape = random_shape()
@@ -93,16 +83,6 @@ def test_the_last_faces_belong_to_their_cells() -> None:
     torch.testing.assert_close(shape.value_and_derivatives(points, index).gradient, from_autograd)
 
 
-def test_gradient_by_central_differences() -> None:
-    shape, points = random_shape(), torch.cat([points_inside(20), points_outside(20)])
-    index = torch.arange(40) % 2
-    for axis in range(3):
-        step = 1e-7 * torch.eye(3, dtype=torch.float64)[axis]
-        numeric = (shape.value(points + step, index) - shape.value(points - step, index)) / 2e-7
-        analytic = shape.value_and_derivatives(points, index).gradient[:, axis]
-        torch.testing.assert_close(analytic, numeric, atol=1e-6, rtol=1e-6)
-
-
 def test_code_derivative_is_the_derivative_by_the_nodes_values() -> None:
     basis = random_shape().basis
     mean = random_shape(1).values[0]
@@ -121,58 +101,12 @@ def test_code_derivative_is_the_derivative_by_the_nodes_values() -> None:
     torch.testing.assert_close(bound.value_and_derivatives(points, index).J_value_code, J[:, 0])
 
 
-def test_continuation_is_continuous_and_grows_with_the_distance() -> None:
-    shape = random_shape(1)
-    index = torch.zeros(1, dtype=torch.long)
-    face = torch.tensor([[float(LAST[0]), -1.13, 1.07]], dtype=torch.float64)
-    out = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
-    on_face = shape.value(face, index)
-    torch.testing.assert_close(shape.value(face + 1e-12 * out, index), on_face, atol=1e-10, rtol=0)
-    torch.testing.assert_close(shape.value(face - 1e-12 * out, index), on_face, atol=1e-10, rtol=0)
-    torch.testing.assert_close(shape.value(face + 2.5 * out, index), on_face + 2.5)
-    # Outside, the field grows by one metre a metre along the way out, and along the face as the face does.
-    gradient = shape.value_and_derivatives(face + 0.3 * out, index).gradient[0]
-    assert float(gradient[0]) == pytest.approx(1.0)
-    assert gradient[1:].abs().max() > 0
-
-
 def test_continuation_beyond_a_corner_points_away_from_it() -> None:
     shape = random_shape(1)
     away = torch.tensor([[0.3, 0.4, 1.2]], dtype=torch.float64)
     at = shape.value_and_derivatives(LAST + away, torch.zeros(1, dtype=torch.long))
     torch.testing.assert_close(at.value, shape.values[:, -1, -1, -1] + 1.3)
     torch.testing.assert_close(at.gradient, away / 1.3)
-
-
-def test_linear_fields_are_exact_at_all_nodes() -> None:
-    axes = [ORIGIN[i] + SPACING * torch.arange(COUNTS[i], dtype=torch.float64) for i in range(3)]
-    nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-    slope = torch.tensor([0.7, -0.2, 1.1], dtype=torch.float64)
-    shape = GridShape((nodes @ slope)[None], torch.zeros(*COUNTS, 0, dtype=torch.float64), ORIGIN, SPACING)
-    points = nodes.reshape(-1, 3)
-    at = shape.value_and_derivatives(points, torch.zeros(len(points), dtype=torch.long))
-    torch.testing.assert_close(at.value, points @ slope)
-    # On the border itself rounding decides which side a node is on, and the slope across the border differs.
-    inner = ((points > ORIGIN + 0.1) & (points < LAST - 0.1)).all(1)
-    torch.testing.assert_close(at.gradient[inner], slope.expand(int(inner.sum()), 3))
-
-
-def test_float32_is_close_to_float64() -> None:
-    double = random_shape()
-    single = GridShape(double.values.float(), double.basis.float(), ORIGIN.float(), SPACING)
-    points, index = torch.cat([points_inside(30), points_outside(30)]), torch.arange(60) % 2
-    a, b = single.value_and_derivatives(points.float(), index), double.value_and_derivatives(points, index)
-    for low, high in zip(a, b, strict=True):
-        assert low.dtype == torch.float32
-        torch.testing.assert_close(low.double(), high, atol=2e-5, rtol=2e-5)
-
-
-def test_no_points_and_no_objects() -> None:
-    empty = torch.zeros(0, 3, dtype=torch.float64)
-    none = torch.zeros(0, dtype=torch.long)
-    for shape in (random_shape(), random_shape(0)):
-        at = shape.value_and_derivatives(empty, none)
-        assert (at.value.shape, at.gradient.shape, at.J_value_code.shape) == ((0,), (0, 3), (0, 3))
 
 
 @pytest.mark.parametrize("where", ["inside", "outside"])
@@ -210,20 +144,3 @@ def test_the_gradient_can_be_traced() -> None:
     shape, points, index = random_shape(), points_inside(20), torch.arange(20) % 2
     traced = torch.compile(shape.gradient, backend="eager", fullgraph=True)
     torch.testing.assert_close(traced(points, index), shape.gradient(points, index), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("differentiable", [True, False])
-def test_points_that_are_not_finite_disturb_no_others(differentiable: bool) -> None:
-    points = points_inside(4)
-    index = torch.zeros(4, dtype=torch.long)
-    expected = random_shape(1).value(points, index)
-    broken = points.clone()
-    broken[1, 0], broken[2, 2] = torch.nan, torch.inf
-    with torch.set_grad_enabled(differentiable):
-        at = random_shape(1).value_and_derivatives(broken, index)
-        value = random_shape(1).value(broken, index)
-    assert value[1].isnan()
-    assert value[2].isinf()
-    assert (value[[0, 3]] == expected[[0, 3]]).all()
-    for mine, theirs in zip(at, random_shape(1).value_and_derivatives(points, index), strict=True):
-        torch.testing.assert_close(mine[[0, 3]], theirs[[0, 3]], rtol=1e-12, atol=1e-12)
