@@ -37,12 +37,12 @@ class Draw(NamedTuple):
 
     scene: LaboratoryScene
     prior: PCAShapePrior
-    count: int
+    num_states: int
     generator: torch.Generator
 
     def uniform(self, low: float, high: float) -> Tensor:
         """One number a state."""
-        return low + (high - low) * torch.rand(self.count, generator=self.generator, dtype=torch.float64)
+        return low + (high - low) * torch.rand(self.num_states, generator=self.generator, dtype=torch.float64)
 
     def yaw(self) -> Tensor:
         """Any heading."""
@@ -58,7 +58,7 @@ class Draw(NamedTuple):
 
     def of_frame(self, T_cam_obj: Tensor, code: Tensor, metres: float, degrees: float, sigma: float) -> DrawnStates:
         """The detections of the frame, over and over, at states about the given ones of each."""
-        rows = torch.arange(self.count) % len(T_cam_obj)
+        rows = torch.arange(self.num_states) % len(T_cam_obj)
         start = CarState.of(se3.inverse(T_cam_obj[rows]), code[rows])
         detections = select_detections(self.scene.detections, rows)
         return DrawnStates(detections, self.disturbed(start, metres, degrees, sigma))
@@ -69,7 +69,7 @@ class Draw(NamedTuple):
         """Cars put somewhere, seen from states a little off."""
         T_cam_obj = pose_from_kitti(torch.stack([x_m, torch.full_like(x_m, _GROUND_Y_M), z_m], dim=-1), yaw_rad)
         if code is None:
-            size = (self.count, self.prior.num_codes)
+            size = (self.num_states, self.prior.num_codes)
             code = torch.randn(*size, generator=self.generator, dtype=torch.float64).clamp(-3, 3)
         detections = place_cars(self.scene, self.prior, T_cam_obj, code)
         state = CarState.of(se3.inverse(T_cam_obj), code)
@@ -128,7 +128,7 @@ def _cut(d: Draw) -> DrawnStates:
     """The middle of the car projects onto the left or right border of the image."""
     K, width = d.scene.frame.camera.K_left[0], float(d.scene.frame.sizes[0, 1])
     z = d.uniform(7, 14)
-    border = torch.where(torch.arange(d.count) % 2 == 0, 0.0, width - 1.0)
+    border = torch.where(torch.arange(d.num_states) % 2 == 0, 0.0, width - 1.0)
     return d.placed((border - K[0, 2]) * z / K[0, 0], z, d.yaw())
 
 
@@ -138,13 +138,13 @@ def _anywhere(d: Draw) -> DrawnStates:
 
 def _with_offset(d: Draw) -> DrawnStates:
     drawn = _anywhere(d)
-    detections = replace(drawn.detections, offset_sigma_px=torch.full((d.count,), 0.5, dtype=torch.float64))
+    detections = replace(drawn.detections, offset_sigma_px=torch.full((d.num_states,), 0.5, dtype=torch.float64))
     return DrawnStates(detections, drawn.state._replace(offset_px=d.uniform(-1, 1)[:, None]))
 
 
 def _with_code(size: float) -> Callable[[Draw], DrawnStates]:
     def draw(d: Draw) -> DrawnStates:
-        sign = torch.randint(0, 2, (d.count, d.prior.num_codes), generator=d.generator) * 2 - 1
+        sign = torch.randint(0, 2, (d.num_states, d.prior.num_codes), generator=d.generator) * 2 - 1
         return d.placed(*d.anywhere(), code=size * sign.double())
 
     return draw
@@ -155,7 +155,7 @@ def _with_yaw(*yaws: float) -> Callable[[Draw], DrawnStates]:
 
     def draw(d: Draw) -> DrawnStates:
         x, z, _ = d.anywhere()
-        yaw = torch.tensor(yaws, dtype=torch.float64)[torch.arange(d.count) % len(yaws)]
+        yaw = torch.tensor(yaws, dtype=torch.float64)[torch.arange(d.num_states) % len(yaws)]
         return d.placed(x, z, yaw, disturb=False)
 
     return draw
