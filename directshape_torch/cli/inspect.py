@@ -10,8 +10,7 @@ import argparse
 from pathlib import Path
 
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.cli.inspect_cars import inspect_frame
-from directshape_torch.cli.inspect_tracks import inspect_tracks
+from directshape_torch.cli.inspect_cars import inspect_frame, inspect_tracks
 from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, frame_id_of, make_refiner
 from directshape_torch.errors import InputError
 from directshape_torch.io.figure_files import check_figures

@@ -21,6 +21,10 @@ class Line:
     text: str
     raw: str
 
+    def error(self, path: Path | str, problem: str, cure: str = "") -> DataFormatError:
+        """A complaint about the line that names it."""
+        return DataFormatError(path, problem, line_number=self.number, line=self.text, cure=cure)
+
 
 def read_lines(path: Path | str) -> list[Line]:
     """The lines of a text file that are not blank.
@@ -47,9 +51,7 @@ def finite_numbers(
     try:
         values = np.array([float(word) for word in (line.text.split() if words is None else words)])
     except ValueError as error:
-        problem = f"expected {count} numbers ({error})"
-        raise DataFormatError(path, problem, line_number=line.number, line=line.text, cure=cure) from error
+        raise line.error(path, f"expected {count} numbers ({error})", cure) from error
     if len(values) != count or not np.isfinite(values).all():
-        problem = f"expected {count} finite numbers, got {len(values)}"
-        raise DataFormatError(path, problem, line_number=line.number, line=line.text, cure=cure)
+        raise line.error(path, f"expected {count} finite numbers, got {len(values)}", cure)
     return values

@@ -9,11 +9,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import DataFormatError
 from directshape_torch.files.text_files import Line, read_lines
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 
-_COLUMNS = "type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
+_CURE = "write one object a line: type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
 # KITTI writes these where a box has no 3D part (DontCare, 2D detectors).
 _NO_LOCATION_M = -1000.0
 
@@ -78,13 +77,7 @@ def parse_object(path: Path | str, line: Line, with_score: bool | None = None) -
 def _check_column_count(path: Path | str, line: Line, count: int, with_score: bool | None) -> None:
     allowed = {None: (15, 16), False: (15,), True: (16,)}[with_score]
     if count not in allowed:
-        raise DataFormatError(
-            path,
-            f"expected {' or '.join(map(str, allowed))} columns, got {count}",
-            line_number=line.number,
-            line=line.text,
-            cure=f"write one object a line: {_COLUMNS}",
-        )
+        raise line.error(path, f"expected {' or '.join(map(str, allowed))} columns, got {count}", _CURE)
 
 
 def _finite_numbers(path: Path | str, line: Line, words: Sequence[str]) -> list[float]:
@@ -95,13 +88,7 @@ def _finite_numbers(path: Path | str, line: Line, words: Sequence[str]) -> list[
         except ValueError:
             number = float("nan")
         if not abs(number) < float("inf"):
-            raise DataFormatError(
-                path,
-                f"column {column} is {word!r}, not a finite number",
-                line_number=line.number,
-                line=line.text,
-                cure=f"write one object a line: {_COLUMNS}",
-            )
+            raise line.error(path, f"column {column} is {word!r}, not a finite number", _CURE)
         numbers.append(number)
     return numbers
 

@@ -29,8 +29,7 @@ def read_times(path: Path | str) -> NDArray[np.float64]:
     seconds: NDArray[np.float64] = np.array([_seconds(path, line) for line in lines], dtype=np.float64)
     for line, (before, here) in zip(lines[1:], pairwise(seconds), strict=True):
         if not before < here:
-            cure = "write one time a frame, in their order"
-            raise DataFormatError(path, "time does not go on", line_number=line.number, line=line.text, cure=cure)
+            raise line.error(path, "time does not go on", "write one time a frame, in their order")
     return seconds - seconds[:1]
 
 
@@ -72,14 +71,14 @@ def _seconds(path: Path | str, line: Line) -> float:
         )
     except (ValueError, OverflowError) as error:
         problem = f"expected seconds or a date and time ({error})"
-        raise DataFormatError(path, problem, line_number=line.number, line=line.text) from error
+        raise line.error(path, problem) from error
     if not np.isfinite(seconds):
-        raise DataFormatError(path, "expected finite seconds", line_number=line.number, line=line.text)
+        raise line.error(path, "expected finite seconds")
     return seconds
 
 
 def _matrix(path: Path | str, line: Line) -> NDArray[np.float64]:
     matrix = finite_numbers(path, line, 12).reshape(3, 4)
     if is_no_rotation(torch.from_numpy(matrix)[None]).any():
-        raise DataFormatError(path, "its first three columns are no rotation", line_number=line.number, line=line.text)
+        raise line.error(path, "its first three columns are no rotation")
     return matrix

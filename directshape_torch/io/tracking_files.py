@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import InputError
 from directshape_torch.files.text_files import Line, read_lines
 from directshape_torch.io.instance_masks import file_of_frame
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, read_objects
@@ -30,13 +30,8 @@ def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
     for line in read_lines(path):
         words = line.text.split()
         if len(words) not in (17, 18) or not _is_number(words[0]) or not _is_number(words[1].removeprefix("-")):
-            raise DataFormatError(
-                path,
-                f"expected 17 or 18 columns beginning with the numbers of frame and track, got {len(words)}",
-                line_number=line.number,
-                line=line.text,
-                cure=f"write one object a line: {_COLUMNS}",
-            )
+            problem = f"expected 17 or 18 columns beginning with the numbers of frame and track, got {len(words)}"
+            raise line.error(path, problem, f"write one object a line: {_COLUMNS}")
         text = " ".join(words[_LEADING:])
         objects = frames.setdefault(int(words[0]), [])
         found = parse_object(path, Line(line.number, text, text))
