@@ -102,13 +102,6 @@ def test_files_that_are_no_shapes(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     with pytest.raises(DataFormatError, match=r"a\.npz: cannot be read"):
         read_shapes(path)
-    with path.open("wb") as file:
-        np.save(file, np.zeros(3))
-    with pytest.raises(DataFormatError, match=r"a\.npz: is no readable npz file"):
-        read_shapes(path)
-    path.write_bytes(b"PK\x03\x04 broken")
-    with pytest.raises(DataFormatError, match="is no readable npz file"):
-        read_shapes(path)
     write_npz(path, {"codes": np.zeros(3)})
     with pytest.raises(DataFormatError, match="has shape schema None, this version reads 3"):
         read_shapes(path)
