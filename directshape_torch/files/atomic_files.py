@@ -48,17 +48,6 @@ def replaced_file(path: Path | str) -> Iterator[IO[bytes]]:
     """A file that takes the place of `path` when the body ends, and leaves it alone when the body fails.
 
     Its folder is made where it is missing. A link of that name is replaced and not followed.
-
-    Raises:
-        OSError: the folder cannot be made or written.
-
-    Examples:
-        >>> import tempfile
-        >>> target = Path(tempfile.mkdtemp()) / "a.bin"
-        >>> with replaced_file(target) as file:
-        ...     count = file.write(b"done")
-        >>> target.read_bytes()
-        b'done'
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -94,13 +83,6 @@ def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
 
     Raises:
         ValueError: an array of Python objects, which would need pickle.
-
-    Examples:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp()) / "a.npz"
-        >>> write_npz(file, {"codes": np.zeros((2, 5))})
-        >>> np.load(file, allow_pickle=False)["codes"].shape
-        (2, 5)
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:

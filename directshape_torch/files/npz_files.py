@@ -57,13 +57,6 @@ def read_npy(path: Path | str, cure: str = "save it with numpy.save") -> NDArray
 
     Raises:
         DataFormatError: the file is missing, damaged, no npy, larger than 512 MiB, or holds Python objects.
-
-    Examples:
-        >>> import tempfile
-        >>> file = Path(tempfile.mkdtemp()) / "a.npy"
-        >>> np.save(file, np.zeros((2, 5)))
-        >>> read_npy(file).shape
-        (2, 5)
     """
     content = read_bytes(path, _MOST_BYTES, cure)
     stream = io.BytesIO(content)

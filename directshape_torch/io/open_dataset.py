@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, Unpack, get_args
 
 from directshape_torch.errors import InputError
 from directshape_torch.io.folder_layout import FolderLayout
+from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.instance_masks import MaskSource
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.kitti_layout import raw_layout, stereo2015_layout, tracking_layout
+from directshape_torch.io.kitti_layout import object_layout, raw_layout, stereo2015_layout, tracking_layout
 from directshape_torch.io.stereo_files import DatasetOptions, FileStereoDataset
 
 LayoutName = Literal["kitti", "raw", "tracking", "stereo2015", "folder"]
+_LAYOUTS: dict[LayoutName, Callable[..., FrameLayout]] = {
+    "kitti": object_layout,
+    "raw": raw_layout,
+    "tracking": tracking_layout,
+    "stereo2015": stereo2015_layout,
+    "folder": FolderLayout,
+}
 
 
 def open_dataset(
@@ -40,9 +48,4 @@ def open_dataset(
         raise InputError("layout", f"one of {', '.join(get_args(LayoutName))}", repr(layout))
     if detections_dir is None and layout != "folder":
         raise InputError("detections", f"a folder of detections for the layout {layout!r}", "none", "--detections DIR")
-    if layout == "kitti":
-        return KittiStereoDataset(root, str(detections_dir), masks, **options)
-    if layout == "folder":
-        return FileStereoDataset(FolderLayout(root, detections_dir), masks, **options)
-    find = {"raw": raw_layout, "tracking": tracking_layout, "stereo2015": stereo2015_layout}[layout]
-    return FileStereoDataset(find(root, str(detections_dir)), masks, **options)
+    return FileStereoDataset(_LAYOUTS[layout](root, detections_dir), masks, **options)
