@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,17 @@ import pytest
 import torch
 from helpers.layouts import write_folder
 
+import directshape_torch
 from directshape_torch.cli.main import main
+from directshape_torch.data_check import check_rig as module
 from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.data_check.frame_parts import numbers_of
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
-from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.scene_check.car_evidence import CarBoxes
 from directshape_torch.scene_check.check_calibration import check_calibration
 from directshape_torch.scene_check.check_pair import PairMatches, check_pair, fit_rows, match_pair
@@ -207,3 +212,42 @@ def test_command(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert main([*command(kitti), "--frames", "77"]) == 2
     with pytest.raises(InputError, match="max_frames: expected at least 1"):
         check_dataset(open_dataset("kitti", kitti, kitti / "detections"), 0)
+
+
+DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
+
+
+@pytest.mark.parametrize(("bias_px", "expected"), [(0.0, []), (1.5, ["rig_offset"])])
+def test_a_field_that_the_cars_contradict(bias_px: float, expected: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bundled frame is exact, so a field of 1.5 px is what is wrong; it has six cars."""
+    monkeypatch.setattr(module, "FEWEST_CARS", 4)
+    dataset = KittiStereoDataset(DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks")
+    frame = dataset.load("000000").frame
+    height, width = frame.sizes[0].tolist()
+    matrices = (frame.camera.K_left[0], frame.camera.K_right[0], frame.camera.T_right_cam[0])
+    field = DisparityField.constant(bias_px, (width, height), *matrices)
+    found = module.check_rig(dataset.changed(ground="file", disparity_field=field), ["000000"])
+    assert [finding.check for finding in found] == expected
+    for finding in found:
+        assert "m at 30 m" in finding.measured
+        assert "--rig auto" in finding.cure
+
+
+DATA = os.environ.get("DIRECTSHAPE_DATA")
+
+
+@pytest.mark.skipif(DATA is None, reason="DIRECTSHAPE_DATA is not set")
+@pytest.mark.parametrize(
+    ("layout", "root", "detections", "masks"),
+    [
+        ("kitti", "rendered", "rendered/detections/mono", "rendered/masks_degraded"),
+        ("kitti", "kitti", "kitti/detections/noisy_stereo", "kitti/training/masks"),
+        ("tracking", "kitti/tracking/0005", "kitti/tracking/0005/detections/pointrcnn", "kitti/tracking/0005"),
+    ],
+)
+def test_intact_frames(layout: LayoutName, root: str, detections: str, masks: str) -> None:
+    base = Path(str(DATA))
+    report = check_dataset(open_dataset(layout, base / root, base / detections, base / masks), 2)
+    assert report.findings == ()
+    assert report.num_checked == 2
+    assert report.num_cars > 4
