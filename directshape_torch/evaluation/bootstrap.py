@@ -15,6 +15,7 @@ Statistic = Callable[..., Any]
 """`numpy.mean` or `numpy.median`, or another that takes values and an axis."""
 
 _PERCENTILES = (2.5, 97.5)
+_MOST_ELEMENTS = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -71,15 +72,20 @@ class CarBootstrap:
 
     def estimate(self, values: NDArray[np.float64], statistic: Statistic = np.mean) -> Estimate:
         """The statistic of `values` (N,) with its percentile interval over the draws."""
-        return self._interval(statistic(values), statistic(values[self._draws], axis=1))
+        return self._interval(statistic(values), self._drawn(values, statistic))
 
     def summary(
         self, before: NDArray[np.float64], after: NDArray[np.float64], statistic: Statistic = np.mean
     ) -> MetricSummary:
         """Statistics of `before` and `after` (N,), and of the second less the first, of the same cars in every draw."""
-        values, drawn = ([statistic(x[rows], axis=-1) for x in (before, after)] for rows in (..., self._draws))
+        values, drawn = [statistic(x) for x in (before, after)], [self._drawn(x, statistic) for x in (before, after)]
         first, second = map(self._interval, values, drawn)
         return MetricSummary(first, second, self._interval(values[1] - values[0], drawn[1] - drawn[0]))
+
+    def _drawn(self, values: NDArray[np.float64], statistic: Statistic) -> NDArray[np.float64]:
+        # Some draws at a time, to bound the memory for thousands of cars.
+        parts = np.array_split(self._draws, 1 + self._draws.size // _MOST_ELEMENTS)
+        return np.concatenate([statistic(values[rows], axis=1) for rows in parts])
 
     def _interval(self, value: float, drawn: NDArray[np.float64]) -> Estimate:
         if self._draws.shape[1] < 2:
