@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.finished_run import FRAMES, FinishedRun
+from helpers.finished_run import FRAMES, FinishedRun, by_place
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
@@ -25,22 +25,12 @@ def exported(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) ->
     return folder
 
 
-def arrays(run: FinishedRun, frame_id: str) -> dict[str, NDArray[np.generic]]:
-    with np.load(run.out / "shapes" / f"{frame_id}.npz", allow_pickle=False) as file:
-        return dict(file)
-
-
 def corners_ref(run: FinishedRun, frame_id: str, car: int) -> NDArray[np.float64]:
     """The corners that state and size of the npz file give by this package's own formula, sorted."""
-    state = arrays(run, frame_id)
+    state = run.state(frame_id)
     T = torch.from_numpy(state["T_ref_obj"][car].astype(np.float64)).clone()
     T[:3, 3] = torch.from_numpy(state["boxes_location_ref"][car].astype(np.float64))
     return by_place(box_corners(T, torch.from_numpy(state["boxes_hwl"][car].astype(np.float64))).numpy())
-
-
-def by_place(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points in an order of their own: by their places along three directions that no box is aligned with."""
-    return points[np.argsort(points @ np.array([1.0, 0.0123, 0.345]))]
 
 
 def test_kitti_text_is_copied_byte_for_byte(finished: FinishedRun, exported: Path) -> None:
@@ -51,7 +41,7 @@ def test_kitti_text_is_copied_byte_for_byte(finished: FinishedRun, exported: Pat
 
 def test_kitti_json_says_what_the_lines_and_the_npz_say(finished: FinishedRun, exported: Path) -> None:
     content = json.loads((exported / "kitti" / "json" / "000001.json").read_text())
-    state = arrays(finished, "000001")
+    state = finished.state("000001")
     lines = (finished.out / "data" / "000001.txt").read_text().splitlines()
     assert [one["status"] for one in content["objects"]] == [state["statuses"][0], "copied", state["statuses"][1]]
     for one, line in zip(content["objects"], lines, strict=True):
@@ -83,14 +73,13 @@ def test_pycocotools_loads_the_coco_file(exported: Path) -> None:
 
 def test_coco_boxes_are_those_of_the_run_in_the_left_camera(finished: FinishedRun, exported: Path) -> None:
     content = json.loads((exported / "coco3d.json").read_text())
-    P2 = np.array((finished.root / "training/calib/000001.txt").read_text().split("\n")[0].split()[1:], float)
-    K, fourth = P2.reshape(3, 4)[:, :3], P2.reshape(3, 4)[:, 3]
+    K, fourth = np.split(finished.P_left("000001"), [3], axis=1)
     np.testing.assert_allclose(content["images"][1]["K"], K, rtol=1e-6)
     for annotation in content["annotations"]:
         if annotation["category_name"] != "car":
             continue
         frame_id = f"{annotation['image_id']:06d}"
-        wanted = corners_ref(finished, frame_id, [1, 3].index(annotation["line"])) + np.linalg.solve(K, fourth)
+        wanted = corners_ref(finished, frame_id, [1, 3].index(annotation["line"])) + np.linalg.solve(K, fourth)[:, 0]
         width, height, length = annotation["dimensions"]
         # As Omni3D's own tools build a box: length along x, height along y, width along z.
         signs = np.array(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])).reshape(3, -1).T
@@ -142,7 +131,7 @@ def test_nuscenes_heading_is_the_cars_own(finished: FinishedRun, exported: Path)
     from pyquaternion import Quaternion
 
     boxes = json.loads((exported / "nuscenes.json").read_text())["results"]["000000"]
-    state = arrays(finished, "000000")
+    state = finished.state("000000")
     for car, box in enumerate(box for box in boxes if box["detection_name"] == "car"):
         forward = Quaternion(box["rotation"]).rotate([1.0, 0.0, 0.0])
         yaw = -float(state["boxes_rotation_y"][car]) - np.pi / 2

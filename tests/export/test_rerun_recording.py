@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.finished_run import FinishedRun
+from helpers.finished_run import FinishedRun, by_place
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -70,10 +70,6 @@ class Recording:
         return np.stack([by_place(c + box) for c, box in zip(centres, rotated, strict=True)])
 
 
-def by_place(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return points[np.argsort(points @ np.array([1.0, 0.0123, 0.345]))]
-
-
 def refiner_of(run: FinishedRun) -> DirectShapeRefiner:
     config = config_from_mapping(RefinerConfig, run.folder().setting("refiner"))
     return DirectShapeRefiner(PCAShapePrior.load(run.root / "prior.npz"), config)
@@ -91,11 +87,6 @@ def path(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> Pat
 @pytest.fixture(scope="module")
 def recording(path: Path) -> Recording:
     return Recording(path)
-
-
-def state(run: FinishedRun, frame: int) -> dict[str, NDArray[Any]]:
-    with np.load(run.out / "shapes" / f"{frame:06d}.npz", allow_pickle=False) as file:
-        return dict(file)
 
 
 def t_cam_ref(run: FinishedRun) -> torch.Tensor:
@@ -153,8 +144,7 @@ def test_the_camera_is_the_calibrations_with_pixels_from_their_corners(
     finished: FinishedRun, recording: Recording
 ) -> None:
     K = np.array(recording.at("/world/cam", "image_from_camera", 0)[0]).reshape(3, 3).T
-    P2 = np.array((finished.root / "training/calib/000000.txt").read_text().split("\n")[0].split()[1:], float)
-    np.testing.assert_allclose(K, P2.reshape(3, 4)[:, :3] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(K, finished.P_left("000000")[:, :3] + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("frame", [0, 1])
@@ -165,7 +155,7 @@ def test_boxes_are_those_of_the_files(finished: FinishedRun, recording: Recordin
     np.testing.assert_allclose(recording.corners("/world/boxes/before", place), before, atol=2e-5)
     truth = corners_of_lines(finished, finished.root / "training" / "label_2" / name)
     np.testing.assert_allclose(recording.corners("/world/boxes/truth", place), truth, atol=2e-5)
-    arrays = state(finished, frame)
+    arrays = finished.state(f"{frame:06d}")
     T = torch.from_numpy(arrays["T_cam_obj"].astype(np.float64))
     T[:, :3, 3] = torch.from_numpy(arrays["boxes_location_ref"].astype(np.float64)) + t_cam_ref(finished)
     after = box_corners(T, torch.from_numpy(arrays["boxes_hwl"].astype(np.float64))).numpy()
@@ -194,7 +184,7 @@ def test_frames_show_the_refined_surfaces_with_the_colours_of_the_image(
 
 def test_iterations_begin_at_the_detection_and_end_at_the_result(finished: FinishedRun, recording: Recording) -> None:
     numbers = second_frame(recording)
-    arrays = state(finished, 1)
+    arrays = finished.state("000001")
     assert set(arrays["statuses"].tolist()) <= {"converged", "max_iterations"}
     last = recording.corners("/world/boxes/iteration", (None, max(numbers)))
     after = corners_of_lines(finished, finished.out / "data" / "000001.txt")
@@ -208,7 +198,7 @@ def test_iterations_begin_at_the_detection_and_end_at_the_result(finished: Finis
 
 
 def test_costs_end_at_those_of_the_result_and_fall(finished: FinishedRun, recording: Recording) -> None:
-    arrays, numbers = state(finished, 1), second_frame(recording)
+    arrays, numbers = finished.state("000001"), second_frame(recording)
     for car, line in enumerate((1, 3)):
         series = {
             str(name): recording.of(f"/terms/000001/{line}/{str(name).replace(' ', '_')}", "scalars")

@@ -72,14 +72,9 @@ def glb(path: Path) -> Glb:
     return Glb(path)
 
 
-def state(run: FinishedRun, frame_id: str) -> dict[str, NDArray[np.generic]]:
-    with np.load(run.out / "shapes" / f"{frame_id}.npz", allow_pickle=False) as file:
-        return dict(file)
-
-
 def distances(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> Floats:
     """How far points are from the surface that the npz describes, by the signed distance field itself."""
-    arrays = state(run, frame_id)
+    arrays = run.state(frame_id)
     T = arrays["T_cam_obj"][car].astype(np.float64)
     points_obj = (points_cam - T[:3, 3]) @ T[:3, :3]
     shape = run.prior.bind(torch.from_numpy(arrays["codes"][car : car + 1]).to(run.prior.origin))
@@ -89,7 +84,7 @@ def distances(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> 
 
 def extents(run: FinishedRun, frame_id: str, car: int, points_cam: Floats) -> Floats:
     """Height, width, length of points along the axes of the car."""
-    R = state(run, frame_id)["T_cam_obj"][car][:3, :3].astype(np.float64)
+    R = run.state(frame_id)["T_cam_obj"][car][:3, :3].astype(np.float64)
     length, height, width = np.ptp(points_cam @ R, axis=0)
     return np.array([height, width, length])
 
@@ -102,8 +97,7 @@ def srgb(linear: NDArray[np.generic]) -> Floats:
 
 def image_at(run: FinishedRun, frame_id: str, points_cam: Floats) -> Floats:
     """The left image where points appear, by OpenCV's interpolation."""
-    P2 = np.array((run.root / f"training/calib/{frame_id}.txt").read_text().split("\n")[0].split()[1:], float)
-    uv = points_cam @ P2.reshape(3, 4)[:, :3].T
+    uv = points_cam @ run.P_left(frame_id)[:, :3].T
     uv = (uv[:, :2] / uv[:, 2:]).astype(np.float32)[:, None]
     bgr = cv2.imread(str(run.root / f"training/image_2/{frame_id}.png"))
     return cv2.remap(bgr, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)[:, 0, ::-1].astype(np.float64)
@@ -115,7 +109,7 @@ def test_glb_surface_is_the_zero_level_of_the_npz(finished: FinishedRun, exporte
     points = file.attribute(name, "POSITION").astype(np.float64)
     assert np.abs(distances(finished, "000000", car, points)).max() < 0.02
     np.testing.assert_allclose(
-        extents(finished, "000000", car, points), state(finished, "000000")["boxes_hwl"][car], atol=1e-3
+        extents(finished, "000000", car, points), finished.state("000000")["boxes_hwl"][car], atol=1e-3
     )
     faces = file.attribute(name, "indices").reshape(-1, 3).astype(np.int64)
     # Each edge of a closed surface belongs to two triangles, once in each direction.
@@ -124,7 +118,7 @@ def test_glb_surface_is_the_zero_level_of_the_npz(finished: FinishedRun, exporte
     assert set(map(tuple, edges)) == set(map(tuple, edges[:, ::-1]))
     a, b, c = points[faces].transpose(1, 0, 2)
     volume = (np.cross(a, b) * c).sum() / 6
-    height, width, length = state(finished, "000000")["boxes_hwl"][car]
+    height, width, length = finished.state("000000")["boxes_hwl"][car]
     assert volume == pytest.approx(np.pi / 6 * height * width * length, rel=0.1)
 
 
@@ -162,7 +156,7 @@ def test_mirrored_colours_are_those_of_the_other_side(finished: FinishedRun, exp
     file = glb(exported / "glb" / "000000.glb")
     colours = file.attribute("car_1", "COLOR_0")[:, :3].astype(np.int64)
     source = file.attribute("car_1", "_COLOR_SOURCE")[:, 0]
-    T = state(finished, "000000")["T_cam_obj"][0].astype(np.float64)
+    T = finished.state("000000")["T_cam_obj"][0].astype(np.float64)
     points_obj = (file.attribute("car_1", "POSITION") - T[:3, 3]) @ T[:3, :3]
     seen, mirrored = np.flatnonzero(source == SEEN), np.flatnonzero(source == MIRRORED)[::31]
     assert len(mirrored) > 20
@@ -177,7 +171,7 @@ def test_mirrored_colours_are_those_of_the_other_side(finished: FinishedRun, exp
 
 def test_glb_carries_what_is_known_of_a_car(finished: FinishedRun, exported: Path) -> None:
     extras = glb(exported / "glb" / "000001.glb").extras("car_3")
-    arrays = state(finished, "000001")
+    arrays = finished.state("000001")
     assert extras["line"] == 3
     assert extras["status"] == arrays["statuses"][1]
     np.testing.assert_allclose(extras["dimensions_hwl_m"], arrays["boxes_hwl"][1])
@@ -209,12 +203,12 @@ def test_a_car_moves_through_the_poses_of_its_track(finished: FinishedRun, tmp_p
     )
     points = file.attribute("car", "POSITION").astype(np.float64)
     for view, frame_id in enumerate(("000000", "000001")):
-        expected = state(finished, frame_id)["T_cam_obj"][0].astype(np.float64)
+        expected = finished.state(frame_id)["T_cam_obj"][0].astype(np.float64)
         R = Rotation.from_quat(rotation[view]).as_matrix()
         np.testing.assert_allclose(translation[view], expected[:3, 3], atol=1e-5)
         np.testing.assert_allclose(R, expected[:3, :3], atol=1e-6)
-    nearest = min(("000000", "000001"), key=lambda name: state(finished, name)["T_cam_obj"][0, 2, 3])
-    T = state(finished, nearest)["T_cam_obj"][0].astype(np.float64)
+    nearest = min(("000000", "000001"), key=lambda name: finished.state(name)["T_cam_obj"][0, 2, 3])
+    T = finished.state(nearest)["T_cam_obj"][0].astype(np.float64)
     assert np.abs(distances(finished, nearest, 0, points @ T[:3, :3].T + T[:3, 3])).max() < 0.02
     # A viewer that plays nothing shows the first view, and y is up.
     np.testing.assert_allclose(file.nodes["car"].translation, translation[0], atol=1e-6)
@@ -257,7 +251,7 @@ def test_points_lie_evenly_on_the_surface(finished: FinishedRun, exported: Path)
     outside = distances(finished, "000000", 0, points + 0.05 * normals)
     assert (outside > distances(finished, "000000", 0, points)).mean() > 0.999
     # The two halves of a symmetric surface have equal areas: 1500 points each, give or take four standard deviations.
-    T = state(finished, "000000")["T_cam_obj"][0].astype(np.float64)
+    T = finished.state("000000")["T_cam_obj"][0].astype(np.float64)
     left = ((points - T[:3, 3]) @ T[:3, 2] > 0).sum()
     assert abs(left - 1500) < 110
     seen = vertex["color_source"] == SEEN

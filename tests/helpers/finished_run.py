@@ -47,6 +47,16 @@ class FinishedRun:
     def folder(self, *frames: str) -> RunFolder:
         return RunFolder(self.out, frames or None)
 
+    def state(self, frame_id: str) -> dict[str, NDArray[Any]]:
+        """What the npz of a frame holds."""
+        with np.load(self.out / "shapes" / f"{frame_id}.npz", allow_pickle=False) as file:
+            return dict(file)
+
+    def P_left(self, frame_id: str) -> NDArray[np.float64]:
+        """The left camera (3, 4) of the calibration file."""
+        words = (self.root / f"training/calib/{frame_id}.txt").read_text().split("\n")[0].split()
+        return np.array(words[1:], float).reshape(3, 4)
+
     def inputs(self, with_images: bool = True, **options: Any) -> ExportInputs:
         """What an export may use."""
         return ExportInputs(self.prior, self.dataset if with_images else None, self.root, **options)
@@ -81,6 +91,11 @@ def finished_run(
         for path in (*(root / "detections" / "data").glob("*.txt"), *(root / "training" / "label_2").glob("*.txt")):
             path.write_text(path.read_text().replace("Car ", f"{car_type} "))
     return refined(root, folder / out_name, (car_type,), meshes)
+
+
+def by_place(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points in an order of their own: by their places along three directions that no box is aligned with."""
+    return points[np.argsort(points @ np.array([1.0, 0.0123, 0.345]))]
 
 
 def unpacked(text: str) -> NDArray[np.int64]:
