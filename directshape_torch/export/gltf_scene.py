@@ -111,8 +111,8 @@ class _MovingCar:
         place(frame_to=_CAMERA, matrix=T_GLTF_CAM)
         _add(scene, _CAR, mesh, paint, _CAMERA)
         numbers = image_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
-        seconds, poses = _SECONDS_A_FRAME * np.array(list(numbers.values())), np.stack(list(self.T_cam_obj.values()))
-        return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], poses))
+        seconds, T_views = _SECONDS_A_FRAME * np.array(list(numbers.values())), np.stack(list(self.T_cam_obj.values()))
+        return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], T_views))
 
 
 def _animate(

@@ -86,7 +86,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     prior = write_data_set(root, FRAMES)
     write_truth(root, prior)
     words = ["refine", "--data", root, "--detections", root / "detections", "--masks", root / "masks"]
-    words += ["--out", root / "refined", "--prior", root / "prior.npz", "--device", "cpu"]
+    words += ["--out", root / "refined", "--prior", root / "prior.npz", "--device", "cpu", "--rig", "none"]
     assert main([*map(str, words), "--set", "stages=[{max_iterations: 1}]"]) == 0
     write_perfect(root / "refined", root / "perfect")
     return root
