@@ -305,11 +305,17 @@ class PriorConfig(Settings):
 
 @dataclass(frozen=True)
 class TracksConfig(Settings):
-    """How cars with numbers move, where the times of the frames are known (docs/tracks.md)."""
+    """How the frames of cars with numbers belong together (docs/tracks.md)."""
 
+    next_view_weight: float = setting(
+        0.15,
+        "factor of the left image against that of the next frame, warped through the car's surface; 0 switches it off",
+        at_least=0,
+    )
     path_sigma_m: float = setting(
         0.05,
-        "standard deviation of a car's place on the ground about a smooth path; 0: each frame by itself",
+        "standard deviation of a car's place on the ground about a smooth path, where the times of the frames are "
+        "known; 0: each frame by itself",
         at_least=0,
     )
     path_sigma_yaw_deg: float = setting(1.0, "that of its heading", above=0)

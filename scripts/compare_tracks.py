@@ -33,6 +33,7 @@ from command_line import run_command
 from torch import Tensor
 
 from directshape_torch.cli.options import frame_id_of
+from directshape_torch.config_files import load_config
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
@@ -86,7 +87,7 @@ def run(args: argparse.Namespace) -> None:
     dataset = open_dataset(
         args.layout, args.data, args.detections, args.masks, tracks=True, split=args.split, frames=args.frames
     )
-    refiner = DirectShapeRefiner()
+    refiner = DirectShapeRefiner(config=load_config(None, args.set))
     if args.rig is not None:
         rigs = load_rigs(args.rig)
         dataset = dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
@@ -289,6 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--interval", type=float, metavar="SECONDS", help="between frames; default: not known")
     parser.add_argument("--swap", action="store_true", help="exchange two tracks half way")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="of 'calibrate-rig' or a run; default: none")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings, as of 'refine'")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     return run_command(parser, run, arguments)

@@ -61,6 +61,7 @@ class CarProblem:
         num_extra: how many of the terms, the last ones, are a user's own.
         num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
         num_path: N, 9 where views of a track have a path in common.
+        num_next: M, 1 where views of a track look at the next.
         sharing: whose shapes are one (`tracks.py`).
     """
 
@@ -73,6 +74,7 @@ class CarProblem:
     num_extra: int = 0
     num_offsets: int = 0
     num_path: int = 0
+    num_next: int = 0
     sharing: Sharing = INDEPENDENT
 
     @property
@@ -223,9 +225,10 @@ class CarStage:
     def moving_unknowns(self, like: Tensor) -> Tensor:
         """Unknowns (D,) that the stage moves, offsets and paths always, on the device of `like`."""
         problem, unknowns = self.problem, self.config.unknowns
-        num_codes, num_others = problem.prior.num_codes, problem.num_offsets + problem.num_path
-        number = torch.arange(6 + num_codes + num_others, device=like.device)
-        is_pose, is_other = number < 6, number >= 6 + num_codes
+        first_other = 6 + problem.prior.num_codes
+        first_next = first_other + problem.num_offsets + problem.num_path
+        number = torch.arange(first_next + 6 * problem.num_next, device=like.device)
+        is_pose, is_other = (number < 6) | (number >= first_next), (number >= first_other) & (number < first_next)
         return is_other | (is_pose & (unknowns != "shape")) | (~is_pose & (unknowns != "pose"))
 
     def without_held(self, at: Evaluation) -> Evaluation:
@@ -241,8 +244,8 @@ class CarStage:
         """Unknowns (B, D) that no bound holds: a code component at its bound is a constant."""
         free_pose = torch.ones_like(state.T_obj_cam[:, 0, :1], dtype=torch.bool).expand(-1, 6)
         free_code = state.code.abs() < self.problem.config.solver.max_code
-        others = (torch.ones_like(x, dtype=torch.bool) for x in (state.offset_px, state.path))
-        free = torch.cat([free_pose, free_code, *others], dim=1)
+        free_others = free_pose[:, :1].expand(-1, state.num_unknowns - 6 - state.code.shape[1])
+        free = torch.cat([free_pose, free_code, free_others], dim=1)
         return free & self.moving_unknowns(free)
 
     def retract(self, state: CarState, step: Tensor) -> CarState:
@@ -253,8 +256,8 @@ class CarStage:
         """Largest trusted step of each unknown, (D,) float64; not to be written to."""
         prior, num_offsets = self.problem.prior, self.problem.num_offsets
         limits = [_MAX_STEP_M] * 3 + [_MAX_STEP_RAD] * 3 + [_MAX_STEP_CODE] * prior.num_codes
-        # A path follows its views.
-        limits += [_MAX_STEP_OFFSET_PX] * num_offsets + [math.inf] * self.problem.num_path
+        # A path follows its views, and the next view is one of them.
+        limits += [_MAX_STEP_OFFSET_PX] * num_offsets + [math.inf] * (self.problem.num_path + 6 * self.problem.num_next)
         return constant_like(tuple(limits), torch.empty(0, dtype=torch.float64, device=prior.origin.device))
 
 

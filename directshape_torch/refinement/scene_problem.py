@@ -21,6 +21,7 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.motion import MOTION_NAMES
+from directshape_torch.terms.next_view import NEXT_VIEW_NAME
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import LeftPixels
 from directshape_torch.terms.priors import prior_terms
@@ -102,7 +103,7 @@ def _check_extra(problem: CarProblem, own: int, cars: CarBatch) -> None:
 
     code = problem.prior.initial_code(len(cars)).to(cars.detector_T_cam_obj)
     sight = problem.look(CarState.of(se3.inverse(cars.detector_T_cam_obj), code, cars.num_offsets))
-    names = [*MOTION_NAMES, *(name for term in problem.terms[:own] for name in term.names)]
+    names = [*MOTION_NAMES, NEXT_VIEW_NAME, *(name for term in problem.terms[:own] for name in term.names)]
     for term in problem.terms[own:]:
         check_term(term, problem.stages()[0], sight, names)
         names += term.names

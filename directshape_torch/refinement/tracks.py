@@ -21,6 +21,9 @@ from directshape_torch.solver.sharing import Groups, said_of_shared
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState, following, retract
 from directshape_torch.terms.motion import NUM_PATH, hold_of_path, motion_terms, timed, with_path
+from directshape_torch.terms.next_view import NextView, NextViews
+from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.term import Term
 
 # What the family of shapes says is known once, however many views there are; each detection's dimensions are a
 # measurement of their own.
@@ -28,6 +31,8 @@ _KNOWN_ONCE = "shape"
 # Two halves of a track are of one car unless shapes of their own save more than this, twice the cost: of 22 tracks on
 # which this was tried one shape costs 6.9 at most.
 _MOST_SAVED = 8.0
+# Of a track, times those of the last stage.
+_MORE_ITERATIONS = 2
 
 
 def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarState) -> Outcome:
@@ -49,7 +54,7 @@ def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarSt
             return replace(outcome, state=_attached(problem, cars, origin, minimum))
         views, rows = cars.of_cars(shared.keep), shared.keep.nonzero()[:, 0]
         agreed = shared.agreed(take_rows(minimum.state, rows))
-        before = shared.with_path(take_rows(initial, rows))
+        before = shared.linked(take_rows(initial, rows))
         in_track, of_track = _judged(shared.problem, views, before, agreed, unroll)
         left = (in_track.status == Status.singular.code) | (in_track.status == Status.non_finite.code)
         if not bool(left.any()):
@@ -65,8 +70,8 @@ def refined(problem: CarProblem, cars: CarBatch, initial: CarState, start: CarSt
     of_views = _attached(shared.problem, views, shared.agreed(take_rows(alone, rows)), _of_all_members(in_track))
     of_track = replace(of_track, track_part=shared.part_of(in_track.status))
     outcome = outcome.with_columns(of_track.term_names).going_on(rows[chosen], of_track.rows(chosen))
-    # The path has done its work.
-    of_views = of_views._replace(path=of_views.path[:, :0])
+    # Path and neighbours have done their work.
+    of_views = of_views._replace(path=of_views.path[:, :0], T_obj_next=of_views.T_obj_next[:, :0])
     return replace(outcome, state=put_rows(alone, rows[chosen], take_rows(of_views, chosen)))
 
 
@@ -100,6 +105,7 @@ class Together:
         cars: the views, with times and cameras of their track.
         gradient, hessian: (R, D) and (R, D, D) of what each adds to the cost of its track, where it ended by itself.
         part: (R,) of its track, 0 unless it was split.
+        next_view: (R,) number of the next view of its part in time, of the last one its own.
     """
 
     keep: Tensor
@@ -109,6 +115,7 @@ class Together:
     gradient: Tensor
     hessian: Tensor
     part: Tensor
+    next_view: Tensor
 
     def agreed(self, alone: CarState) -> CarState:
         """States (R) with the one shape on which the views agree best, and poses as they go with it.
@@ -122,10 +129,12 @@ class Together:
         to_agreement, _ = self.agreement.damped_step(self.hessian, slope, undamped, everybody)
         max_code = self.problem.config.solver.max_code
         code = to_agreement[:, number].to(alone.code).clamp(-max_code, max_code)
-        return self.with_path(retract(alone, to_agreement - step)._replace(code=code))
+        return self.linked(retract(alone, to_agreement - step)._replace(code=code))
 
-    def with_path(self, state: CarState) -> CarState:
-        """States (R) with the paths that fit their views best, where there is a motion prior."""
+    def linked(self, state: CarState) -> CarState:
+        """States (R) with the paths that fit their views best, and poses of next views, where these are unknowns."""
+        if self.problem.num_next:
+            state = state._replace(T_obj_next=state.T_obj_cam[self.next_view][:, None])
         return with_path(self.problem.config.tracks, self.agreement, self.cars, state)
 
     def part_of(self, status: Tensor) -> Tensor:
@@ -141,27 +150,31 @@ def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], jo
     hessian = minimum.after.hessian.sum(dim=1)
     _, solvable = damped_step(hessian, hessian[:, 0], torch.zeros_like(minimum.after.cost))
     says, has_any = _Quadratics.of(problem, minimum)
-    part_of_row: dict[int, tuple[int, int]] = {}  # number of the group, and of the part of its track
+    # Of each view its group, its place there, the view in the next place, and the number of the part of its track.
+    views_of_parts: dict[int, tuple[int, int, int, int]] = {}
     for views in _tracks(cars, joins & solvable & has_any):
         for number, part in enumerate(_of_one_car(views, says)):
             if len(part) > 1:
-                part_of_row |= dict.fromkeys(part, (part[0], number))
-    if not part_of_row:
+                followers = [*part[1:], part[-1]]
+                views_of_parts |= {row: (part[0], k, followers[k], number) for k, row in enumerate(part)}
+    if not views_of_parts:
         return None
-    numbers = sorted(part_of_row)
+    numbers = sorted(views_of_parts)
+    group, place, after, parts = zip(*(views_of_parts[row] for row in numbers), strict=True)
     index = torch.tensor(numbers, device=hessian.device)
     keep = torch.zeros_like(solvable).index_fill(0, index, True)
     own, shared = _unknowns(problem, hessian.device)
-    sharing = Groups.of([part_of_row[row][0] for row in numbers], own, shared)
-    parts = torch.tensor([part_of_row[row][1] for row in numbers], device=hessian.device)
+    sharing = Groups.of(group, own, shared, place=place)
+    part_number = torch.tensor(parts, device=hessian.device)
+    next_view = torch.tensor([numbers.index(row) for row in after], device=hessian.device)
     once = _once(problem, sharing)
     # Each by itself ended where its slopes add up to nothing: what is left is that of what counts less from here on.
     slopes, curvatures = minimum.after.gradient[index], minimum.after.hessian[index]
     gradient = ((once - 1)[:, :, None] * slopes).sum(dim=1)
     hessian = (once[:, :, None, None] * curvatures).sum(dim=1)
     timed_views = timed(sharing, cars.of_cars(keep))
-    of_track = _in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index))
-    return Together(keep, of_track, sharing, timed_views, gradient, hessian, parts)
+    of_track = _in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index), next_view)
+    return Together(keep, of_track, sharing, timed_views, gradient, hessian, part_number, next_view)
 
 
 def _unknowns(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -244,28 +257,37 @@ def _once(problem: CarProblem, sharing: Groups) -> Tensor:
 
 def _share(sharing: Groups) -> Tensor:
     """One over the number of views in the group of each (R,), float64."""
-    everybody = torch.ones_like(sharing.is_alone)
+    everybody = sharing.everybody
     return 1 / sharing.total(everybody.to(torch.float64), everybody)
 
 
-def _in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState) -> CarProblem:
-    """The last stage of a problem of R views, with one shape in each group, and one path where times are known."""
-    once = _once(problem, sharing)
-    factors = once if problem.factors is None else once * problem.factors
-    config = replace(problem.config, stages=problem.config.stages[-1:])
-    problem = replace(problem, config=config, sharing=sharing, factors=factors)
-    motion = motion_terms(config.tracks, views)
-    if not motion:
-        return problem
+def _in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, next_view: Tensor) -> CarProblem:
+    """The last stage of a problem of R views: one shape in each group, a path where times are known, each view seen in
+    the next."""
+    factors = _once(problem, sharing) if problem.factors is None else _once(problem, sharing) * problem.factors
+    last = problem.config.stages[-1]
+    # Views that look at each other take more steps to settle.
+    last = replace(last, max_iterations=_MORE_ITERATIONS * last.max_iterations)
+    config = replace(problem.config, stages=(last,))
+    terms: list[Term] = [*motion_terms(config.tracks, views)]
+    columns = [hold_of_path(config.tracks, sharing, views, alone), _share(sharing)] if terms else []
+    num_path = NUM_PATH if terms else 0
+    stereo = next((term for term in problem.terms if isinstance(term, Photometric)), None)
+    num_next = int(stereo is not None and config.tracks.next_view_weight > 0)
+    if stereo is not None and num_next:
+        terms.append(NextView(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))
+        columns.append(torch.ones_like(factors[:, 0]))
     own = len(problem.terms) - problem.num_extra
     before = sum(len(term.names) for term in problem.terms[:own])
-    of_motion = torch.stack([hold_of_path(config.tracks, sharing, views, alone), _share(sharing)], dim=1)
-    last = len(sharing.own) + len(sharing.shared)
-    of_path = torch.arange(last, last + NUM_PATH, device=sharing.shared.device)
+    first = len(sharing.own) + len(sharing.shared)
+    number = torch.arange(first, first + num_path + 6 * num_next, device=sharing.own.device)
+    shared = torch.cat([sharing.shared, number[:num_path]])
     return replace(
         problem,
-        terms=(*problem.terms[:own], *motion, *problem.terms[own:]),
-        factors=torch.cat([factors[:, :before], of_motion, factors[:, before:]], dim=1),
-        sharing=replace(sharing, shared=torch.cat([sharing.shared, of_path])),
-        num_path=NUM_PATH,
+        config=config,
+        terms=(*problem.terms[:own], *terms, *problem.terms[own:]),
+        factors=torch.cat([factors[:, :before], *(x[:, None] for x in columns), factors[:, before:]], dim=1),
+        sharing=Groups.of(sharing.group, sharing.own, shared, number[num_path:], sharing.place),
+        num_path=num_path,
+        num_next=num_next,
     )

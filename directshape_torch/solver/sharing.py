@@ -7,21 +7,15 @@ one loop. A group takes a step together or not at all; it does not wait for a pr
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from directshape_torch.solver.damped_solve import (
-    damped_solution,
-    damped_step,
-    floored_diagonal,
-    general_solution,
-    newton_step,
-)
+from directshape_torch.solver.damped_solve import damped_solution, damped_step, is_finite, newton_step
 
 
 class Sharing(Protocol):
@@ -54,9 +48,10 @@ class Sharing(Protocol):
         ...
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
-        """Fisher matrices (B, D, D) of each problem, with what the others of its group say of shared unknowns.
+        """Fisher matrices of each problem, from those of all (B, D, D), with what the others of its group say.
 
-        The inverse is each problem's block of the inverse of the group's matrix.
+        The inverse is each problem's block of the inverse of the group's matrix. Unknowns of another problem are none
+        of it.
         """
         ...
 
@@ -92,64 +87,90 @@ class Independent:
 
 INDEPENDENT = Independent()
 
-_Solve: TypeAlias = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-
 
 @dataclass(frozen=True)
 class Groups:
-    """B problems in G groups of at most F, which share some of their D unknowns.
-
-    Their own unknowns are eliminated problem by problem (Schur's complement), so that time and memory grow with the
-    problems and not with the square of a group.
+    """B problems in G groups, which share some of their D unknowns and step by one dense system of N unknowns a group.
 
     Attributes:
-        group: (B,) of each problem, as the host knows it.
+        group, place: (B,) of each problem, as the host knows it: its group, and where it stands there.
         own, shared: (P,) and (K,) numbers of the unknowns.
+        of_next: (Q,) numbers of those that are the first own ones of the problem in the next place of the group;
+            constants where nobody stands there.
         of_problem: (B,) the group on the device.
-        is_alone: (B,) bool, the only problem of its group.
         rows: (G, F) the problem in each place; an empty place repeats the first.
         filled: (G, F) bool.
+        column: (B, D) of each unknown in the system of its group.
     """
 
     group: tuple[int, ...]
+    place: tuple[int, ...]
     own: Tensor
     shared: Tensor
+    of_next: Tensor
     of_problem: Tensor
-    is_alone: Tensor
     rows: Tensor
     filled: Tensor
+    column: Tensor
 
     @classmethod
-    def of(cls, group: Sequence[int], own: Tensor, shared: Tensor) -> Groups:
-        """Problems of the same number share.
+    def of(
+        cls,
+        group: Sequence[int],
+        own: Tensor,
+        shared: Tensor,
+        of_next: Tensor | None = None,
+        place: Sequence[int] | None = None,
+    ) -> Groups:
+        """Problems of the same number share; without places they stand as they come.
 
         Examples:
-            >>> groups = Groups.of([7, 3, 7], own=torch.arange(6), shared=torch.arange(6, 8))
-            >>> groups.of_problem, groups.rows
-            (tensor([0, 1, 0]), tensor([[0, 2],
-                    [1, 1]]))
+            >>> groups = Groups.of([7, 3, 7], own=torch.arange(2), shared=torch.arange(2, 3))
+            >>> groups.rows
+            tensor([[0, 2],
+                    [1, 1]])
+            >>> groups.column
+            tensor([[0, 1, 6],
+                    [0, 1, 6],
+                    [2, 3, 6]])
         """
-        sizes = Counter(group)
-        places = {name: place for place, name in enumerate(sizes)}
-        rows: list[list[int]] = [[] for _ in sizes]
-        for row, name in enumerate(group):
-            rows[places[name]].append(row)
-        longest = max(sizes.values(), default=0)
-        filled = [[place < len(members) for place in range(longest)] for members in rows]
-        padded = [members + members[:1] * (longest - len(members)) for members in rows]
+        of_next = own[:0] if of_next is None else of_next
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(group))}
+        so_far = Counter[int]()
+        come = [so_far.update([name]) or so_far[name] - 1 for name in group]
+        standing = come if place is None else list(place)
+        longest = max(standing, default=-1) + 1
+        rows = [[group.index(name)] * longest for name in numbers]
+        filled = [[False] * longest for _ in numbers]
+        for row, (name, where) in enumerate(zip(group, standing, strict=True)):
+            rows[numbers[name]][where], filled[numbers[name]][where] = row, True
         index = partial(torch.tensor, device=own.device, dtype=torch.long)
+        first = len(own) * index(standing)[:, None]
+        column = first.new_empty(len(group), len(own) + len(shared) + len(of_next))
+        column[:, own] = first + torch.arange(len(own), device=own.device)
+        column[:, of_next] = first + len(own) + torch.arange(len(of_next), device=own.device)
+        # One place more than there are: nobody stands behind the last.
+        column[:, shared] = len(own) * (longest + 1) + torch.arange(len(shared), device=own.device)
         return cls(
             group=tuple(group),
+            place=tuple(standing),
             own=own,
             shared=shared,
-            of_problem=index([places[name] for name in group]),
-            is_alone=index([sizes[name] for name in group]) == 1,
-            rows=index(padded).view(len(rows), longest),
+            of_next=of_next,
+            of_problem=index([numbers[name] for name in group]),
+            rows=index(rows).view(len(rows), longest),
             filled=index(filled).view(len(rows), longest).bool(),
+            column=column,
         )
 
+    @property
+    def everybody(self) -> Tensor:
+        """Members (B,): all."""
+        return torch.ones_like(self.of_problem, dtype=torch.bool)
+
     def of_problems(self, numbers: Sequence[int]) -> Groups:
-        return Groups.of([self.group[number] for number in numbers], self.own, self.shared)
+        group, place = ([of_all[number] for number in numbers] for of_all in (self.group, self.place))
+        return Groups.of(group, self.own, self.shared, self.of_next, place)
 
     def total(self, values: Tensor, members: Tensor) -> Tensor:
         return self._members(values, members).sum(dim=1)[self.of_problem]
@@ -161,47 +182,66 @@ class Groups:
         return (self.filled & flags[self.rows]).any(dim=1)[self.of_problem]
 
     def damped_step(self, hessian: Tensor, gradient: Tensor, damping: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
-        damped = hessian + torch.diag_embed(damping[:, None] * floored_diagonal(hessian))
-        together = self._step(damped, gradient, _undamped_solution, members)
-        return self._unless_alone(damped_step(self._of_the_alone(hessian), gradient, damping), together)
+        members = members & self._steps_by_itself(hessian, gradient, damping)
+        of_group = self._members(damping, members).amax(dim=1)
+        step, solvable = damped_step(*self._system(hessian, gradient, members), of_group)
+        return self._of_problems(step, members & solvable[self.of_problem])
 
     def newton_step(self, J: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        everybody = torch.ones_like(self.is_alone)
-        together = self._step(J.detach(), gradient, general_solution, everybody)
-        return self._unless_alone(newton_step(self._of_the_alone(J), gradient), together)
+        step, solvable = newton_step(*self._system(J.detach(), gradient, self.everybody))
+        return self._of_problems(step, solvable[self.of_problem])
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
-        of_each, _, solvable = said_of_shared(information, torch.zeros_like(information[:, 0]), self.own, self.shared)
-        members = members & solvable
-        of_each = torch.where(members[:, None, None], of_each, 0.0)
-        widened = information.clone()
-        widened[:, self.shared[:, None], self.shared] += self.total(of_each, members) - of_each
-        return widened
+        nothing = torch.zeros_like(information[:, 0])
+        members = members & self._steps_by_itself(information, nothing, nothing[:, 0])
+        system, _ = self._system(information, nothing, members)
+        # What is added to the shared ones comes off again: without it there is no inverse where they are not all seen.
+        seen = system.diagonal(dim1=1, dim2=2)
+        is_shared = torch.arange(seen.shape[1], device=seen.device) >= seen.shape[1] - len(self.shared)
+        added = torch.where(is_shared, torch.where(seen > 0, seen, 1.0), 0.0)
+        covariance, has_inverse = _inverse(system + torch.diag_embed(added))
+        kept = torch.cat([self.own, self.shared]).sort().values
+        at, group = self.column[:, kept], self.of_problem[:, None]
+        widened, is_regular = _inverse(covariance[group[..., None], at[:, :, None], at[:, None]])
+        widened = widened - torch.diag_embed(added[group, at])
+        members = members & has_inverse[self.of_problem] & is_regular
+        return torch.where(members[:, None, None], widened, information[:, kept[:, None], kept])
 
     def _members(self, values: Tensor, members: Tensor) -> Tensor:
         """Values (B, ...) in their places (G, F, ...), 0 in those without a member."""
         is_member = self.filled & members[self.rows]
         return torch.where(is_member.view(*is_member.shape, *(1,) * (values.ndim - 1)), values[self.rows], 0)
 
-    def _of_the_alone(self, matrix: Tensor) -> Tensor:
-        """Matrices (B, D, D) of those by themselves; another's own says nothing of some unknowns, and what cannot be
-        solved has NaN as its gradient even where nobody takes the solution."""
-        identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-        return torch.where(self.is_alone[:, None, None], matrix, identity)
+    def _steps_by_itself(self, matrix: Tensor, gradient: Tensor, damping: Tensor) -> Tensor:
+        """Problems (B,) whose own unknowns have a step, the others standing still, and that have numbers."""
+        _, solvable = damped_step(matrix[:, self.own[:, None], self.own], gradient[:, self.own], damping)
+        return solvable & is_finite(matrix.sum(dim=(1, 2)) + gradient.sum(dim=1))
 
-    def _unless_alone(self, alone: tuple[Tensor, Tensor], together: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-        """To the bit what problems that share nothing get."""
-        step = torch.where(self.is_alone[:, None], alone[0], together[0])
-        return step, torch.where(self.is_alone, alone[1], together[1])
+    def _system(self, matrix: Tensor, gradient: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
+        """Matrices (G, N, N) and gradients (G, N) of the members together; what no member owns is held."""
+        num_groups, size = len(self.rows), len(self.own) * (self.filled.shape[1] + 1) + len(self.shared)
+        entry = self.of_problem[:, None] * size + self.column
 
-    def _step(self, matrix: Tensor, gradient: Tensor, solve: _Solve, members: Tensor) -> tuple[Tensor, Tensor]:
-        W, of_each, right, solvable = _reduced(matrix, gradient, self.own, self.shared, solve)
-        members = members & solvable
-        common, has_step = solve(self.total(of_each, members), self.total(right, members)[:, :, None])
-        own = W[:, :, :1] + W[:, :, 1:] @ common
-        nothing, solvable = torch.zeros_like(gradient), members & has_step
-        step = nothing.index_copy(1, self.own, own[:, :, 0]).index_copy(1, self.shared, common[:, :, 0])
-        return torch.where(solvable[:, None], step, 0.0), solvable
+        def total(entries: Tensor, values: Tensor) -> Tensor:
+            # In float64 a processor adds one after the other.
+            values = torch.where(members.view(-1, *(1,) * (values.ndim - 1)), values, 0)
+            return values.new_zeros(num_groups * size ** (values.ndim - 1)).index_put((entries,), values, True)
+
+        owned = torch.cat([self.own, self.shared])
+        is_owned = total(entry[:, owned], torch.ones_like(gradient[:, owned])).view(num_groups, size) > 0
+        together = total(entry[:, :, None] * size + self.column[:, None], matrix).view(num_groups, size, size)
+        identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+        together = torch.where(is_owned[:, :, None] & is_owned[:, None], together, identity)
+        return together, torch.where(is_owned, total(entry, gradient).view(num_groups, size), 0.0)
+
+    def _of_problems(self, step: Tensor, solvable: Tensor) -> tuple[Tensor, Tensor]:
+        """The steps (B, D) of all problems, from those of their groups (G, N)."""
+        return torch.where(solvable[:, None], step[self.of_problem[:, None], self.column], 0.0), solvable
+
+
+def _inverse(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix)
+    return damped_solution(matrix, identity, torch.zeros_like(matrix[:, 0, 0]))
 
 
 def said_of_shared(
@@ -220,24 +260,9 @@ def said_of_shared(
         >>> said_of_shared(matrix, gradient, own=torch.tensor([0]), shared=torch.tensor([1]))
         (tensor([[[1.]]]), tensor([[2.]]), tensor([True]))
     """
-    return _reduced(matrix, gradient, own, shared, _undamped_solution)[1:]
-
-
-def _reduced(
-    matrix: Tensor, gradient: Tensor, own: Tensor, shared: Tensor, solve: _Solve
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Each problem's own unknowns as they follow the shared ones, and what it then says of these alone.
-
-    Returns:
-        W (B, P, 1 + K) of `own = W[:, :, 0] + W[:, :, 1:] @ shared`; matrix (B, K, K) and right side (B, K) of the
-        shared unknowns; where (B,) there are these.
-    """
-    rows = matrix[:, own]
-    W, solvable = solve(rows[:, :, own], -torch.cat([gradient[:, own, None], rows[:, :, shared]], dim=2))
-    rows = matrix[:, shared]
-    of_each = torch.cat([gradient[:, shared, None], rows[:, :, shared]], dim=2) + rows[:, :, own] @ W
-    return W, of_each[:, :, 1:], -of_each[:, :, 0], solvable & of_each.flatten(1).isfinite().all(dim=1)
-
-
-def _undamped_solution(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    return damped_solution(matrix, right, torch.zeros_like(matrix[:, 0, 0]))
+    both = torch.cat([gradient[:, :, None], matrix[:, :, shared]], dim=2)
+    following, solvable = damped_solution(
+        matrix[:, own[:, None], own], -both[:, own], torch.zeros_like(matrix[:, 0, 0])
+    )
+    of_each = both[:, shared] + matrix[:, shared[:, None], own] @ following
+    return of_each[:, :, 1:], -of_each[:, :, 0], solvable & of_each.flatten(1).isfinite().all(dim=1)

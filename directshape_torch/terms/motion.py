@@ -79,7 +79,7 @@ def path_prior(cars: CarBatch, state: CarState, config: TracksConfig) -> PriorRe
     J = residual.new_zeros(len(residual), 3, state.num_unknowns)
     J[:, :2, :3] = J_v
     J[:, 2, 3:6] = slope * J_omega
-    first = state.num_unknowns - NUM_PATH
+    first = _first_of_path(state)
     for row in range(3):
         J[:, row, first + 3 * row : first + 3 * row + 3] = -basis if row < 2 else -slope * basis
     assert cars.time_s is not None
@@ -87,12 +87,16 @@ def path_prior(cars: CarBatch, state: CarState, config: TracksConfig) -> PriorRe
     return PriorResidual(residual * per_sigma, J * per_sigma[:, :, None])
 
 
+def _first_of_path(state: CarState) -> int:
+    return 6 + state.code.shape[1] + state.offset_px.shape[1]
+
+
 def acceleration_prior(state: CarState, sigma: tuple[float, float, float]) -> PriorResidual:
     """Acceleration of the path along x and z and of its heading, in standard deviations."""
     per_sigma = 1 / state.path.new_tensor(sigma)
     J = state.path.new_zeros(len(state.path), 3, state.num_unknowns)
     for row in range(3):
-        J[:, row, state.num_unknowns - NUM_PATH + 3 * row + 2] = per_sigma[row]
+        J[:, row, _first_of_path(state) + 3 * row + 2] = per_sigma[row]
     return PriorResidual(state.path[:, 2::3] * per_sigma, J)
 
 
@@ -103,7 +107,7 @@ def with_path(config: TracksConfig, sharing: Groups, cars: CarBatch, state: CarS
     place, heading, _, _ = _on_the_ground(cars, state.T_obj_cam)
     assert cars.time_s is not None
     seen = torch.cat([place, _continuous(sharing, cars.time_s, heading)[:, None]], dim=1)
-    everybody, basis = torch.ones_like(sharing.is_alone), _basis(cars).to(torch.float64)
+    everybody, basis = sharing.everybody, _basis(cars).to(torch.float64)
     weight = 1 / deviation_sigma(config, cars.time_s).to(basis).square()
     columns = []
     for column, sigma in enumerate(_of_acceleration(config)):
@@ -151,7 +155,7 @@ def timed(sharing: Groups, cars: CarBatch) -> CarBatch:
 
 
 def _mean(sharing: Groups, values: Tensor) -> Tensor:
-    everybody = torch.ones_like(sharing.is_alone)
+    everybody = sharing.everybody
     return sharing.total(values, everybody) / sharing.total(torch.ones_like(values), everybody)
 
 

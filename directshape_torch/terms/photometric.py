@@ -22,7 +22,7 @@ from directshape_torch.config import PhotometricConfig, StageConfig
 from directshape_torch.depth import NEAR_SURFACE_M, Hits, surface_depth, tracked_depth
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import length
-from directshape_torch.rows import BLOCK, Blocks, CarSums, Rows
+from directshape_torch.rows import BLOCK, Blocks, CarSums, ObjectRays, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
@@ -174,22 +174,10 @@ class Photometric:
         return depth / ratio, ratio
 
     def linear(self, field: Field, state: CarState, where: Surface) -> Linear:
-        rows = self.pixel_set.rows
-        rays, owner = rows.rays.in_objects(state.T_obj_cam), rows.rays.owner
-        near = tracked_depth(field, rows.rays, rays, Hits(*where[:2], where.usable, where.depth))
-        constant = nothing_is_differentiated()
-        if not constant:
-            is_near = field.value(rays.at(near), owner).detach().abs() < NEAR_SURFACE_M
-            near = surface_depth(field, owner, rays, near, is_near)
-        points = rays.at(near)
-        at = field.derivatives(points, owner, constant)
-        slope = (at.gradient * rays.direction_obj).sum(0)
-        found = (at.value.abs() < NEAR_SURFACE_M) & (slope < 0)
-        found = found & ~is_grazing(at.gradient, rays.direction_obj)
-        per_sdf = -1 / torch.where(found, slope, torch.full_like(slope, -1.0))
-        depth = near + torch.where(found, at.value * per_sdf, torch.zeros_like(slope))
-        J_depth_state = torch.where(found, per_sdf, 0.0)[..., None] * sdf_state_jacobian(points, at.gradient, at)
-        depth, ratio = self.warped_depth(depth, state, owner)
+        rows, owner = self.pixel_set.rows, self.blocks.owner
+        surface = near_surface(rows.rays, field, state, where)
+        found, J_depth_state = surface.found, surface.J_depth_state
+        depth, ratio = self.warped_depth(surface.depth, state, owner)
         if ratio is not None:
             J_depth_offset = -depth * depth * self.cars.inverse_depth_of_offset(torch.ones_like(state.offset_px))[owner]
             J_depth_state = torch.cat([J_depth_state / (ratio * ratio)[..., None], J_depth_offset[..., None]], dim=-1)
@@ -197,24 +185,11 @@ class Photometric:
         usable = found & compare.comparable
         residual = torch.where(usable[..., None], compare.residual, self.config.lost_grey_levels)
         J = torch.where(usable[..., None], compare.J_residual_depth, 0.0)
-        # A pixel whose surface is not found keeps its last hit for the states that follow.
-        seen = Surface(
-            torch.where(found, points.detach(), where.points_obj),
-            torch.where(found, at.gradient.detach(), where.normal_obj),
-            depth.detach(),
-            found,
-            usable,
-        )
-        return Linear(residual, J, J_depth_state, seen)
+        return Linear(residual, J, J_depth_state, surface.seen(where, depth, usable))
 
     def residual(self, field: Field, state: CarState, where: Surface) -> Tensor:
         rows = self.pixel_set.rows
-        rays = rows.rays.in_objects(state.T_obj_cam)
-        # The very step to the surface that `linear` took: its derivatives are those of its residuals.
-        near = rays.depth_next_to(where.points_obj).detach()
-        slope = (where.normal_obj * rays.direction_obj).sum(0).detach()
-        step = field.value(rays.at(near), rows.rays.owner) / torch.where(where.usable, slope, -1.0)
-        depth = near - torch.where(where.usable, step, torch.zeros_like(step))
+        depth = depth_of(rows.rays.in_objects(state.T_obj_cam), rows.rays.owner, field, where)
         depth, _ = self.warped_depth(depth, state, rows.rays.owner)
         residual, _ = residuals_at(rows, self.config, depth)
         return torch.where(where.usable[..., None], residual, self.config.lost_grey_levels)
@@ -237,6 +212,51 @@ class Photometric:
         rows = fixed.rows.take(kept, blocks.owner)
         of_cars = PixelSet(rows, blocks, sight_blocks, place, filled, weight, fixed.support.index_select(0, index))
         return Photometric(self.config, cars, None, of_cars)
+
+
+class NearSurface(NamedTuple):
+    """The surface under pixels, within a Newton step of where they looked before."""
+
+    rays: ObjectRays
+    points_obj: Tensor  # (3, M, 64) metres, from which the step was taken
+    normal_obj: Tensor  # (3, M, 64)
+    depth: Tensor  # (M, 64) of the surface, metres
+    found: Tensor  # (M, 64) bool: there is one, and it is not grazing
+    J_depth_state: Tensor  # (M, 64, 6 + K), zero where there is none
+
+    def seen(self, before: Surface, depth: Tensor, usable: Tensor) -> Surface:
+        """Where to look from here; a pixel whose surface is not found keeps its last hit for the states that follow."""
+        points, normal = self.points_obj.detach(), self.normal_obj.detach()
+        points = torch.where(self.found, points, before.points_obj)
+        normal = torch.where(self.found, normal, before.normal_obj)
+        return Surface(points, normal, depth.detach(), self.found, usable)
+
+
+def near_surface(rays_cam: Rays, field: Field, state: CarState, where: Surface) -> NearSurface:
+    """The surface that rays meet, with the derivative of its depth; differentiable with gradients enabled."""
+    rays, owner = rays_cam.in_objects(state.T_obj_cam), rays_cam.owner
+    near = tracked_depth(field, rays_cam, rays, Hits(*where[:2], where.usable, where.depth))
+    constant = nothing_is_differentiated()
+    if not constant:
+        is_near = field.value(rays.at(near), owner).detach().abs() < NEAR_SURFACE_M
+        near = surface_depth(field, owner, rays, near, is_near)
+    points = rays.at(near)
+    at = field.derivatives(points, owner, constant)
+    slope = (at.gradient * rays.direction_obj).sum(0)
+    found = (at.value.abs() < NEAR_SURFACE_M) & (slope < 0)
+    found = found & ~is_grazing(at.gradient, rays.direction_obj)
+    per_sdf = -1 / torch.where(found, slope, torch.full_like(slope, -1.0))
+    depth = near + torch.where(found, at.value * per_sdf, torch.zeros_like(slope))
+    J_depth_state = torch.where(found, per_sdf, 0.0)[..., None] * sdf_state_jacobian(points, at.gradient, at)
+    return NearSurface(rays, points, at.gradient, depth, found, J_depth_state)
+
+
+def depth_of(rays: ObjectRays, owner: Tensor, field: Field, where: Surface) -> Tensor:
+    """The depth (M, 64) by the very step that led from `where`: its derivatives are those that `near_surface` gives."""
+    near = rays.depth_next_to(where.points_obj).detach()
+    slope = (where.normal_obj * rays.direction_obj).sum(0).detach()
+    step = field.value(rays.at(near), owner) / torch.where(where.usable, slope, -1.0)
+    return near - torch.where(where.usable, step, torch.zeros_like(step))
 
 
 def photometric_norm(config: PhotometricConfig, residual: Tensor) -> robust.RobustValue:

@@ -29,7 +29,7 @@ PatchForm = Literal["plain", "zero_mean", "normalised"]
 
 # DSO's pattern of 8 neighbourhood pixels (Engel et al., Direct Sparse Odometry, fig. 4), as (du, dv).
 DSO_PATTERN: tuple[tuple[int, int], ...] = ((0, -2), (-1, -1), (1, -1), (-2, 0), (0, 0), (2, 0), (-1, 1), (0, 2))
-_CENTRE = DSO_PATTERN.index((0, 0))
+CENTRE = DSO_PATTERN.index((0, 0))
 # c of the gradient weight c^2 / (c^2 + |grad I_l|^2) (DSO), grey levels per pixel.
 GRADIENT_CONSTANT = 50.0
 # Standard deviation that a neighbourhood has at least for "normalised", grey levels: noise is not blown up.
@@ -139,7 +139,7 @@ class LeftPixels:
         owner, images = packed.blocks.owner, self.pyramid[image_level]
         frame = cars.frame_index[owner]
         uv_level = (self.pixels.uv[row].movedim(-1, 0)[:, None] + 0.5) * images.scale - 0.5 + _pattern(self.pixels.uv)
-        view = _frame_view(images, frame)
+        view = frame_view(images, frame)
         u_level, v_level = uv_level
         intensity = bilinear_patch(images.left.reshape(-1), *view[:2], u_level, v_level, *view[2:]).value
         uv_full = (uv_level + 0.5) / images.scale - 0.5
@@ -198,7 +198,7 @@ class LeftPixels:
         per_level = 1 / images.scale
         to_full = images.right.new_full((len(owner), 2), per_level)
         to_full[:, 1] = 0.5 * per_level - 0.5
-        view = torch.cat(_frame_view(images, frame), dim=1)
+        view = torch.cat(frame_view(images, frame), dim=1)
         hidden, row = self.hidden_right, cars.detection_row[owner]
         if hidden is None:
             nowhere = torch.zeros(len(owner), 6, dtype=torch.long, device=owner.device)
@@ -208,7 +208,7 @@ class LeftPixels:
         return RightView(images.right.reshape(-1), view, to_full, *covered)
 
 
-def _frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """First pixel of frames (M,), pixels from row to row, last column, last row: (M, 1) each."""
     _, height, width = images.right.shape
     last_row, last_column = (images.sizes[frame] - 1).unbind(1)
@@ -256,7 +256,7 @@ class Warped(NamedTuple):
     def is_comparable(self, right: RightView) -> Tensor:
         """Pixels (..., M, 64) all of whose neighbours land in the right image, and that nothing nearer hides there."""
         inside = all_along(self.at.inside & self.in_front, dim=-3)
-        u, v = (x[..., _CENTRE, :, :].detach() for x in (self.u, self.v))
+        u, v = (x[..., CENTRE, :, :].detach() for x in (self.u, self.v))
         return inside & ~_is_hidden(right, u, v)
 
 

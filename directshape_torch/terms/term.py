@@ -119,10 +119,10 @@ class Part(NamedTuple):
 
 
 def linear_of(term: Term, field: Field, state: CarState, where: Where) -> Linear:
-    """`term.linear` with a column for each unknown of the state; few terms know of the last, offset and path."""
+    """`term.linear` with a column for each unknown of the state; few terms know of the last, beside pose and code."""
     at = term.linear(field, state, where)
     missing = state.num_unknowns - at.J_inner_state.shape[-1]
-    if not 0 < missing <= state.offset_px.shape[1] + state.path.shape[1]:
+    if not 0 < missing <= state.num_unknowns - 6 - state.code.shape[1]:
         return at
     return at._replace(J_inner_state=torch.nn.functional.pad(at.J_inner_state, (0, missing)))
 
@@ -164,6 +164,7 @@ _SIZES = {
     "code": 0,
     "offset_px": 0,
     "path": 0,
+    "T_obj_next": 0,
     "values": 0,
     "points_obj": 1,
     "normal_obj": 1,

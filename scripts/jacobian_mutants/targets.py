@@ -48,7 +48,7 @@ TARGETS: dict[str, Target] = {
     ),
     "photometric": Target(
         "directshape_torch/terms/photometric.py",
-        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth"),
+        ("Photometric.linear", "Photometric.residual", "Photometric.warped_depth", "near_surface", "depth_of"),
         (*_OFFSET, *_GRADIENTS),
     ),
     "photometric_rows": Target(
@@ -81,6 +81,11 @@ TARGETS: dict[str, Target] = {
         "directshape_torch/terms/motion.py",
         ("path_prior", "acceleration_prior", "_on_the_ground", "_basis"),
         ("tests/terms/test_motion.py",),
+    ),
+    "next_view": Target(
+        "directshape_torch/terms/next_view.py",
+        ("NextView.linear", "NextView.residual", "NextView._looked_up"),
+        ("tests/terms/test_next_view.py::test_derivatives_are_those_of_autograd_and_of_differences",),
     ),
     "robust": Target(
         "directshape_torch/terms/robust.py",

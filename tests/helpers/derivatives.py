@@ -14,10 +14,12 @@ from directshape_torch.terms.cars import CarState
 def moved(state: CarState, delta: Tensor) -> CarState:
     """The state at `delta` (B, D) of its own tangent, by the definition of CONVENTIONS.md; differentiable."""
     last, size = 6, []
-    for part in state[1:]:
+    for part in state[1:4]:
         size.append(delta[:, last : last + part.shape[1]])
         last += part.shape[1]
-    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, *(x + dx for x, dx in zip(state[1:], size, strict=True)))
+    others = (x + dx for x, dx in zip(state[1:4], size, strict=True))
+    T_obj_next = se3.exp(delta[:, last:].unflatten(1, (state.T_obj_next.shape[1], 6))) @ state.T_obj_next
+    return CarState(se3.exp(delta[:, :6]) @ state.T_obj_cam, *others, T_obj_next)
 
 
 def tangent_of(state: CarState) -> Tensor:

@@ -1,0 +1,213 @@
+"""The left image of a view of a track against that of the next view, warped there through the car's own surface.
+
+`1 / |Omega| sum_p w_p ||I_next(pi(T_next_obj X(p))) - I(p)||`: X(p) is the surface under pixel p, T_next_obj the pose
+of the car in the next view. Both poses are unknown, so how the camera moves need not be known: between two frames car
+and camera move by metres against each other, where the pair of a rig has half a metre. Pixels are those of the
+photometric term that the next view shows too. Derivation: docs/derivations/tracks.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from directshape_torch.config import StageConfig
+from directshape_torch.geometry import se3
+from directshape_torch.image.interpolate import bilinear_patch
+from directshape_torch.numerics.tensors import cross
+from directshape_torch.rows import Blocks
+from directshape_torch.shape.field import Field
+from directshape_torch.terms import robust
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.photometric import (
+    Photometric,
+    Surface,
+    depth_of,
+    is_grazing,
+    matched_brightness,
+    near_surface,
+    photometric_norm,
+)
+from directshape_torch.terms.photometric_rows import CENTRE, frame_view
+from directshape_torch.terms.term import Linear, Sight
+
+NEXT_VIEW_NAME = "next_view"
+# What is not so far in front of the next camera is not seen by it.
+_LEAST_DEPTH_M = 0.1
+
+
+class NextViews(NamedTuple):
+    """The next view of each of B views."""
+
+    exists: Tensor  # (B,) bool: not so of the last view of a track
+    frame_index: Tensor  # (B,)
+    detection_row: Tensor  # (B,)
+    K_left: Tensor  # (B, 3, 3)
+
+    @classmethod
+    def of(cls, cars: CarBatch, next_view: Tensor) -> NextViews:
+        """From the number (B,) of the next view; the last one of a track has its own."""
+        exists = next_view != torch.arange(len(next_view), device=next_view.device)
+        return cls(exists, *(x[next_view] for x in (cars.frame_index, cars.detection_row, cars.K_left)))
+
+
+class NextImage(NamedTuple):
+    """What the pixels of M blocks are compared with in a stage."""
+
+    pixels: Tensor  # (A,) grey levels of all left images at the pyramid level, behind one another
+    frame: Tensor  # (M, 4) see `RightView`
+    K: Tensor  # (M, 3, 3) of the next camera, at the level
+    grey: Tensor  # (M, 64) of the pixels, brought to the brightness of the next image
+    weight: Tensor  # (M, 64) of the pixels; zero for those that the next view does not show
+
+
+class LookedUp(NamedTuple):
+    """Points (3, M, 64) of cars in their next image."""
+
+    u: Tensor  # (M, 64) at the level
+    v: Tensor
+    value: Tensor  # (M, 64) grey levels
+    J_value_point: Tensor  # (3, M, 64) per metre in the object frame
+    inside: Tensor  # (M, 64) bool: in the image, and in front of the camera
+
+
+@dataclass(frozen=True)
+class NextView:
+    """The term; see module.
+
+    Attributes:
+        weight: of the term.
+        stereo: the photometric term of the B views, whose pixels and surfaces these are.
+        next_views: of these views.
+        fixed: what is fixed in the stage that has begun.
+    """
+
+    weight: float
+    stereo: Photometric
+    next_views: NextViews
+    fixed: NextImage | None = None
+
+    names = (NEXT_VIEW_NAME,)
+    is_prior = False
+
+    @property
+    def image(self) -> NextImage:
+        """What the stage that has begun compares with."""
+        if self.fixed is None:
+            raise RuntimeError("the next view is not compared before a stage begins: call `begin` first")
+        return self.fixed
+
+    @property
+    def blocks(self) -> Blocks:
+        return self.stereo.blocks
+
+    @property
+    def column(self) -> Tensor:
+        return self.stereo.column
+
+    @property
+    def block_weight(self) -> Tensor:
+        # A mean over all pixels of the view, so that few in common say little.
+        return self.weight / self.stereo.pixel_set.support.clamp_min(1)[self.blocks.owner]
+
+    @property
+    def information(self) -> Tensor:
+        return torch.full_like(self.block_weight, 1 / self.stereo.config.huber_grey_levels**2)
+
+    @property
+    def row_weight(self) -> Tensor:
+        return self.image.weight[..., None]
+
+    def begin(self, stage: StageConfig, sight: Sight) -> NextView:
+        stereo = self.stereo.begin(stage, sight)
+        rows, owner, left = stereo.pixel_set.rows, stereo.blocks.owner, stereo.left
+        assert left is not None
+        images = left.pyramid[stage.image_level]
+        K = self.next_views.K_left[owner] * images.scale
+        K[:, 0, 2], K[:, 1, 2] = K[:, 0, 2] + 0.5 * images.scale - 0.5, K[:, 1, 2] + 0.5 * images.scale - 0.5
+        K[:, 2, 2] = 1
+        frame = torch.cat(frame_view(images, self.next_views.frame_index[owner]), dim=1)
+        grey = rows.intensity_left[CENTRE]
+        begun = replace(
+            self,
+            stereo=stereo,
+            fixed=NextImage(images.left.reshape(-1), frame, K, grey, torch.ones_like(grey)),
+        )
+        surface = near_surface(rows.rays, sight.field, sight.state, stereo.where(sight))
+        points = surface.rays.at(surface.depth)
+        at = begun._looked_up(sight.state, points)
+        centre = sight.state.T_obj_next[:, 0, :3, 3][owner].mT[..., None]
+        towards = points - centre
+        is_turned = ((surface.normal_obj * towards).sum(0) < 0) & ~is_grazing(surface.normal_obj, towards)
+        shown = surface.found & at.inside & is_turned & self._is_on_mask(left.mask_left, at, images.scale, owner)
+        weight = rows.pixel_weight * (shown & self.next_views.exists[owner, None]).to(grey.dtype)
+        counted = (weight > 0).to(grey.dtype)[None]
+        form, right = stereo.config.brightness, at.value[None]
+        matched = matched_brightness(form, grey[None], right, counted, owner, len(self.next_views.exists))[0]
+        return replace(begun, fixed=begun.image._replace(grey=matched, weight=weight))
+
+    def _is_on_mask(self, mask_left: Tensor, at: LookedUp, scale: float, owner: Tensor) -> Tensor:
+        """Where points (M, 64) are on the mask of their car in the next image."""
+        u, v = ((x.detach() + 0.5) / scale - 0.5 for x in (at.u, at.v))
+        height, width = mask_left.shape[-2:]
+        column, row = (x.round().long().clamp(0, last - 1) for x, last in ((u, width), (v, height)))
+        return mask_left[self.next_views.detection_row[owner][:, None], row, column] > 0.5
+
+    def _looked_up(self, state: CarState, points_obj: Tensor) -> LookedUp:
+        image, owner = self.image, self.blocks.owner
+        T_next_obj = se3.inverse(state.T_obj_next[:, 0])[owner]
+        R, t = T_next_obj[:, :3, :3], T_next_obj[:, :3, 3]
+        P = (image.K @ R).permute(1, 2, 0)[..., None]  # (3, 3, M, 1)
+        moved = (image.K @ t[..., None])[..., 0].mT[..., None]
+        x, y, z = P[:, 0] * points_obj[0] + P[:, 1] * points_obj[1] + P[:, 2] * points_obj[2] + moved
+        in_front = z > _LEAST_DEPTH_M
+        inverse_z = 1 / torch.where(in_front, z, 1.0)
+        u, v = x * inverse_z, y * inverse_z
+        first_pixel, row_step, last_column, last_row = image.frame.mT[..., None]
+        at = bilinear_patch(image.pixels, first_pixel, row_step, u, v, last_column, last_row)
+        J_u, J_v = ((P[n] - w * P[2]) * inverse_z for n, w in ((0, u), (1, v)))
+        return LookedUp(u, v, at.value, at.d_u * J_u + at.d_v * J_v, at.inside & in_front)
+
+    def moving(self, sight: Sight, after_wider: bool) -> tuple[NextView, Surface, Tensor]:
+        stereo, where, nothing = self.stereo.moving(sight, after_wider)
+        return replace(self, stereo=stereo), where, nothing
+
+    def where(self, sight: Sight) -> Surface:
+        return self.stereo.where(sight)
+
+    def linear(self, field: Field, state: CarState, where: Surface) -> Linear:
+        surface = near_surface(self.stereo.pixel_set.rows.rays, field, state, where)
+        points = surface.rays.at(surface.depth)
+        at = self._looked_up(state, points)
+        usable = surface.found & at.inside
+        residual = torch.where(usable, at.value - self.image.grey, self.stereo.config.lost_grey_levels)
+        J_depth = (at.J_value_point * surface.rays.direction_obj).sum(0)[..., None] * surface.J_depth_state
+        J_value_point, points = at.J_value_point.movedim(0, -1), points.movedim(0, -1)
+        # The next camera sees a point that stands still in this one by both poses, with opposite signs.
+        J_pose = torch.cat([J_value_point, cross(points, J_value_point)], dim=-1)
+        others = J_pose.new_zeros(*residual.shape, state.offset_px.shape[1] + state.path.shape[1])
+        J = torch.cat([J_depth[..., :6] + J_pose, J_depth[..., 6:], others, -J_pose], dim=-1)
+        one = usable[..., None].to(J.dtype)
+        return Linear(residual[..., None], one, J, surface.seen(where, surface.depth, usable))
+
+    def residual(self, field: Field, state: CarState, where: Surface) -> Tensor:
+        rays, owner = self.stereo.pixel_set.rows.rays.in_objects(state.T_obj_cam), self.blocks.owner
+        at = self._looked_up(state, rays.at(depth_of(rays, owner, field, where)))
+        lost = self.stereo.config.lost_grey_levels
+        return torch.where(where.usable, at.value - self.image.grey, lost)[..., None]
+
+    def norm(self, residual: Tensor) -> robust.RobustValue:
+        return photometric_norm(self.stereo.config, residual)
+
+    def of_cars(self, keep: Tensor, numbers: Sequence[int]) -> NextView:
+        index = torch.nonzero_static(keep, size=len(numbers))[:, 0]
+        next_views, stereo = NextViews(*(x[index] for x in self.next_views)), self.stereo.of_cars(keep, numbers)
+        if self.fixed is None:
+            return NextView(self.weight, stereo, next_views)
+        _, kept = self.blocks.of_cars(keep, numbers)
+        fixed = NextImage(self.fixed.pixels, *(x.index_select(0, kept) for x in self.fixed[1:]))
+        return NextView(self.weight, stereo, next_views, fixed)
