@@ -1,4 +1,7 @@
-"""The options that several commands share, and what they stand for: data, frames, settings, a finished run."""
+"""The options that several commands share, and what they stand for: data, frames, settings, a finished run.
+
+What is wrong with one of them raises an error of the package that names it, for the main program to show.
+"""
 
 from __future__ import annotations
 
@@ -120,12 +123,7 @@ def add_interval_options(parser: argparse.ArgumentParser) -> None:
 
 
 def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
-    """The data set that the options describe.
-
-    Raises:
-        DataFormatError: a folder or file is missing or not laid out so.
-        InputError: options that contradict each other, or no frames.
-    """
+    """The data set that the options describe."""
     masks = mask_source(args)
     if masks is None and args.layout != "folder":
         raise InputError("--masks", _EITHER, "neither")
@@ -152,11 +150,7 @@ def frame_id_of(word: str) -> int | str:
 
 
 def mask_source(args: argparse.Namespace) -> MaskSource | Path | None:
-    """The masks that the options name, or None.
-
-    Raises:
-        InputError: a folder and COCO files.
-    """
+    """The masks that the options name, or None."""
     files = (args.masks_left, args.masks_right)
     if args.masks is not None and files != (None, None):
         raise InputError("--masks", _EITHER, "both")
@@ -173,24 +167,14 @@ def make_refiner(
     device: str,
     extra_terms: Sequence[TermFactory] = (),
 ) -> DirectShapeRefiner:
-    """The refiner that the options describe.
-
-    Raises:
-        ConfigError: unknown settings.
-        DataFormatError: a prior that cannot be used.
-        InputError: no such device.
-    """
+    """The refiner that the options describe."""
     settings = load_config(config, overrides)
     refiner = DirectShapeRefiner(load_prior("pca" if prior is None else prior), settings, extra_terms)
     return refiner.to(find_device(device))
 
 
 def find_device(name: str) -> torch.device:
-    """The device of that name; "auto" is a graphics card where there is one.
-
-    Raises:
-        InputError: PyTorch does not know or does not have it.
-    """
+    """The device of that name; "auto" is a graphics card where there is one."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
@@ -219,12 +203,7 @@ def add_run_inputs(group: argparse._ActionsContainer, needed_for: str) -> None:
 
 
 def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> FileStereoDataset | None:
-    """The chosen frames of a run; None without `--data`.
-
-    Raises:
-        DataFormatError: a folder is missing or not laid out so.
-        InputError: options that say nothing without `--data`, or another rig than the run's.
-    """
+    """The chosen frames of a run; None without `--data`."""
     if args.data is None:
         names = ("detections", "masks", "masks_left", "masks_right", "disparity", "rig")
         given = [f"--{name.replace('_', '-')}" for name in names if getattr(args, name, None) not in (None, "none")]
@@ -252,12 +231,7 @@ def has_detections(args: argparse.Namespace) -> bool:
 
 
 def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
-    """The named prior, or else that bundled one which the run used, or None where it used another.
-
-    Raises:
-        DataFormatError: a file that is no prior.
-        InputError: the named prior is not that of the run.
-    """
+    """The named prior, which must be the run's, or the bundled one that it used; None where it used another."""
     wanted = run.manifest.sha256["prior"]
     priors = map(load_prior, BUNDLED_PRIORS if source is None else (source,))
     found = next((prior for prior in priors if hash_prior(prior) == wanted), None)
@@ -267,12 +241,7 @@ def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
 
 
 def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:
-    """The disparity fields that a run was made with: those of its own folder, or of the file that `--rig` names.
-
-    Raises:
-        DataFormatError: the file holds none.
-        InputError: the run was made with others, or with none.
-    """
+    """The disparity fields that a run was made with, of its own folder or of the file that `--rig` names, no others."""
     own = run.path / RIG_FILE
     if rig == "none" and not own.is_file():
         return ()
