@@ -96,7 +96,6 @@ class _Run:
         num_cars = expected_cars(dataset, dataset.frame_ids)
         prior_sha256 = manifest.sha256["prior"] or ""
         self.job = RunJob(dataset, refiner, self.out_dir, options, manifest.hash, prior_sha256, num_cars)
-        self.failed: dict[str, str] = {}
         self.digit_warnings: tuple[str, ...] = ()
         self.num_halved = 0
 
@@ -157,11 +156,8 @@ class _Run:
 
     def _note(self, frame_id: str, entry: FrameEntry) -> None:
         self.earlier.manifest.frames[frame_id] = entry
-        failure = entry.get("reason")
-        if failure is not None:
-            self.failed[frame_id] = failure
-        self.log.frame(frame_id, failure)
-        self.observer.finished(frame_id, failure)
+        self.log.frame(frame_id, entry.get("reason"))
+        self.observer.finished(frame_id, entry.get("reason"))
 
     def _finished(self, frame_ids: Collection[str]) -> Collection[str]:
         """Which frames are finished after all; for the group of a worker that died."""
@@ -177,7 +173,7 @@ class _Run:
         if reason is None:
             self._look_for_files()
             if has_tracks(self.dataset):
-                write_tracks(self.out_dir, sorted(set(self.dataset.frame_ids).difference(self.failed)))
+                write_tracks(self.out_dir, sorted(set(self.dataset.frame_ids).difference(self.earlier.manifest.failed)))
         else:
             # Workers have ended the frames that they had, and nobody heard of it.
             self.earlier.take_in(set(done_frames(self.out_dir)).intersection(self.dataset.frame_ids))
@@ -191,17 +187,17 @@ class _Run:
     def _look_for_files(self) -> None:
         """Every frame must have come to an end; one without files has failed."""
         paths = [result_path, shapes_path, *([overlay_path] if self.options.overlays else [])]
+        failed = self.earlier.manifest.failed
         for frame_id in self.dataset.frame_ids:
-            if frame_id not in self.failed and not all(path(self.out_dir, frame_id).is_file() for path in paths):
+            if frame_id not in failed and not all(path(self.out_dir, frame_id).is_file() for path in paths):
                 reason = f"its files are not in {self.out_dir}: was the folder moved or emptied during the run?"
-                self.failed[frame_id] = reason
                 self.earlier.manifest.frames[frame_id] = failed_entry(reason)
 
     def _summary(self, resumed: Sequence[str]) -> RunSummary:
-        entries = self.earlier.manifest.frames
-        frames = {frame_id: entries[frame_id] for frame_id in self.dataset.frame_ids if frame_id in entries}
+        manifest, wanted = self.earlier.manifest, self.dataset.frame_ids
+        frames = {frame_id: manifest.frames[frame_id] for frame_id in wanted if frame_id in manifest.frames}
         warnings = (*find_warnings(frames, sorted(self.dataset.classes)), *self._own_warnings(bool(resumed)))
-        failed = {frame_id: entry.get("reason", "") for frame_id, entry in frames.items() if entry["state"] == "failed"}
+        failed = {frame_id: reason for frame_id, reason in manifest.failed.items() if frame_id in frames}
         return RunSummary(frames, tuple(resumed), failed, warnings, self.timings)
 
     def _own_warnings(self, has_resumed: bool) -> list[str]:
