@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from directshape_torch.batch.content_hashes import hash_fields, hash_prior
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups, track_windows
 from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads
@@ -23,7 +22,7 @@ from directshape_torch.batch.workers import GroupDispatch, LocalWorkers, ThisPro
 from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
-from directshape_torch.io.run_manifest import FrameEntry, RunManifest, SharedHashes
+from directshape_torch.io.run_manifest import FrameEntry, RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.io.track_files import write_tracks
 from directshape_torch.refinement.scene_problem import TermFactory

@@ -10,11 +10,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.cli.options import add_frame_choice, add_interval_options
 from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.evaluate_shapes import evaluate_shapes
 from directshape_torch.evaluation.reports import format_shape_scores, write_scores, write_shape_scores_csv
+from directshape_torch.io.run_manifest import hash_prior
 from directshape_torch.shape.load_prior import load_prior
 
 

@@ -12,7 +12,6 @@ from typing import get_args
 
 import torch
 
-from directshape_torch.batch.content_hashes import hash_fields, hash_prior
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
@@ -20,6 +19,7 @@ from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.mask_files import CocoFileMasks
 from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.run_manifest import hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import GroundSource
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.refinement.scene_problem import TermFactory

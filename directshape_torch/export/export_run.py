@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
-from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.errors import InputError
 from directshape_torch.export.box_files import Coco3dExporter, NuscenesExporter, write_kitti
@@ -16,6 +15,7 @@ from directshape_torch.export.gltf_scene import GlbExporter
 from directshape_torch.export.ply_files import write_ply, write_points
 from directshape_torch.export.rerun_recording import RerunExporter
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.run_manifest import hash_prior
 
 ExportFormat = Literal["glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun"]
 """What `export_run` can write (docs/outputs.md)."""

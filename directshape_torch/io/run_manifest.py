@@ -13,11 +13,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
+import torch
+from torch import Tensor
+
 from directshape_torch.errors import DataFormatError, ResumeError, shown
 from directshape_torch.files import atomic_files
 from directshape_torch.files.names import is_frame_id
 from directshape_torch.files.read_files import read_bytes, read_json
 from directshape_torch.files.schema import check_type, record_of
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.shape.shape_prior import ShapePrior
 
 MANIFEST_SCHEMA_VERSION = 2
 RESUME_CURE = "choose another output folder, or start again with --fresh, which removes the results in this one"
@@ -110,6 +115,40 @@ def _hash_in_state(path: Path, _size_bytes: int, _changed_ns: int) -> str:
 def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
     """The sha256 of several files by their role, such as those of `KittiStereoDataset.input_files`."""
     return {role: hash_file(path) for role, path in files.items()}
+
+
+def hash_tensors(tensors: Mapping[str, Tensor]) -> str:
+    """The sha256 (hexadecimal) of named tensors: name, shape and values as float64, little-endian, in order of name.
+
+    By content, so that it does not depend on a file's name or compression.
+
+    Examples:
+        >>> hash_tensors({"a": torch.zeros(2)}) == hash_tensors({"a": torch.zeros(2, dtype=torch.float64)})
+        True
+    """
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        values = tensors[name].detach().to("cpu", torch.float64).contiguous().numpy()
+        digest.update(json.dumps([name, list(values.shape)]).encode())
+        digest.update(values.astype("<f8", copy=False).tobytes())
+    return digest.hexdigest()
+
+
+def hash_prior(prior: ShapePrior) -> str:
+    """The sha256 of a shape prior: of its buffers, weights and bounds."""
+    tensors = {**dict(prior.named_buffers()), **dict(prior.named_parameters())}
+    return hash_tensors({"bounds_obj": prior.bounds_obj, **tensors})
+
+
+def hash_fields(fields: Sequence[DisparityField]) -> str | None:
+    """The sha256 of residual disparity fields, or None without any; of one alone, that of its tensors."""
+    hashes = []
+    for one in fields:
+        tensors = {name: value for name, value in vars(one).items() if isinstance(value, Tensor)}
+        hashes.append(hash_tensors({"size_wh": torch.tensor(one.size_wh), **tensors}))
+    if len(hashes) < 2:
+        return hashes[0] if hashes else None
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()
 
 
 def write_manifest(path: Path | str, manifest: RunManifest) -> None:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from io import TextIOWrapper
 from pathlib import Path
 
-from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_log import read_log
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.run_folder import RunFolder, shapes_path
+from directshape_torch.io.run_manifest import hash_prior
 from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, car_rows, choose_frames
 from directshape_torch.report.frame_details import DetailSettings, FrameMaterial, frame_details

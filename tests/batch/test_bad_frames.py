@@ -14,12 +14,12 @@ from helpers.kitti_folder import FRAMES
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
-from directshape_torch.batch.content_hashes import hash_prior
 from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
 from directshape_torch.batch.resumption import EarlierResults
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.run_manifest import hash_prior
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import FrameBatch
 

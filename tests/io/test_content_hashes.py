@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from helpers.ellipsoids import ellipsoid_prior
 
-from directshape_torch.batch.content_hashes import hash_fields, hash_prior, hash_tensors
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.run_manifest import hash_fields, hash_prior, hash_tensors
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 
