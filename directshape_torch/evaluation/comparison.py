@@ -12,7 +12,7 @@ import numpy as np
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, Estimate, MetricSummary, Statistic
-from directshape_torch.evaluation.matching import CountedLabels, match_to_labels, named_frames
+from directshape_torch.evaluation.matching import CountedLabels, files_of_frames, match_to_labels, named_frames
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.result_files import read_shapes
@@ -166,18 +166,13 @@ class _Pair(NamedTuple):
 
 def _frames_of(before: Path, after: Path) -> tuple[str, ...]:
     """Of the files of `before`; of a sequence, and of a single file, those that `after` has."""
-    results = _stems(after)
+    results = files_of_frames(after)
     if before.is_file():
         return tuple(results)
     of_sequence: dict[str, list[str]] = {}
     for stem in results:
         of_sequence.setdefault(stem.rpartition("_")[0], []).append(stem)
-    return tuple(frame for stem in _stems(before) for frame in of_sequence.get(stem, [stem]))
-
-
-def _stems(results: Path) -> list[str]:
-    nested = results / "data"
-    return sorted(path.stem for path in (nested if nested.is_dir() else results).glob("*.txt"))
+    return tuple(frame for stem in files_of_frames(before) for frame in of_sequence.get(stem, [stem]))
 
 
 def _pairs_of_frame(

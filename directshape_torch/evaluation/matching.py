@@ -60,6 +60,12 @@ def _image_boxes(objects: Sequence[KittiObject]) -> NDArray[np.float64]:
     return np.array([o.box_2d for o in objects], dtype=np.float64).reshape(-1, 4)
 
 
+def files_of_frames(folder: Path) -> dict[str, Path]:
+    """The files `FRAME.txt` of a folder, or of `data` below it, by frame."""
+    nested = folder / "data"
+    return {path.stem: path for path in sorted((nested if nested.is_dir() else folder).glob("*.txt"))}
+
+
 def named_frames(frames: Iterable[str | int] | None, split: Path | str | None) -> tuple[str, ...] | None:
     """Ids of the frames that a caller names: by id or number, or in a file with one a line; None where by neither.
 

@@ -22,8 +22,6 @@ from directshape_torch.report.residual_maps import photometric_picture, residual
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import (
     ORANGE,
-    Colour,
-    Picture,
     Surface,
     View,
     Window,
@@ -125,18 +123,16 @@ def _thumbnails(view: View | None, window: Window | None, states: dict[str, Draw
     """Nothing for a car that the image does not show."""
     if view is None or window is None:
         return {}
-    colours = {"before": ORANGE, "after": states["after"].colour}
-    return {name: data_url(_thumbnail(view, window, state, colours[name])) for name, state in states.items()}
-
-
-def _thumbnail(view: View, window: Window, state: DrawnCar, colour: Colour) -> Picture:
-    part = view.part(window, min(_WIDTH_PX / (window[2] - window[0]), _LARGEST_SCALE))
-    surface = state.surface
-    if surface is None:
-        draw_box(part, state.corners_cam, colour)
-    else:
-        draw_contour(part, surface, colour, 2)
-    return part.picture
+    pictures = {}
+    for name, state in states.items():
+        part = view.part(window, min(_WIDTH_PX / (window[2] - window[0]), _LARGEST_SCALE))
+        colour, surface = ORANGE if name == "before" else state.colour, state.surface
+        if surface is None:
+            draw_box(part, state.corners_cam, colour)
+        else:
+            draw_contour(part, surface, colour, 2)
+        pictures[name] = data_url(part.picture)
+    return pictures
 
 
 def _figures(shapes: ShapeArrays, car: int) -> dict[str, Any]:

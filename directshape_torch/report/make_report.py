@@ -66,7 +66,9 @@ def make_report(
     if most_frames < 0:
         raise InputError("most_frames", "0 or more", str(most_frames))
     observer = RunObserver() if observer is None else observer
-    prior_was_given, prior = prior is not None, _prior_of(run, prior)
+    prior_was_given = prior is not None
+    if prior is not None and run.manifest.sha256["prior"] != hash_prior(prior):
+        prior = None
     # One for all frames and one for those with details: each counts what it could not use.
     reader, detail_reader = (InputReader(dataset, dataset is not None and has_detections) for _ in range(2))
     rows: list[CarRow] = []
@@ -100,10 +102,6 @@ def make_report(
         file.write(data_block("run", run_facts(run, rows, grounds, notes)))
         file.write(foot)
     return ReportOutcome(page, page.stat().st_size, len(run.frame_ids), len(detailed), len(rows), tuple(notes))
-
-
-def _prior_of(run: RunFolder, prior: ShapePrior | None) -> ShapePrior | None:
-    return None if prior is None or run.manifest.sha256["prior"] != hash_prior(prior) else prior
 
 
 def _known(run: RunFolder, reader: InputReader, frame_id: str) -> FrameMaterial:

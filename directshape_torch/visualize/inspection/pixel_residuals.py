@@ -31,17 +31,8 @@ class CarResiduals(NamedTuple):
     photometric: PixelResiduals  # right less left, grey levels, mean over the part of the neighbourhood on the car
 
 
-class _Pixels(NamedTuple):
-    """Pixels of all cars, with the place of the car of each."""
-
-    car: Tensor
-    uv: Tensor
-    value: Tensor
-    lost: Tensor
-
-    def of_car(self, place: int) -> PixelResiduals:
-        uv, value, lost = (x[self.car == place].cpu().numpy() for x in self[1:])
-        return PixelResiduals(uv.astype(np.float64), value.astype(np.float64), lost)
+# Of all cars: the place of the car of each pixel, and its uv, value and whether it is lost.
+_Pixels = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @torch.no_grad()
@@ -50,19 +41,25 @@ def car_residuals(trace: RefinementTrace, number: int) -> dict[int, CarResiduals
     stage, state = trace.last_stage, CarState(*(x[trace.rows] for x in trace.states[number]))
     figures, masks = stage.figures(stage.problem.look(state)), stage.problem.masks
     nothing = torch.zeros(0)
-    parts = dict.fromkeys(CarResiduals._fields, _Pixels(nothing, nothing.view(0, 2), nothing, nothing.bool()))
+    parts: dict[str, _Pixels] = dict.fromkeys(
+        CarResiduals._fields, (nothing, nothing.view(0, 2), nothing, nothing.bool())
+    )
     for term, at in zip(stage.terms, figures.parts, strict=True):
         if term.names == CarResiduals._fields[:2]:
             for side, pixels in enumerate((trace.pixels.left, trace.pixels.right)):
                 value = at.residual[..., 0][(masks.filled > 0) & (masks.side == side)[:, None]]
-                lost = torch.zeros_like(value, dtype=torch.bool)
-                parts[term.names[side]] = _Pixels(pixels.object_index, pixels.uv, value, lost)
+                parts[term.names[side]] = pixels.object_index, pixels.uv, value, torch.zeros_like(value).bool()
         elif isinstance(term, Photometric):
             parts["photometric"] = _of_photometry(term, at)
     return {
-        car: CarResiduals(*(parts[name].of_car(place) for name in CarResiduals._fields))
-        for place, car in enumerate(trace.rows.tolist())
+        row: CarResiduals(*(_of_car(parts[name], place) for name in CarResiduals._fields))
+        for place, row in enumerate(trace.rows.tolist())
     }
+
+
+def _of_car(pixels: _Pixels, place: int) -> PixelResiduals:
+    uv, value, lost = (x[pixels[0] == place].cpu().numpy() for x in pixels[1:])
+    return PixelResiduals(uv.astype(np.float64), value.astype(np.float64), lost)
 
 
 def _of_photometry(term: Photometric, at: Part) -> _Pixels:
@@ -73,4 +70,4 @@ def _of_photometry(term: Photometric, at: Part) -> _Pixels:
     mean = (at.residual * weight).sum(dim=-1) / weight.sum(dim=-1).clamp_min(1)
     pixel = left.packed.row.flatten()[fixed.sight_place]
     car = fixed.blocks.owner[:, None].expand_as(counted)
-    return _Pixels(car[counted], left.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted])
+    return car[counted], left.pixels.uv[pixel[counted]], mean[counted], ~Surface(*at.where).usable[counted]
