@@ -71,25 +71,24 @@ def evaluate_kitti(
 ) -> KittiScores:
     """Score detections as KITTI's devkit (2017) does: 2D, bird's-eye view and 3D, at IoU 0.5 and 0.7.
 
-        Args:
-            labels: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`), or objects by frame id.
-            results: folder of result files `NNNNNN.txt` with scores, or above a folder `data` with them, or objects by
-                frame id. A frame without results counts as missed.
-            split: frame ids, or a file with one a line; default every frame that has labels.
-            object_type: the class to score; labels of its neighbour (Van for Car) are ignored.
+    Args:
+        labels: folder of KITTI labels `NNNNNN.txt` (usually `training/label_2`), or objects by frame id.
+        results: folder of result files `NNNNNN.txt` with scores, or above a folder `data` with them, or objects by
+            frame id. A frame without results counts as missed.
+        split: frame ids, or a file with one a line; default every frame that has labels.
+        object_type: the class to score; labels of its neighbour (Van for Car) are ignored.
 
-        Raises:
-            DataFormatError: a folder, a label file of the split or a line is missing or damaged, or a result has no score.
-            InputError: no frame has labels, or none has results.
+    Raises:
+        DataFormatError: a folder, a label file of the split or a line is missing or damaged, or a result has no score.
+        InputError: no frame has labels, or none has results.
 
-        Example: one car, found with perfect overlap.
-            >>> from directshape_torch.io.kitti_labels import parse_object
-            >>> from directshape_torch.evaluation.matching import files_of_frames
-    from directshape_torch.files.text_files import Line
-            >>> text = "Car 0 0 0 100 100 200 180 1.5 1.6 3.9 1 1.6 20 0"
-            >>> label, result = (parse_object("a file", Line(1, t, t)) for t in (text, text + " 0.9"))
-            >>> evaluate_kitti({"000007": [label]}, {"000007": [result]}).score("3d", 0.7, "easy").ap_area
-            100.0
+    Example: one car, found with perfect overlap.
+        >>> from directshape_torch.io.kitti_labels import parse_object
+        >>> from directshape_torch.files.text_files import Line
+        >>> text = "Car 0 0 0 100 100 200 180 1.5 1.6 3.9 1 1.6 20 0"
+        >>> label, result = (parse_object("a file", Line(1, t, t)) for t in (text, text + " 0.9"))
+        >>> evaluate_kitti({"000007": [label]}, {"000007": [result]}).score("3d", 0.7, "easy").ap_area
+        100.0
     """
     of_labels, of_results = _source(labels, "labels"), _source(results, "results")
     listed = [line.text for line in read_lines(split)] if isinstance(split, (Path, str)) else split
