@@ -1,10 +1,12 @@
-"""Projection of views, contours and boxes against hand-derived pixels."""
+"""Projection of views, contours and boxes against hand-derived pixels; the signs of a disparity field."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
+from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.visualize.drawing import (
     Surface,
     View,
@@ -13,6 +15,7 @@ from directshape_torch.visualize.drawing import (
     draw_segment,
     silhouette_mask,
 )
+from directshape_torch.visualize.rig_picture import draw_disparity_field
 
 K = np.array([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
 SQUARE = np.array([[-1.0, -1.0, 10.0], [1.0, -1.0, 10.0], [1.0, 1.0, 10.0], [-1.0, 1.0, 10.0]])
@@ -101,3 +104,25 @@ def test_box_is_drawn_around_its_corners() -> None:
     assert abs(columns.max() - 61.1) <= 2
     assert abs(rows.min() - 28.9) <= 2
     assert abs(rows.max() - 51.1) <= 2
+
+
+FIELD_SIZE = (200, 80)
+TITLE_PX = 34
+
+
+@pytest.mark.parametrize(("value_px", "strong", "weak"), [(-0.4, 2, 0), (0.4, 0, 2)])
+def test_negative_is_blue_and_positive_red(value_px: float, strong: int, weak: int) -> None:
+    field = DisparityField.constant(value_px, FIELD_SIZE, torch.eye(3), torch.eye(3), torch.eye(4))
+    picture = draw_disparity_field(field, torch.tensor([[100.0, 40.0]]), torch.tensor([value_px]))
+    assert picture.shape == (3 * (FIELD_SIZE[1] + TITLE_PX), FIELD_SIZE[0], 3)
+    field_pixel = picture[TITLE_PX + 40, 100].astype(int)
+    before = picture[(TITLE_PX + FIELD_SIZE[1]) + TITLE_PX + 40, 100].astype(int)
+    after = picture[2 * (TITLE_PX + FIELD_SIZE[1]) + TITLE_PX + 40, 100].astype(int)
+    assert field_pixel[strong] > field_pixel[weak] + 80
+    assert before[strong] > before[weak] + 80
+    assert after.min() > 240
+
+
+def test_no_data_is_drawn_as_such() -> None:
+    field = DisparityField.constant(0.1, FIELD_SIZE, torch.eye(3), torch.eye(3), torch.eye(4))
+    assert draw_disparity_field(field, torch.zeros(0, 2), torch.zeros(0)).dtype == "uint8"
