@@ -11,7 +11,7 @@ from demo_scene import sensor
 from demo_scene.camera import Array, transform
 from demo_scene.car_surfaces import CarModel, car_model, car_surfaces
 from demo_scene.frame_files import Frame
-from demo_scene.labels import CarLabel, StereoNoise, noisy_detection, true_label
+from demo_scene.labels import CarLabel, noisy_detection, true_label
 from demo_scene.layout import SceneLayout
 from demo_scene.rendering import Light, PixelTruth, Renderer
 from demo_scene.sky import sky_radiance
@@ -49,7 +49,7 @@ def render_sequence(layouts: Sequence[SceneLayout], settings: RenderSettings) ->
         truth = Renderer(surfaces, None, settings.variant)
         truth_left, truth_right = (truth.pixel_truth(view) for view in _views(layout))
         labels = _labels(layout, models, car_parts, truth_left, settings.variant)
-        detections = {k: noisy_detection(rngs["detector"], label, StereoNoise()) for k, label in labels.items()}
+        detections = {k: noisy_detection(rngs["detector"], label) for k, label in labels.items()}
         yield Frame(layout, left, right, truth_left.instance, truth_right.instance, labels, detections)
 
 

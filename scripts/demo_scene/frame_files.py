@@ -38,17 +38,12 @@ class Frame:
 
 def write_frame(root: Path, name: str, frame: Frame) -> None:
     """Write images, calibration, labels, plane, masks, detections and the scene's description under `root`."""
+    _write_views(root, ("image_2", "image_3"), name, frame, {})
     training = root / "training"
-    _write_png(training / "image_2" / f"{name}.png", frame.image_left)
-    _write_png(training / "image_3" / f"{name}.png", frame.image_right)
     _write_text(training / "calib" / f"{name}.txt", calibration_text())
     _write_text(training / "label_2" / f"{name}.txt", "".join(label_line(x) + "\n" for x in frame.labels.values()))
-    _write_text(training / "planes" / f"{name}.txt", plane_text(frame.layout.camera))
-    masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
-    _write_text(training / "masks" / f"{name}.json", json.dumps(masks))
     detections = root / "detections" / "noisy_stereo" / "data" / f"{name}.txt"
     _write_text(detections, "".join(result_line(x, 0.9) + "\n" for x in frame.detections.values()))
-    _write_text(training / "meta" / f"{name}.json", json.dumps(scene_description(frame.layout), indent=1) + "\n")
 
 
 def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: float) -> None:
@@ -59,14 +54,8 @@ def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: f
     """
     training = root / "training"
     for number, frame in enumerate(frames):
-        stem = f"{number:06d}"
-        _write_png(training / "image_02" / name / f"{stem}.png", frame.image_left)
-        _write_png(training / "image_03" / name / f"{stem}.png", frame.image_right)
-        _write_text(training / "planes" / name / f"{stem}.txt", plane_text(frame.layout.camera))
-        masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
-        _write_text(training / "masks" / name / f"{stem}.json", json.dumps(masks))
-        description = {"time_s": number * interval_s, **scene_description(frame.layout)}
-        _write_text(training / "meta" / name / f"{stem}.json", json.dumps(description, indent=1) + "\n")
+        when = {"time_s": number * interval_s}
+        _write_views(root, ("image_02", "image_03"), f"{name}/{number:06d}", frame, when)
     lines = [(f"{n} {k}", frame.labels[k], frame.detections[k]) for n, frame in enumerate(frames) for k in frame.labels]
     _write_text(training / "calib" / f"{name}.txt", calibration_text())
     _write_text(training / "poses" / f"{name}.txt", "".join(pose_lines([f.layout.camera for f in frames])))
@@ -75,6 +64,18 @@ def write_sequence(root: Path, name: str, frames: Sequence[Frame], interval_s: f
     _write_text(training / "label_02" / f"{name}.txt", "".join(f"{n} {label_line(x)}\n" for n, x, _ in lines))
     found = "".join(f"{n} {result_line(x, 0.9)}\n" for n, _, x in lines)
     _write_text(root / "detections" / "noisy_stereo" / f"{name}.txt", found)
+
+
+def _write_views(root: Path, folders: tuple[str, str], stem: str, frame: Frame, when: dict[str, Any]) -> None:
+    """What every frame of either layout has: images, plane, masks and description."""
+    training = root / "training"
+    for folder, image in zip(folders, (frame.image_left, frame.image_right), strict=True):
+        _write_png(training / folder / f"{stem}.png", image)
+    _write_text(training / "planes" / f"{stem}.txt", plane_text(frame.layout.camera))
+    masks = mask_entries(frame.instance_left, "left") + mask_entries(frame.instance_right, "right")
+    _write_text(training / "masks" / f"{stem}.json", json.dumps(masks))
+    description = json.dumps({**when, **scene_description(frame.layout)}, indent=1)
+    _write_text(training / "meta" / f"{stem}.json", description + "\n")
 
 
 def pose_lines(cameras: Sequence[CameraPose]) -> list[str]:

@@ -18,6 +18,8 @@ from demo_scene.camera import (
 from demo_scene.layout import PlacedCar
 
 _MEAN_HWL_M = np.array([1.53, 1.63, 3.88])
+# Standard deviations of a stereo detector: shares of depth along the viewing ray and of sizes, metres, degrees, pixels.
+_DEPTH_SHARE, _SIZE_SHARE, _LATERAL_M, _VERTICAL_M, _YAW_DEG, _BOX_PX = 0.025, 0.03, 0.12, 0.05, 5.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -36,18 +38,6 @@ class CarLabel:
         """Observation angle, wrapped to [-pi, pi)."""
         x, _, z = self.location_ref
         return wrap_angle(self.rotation_y - float(np.arctan2(x, z)))
-
-
-@dataclass(frozen=True)
-class StereoNoise:
-    """Standard deviations of a stereo detector: relative depth along the viewing ray, metres, degrees, sizes."""
-
-    depth_share: float = 0.025
-    lateral_m: float = 0.12
-    vertical_m: float = 0.05
-    yaw_deg: float = 5.0
-    size_share: float = 0.03
-    box_px: float = 1.0
 
 
 def wrap_angle(angle_rad: float) -> float:
@@ -85,26 +75,19 @@ def _area(box: Array) -> float:
     return float((box[2] - box[0]) * (box[3] - box[1]))
 
 
-def noisy_detection(rng: np.random.Generator, truth: CarLabel, noise: StereoNoise) -> CarLabel:
+def noisy_detection(rng: np.random.Generator, truth: CarLabel) -> CarLabel:
     """The label as a stereo detector might find it: wrong in depth, place, heading and size."""
-    x, y, z = np.array(truth.location_ref) * (1.0 + noise.depth_share * rng.standard_normal())
-    h, w, length = _MEAN_HWL_M * (1.0 + noise.size_share * rng.standard_normal(3))
-    u0, v0, u1, v1 = np.array(truth.box_2d) + noise.box_px * rng.standard_normal(4)
+    x, y, z = np.array(truth.location_ref) * (1.0 + _DEPTH_SHARE * rng.standard_normal())
+    h, w, length = _MEAN_HWL_M * (1.0 + _SIZE_SHARE * rng.standard_normal(3))
+    limits = np.array([IMAGE_WIDTH_PX - 1, IMAGE_HEIGHT_PX - 1] * 2)
+    u0, v0, u1, v1 = np.clip(np.array(truth.box_2d) + _BOX_PX * rng.standard_normal(4), 0, limits)
+    x, y = x + _LATERAL_M * rng.standard_normal(), y + _VERTICAL_M * rng.standard_normal()
     return replace(
         truth,
-        location_ref=(
-            float(x + noise.lateral_m * rng.standard_normal()),
-            float(y + noise.vertical_m * rng.standard_normal()),
-            float(z),
-        ),
-        rotation_y=wrap_angle(truth.rotation_y + np.radians(noise.yaw_deg) * rng.standard_normal()),
+        location_ref=(float(x), float(y), float(z)),
+        rotation_y=wrap_angle(truth.rotation_y + np.radians(_YAW_DEG) * rng.standard_normal()),
         dimensions_hwl=(float(h), float(w), float(length)),
-        box_2d=(
-            float(np.clip(u0, 0, IMAGE_WIDTH_PX - 1)),
-            float(np.clip(v0, 0, IMAGE_HEIGHT_PX - 1)),
-            float(np.clip(u1, 0, IMAGE_WIDTH_PX - 1)),
-            float(np.clip(v1, 0, IMAGE_HEIGHT_PX - 1)),
-        ),
+        box_2d=(float(u0), float(v0), float(u1), float(v1)),
     )
 
 
