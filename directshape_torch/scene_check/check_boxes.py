@@ -9,9 +9,8 @@ import numpy as np
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_masks import check_placement
 from directshape_torch.scene_check.conventions import (
-    BoxConvention,
     ConventionScores,
-    project_conventions,
+    projected_boxes,
     score_conventions,
 )
 from directshape_torch.scene_check.finding import Finding, found, of_cars
@@ -67,7 +66,7 @@ def check_boxes(frames: Sequence[FrameEvidence]) -> list[Finding]:
 def _better_convention(scores: ConventionScores) -> int | None:
     """The convention that explains image and observation angles so much better that it must be the one in use."""
     image_gain = MIN_GAIN_IMAGE if scores.overlap.shape[1] >= MANY_CARS else MIN_GAIN_OF_FEW
-    by_angles = [(scores.score_with_angles, MIN_GAIN)] if scores.has_angles else []
+    by_angles = [] if scores.angle_share is None else [(scores.score_with_angles, MIN_GAIN)]
     for score, gain in (*by_angles, (scores.score, image_gain)):
         # Of those that explain about the same the simplest.
         close = np.flatnonzero(score > score.max() - TIE)
@@ -87,9 +86,9 @@ def _deviations(scores: ConventionScores, best: int) -> list[Finding]:
         measured = (
             f"they fit when {way}: projected boxes overlap 2D boxes or masks by {after:.2f} instead of {before:.2f}"
         )
-        shares = scores.angle_share[best], scores.angle_share[0]
-        if scores.has_angles and shares[0] > shares[1]:
-            measured += f", alpha agrees in {shares[0]:.0%} instead of {shares[1]:.0%}"
+        share = scores.angle_share
+        if share is not None and share[best] > share[0]:
+            measured += f", alpha agrees in {share[best]:.0%} instead of {share[0]:.0%}"
         where = of_cars(scores.overlap.shape[1])
         findings.append(found(check, where, measured, expected=expected, cure=cure))
     return findings
@@ -126,27 +125,25 @@ def _check_turns(frames: Sequence[FrameEvidence]) -> list[Finding]:
 
 def check_box_2d(frames: Sequence[FrameEvidence]) -> list[Finding]:
     """Whether `x y width height` fits the projected 3D boxes better than `u_min v_min u_max v_max`."""
-    as_corners, as_size = [], []
-    for frame in frames:
-        projected = project_conventions(frame, [BoxConvention()])[0]
-        for seen, box in zip(frame.boxes.box_2d, projected, strict=True):
-            other = np.array([seen[0], seen[1], seen[0] + seen[2], seen[1] + seen[3]])
-            both = box_iou(box[None], np.stack([seen, other]))[0]
-            as_corners.append(both[0])
-            as_size.append(both[1])
-    if not as_corners or np.mean(as_size) <= np.mean(as_corners) + MIN_GAIN_2D:
+    if not frames:
+        return []
+    seen = np.concatenate([frame.boxes.box_2d for frame in frames])
+    boxes = np.concatenate([projected_boxes(frame) for frame in frames])
+    sized = np.concatenate([seen[:, :2], seen[:, :2] + seen[:, 2:]], axis=1)
+    as_corners, as_size = (float(box_iou(boxes, way).diagonal().mean()) for way in (seen, sized))
+    if as_size <= as_corners + MIN_GAIN_2D:
         return []
     measured = (
-        f"projected 3D boxes overlap 2D boxes by {np.mean(as_corners):.2f}, "
-        f"and by {np.mean(as_size):.2f} when these are read as x y width height"
+        f"projected 3D boxes overlap 2D boxes by {as_corners:.2f}, "
+        f"and by {as_size:.2f} when these are read as x y width height"
     )
-    return [found("box_2d", of_cars(len(as_corners)), measured)]
+    return [found("box_2d", of_cars(len(seen)), measured)]
 
 
 def check_corners(frames: Sequence[FrameEvidence]) -> list[Finding]:
     """Whether 2D boxes end after they begin."""
-    boxes = np.concatenate([frame.boxes.box_2d for frame in frames]) if frames else np.empty((0, 4))
-    empty = int(np.sum((boxes[:, 2] <= boxes[:, 0]) | (boxes[:, 3] <= boxes[:, 1])))
+    boxes = np.concatenate([np.empty((0, 4)), *(frame.boxes.box_2d for frame in frames)])
+    empty = int((boxes[:, 2:] <= boxes[:, :2]).any(axis=1).sum())
     if not empty:
         return []
     return [

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
-from directshape_torch.scene_check.conventions import BoxConvention, project_conventions
+from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, found, of_cars
 from directshape_torch.scene_check.image_boxes import box_iou
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -66,7 +66,7 @@ def _finding(num_cars: int, measured: str, cure: str) -> Finding:
 
 def _gains(frame: FrameEvidence) -> list[list[float]]:
     """For each car what each way gains in agreement, what the best heading gains, and how much of its side is seen."""
-    projected = project_conventions(frame, [BoxConvention()])[0] if len(frame.boxes) else np.empty((0, 4))
+    projected = projected_boxes(frame)
     height, width = frame.size_hw
     gains = []
     for car, mask in enumerate(frame.masks):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from directshape_torch.scene_check.car_evidence import SIDES, Floats, FrameEvidence, Side
-from directshape_torch.scene_check.conventions import BoxConvention, project_conventions
+from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
 from directshape_torch.scene_check.image_boxes import box_iou
 
@@ -84,11 +84,9 @@ def check_placement(frames: Sequence[FrameEvidence], explained: float) -> list[F
 
 def _pairs_of(frame: FrameEvidence) -> tuple[Floats, Floats]:
     """Boxes around the projected 3D box and the own left mask of each car that has one."""
-    if not len(frame.boxes):
-        return np.empty((0, 4)), np.empty((0, 4))
     masks = frame.mask_boxes["left"]
     has = np.isfinite(masks).all(axis=1)
-    return project_conventions(frame, [BoxConvention()])[0][has], masks[has]
+    return projected_boxes(frame)[has], masks[has]
 
 
 def _middle(boxes: Floats) -> Floats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -115,33 +116,19 @@ _ANGLE_TOLERANCE_RAD = 0.06
 _MAX_ANGLE_RAD = 2 * np.pi + 0.01
 
 
-@dataclass(frozen=True)
-class ConventionScores:
-    """Overlaps of N projected boxes with what the image shows, for C conventions.
+class ConventionScores(NamedTuple):
+    """How well boxes explain what the image shows, for C conventions."""
 
-    Attributes:
-        conventions: C, the documented one first.
-        overlap: (C, N) with what the image shows.
-        penalty: (C,) to be taken from the mean overlap.
-        angle_share: (C,) share of the cars whose observation angle `alpha` agrees with heading and place.
-        has_angles: whether the observation angles say anything.
-    """
-
-    conventions: tuple[BoxConvention, ...]
-    overlap: NDArray[np.float64]
-    penalty: NDArray[np.float64]
-    angle_share: NDArray[np.float64]
-    has_angles: bool
+    conventions: tuple[BoxConvention, ...]  # the documented one first
+    overlap: NDArray[np.float64]  # (C, N) of N projected boxes with what the image shows
+    score: NDArray[np.float64]  # (C,) mean overlap less a penalty for deviations
+    # (C,) share of the cars whose observation angle `alpha` agrees with heading and place; None where it says nothing.
+    angle_share: NDArray[np.float64] | None
 
     @property
     def score_with_angles(self) -> NDArray[np.float64]:  # (C,)
         """The same with a premium for observation angles that agree."""
-        return np.asarray(self.score + _ANGLE_WEIGHT * self.has_angles * self.angle_share)
-
-    @property
-    def score(self) -> NDArray[np.float64]:  # (C,)
-        """Mean overlap less the penalty."""
-        return np.asarray(self.overlap.mean(axis=1) - self.penalty)
+        return np.asarray(self.score + _ANGLE_WEIGHT * (0.0 if self.angle_share is None else self.angle_share))
 
 
 def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
@@ -154,13 +141,13 @@ def score_conventions(frames: Sequence[FrameEvidence]) -> ConventionScores:
     projections = boxes_are_projections(frames)
     overlap = np.concatenate([_overlaps(frame, conventions, projections) for frame in frames], axis=1)
     median_hwl = np.median(np.concatenate([frame.boxes.hwl for frame in frames]), axis=0)
-    penalty = [_penalty(convention, median_hwl) for convention in conventions]
-    alpha = np.concatenate([frame.boxes.alpha for frame in frames])
-    has_angles = bool((np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0))  # not of NaN
-    # Neither origin nor order changes an angle seen from above.
-    share = {(axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames) for axes, yaw in product(AXES, YAWS)}
-    angle_share = np.array([share[convention.axes, convention.yaw] for convention in conventions])
-    return ConventionScores(conventions, overlap, np.array(penalty), angle_share, has_angles)
+    penalty = np.array([_penalty(convention, median_hwl) for convention in conventions])
+    alpha, angle_share = np.concatenate([frame.boxes.alpha for frame in frames]), None
+    if (np.abs(alpha) <= _MAX_ANGLE_RAD).all() and (len(alpha) == 1 or np.ptp(alpha) > 0):  # not of NaN
+        # Neither origin nor order changes an angle seen from above.
+        share = {(axes, yaw): _angles_agree(BoxConvention(axes, yaw=yaw), frames) for axes, yaw in product(AXES, YAWS)}
+        angle_share = np.array([share[convention.axes, convention.yaw] for convention in conventions])
+    return ConventionScores(conventions, overlap, overlap.mean(axis=1) - penalty, angle_share)
 
 
 def _angles_agree(convention: BoxConvention, frames: Sequence[FrameEvidence]) -> float:
@@ -201,12 +188,13 @@ def boxes_are_projections(frames: Sequence[FrameEvidence]) -> bool:
     """
     if not any(frame.num_masks["left"] for frame in frames):
         return False
-    overlaps = [
-        box_iou(box[None], seen[None])[0, 0]
-        for frame in frames
-        for box, seen in zip(project_conventions(frame, [BoxConvention()])[0], frame.boxes.box_2d, strict=True)
-    ]
-    return bool(np.mean(overlaps) > _SAME_BOX)
+    overlaps = [box_iou(projected_boxes(frame), frame.boxes.box_2d).diagonal() for frame in frames]
+    return bool(np.mean(np.concatenate(overlaps)) > _SAME_BOX)
+
+
+def projected_boxes(frame: FrameEvidence) -> NDArray[np.float64]:  # (N, 4) pixels
+    """2D boxes around the 3D boxes in the left image, read as documented."""
+    return np.asarray(project_conventions(frame, [BoxConvention()])[0])
 
 
 def project_conventions(
@@ -214,6 +202,8 @@ def project_conventions(
 ) -> NDArray[np.float64]:  # (C, N, 4) pixels
     """2D boxes around the 3D boxes in the left image, under each convention."""
     projected = np.empty((len(conventions), len(frame.boxes), 4))
+    if not len(frame.boxes):
+        return projected
     for focal in {convention.focal for convention in conventions}:
         rows = [row for row, convention in enumerate(conventions) if convention.focal == focal]
         found = [conventions[row].to_kitti(frame.boxes) for row in rows]
