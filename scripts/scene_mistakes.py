@@ -30,17 +30,11 @@ Scene = tuple[FrameBatch, Detections]
 
 @dataclass(frozen=True)
 class Mistake:
-    """One mistake.
+    """One mistake."""
 
-    Attributes:
-        make: changes a correct scene.
-        says: what an answer that names it contains: the check, and words of measurement or cure.
-        of_images: it takes features of both images to see it.
-    """
-
-    make: Callable[[FrameBatch, Detections], Scene]
-    says: tuple[str, str]
-    of_images: bool = False
+    make: Callable[[FrameBatch, Detections], Scene]  # changes a correct scene
+    says: tuple[str, str]  # what an answer that names it contains: the check, and words of measurement or cure
+    of_images: bool = False  # it takes features of both images to see it
 
 
 def answer(mistake: Mistake, correct: Scene) -> CheckReport:

@@ -40,23 +40,14 @@ _POINT_NOISE_M = 0.05
 
 @dataclass(frozen=True)
 class Bench:
-    """B states of one regime, ready to be examined.
+    """B states of one regime, ready to be examined."""
 
-    Attributes:
-        regime: they were drawn from.
-        stage: of the problem with the default settings, a pose prior, points and the user's own terms, begun.
-        terms: by the laboratory's names, in all forms, the paper's among them.
-        state: of the B cars.
-        sight: what the rays see of it.
-        rows: residuals and factors of each term at that state.
-    """
-
-    regime: Regime
-    stage: CarStage
-    terms: Mapping[str, Term]
-    state: CarState
-    sight: Sight
-    rows: Mapping[str, Linear]
+    regime: Regime  # that they were drawn from
+    stage: CarStage  # of the problem with the default settings, a pose prior, points and the user's own terms, begun
+    terms: Mapping[str, Term]  # by the laboratory's names, in all forms, the paper's among them
+    state: CarState  # of the B cars
+    sight: Sight  # what the rays see of it
+    rows: Mapping[str, Linear]  # residuals and factors of each term at that state
 
     @property
     def problem(self) -> CarProblem:

@@ -37,29 +37,17 @@ class PairError:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One subject in one regime.
+    """One subject in one regime."""
 
-    Attributes:
-        name: of the factor or term.
-        regime: of the state.
-        entries: rows times unknowns.
-        compared: entries that differences could judge.
-        excluded: by reason, the entries that they could not.
-        zero_rows: rows whose Jacobian is exactly zero, also by a skip rule of the residual.
-        flat_rows: further rows so short that they are compared with `FLAT_SHARE` of the longest.
-        errors: for each pair.
-        value_error: see `Subject`.
-    """
-
-    name: str
-    regime: str
-    entries: int
-    compared: int
-    excluded: Mapping[str, int]
-    zero_rows: int
-    flat_rows: int
-    errors: Mapping[str, PairError]
-    value_error: float = 0.0
+    name: str  # of the factor or term
+    regime: str  # of the state
+    entries: int  # rows times unknowns
+    compared: int  # entries that differences could judge
+    excluded: Mapping[str, int]  # by reason, the entries that they could not
+    zero_rows: int  # rows whose Jacobian is exactly zero, also by a skip rule of the residual
+    flat_rows: int  # further rows so short that they are compared with `FLAT_SHARE` of the longest
+    errors: Mapping[str, PairError]  # for each pair
+    value_error: float = 0.0  # see `Subject`
 
     @property
     def excluded_share(self) -> float:

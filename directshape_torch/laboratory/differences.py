@@ -40,17 +40,11 @@ Evaluate = Callable[[Tensor], Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class DifferenceSweep:
-    """Derivatives of one function of D unknowns with values (R,), from S steps, which make S - 2 stencils.
+    """Derivatives of one function of D unknowns with values (R,), from S steps, which make S - 2 stencils."""
 
-    Attributes:
-        extrapolated: (S - 2, R, D) Richardson's.
-        error: (S - 2, R, D) estimated error of those: truncation, kinks and rounding.
-        rounding: (S - 2, R, D) the rounding part alone.
-    """
-
-    extrapolated: Tensor
-    error: Tensor
-    rounding: Tensor
+    extrapolated: Tensor  # (S - 2, R, D) Richardson's
+    error: Tensor  # (S - 2, R, D) estimated error of those: truncation, kinks and rounding
+    rounding: Tensor  # (S - 2, R, D) the rounding part alone
 
 
 def sweep(evaluate: Evaluate, units: Tensor) -> list[DifferenceSweep]:

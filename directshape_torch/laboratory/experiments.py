@@ -39,22 +39,15 @@ AT_FIXED_DEPTHS = ("silhouettes_product",)
 
 @dataclass(frozen=True)
 class Subject:
-    """R values of D unknowns.
+    """R values of D unknowns."""
 
-    Attributes:
-        name: of the factor or term.
-        analytic: (R, D) hand-derived.
-        autograd: (R, D).
-        block: so many consecutive rows are the components of one vector and are compared relative to their common
-            norm: the vertical part of a warp by depth is next to nothing, and so is its own norm.
-        value_error: largest difference of the values that two ways of computing them give, relative.
-    """
-
-    name: str
-    analytic: Tensor
-    autograd: Tensor
+    name: str  # of the factor or term
+    analytic: Tensor  # (R, D) hand-derived
+    autograd: Tensor  # (R, D)
+    # So many consecutive rows are the components of one vector and are compared relative to their common norm: the
+    # vertical part of a warp by depth is next to nothing, and so is its own norm.
     block: int = 1
-    value_error: float = 0.0
+    value_error: float = 0.0  # largest difference of the values that two ways of computing them give, relative
 
     @property
     def norm(self) -> Tensor:
@@ -66,17 +59,11 @@ class Subject:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Subjects that are evaluated together at each displacement of their common unknowns.
+    """Subjects that are evaluated together at each displacement of their common unknowns."""
 
-    Attributes:
-        subjects: J of them.
-        evaluate: their values at a displacement (D,), in the order of the subjects.
-        units: (D,) see `sweep`.
-    """
-
-    subjects: tuple[Subject, ...]
-    evaluate: Evaluate
-    units: Tensor
+    subjects: tuple[Subject, ...]  # J of them
+    evaluate: Evaluate  # their values at a displacement (D,), in the order of the subjects
+    units: Tensor  # (D,) see `sweep`
 
 
 def factor_experiment(

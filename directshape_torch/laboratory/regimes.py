@@ -83,23 +83,14 @@ class Draw(NamedTuple):
 
 @dataclass(frozen=True)
 class Regime:
-    """How states are drawn.
+    """How states are drawn."""
 
-    Attributes:
-        name: of the regime.
-        explanation: in a few words, for reports.
-        draw: the states.
-        pixels: which pixels of the cars take part.
-        stage: of the settings: 1 is the fine one, 0 has a softer contour and half the image resolution.
-        occlusion: whether cars hide one another; cars that were placed each on its own must not.
-    """
-
-    name: str
-    explanation: str
-    draw: Callable[[Draw], DrawnStates]
-    pixels: Pixels = "sampled"
-    stage: int = 1
-    occlusion: bool = False
+    name: str  # of the regime
+    explanation: str  # in a few words, for reports
+    draw: Callable[[Draw], DrawnStates]  # the states
+    pixels: Pixels = "sampled"  # which pixels of the cars take part
+    stage: int = 1  # of the settings: 1 is the fine one, 0 has a softer contour and half the image resolution
+    occlusion: bool = False  # whether cars hide one another; cars that were placed each on its own must not
 
 
 def _typical(d: Draw) -> DrawnStates:

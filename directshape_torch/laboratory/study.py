@@ -20,25 +20,15 @@ SUBJECT_NAMES = (*FACTORS, *TERM_NAMES)
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """What to examine.
+    """What to examine."""
 
-    Attributes:
-        subjects: factors and terms by name.
-        own_terms: make further terms, which are examined as the others.
-        regimes: by name.
-        num_states: per regime.
-        seed: of the draws.
-        pixels_per_car: at most, on each side.
-        second: examine the derivatives of the terms' gradients too.
-    """
-
-    subjects: tuple[str, ...] = SUBJECT_NAMES
-    own_terms: tuple[TermFactory, ...] = ()
-    regimes: tuple[Regime, ...] = field(default_factory=lambda: tuple(regimes_named(None)))
-    num_states: int = 3
-    seed: int = 0
-    pixels_per_car: int = 24
-    second: bool = True
+    subjects: tuple[str, ...] = SUBJECT_NAMES  # factors and terms by name
+    own_terms: tuple[TermFactory, ...] = ()  # make further terms, which are examined as the others
+    regimes: tuple[Regime, ...] = field(default_factory=lambda: tuple(regimes_named(None)))  # by name
+    num_states: int = 3  # per regime
+    seed: int = 0  # of the draws
+    pixels_per_car: int = 24  # at most, on each side
+    second: bool = True  # examine the derivatives of the terms' gradients too
 
 
 def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
@@ -56,15 +46,10 @@ def subjects_named(names: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class StudyResult:
-    """What a study found.
+    """What a study found."""
 
-    Attributes:
-        comparisons: one for each subject and regime.
-        states_without_pixels: how many states of each regime saw no pixel at all.
-    """
-
-    comparisons: tuple[Comparison, ...]
-    states_without_pixels: dict[str, int]
+    comparisons: tuple[Comparison, ...]  # one for each subject and regime
+    states_without_pixels: dict[str, int]  # how many states of each regime saw no pixel at all
 
     def broken_bounds(self) -> list[str]:
         """One sentence for each bound that does not hold in float64."""

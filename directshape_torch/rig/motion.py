@@ -199,14 +199,10 @@ class MotionConstraint(FieldConstraint):
     """Points of one left image found in a later one; own unknowns: a twist (6,) of `T_later_cam`.
 
     Depths are unknowns too, one a point; they are always the best ones for motion and field, and eliminated.
-
-    Attributes:
-        uv_later: (P, 2) pixels in the later left image.
-        T_later_cam: (4, 4) motion of the left camera.
     """
 
-    uv_later: Tensor
-    T_later_cam: Tensor
+    uv_later: Tensor  # (P, 2) pixels in the later left image
+    T_later_cam: Tensor  # (4, 4) motion of the left camera
 
     def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Disparity and later pixel, less what a change of the point's own depth could mend: that says nothing."""

@@ -36,15 +36,10 @@ _HEIGHT_SIGMA_M = 0.02
 
 @dataclass(frozen=True)
 class RoadConstraint(FieldConstraint):
-    """The road of one frame; own unknowns: `inverse_plane`.
+    """The road of one frame; own unknowns: `inverse_plane`."""
 
-    Attributes:
-        inverse_plane: (3,) `a` with `a . x_cam = 1` on the road, 1/m: minus the upward normal over the height.
-        height_m: of the camera above it.
-    """
-
-    inverse_plane: Tensor
-    height_m: float
+    inverse_plane: Tensor  # (3,) `a` with `a . x_cam = 1` on the road, 1/m: minus the upward normal over the height
+    height_m: float  # of the camera above it
 
     def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Disparity, predicted less measured."""

@@ -70,15 +70,10 @@ class Linearisation(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldConstraint(ABC):
-    """Points of one pair that the field has to explain, with M unknowns of their own.
+    """Points of one pair that the field has to explain, with M unknowns of their own."""
 
-    Attributes:
-        rig: of the images.
-        seen: (P, 4) u, v, measured disparity, measured row shift v_left - v_right, pixels.
-    """
-
-    rig: Rig
-    seen: Tensor
+    rig: Rig  # of the images
+    seen: Tensor  # (P, 4) u, v, measured disparity, measured row shift v_left - v_right, pixels
 
     @abstractmethod
     def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:

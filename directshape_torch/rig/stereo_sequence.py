@@ -25,17 +25,11 @@ from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
 @dataclass(frozen=True)
 class StereoSequence:
-    """Where the frames of a sequence are.
+    """Where the frames of a sequence are."""
 
-    Attributes:
-        root: folder that holds `image_02`, `image_03` and `calib.txt`.
-        frame_ids: in their order in time.
-        camera: the rig's calibration (one frame, float64).
-    """
-
-    root: Path
-    frame_ids: tuple[str, ...]
-    camera: StereoCamera
+    root: Path  # folder that holds `image_02`, `image_03` and `calib.txt`
+    frame_ids: tuple[str, ...]  # in their order in time
+    camera: StereoCamera  # the rig's calibration (one frame, float64)
 
     def gaps(self) -> tuple[tuple[str, str], ...]:
         """Neighbours (before, after) whose numbers are farther apart than those of the closest pair; none where ids

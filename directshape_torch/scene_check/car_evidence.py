@@ -22,21 +22,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CarBoxes:
-    """N boxes as they are given.
+    """N boxes as they are given."""
 
-    Attributes:
-        location: (N, 3) metres.
-        hwl: (N, 3) the three lengths in the order of the file, metres.
-        rotation_y: (N,) radians, or what stands there.
-        alpha: (N,) radians, or what stands there; NaN where nobody gives it.
-        box_2d: (N, 4) u_min, v_min, u_max, v_max, or what stands there, pixels.
-    """
-
-    location: Floats
-    hwl: Floats
-    rotation_y: Floats
-    alpha: Floats
-    box_2d: Floats
+    location: Floats  # (N, 3) metres
+    hwl: Floats  # (N, 3) the three lengths in the order of the file, metres
+    rotation_y: Floats  # (N,) radians, or what stands there
+    alpha: Floats  # (N,) radians, or what stands there; NaN where nobody gives it
+    box_2d: Floats  # (N, 4) u_min, v_min, u_max, v_max, or what stands there, pixels
 
     def __len__(self) -> int:
         return len(self.location)
@@ -44,31 +36,20 @@ class CarBoxes:
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """The N boxes of a frame and the masks that belong to them.
+    """The N boxes of a frame and the masks that belong to them."""
 
-    Attributes:
-        frame_id: its name.
-        boxes: of N cars, locations in the frame `ref` of the camera.
-        mask_boxes: for each side the box (N, 4) around the mask of each car, pixels, NaN where it has none.
-        overlap: for each side the overlap (N,) of that box with what it was matched by, 0 where it has none.
-        num_masks: for each side the masks of cars, whether they belong to a box or not.
-        seen: for each car what of the left masks may be its own, (., 4) boxes.
-        masks: the left mask (H, W) of each car, bool, or None.
-        camera: of the frame.
-        size_hw: of its images.
-        has_masks: whether the frame's masks could be read.
-    """
-
-    frame_id: str
-    boxes: CarBoxes
+    frame_id: str  # its name
+    boxes: CarBoxes  # of N cars, locations in the frame `ref` of the camera
+    # For each side the box (N, 4) around the mask of each car, pixels, NaN where it has none.
     mask_boxes: dict[Side, Floats]
+    # For each side the overlap (N,) of that box with what it was matched by, 0 where it has none.
     overlap: dict[Side, Floats]
-    num_masks: dict[Side, int]
-    seen: tuple[Floats, ...]
-    masks: tuple[NDArray[np.bool_] | None, ...]
-    camera: StereoCamera
-    size_hw: tuple[int, int]
-    has_masks: bool
+    num_masks: dict[Side, int]  # for each side the masks of cars, whether they belong to a box or not
+    seen: tuple[Floats, ...]  # for each car what of the left masks may be its own, (., 4) boxes
+    masks: tuple[NDArray[np.bool_] | None, ...]  # the left mask (H, W) of each car, bool, or None
+    camera: StereoCamera  # of the frame
+    size_hw: tuple[int, int]  # of its images
+    has_masks: bool  # whether the frame's masks could be read
 
 
 def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameEvidence]:

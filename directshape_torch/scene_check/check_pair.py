@@ -132,18 +132,12 @@ def fit_rows(
 
 @dataclass(frozen=True)
 class PairMatches:
-    """Points that show the same thing in both images.
+    """Points that show the same thing in both images."""
 
-    Attributes:
-        uv_left, uv_right: (N, 2) pixels.
-        num_candidates: matches before those were dropped that obey no common epipolar geometry.
-        num_features: of the image that has fewer of them.
-    """
-
-    uv_left: NDArray[np.float64]
+    uv_left: NDArray[np.float64]  # (N, 2) pixels
     uv_right: NDArray[np.float64]
-    num_candidates: int
-    num_features: int = 0
+    num_candidates: int  # matches before those were dropped that obey no common epipolar geometry
+    num_features: int = 0  # of the image that has fewer of them
 
     def __len__(self) -> int:
         return len(self.uv_left)

@@ -29,17 +29,11 @@ FEW_CARS, WARNING_RATIO_OF_FEW = 8, 1.25
 
 @dataclass(frozen=True)
 class StereoCars:
-    """What the two images say of the distances of N cars, where they say anything.
+    """What the two images say of the distances of N cars, where they say anything."""
 
-    Attributes:
-        disparity: (N,) pixels.
-        stereo: (N,) distance by disparity over that of the box.
-        size: (N,) distance by the height of the mask, which needs no baseline, over that of the box.
-    """
-
-    disparity: Floats
-    stereo: Floats
-    size: Floats
+    disparity: Floats  # (N,) pixels
+    stereo: Floats  # (N,) distance by disparity over that of the box
+    size: Floats  # (N,) distance by the height of the mask, which needs no baseline, over that of the box
 
 
 def measure_cars(frame: FrameEvidence, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> StereoCars:

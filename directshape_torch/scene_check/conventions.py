@@ -63,22 +63,15 @@ SIZES = (0.5, 2.0)
 
 @dataclass(frozen=True)
 class BoxConvention:
-    """One way to write a box; each part is a key of a table above, or a factor.
+    """One way to write a box; each part is a key of a table above, or a factor."""
 
-    Attributes:
-        axes, origin, yaw, order: how the box is written.
-        focal: factor of the focal lengths.
-        distance: factor of the locations.
-        size: factor of height, width and length.
-    """
-
-    axes: str = AS_DOCUMENTED
+    axes: str = AS_DOCUMENTED  # how the box is written
     origin: str = AS_DOCUMENTED
     yaw: str = AS_DOCUMENTED
     order: str = AS_DOCUMENTED
-    focal: float = 1.0
-    distance: float = 1.0
-    size: float = 1.0
+    focal: float = 1.0  # factor of the focal lengths
+    distance: float = 1.0  # factor of the locations
+    size: float = 1.0  # factor of height, width and length
 
     @property
     def deviations(self) -> dict[str, str | float]:

@@ -22,21 +22,13 @@ _RIDGE = 1e-4
 
 @dataclass(frozen=True)
 class FittedCar:
-    """A known car and the shape of a prior that is nearest to it.
+    """A known car and the shape of a prior that is nearest to it."""
 
-    Attributes:
-        name: of the car.
-        truth: (nx, ny, nz) its signed distance on the prior's grid, metres.
-        values: (nx, ny, nz) that of the prior's shape.
-        code: (K,) of that shape.
-        error_cm: mean |difference| over the nodes within 7 cm of the true surface.
-    """
-
-    name: str
-    truth: Tensor
-    values: Tensor
-    code: Tensor
-    error_cm: float
+    name: str  # of the car
+    truth: Tensor  # (nx, ny, nz) its signed distance on the prior's grid, metres
+    values: Tensor  # (nx, ny, nz) that of the prior's shape
+    code: Tensor  # (K,) of that shape
+    error_cm: float  # mean |difference| over the nodes within 7 cm of the true surface
 
 
 def grid_of(prior: ShapePrior) -> GridSpec:

@@ -40,19 +40,14 @@ T_RIGHT_CAM = T_RIGHT_REF - T_CAM_REF
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Where the left camera stands over the road: height in metres, pitch (nose down) and roll in radians.
-
-    Attributes:
-        x_m, z_m: place on the road, metres.
-        yaw_rad: where it looks, 0 along the street, positive to the right.
-    """
+    """Where the left camera stands over the road: height in metres, pitch (nose down) and roll in radians."""
 
     height_m: float
     pitch_rad: float
     roll_rad: float
-    x_m: float = 0.0
+    x_m: float = 0.0  # place on the road, metres
     z_m: float = 0.0
-    yaw_rad: float = 0.0
+    yaw_rad: float = 0.0  # where it looks, 0 along the street, positive to the right
 
     @property
     def T_cam_road(self) -> Array:

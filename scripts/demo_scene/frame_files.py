@@ -21,18 +21,14 @@ _COCO_CAR = 3
 
 @dataclass(frozen=True)
 class Frame:
-    """All that is written of a frame; instance maps hold the number of the car, -1 elsewhere.
-
-    Attributes:
-        labels, detections: of the cars in view, by the car's number.
-    """
+    """All that is written of a frame; instance maps hold the number of the car, -1 elsewhere."""
 
     layout: SceneLayout
     image_left: Picture
     image_right: Picture
     instance_left: Indices
     instance_right: Indices
-    labels: dict[int, CarLabel]
+    labels: dict[int, CarLabel]  # of the cars in view, by the car's number
     detections: dict[int, CarLabel]
 
 

@@ -26,16 +26,13 @@ _STEP_S = 0.005
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive on the ground at constant speed: start in metres, KITTI's `rotation_y`, and turns one after the other.
-
-    Attributes:
-        turns: `(duration_s, rate_rad_s)`, positive to the right; straight on after the last.
-    """
+    """A drive on the ground at constant speed: start in metres, KITTI's `rotation_y`, and turns one after the other."""
 
     x_m: float
     z_m: float
     rotation_y: float
     speed_m_s: float = 0.0
+    # `(duration_s, rate_rad_s)`, positive to the right; straight on after the last.
     turns: tuple[tuple[float, float], ...] = ()
 
     def at(self, time_s: float) -> tuple[float, float, float]:

@@ -40,15 +40,10 @@ class PathTraced:
 
 @dataclass(frozen=True)
 class PixelTruth:
-    """What the ray through each pixel's centre meets first.
+    """What the ray through each pixel's centre meets first."""
 
-    Attributes:
-        instance: (H, W) number of the car, -1 for the street and the sky.
-        depth_m: (H, W) distance along the optical axis, 0 for the sky.
-    """
-
-    instance: Indices
-    depth_m: Array
+    instance: Indices  # (H, W) number of the car, -1 for the street and the sky
+    depth_m: Array  # (H, W) distance along the optical axis, 0 for the sky
 
 
 def import_mitsuba() -> Any:

@@ -15,39 +15,27 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Material:
-    """A glossy or matt surface.
+    """A glossy or matt surface."""
 
-    Attributes:
-        base_color: linear RGB, an sRGB picture (H, W, 3), or None for the mesh's own vertex colours.
-        roughness: 0 mirror to 1 matt, or a picture (H, W) of it, 255 for 1.
-        metallic, specular, clearcoat: shares as in the usual principled material.
-    """
-
+    # Linear RGB, an sRGB picture (H, W, 3), or None for the mesh's own vertex colours.
     base_color: tuple[float, float, float] | Picture | None
-    roughness: float | Picture = 0.8
-    metallic: float = 0.0
+    roughness: float | Picture = 0.8  # 0 mirror to 1 matt, or a picture (H, W) of it, 255 for 1
+    metallic: float = 0.0  # shares as in the usual principled material
     specular: float = 0.3
     clearcoat: float = 0.0
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A mesh: vertices (N, 3) in the road frame, faces (M, 3), and what else the material asks for.
-
-    Attributes:
-        uv: texture coordinates (N, 2), v = 0 at the texture's last row, or None.
-        normals: smooth vertex normals (N, 3), or None for flat faces.
-        colors: linear RGB of the vertices (N, 3), or None.
-        instance: number of the car that it belongs to, from 0; -1 for the street.
-    """
+    """A mesh: vertices (N, 3) in the road frame, faces (M, 3), and what else the material asks for."""
 
     vertices: Array
     faces: Indices
     material: Material
-    uv: Array | None = None
-    normals: Array | None = None
-    colors: Array | None = None
-    instance: int = -1
+    uv: Array | None = None  # texture coordinates (N, 2), v = 0 at the texture's last row, or None
+    normals: Array | None = None  # smooth vertex normals (N, 3), or None for flat faces
+    colors: Array | None = None  # linear RGB of the vertices (N, 3), or None
+    instance: int = -1  # number of the car that it belongs to, from 0; -1 for the street
 
 
 def quad(corner: Array, edge_u: Array, edge_v: Array, material: Material) -> Surface:

@@ -20,14 +20,10 @@ _PATIENCE_AT_START_S = 1800.0
 
 @dataclass
 class Tally:
-    """How the cases of one kind ended.
+    """How the cases of one kind ended."""
 
-    Attributes:
-        counts: by outcome.
-        found: cases that ended as none should: seed, name and what was said.
-    """
-
-    counts: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)  # by outcome
+    # Cases that ended as none should: seed, name and what was said.
     found: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, answer: dict[str, Any]) -> None:

@@ -18,15 +18,10 @@ from directshape_torch.scene import Detections, FrameBatch
 
 @dataclass(frozen=True)
 class Bend:
-    """By how much disparities and rows of a right image are larger than true ones, as lenses bend it.
+    """By how much disparities and rows of a right image are larger than true ones, as lenses bend it."""
 
-    Attributes:
-        coefficients: (10, 2) pixels, of disparity and row, polynomials over the right image.
-        size_wh: of the image.
-    """
-
-    coefficients: Tensor
-    size_wh: tuple[int, int]
+    coefficients: Tensor  # (10, 2) pixels, of disparity and row, polynomials over the right image
+    size_wh: tuple[int, int]  # of the image
 
     @classmethod
     def drawn(cls, largest_px: float, rows_px: float, size_wh: tuple[int, int], seed: int) -> Bend:

@@ -14,24 +14,15 @@ from directshape_torch.scene import Detections
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """Standard deviations of a detector's errors.
+    """Standard deviations of a detector's errors."""
 
-    Attributes:
-        name: of the level.
-        depth_share: along the viewing ray, of the distance.
-        side_m, height_m: across it, and vertically, metres.
-        yaw_deg: of the heading.
-        dimensions_share: of height, width and length, of themselves.
-        depth_bias: by which all boxes stand too far, as a share of the distance.
-    """
-
-    name: str
-    depth_share: float
-    side_m: float
+    name: str  # of the level
+    depth_share: float  # along the viewing ray, of the distance
+    side_m: float  # across it, and vertically, metres
     height_m: float
-    yaw_deg: float
-    dimensions_share: float
-    depth_bias: float = 0.0
+    yaw_deg: float  # of the heading
+    dimensions_share: float  # of height, width and length, of themselves
+    depth_bias: float = 0.0  # by which all boxes stand too far, as a share of the distance
 
 
 LEVELS = (

@@ -31,26 +31,16 @@ WORSE_BY = 0.05
 
 @dataclass(frozen=True)
 class Observations:
-    """N refined cars.
+    """N refined cars."""
 
-    Attributes:
-        group: (N,) text, frame; cars of one group are never on both sides of a split.
-        source: (N,) text: detector and masks.
-        evidence: (N, E).
-        iou_before, iou_after: (N,) bird's-eye overlap of input and refined box with the label.
-        errors: (N, 4) refined minus true x, y, z (bottom centre, ref) and heading (modulo pi).
-        covariance: (N, 4, 4) of them, uncalibrated.
-        ray: (N, 2) x and z of the viewing ray's unit vector.
-    """
-
-    group: NDArray[np.str_]
-    source: NDArray[np.str_]
-    evidence: Array
-    iou_before: Array
+    group: NDArray[np.str_]  # (N,) text, frame; cars of one group are never on both sides of a split
+    source: NDArray[np.str_]  # (N,) text: detector and masks
+    evidence: Array  # (N, E)
+    iou_before: Array  # (N,) bird's-eye overlap of input and refined box with the label
     iou_after: Array
-    errors: Array
-    covariance: Array
-    ray: Array
+    errors: Array  # (N, 4) refined minus true x, y, z (bottom centre, ref) and heading (modulo pi)
+    covariance: Array  # (N, 4, 4) of them, uncalibrated
+    ray: Array  # (N, 2) x and z of the viewing ray's unit vector
 
     def __len__(self) -> int:
         return len(self.group)
@@ -88,16 +78,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Of the run of one seed.
+    """Of the run of one seed."""
 
-    Attributes:
-        field_px, rows_px: largest errors of the rig's disparities and rows.
-        has_right_masks: False: the left ones alone.
-    """
-
-    field_px: float
+    field_px: float  # largest errors of the rig's disparities and rows
     rows_px: float
-    has_right_masks: bool
+    has_right_masks: bool  # False: the left ones alone
 
 
 CONDITIONS = (Conditions(0.0, 0.0, True), Conditions(0.6, 0.2, True), Conditions(1.2, 0.3, False))

@@ -23,19 +23,12 @@ class Thresholds(NamedTuple):
 
 @dataclass(frozen=True)
 class Judged:
-    """Cars with the figures that a model which has not seen them gives.
+    """Cars with the figures that a model which has not seen them gives."""
 
-    Attributes:
-        name: of the cars.
-        observations: N cars.
-        probabilities: (N, 2) of a better and of a not worse box.
-        errors, sigmas: (N, 4) along the viewing ray, across it, vertically and of the heading.
-    """
-
-    name: str
-    observations: Observations
-    probabilities: Array
-    errors: Array
+    name: str  # of the cars
+    observations: Observations  # N cars
+    probabilities: Array  # (N, 2) of a better and of a not worse box
+    errors: Array  # (N, 4) along the viewing ray, across it, vertically and of the heading
     sigmas: Array
 
     def where(self, condition: NDArray[np.bool_], name: str) -> Judged:

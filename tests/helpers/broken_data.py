@@ -27,15 +27,10 @@ P_LEFT, P_RIGHT = "P2:", "P3:"
 
 @dataclass(frozen=True)
 class Break:
-    """One way to break a data set.
+    """One way to break a data set."""
 
-    Attributes:
-        apply: changes the files below a root with `training`, `detections/data` and `masks`.
-        checks: names of findings, one of which must appear.
-    """
-
-    apply: Callable[[Path], None]
-    checks: frozenset[str]
+    apply: Callable[[Path], None]  # changes the files below a root with `training`, `detections/data` and `masks`
+    checks: frozenset[str]  # names of findings, one of which must appear
 
 
 def copy_data(data: Path, detections: Path, masks: Path, to: Path, frames: list[str] | None = None) -> Path:
