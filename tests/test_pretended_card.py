@@ -23,12 +23,10 @@ pytestmark = pytest.mark.skipif(
 _TESTS = Path(__file__).parent
 _COMPARED = [
     "default",
-    "product form, marched rays",
-    "other residuals and priors, every step",
-    "search",
+    "product form, marched rays, search",
     "point cloud",
     "implicit gradients",
-    "neural prior",
+    "neural prior, other residuals and priors, every step",
     "tracks, unrolled gradients",
 ]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -28,6 +29,7 @@ from directshape_torch.terms.cars import CarState
 LENGTH, DEPTH, WIDTH = (CAR_QUANTITIES.index(name) for name in ("length", "depth", "width"))
 
 
+@cache
 def seen(rotation_y: float, **priors: float) -> Observability:
     """What a car at 9 m, straight ahead, leaves unseen, at the truth."""
     prior = ellipsoid_prior()

@@ -39,26 +39,30 @@ _SIGMAS = {"pose_sigma_along_m": 0.5, "pose_sigma_across_m": 0.3, "pose_sigma_ve
 
 SETTINGS: dict[str, RefinerConfig] = {
     "default": _SHIPPED,
-    "product form, marched rays": with_solver(
-        replace(DEFAULT, silhouette=replace(DEFAULT.silhouette, form="product")), rays="marched"
-    ),
-    "other residuals and priors, every step": with_solver(
+    "product form, marched rays, search": with_solver(
         replace(
             DEFAULT,
-            photometric=replace(
-                DEFAULT.photometric, patch="normalised", brightness="affine", truncated=True, pixel_set="hit"
-            ),
-            sampling=replace(DEFAULT.sampling, mode="uniform"),
-            priors=replace(DEFAULT.priors, tilt_form="cosine", **_SIGMAS),
+            silhouette=replace(DEFAULT.silhouette, form="product"),
+            search=replace(DEFAULT.search, disparity_offsets_px=(-1.0, 1.0)),
         ),
-        initial_damping=0.0,
-        accept_every_step=True,
+        rays="marched",
     ),
-    "search": replace(DEFAULT, search=replace(DEFAULT.search, disparity_offsets_px=(-1.0, 1.0))),
     "point cloud": replace(DEFAULT, method="geometric"),
     "implicit gradients": replace(DEFAULT, backward=replace(DEFAULT.backward, mode="implicit")),
 }
 
+OTHER_FORMS = with_solver(
+    replace(
+        DEFAULT,
+        photometric=replace(
+            DEFAULT.photometric, patch="normalised", brightness="affine", truncated=True, pixel_set="hit"
+        ),
+        sampling=replace(DEFAULT.sampling, mode="uniform"),
+        priors=replace(DEFAULT.priors, tilt_form="cosine", **_SIGMAS),
+    ),
+    initial_damping=0.0,
+    accept_every_step=True,
+)
 # Of views of tracks as well as of cars by themselves.
 UNROLLED = replace(DEFAULT, backward=replace(DEFAULT.backward, mode="unroll"))
 
@@ -179,7 +183,7 @@ def demo() -> dict[str, list[str]]:
 
 CASES: dict[str, Callable[[], Any]] = {
     **{name: lambda config=config: compare(config) for name, config in SETTINGS.items()},  # type: ignore[misc]
-    "neural prior": lambda: compare(DEFAULT, prior_of("neural")),
+    "neural prior, other residuals and priors, every step": lambda: compare(OTHER_FORMS, prior_of("neural")),
     "tracks, unrolled gradients": lambda: compare(UNROLLED, tracks=True),
     "waits of blocks": waits_of_blocks,
     "waits of blocks of tracks": lambda: waits_of_blocks(tracks=True),
