@@ -16,7 +16,7 @@ from directshape_torch.errors import InputError, NoGradientWarning, SceneWarning
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.numerics.gradient_mode import is_within_transform
-from directshape_torch.numerics.records import kept, placed
+from directshape_torch.numerics.records import kept
 from directshape_torch.observation.extents import scene_extents
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
@@ -273,12 +273,7 @@ def _assembled(
     outcome: Outcome,
 ) -> RefinementResult:
     """The result of a call whose cars `rows` were minimised; the others keep what they came with."""
-    count = len(detections)
-
-    def spread(part: Tensor) -> Tensor:
-        return placed(part.to(torch.float64), rows, count)
-
-    iterations = torch.zeros(count, dtype=torch.long, device=status.device).index_copy(0, rows, outcome.iterations)
+    of_all = outcome.spread(rows, len(detections))
     refined = is_refined(status)
     returned_input = (status == Status.not_trusted.code) | (status == Status.no_evidence.code)
     figures_known = refined | returned_input
@@ -288,21 +283,21 @@ def _assembled(
         T_cam_obj=T_cam_obj,
         code=state.code,
         status_code=status,
-        iterations=iterations,
+        iterations=of_all.iterations.clamp_min(0),
         term_names=outcome.term_names,
-        cost_before=spread(outcome.cost_before),
-        cost_after=spread(outcome.cost_after),
-        covariance=kept(spread(outcome.covariance), refined),
-        covariance_xyz_yaw=kept(spread(outcome.covariance_xyz_yaw), refined),
-        cost_history=spread(outcome.cost_history),
-        quality=outcome.quality.spread(rows, count).where(figures_known),
-        observability=outcome.observability.spread(rows, count).where(refined),
-        profile=outcome.profile.spread(rows, count).where(figures_known),
+        cost_before=of_all.cost_before,
+        cost_after=of_all.cost_after,
+        covariance=kept(of_all.covariance, refined),
+        covariance_xyz_yaw=kept(of_all.covariance_xyz_yaw, refined),
+        cost_history=of_all.cost_history,
+        quality=of_all.quality.where(figures_known),
+        observability=of_all.observability.where(refined),
+        profile=of_all.profile.where(figures_known),
         # The caller may reuse the tensor for the next call.
         input_dimensions_hwl=detections.dimensions_hwl.clone(),
         ground_source=_ground_sources(frames, detections),
         t_cam_ref=frames.camera.t_cam_ref[detections.frame_index],
-        track_part=torch.full_like(status, -1).index_copy(0, rows, outcome.track_part),
+        track_part=of_all.track_part,
         prior=prior,
         has_shape=outcome.has_shape,
     )

@@ -170,13 +170,8 @@ class FrameBatch(TensorRecord):
             for name, images in (("images_left", images_left), ("images_right", images_right))
         )
         count, like = len(left), camera.K_left
-        if camera.num_frames == 1 and camera.disparity_field is None:
-            camera = StereoCamera(
-                camera.K_left.expand(count, 3, 3),
-                camera.K_right.expand(count, 3, 3),
-                camera.T_right_cam.expand(count, 4, 4),
-                camera.t_cam_ref.expand(count, 3),
-            )
+        if camera.num_frames == 1:
+            camera = camera.rows(torch.zeros(count, dtype=torch.long))
         if not isinstance(ground, GroundPlane):
             ground = GroundPlane.from_camera_height(ground, count).to(like.device, like.dtype)
         sizes = torch.tensor([left.shape[2:]] * count, device=left.device).reshape(count, 2)

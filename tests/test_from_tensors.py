@@ -72,7 +72,7 @@ def test_intrinsics_of_one_and_of_many_frames() -> None:
         StereoCamera.from_intrinsics(K, -0.5)
     with pytest.raises(InputError, match=r"K: expected \[\[fx, s, cx\]"):
         StereoCamera.from_intrinsics(K.T.contiguous(), 0.5)
-    with pytest.raises(InputError, match=r"baseline_m: expected a number, or 1"):
+    with pytest.raises(InputError, match=r"baseline_m: expected shape \(1,\)"):
         StereoCamera.from_intrinsics(K, torch.tensor([0.5, 0.6]))
     with pytest.raises(InputError, match="K: expected floating point"):
         StereoCamera.from_intrinsics(K.long(), 0.5)

@@ -94,15 +94,11 @@ class StereoCamera(TensorRecord):
         if len(of_right) not in (1, len(K_left)):
             raise InputError("K_right", f"one matrix, or {len(K_left)}", f"{len(of_right)}")
         if isinstance(baseline_m, Tensor):
-            check_shape("baseline_m", baseline_m, ("F",) if baseline_m.ndim else ())
+            check_shape("baseline_m", baseline_m, (len(K_left),) if baseline_m.ndim else ())
         else:
             check_positive("baseline_m", baseline_m, "in metres")
-        baseline = torch.as_tensor(baseline_m, dtype=K_left.dtype, device=K_left.device)
-        if baseline.ndim > 1 or (baseline.ndim == 1 and len(baseline) != len(K_left)):
-            got = str(tuple(baseline.shape))
-            raise InputError("baseline_m", f"a number, or {len(K_left)} of them", f"shape {got}", "in metres")
         T_right_cam = torch.eye(4).to(K_left).repeat(len(K_left), 1, 1)
-        T_right_cam[:, 0, 3] = -baseline
+        T_right_cam[:, 0, 3] = -torch.as_tensor(baseline_m, dtype=K_left.dtype, device=K_left.device)
         of_right = of_right.expand_as(K_left).clone()
         return cls(K_left.clone(), of_right, T_right_cam, torch.zeros_like(K_left[:, 0]), disparity_field)
 

@@ -61,7 +61,7 @@ class Record:
         return self._with(Tensor.detach)
 
     def rows(self, index: Tensor) -> Self:
-        """The rows `index` (M,), in that order.
+        """The rows `index` (M,) int64, in that order.
 
         Examples:
             >>> from dataclasses import dataclass
@@ -71,7 +71,7 @@ class Record:
             >>> Depths(torch.tensor([10.0, 20.0])).rows(torch.tensor([1]))
             Depths(depth_m=tensor([20.]))
         """
-        return self._with(lambda value: value[index.to(value.device)], by_row=True)
+        return self._with(lambda value: value.index_select(0, index.to(value.device)), by_row=True)
 
     def _with(self, change: Callable[..., Tensor], *others: Self, by_row: bool = False) -> Self:
         """A copy with all tensors changed, each with its counterparts; `by_row`, but those that are shared."""
@@ -211,10 +211,11 @@ def _words(name: str, letters: Tensor) -> tuple[str, ...]:
 
 
 def placed(values: Tensor, rows: Tensor, count: int) -> Tensor:
-    """Figures (R, ...) of the cars `rows` (R,), ascending, among `count` cars; NaN for the others."""
+    """Figures (R, ...) of the cars `rows` (R,), ascending, among `count` cars; NaN, of integers -1, for the others."""
     if len(rows) == count:  # all of them, which is the usual case
         return values
-    return values.new_full((count, *values.shape[1:]), torch.nan).index_copy(0, rows, values)
+    nothing = torch.nan if values.is_floating_point() else -1
+    return values.new_full((count, *values.shape[1:]), nothing).index_copy(0, rows, values)
 
 
 def kept(values: Tensor, condition: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from directshape_torch.config import SearchConfig
 from directshape_torch.geometry import se3
+from directshape_torch.numerics.records import Record
 from directshape_torch.scene import Detections, FrameBatch
 
 
@@ -109,7 +110,7 @@ def following(initial: CarState, start: CarState) -> CarState:
 
 
 @dataclass(frozen=True)
-class CarBatch:
+class CarBatch(Record):
     """What the terms know of B cars beside their pixels; fixed for a whole refinement.
 
     Attributes:
@@ -214,6 +215,5 @@ class CarBatch:
 
     def of_cars(self, keep: Tensor, numbers: Sequence[int] | None = None) -> CarBatch:
         """Those of the cars where `keep` (B,) holds: `numbers` of them, should the host know it, who waits if not."""
-        known = {x.name: getattr(self, x.name) for x in fields(self) if getattr(self, x.name) is not None}
         index = keep.nonzero()[:, 0] if numbers is None else torch.nonzero_static(keep, size=len(numbers))[:, 0]
-        return replace(self, **{name: values.index_select(0, index) for name, values in known.items()})
+        return self.rows(index)
