@@ -19,8 +19,9 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.refinement.observability import cholesky_of_regular
+from directshape_torch.refinement.problem import CarStage
 from directshape_torch.rows import CarSums
-from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
+from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.silhouette import MaskRows
@@ -37,9 +38,7 @@ class Course:
     """The course of a refinement of B cars, as far as the evidence needs it.
 
     Attributes:
-        prior: the shapes.
-        term_names: of the T columns of costs.
-        is_prior_column: (T) which of them say what is known beforehand.
+        stage: the last one.
         before, after: input and final state.
         detector_hwl: (B, 3) metres, of the input.
         cost_before, cost_after: (B, T) at the final stage.
@@ -49,13 +48,10 @@ class Course:
         covariance_xyz_yaw: (B, 4, 4), uncalibrated.
         unsettled: (B,) bool, the iterations ran out.
         profile: photometric cost over the disparity.
-        support: (B,) pixels of the photometric set, float64.
         detector_sigma: (B,) metres, of the input along the viewing ray; not finite where nobody knows it.
     """
 
-    prior: ShapePrior
-    term_names: tuple[str, ...]
-    is_prior_column: list[bool]
+    stage: CarStage
     before: CarState
     after: CarState
     detector_hwl: Tensor
@@ -67,7 +63,6 @@ class Course:
     covariance_xyz_yaw: Tensor
     unsettled: Tensor
     profile: DisparityProfile
-    support: Tensor
     detector_sigma: Tensor
 
 
@@ -81,21 +76,16 @@ class Agreement(NamedTuple):
 
 
 @torch.no_grad()
-def fit_quality(course: Course, masks: MaskRows, photometric: Photometric | None, at: Part | None) -> FitQuality:
-    """Figures of B cars at the end of a refinement.
-
-    Args:
-        course: of the refinement.
-        masks: the rays of both images.
-        photometric: the term of the last stage, and what it says of the end; None without photometry.
-        at: see there.
-    """
-    left, right = mask_ious(masks, course.seen)
+def fit_quality(course: Course) -> FitQuality:
+    """Figures of B cars at the end of a refinement."""
+    stage = course.stage
+    left, right = mask_ious(stage.problem.masks, course.seen)
     nan = torch.full_like(left, torch.nan)
+    photometric, at = stage.photometric, stage.photometric_part(course.figures)
     both = (nan, nan) if photometric is None or at is None else photometric_agreement(photometric, at)
     agreed = Agreement(left, right, *both)
     evidence = evidence_of(course, agreed)
-    better, not_worse = _probabilities(course.term_names, evidence)
+    better, not_worse = _probabilities(stage.problem.term_names, evidence)
     return FitQuality(*agreed, evidence, better, not_worse)
 
 
@@ -149,7 +139,7 @@ def _motion(course: Course) -> dict[str, Tensor]:
     T_obj_cam = torch.stack([course.before.T_obj_cam, course.after.T_obj_cam]).to(torch.float64)
     T_cam_obj = se3.inverse(T_obj_cam)
     T_before, T_after = T_cam_obj
-    dimensions = course.prior.dimensions_and_derivative(course.after.code)
+    dimensions = course.stage.problem.prior.dimensions_and_derivative(course.after.code)
     hwl = dimensions.hwl.to(torch.float64)
     shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
     heading_before, heading_after = rotation_y_from_pose(T_cam_obj)
@@ -217,24 +207,27 @@ def _expected(motion: Tensor, sigma: Tensor, hwl: Tensor) -> tuple[Tensor, Tenso
 
 def _agreement(course: Course, agreement: Agreement) -> dict[str, Tensor]:
     """How well the images agree with the final state, and how many pixels say so."""
+    photometric = course.stage.photometric
+    support = torch.zeros_like(course.figures.cost) if photometric is None else photometric.pixel_set.support
     return {
         "mask_misfit_left": 1 - agreement.mask_iou_left,
         "mask_misfit_right": 1 - agreement.mask_iou_right,
         "log_photometric_error": (agreement.photometric_error_grey.clamp_min(0.1) / 10).log(),
         "unmatched_share": 1 - agreement.matched_share,
-        "log_support": torch.log1p(course.support),
+        "log_support": torch.log1p(support),
         "unsettled": course.unsettled.to(torch.float64),
     }
 
 
 def _costs(course: Course) -> dict[str, Tensor]:
     """What the terms paid before and after, and whether photometry pulls against the others at the end."""
-    silhouettes = [name.startswith("silhouette") for name in course.term_names]
-    photometric = [name == "photometric" for name in course.term_names]
+    names = course.stage.problem.term_names
+    silhouettes = [name.startswith("silhouette") for name in names]
+    photometric = [name == "photometric" for name in names]
     # (T, 2, B): before and after.
     costs = torch.stack([course.cost_before, course.cost_after]).permute(2, 0, 1)
     everything = costs.sum(dim=0)
-    by_kind = (_total(costs, chosen) for chosen in (silhouettes, course.is_prior_column, photometric))
+    by_kind = (_total(costs, chosen) for chosen in (silhouettes, course.stage.is_prior_column, photometric))
     paid = torch.stack([*by_kind, everything])
     log_before, log_after = paid.clamp_min(_TINY).log().unbind(dim=1)
     decrease = log_before - log_after

@@ -112,11 +112,8 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
     information = problem.sharing.with_others(after.information.sum(dim=1), refined)
     covariance = covariance_of(information)[:, :num_kept, :num_kept] + _of_field(end, cars)
     at_input, at_end = (None if at is None else at.where for at in map(stage.photometric_part, (before, after)))
-    term = stage.photometric
     course = Course(
-        prior=problem.prior,
-        term_names=problem.term_names,
-        is_prior_column=stage.is_prior_column,
+        stage=stage,
         before=initial,
         after=end,
         detector_hwl=cars.detector_hwl,
@@ -127,8 +124,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
         unsettled=minimum.status == Status.max_iterations.code,
-        profile=disparity_profile(term, at_input, at_end, len(cars), end.code),
-        support=torch.zeros_like(after.cost) if term is None else term.pixel_set.support,
+        profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
         detector_sigma=detector_pose_sigma(problem.config.priors, cars)[:, 0].detach(),
     )
     seen = stage.information_of_measurements(after)
@@ -145,7 +141,7 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         cost_after=course.cost_after,
         covariance=covariance,
         covariance_xyz_yaw=course.covariance_xyz_yaw,
-        quality=fit_quality(course, problem.masks, term, stage.photometric_part(after)),
+        quality=fit_quality(course),
         # The directions are mostly those of the depth, so its factor brings them to size.
         observability=unseen.scaled(bundled_trust_model().sigma_factors[0]),
         profile=course.profile,

@@ -32,9 +32,7 @@ def course_at_truth() -> Course:
     costs, covariance = at_end.term_costs, covariance_of(at_end.information.sum(dim=1))
     surface = photometric_of(stage).where(seen)
     return Course(
-        prior=prior,
-        term_names=stage.problem.term_names,
-        is_prior_column=stage.is_prior_column,
+        stage=stage,
         before=state,
         after=state,
         detector_hwl=prior.dimensions_and_derivative(state.code).hwl,
@@ -46,7 +44,6 @@ def course_at_truth() -> Course:
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, state.T_obj_cam),
         unsettled=torch.tensor([False, True]),
         profile=disparity_profile(stage.photometric, surface, surface, 2, state.code),
-        support=photometric_of(stage).pixel_set.support,
         detector_sigma=torch.tensor([0.5, 0.25], dtype=torch.float64),
     )
 
@@ -120,7 +117,7 @@ def test_sigmas_are_along_and_across_the_viewing_ray() -> None:
 def test_conflict_is_what_photometry_alone_would_gain() -> None:
     """With a unit matrix and a pull of length 0.2 at a cost of 1: log(1 + 100 * 0.02)."""
     course = course_at_truth()
-    column = course.term_names.index("photometric")
+    column = course.stage.problem.term_names.index("photometric")
     pull, hessian = torch.ones_like(course.figures.gradient), torch.zeros_like(course.figures.hessian)
     pull[:, column] = 0
     pull[:, column, 3] = 0.2
