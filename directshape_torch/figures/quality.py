@@ -109,18 +109,12 @@ class FitQuality(CarRecord):
 
 @dataclass(frozen=True)
 class LogisticHead:
-    """`P = sigmoid(bias + sum_i weights_i clamp((evidence_i - means_i) / scales_i))`.
+    """`P = sigmoid(bias + sum_i weights_i clamp((evidence_i - means_i) / scales_i))`."""
 
-    Attributes:
-        columns: names among `EVIDENCE_NAMES`.
-        means, scales: of these columns over the cars of the fit.
-        weights, bias: fitted.
-    """
-
-    columns: tuple[str, ...]
-    means: tuple[float, ...]
-    scales: tuple[float, ...]
-    weights: tuple[float, ...]
+    columns: tuple[str, ...]  # names among `EVIDENCE_NAMES`
+    means: tuple[float, ...]  # of these columns over the cars of the fit
+    scales: tuple[float, ...]  # likewise
+    weights: tuple[float, ...]  # fitted
     bias: float
 
     def __call__(self, evidence: Tensor) -> Tensor:
@@ -137,23 +131,18 @@ class LogisticHead:
 
 @dataclass(frozen=True)
 class TrustModel:
-    """Everything that was calibrated.
+    """Everything that was calibrated."""
 
-    Attributes:
-        better: probability that the refined box overlaps the true one more than the input does, seen from above.
-        not_worse: that its overlap is at least the input's less 0.05.
-        sigma_factors: of the uncalibrated standard deviations along and across the viewing ray in the ground plane,
-            vertically, and of the heading.
-        sigma_floors: added in quadrature to them, metres and radians: what shapes, masks and surfaces that are not
-            as the model has them cost, however many pixels there are.
-        provenance: where the figures come from.
-    """
-
+    # Probability that the refined box overlaps the true one more than the input does, seen from above
     better: LogisticHead
-    not_worse: LogisticHead
+    not_worse: LogisticHead  # that its overlap is at least the input's less 0.05
+    # Of the uncalibrated standard deviations along and across the viewing ray in the ground plane, vertically, and
+    # of the heading
     sigma_factors: tuple[float, float, float, float]
+    # Added in quadrature to them, metres and radians: what shapes, masks and surfaces that are not as the model has
+    # them cost, however many pixels there are
     sigma_floors: tuple[float, float, float, float]
-    provenance: Mapping[str, Any]
+    provenance: Mapping[str, Any]  # where the figures come from
 
     def calibrated_covariance(
         self,

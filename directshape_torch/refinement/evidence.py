@@ -35,35 +35,21 @@ _SIGMA_FLOORS = (0.05, 0.04, 0.01, 0.1, 0.03)
 
 @dataclass(frozen=True)
 class Course:
-    """The course of a refinement of B cars, as far as the evidence needs it.
+    """The course of a refinement of B cars, as far as the evidence needs it."""
 
-    Attributes:
-        stage: the last one.
-        before, after: input and final state.
-        detector_hwl: (B, 3) metres, of the input.
-        cost_before, cost_after: (B, T) at the final stage.
-        figures: of the energy at the final state.
-        seen: what the rays see there.
-        covariance: (B, D, D) in the tangent of `retract`, uncalibrated.
-        covariance_xyz_yaw: (B, 4, 4), uncalibrated.
-        unsettled: (B,) bool, the iterations ran out.
-        profile: photometric cost over the disparity.
-        detector_sigma: (B,) metres, of the input along the viewing ray; not finite where nobody knows it.
-    """
-
-    stage: CarStage
-    before: CarState
-    after: CarState
-    detector_hwl: Tensor
-    cost_before: Tensor
-    cost_after: Tensor
-    figures: Figures
-    seen: Sight
-    covariance: Tensor
-    covariance_xyz_yaw: Tensor
-    unsettled: Tensor
-    profile: DisparityProfile
-    detector_sigma: Tensor
+    stage: CarStage  # the last one
+    before: CarState  # input
+    after: CarState  # final state
+    detector_hwl: Tensor  # (B, 3) metres, of the input
+    cost_before: Tensor  # (B, T) at the final stage
+    cost_after: Tensor  # likewise
+    figures: Figures  # of the energy at the final state
+    seen: Sight  # what the rays see there
+    covariance: Tensor  # (B, D, D) in the tangent of `retract`, uncalibrated
+    covariance_xyz_yaw: Tensor  # (B, 4, 4), uncalibrated
+    unsettled: Tensor  # (B,) bool, the iterations ran out
+    profile: DisparityProfile  # photometric cost over the disparity
+    detector_sigma: Tensor  # (B,) metres, of the input along the viewing ray; not finite where nobody knows it
 
 
 class Agreement(NamedTuple):

@@ -126,19 +126,12 @@ class CarProblem:
 
 @dataclass(frozen=True)
 class CarStage:
-    """A stage that has begun.
+    """A stage that has begun."""
 
-    Attributes:
-        problem: of B cars.
-        config: of the stage.
-        terms: with pixel sets, counts and widths fixed.
-        after_wider: an earlier stage had a wider contour.
-    """
-
-    problem: CarProblem
-    config: StageConfig
-    terms: tuple[Term, ...]
-    after_wider: bool
+    problem: CarProblem  # of B cars
+    config: StageConfig  # of the stage
+    terms: tuple[Term, ...]  # with pixel sets, counts and widths fixed
+    after_wider: bool  # an earlier stage had a wider contour
 
     @property
     def photometric(self) -> Photometric | None:
@@ -293,23 +286,14 @@ class _Layout:
 
 @dataclass(frozen=True)
 class CarIterations:
-    """The cars of a stage that still move: a `solver.StageProblem`.
+    """The cars of a stage that still move: a `solver.StageProblem`."""
 
-    Attributes:
-        stage: of all cars of the problem.
-        terms: of the B cars that still move, with the rows that can still change.
-        layout: of the blocks of these terms.
-        sums: over these blocks.
-        rest: (B,) cost of the other rows; None where every row is marched at every state.
-        factors, masks, sharing: as in `CarProblem`.
-    """
-
-    stage: CarStage
-    terms: tuple[Term, ...]
-    layout: _Layout
-    sums: CarSums
-    rest: Tensor | None
-    factors: Tensor | None
+    stage: CarStage  # of all cars of the problem
+    terms: tuple[Term, ...]  # of the B cars that still move, with the rows that can still change
+    layout: _Layout  # of the blocks of these terms
+    sums: CarSums  # over these blocks
+    rest: Tensor | None  # (B,) cost of the other rows; None where every row is marched at every state
+    factors: Tensor | None  # as in `CarProblem`, like the next two
     masks: MaskRows
     sharing: Sharing
 

@@ -111,42 +111,25 @@ def following(initial: CarState, start: CarState) -> CarState:
 
 @dataclass(frozen=True)
 class CarBatch(Record):
-    """What the terms know of B cars beside their pixels; fixed for a whole refinement.
+    """What the terms know of B cars beside their pixels; fixed for a whole refinement."""
 
-    Attributes:
-        detection_row: (B,) row of each car among the detections of the call.
-        frame_index: (B,) frame of each car.
-        input_depth: (B,) metres.
-        K_left: (B, 3, 3).
-        K_right: (B, 3, 3).
-        T_right_cam: (B, 4, 4).
-        ground_normal_cam: (B, 3).
-        ground_offset: (B,).
-        detector_hwl: (B, 3).
-        detector_T_cam_obj: (B, 4, 4) input pose.
-        detector_pose_sigma: (B, 4) its standard deviations, see `Detections`, or None.
-        offset_sigma_px: (B,) standard deviation of the unknown offset of the disparity; None where no car has one.
-        field_sigma_px: (B,) that of the rig's disparity field at the car; 0 where the offset is an unknown.
-        track_id: (B,) see `Detections`, or None.
-        time_s, T_world_cam: (B,) and (B, 4, 4) of each car's frame, see `FrameBatch`, or None.
-    """
-
-    detection_row: Tensor
-    frame_index: Tensor
-    input_depth: Tensor
-    K_left: Tensor
-    K_right: Tensor
-    T_right_cam: Tensor
-    ground_normal_cam: Tensor
-    ground_offset: Tensor
-    detector_hwl: Tensor
-    detector_T_cam_obj: Tensor
-    detector_pose_sigma: Tensor | None
+    detection_row: Tensor  # (B,) row of each car among the detections of the call
+    frame_index: Tensor  # (B,) frame of each car
+    input_depth: Tensor  # (B,) metres
+    K_left: Tensor  # (B, 3, 3)
+    K_right: Tensor  # (B, 3, 3)
+    T_right_cam: Tensor  # (B, 4, 4)
+    ground_normal_cam: Tensor  # (B, 3)
+    ground_offset: Tensor  # (B,)
+    detector_hwl: Tensor  # (B, 3)
+    detector_T_cam_obj: Tensor  # (B, 4, 4) input pose
+    detector_pose_sigma: Tensor | None  # (B, 4) its standard deviations, see `Detections`, or None
+    # (B,) standard deviation of the unknown offset of the disparity; None where no car has one
     offset_sigma_px: Tensor | None
-    field_sigma_px: Tensor
-    track_id: Tensor | None
-    time_s: Tensor | None = None
-    T_world_cam: Tensor | None = None
+    field_sigma_px: Tensor  # (B,) that of the rig's disparity field at the car; 0 where the offset is an unknown
+    track_id: Tensor | None  # (B,) see `Detections`, or None
+    time_s: Tensor | None = None  # (B,) of each car's frame, see `FrameBatch`, or None
+    T_world_cam: Tensor | None = None  # (B, 4, 4) likewise
 
     @classmethod
     def from_scene(cls, frames: FrameBatch, detections: Detections, disparity_sigma_px: float = 0.0) -> CarBatch:
