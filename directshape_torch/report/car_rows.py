@@ -9,7 +9,7 @@ from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
-from directshape_torch.report.page_data import known
+from directshape_torch.report.page_parts import known
 from directshape_torch.visualize.drawn_car import is_refined
 
 

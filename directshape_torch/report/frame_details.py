@@ -17,7 +17,7 @@ from directshape_torch.io.result_files import ShapeArrays
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.occlusion import occlusion_map
-from directshape_torch.report.page_data import FRAME_QUALITY, data_url, mesh_data, numbers
+from directshape_torch.report.page_parts import FRAME_QUALITY, data_url, mesh_data, numbers
 from directshape_torch.report.residual_maps import photometric_picture, residual_maps, silhouette_picture
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawing import (

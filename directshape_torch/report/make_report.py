@@ -18,8 +18,7 @@ from directshape_torch.io.stereo_files import FileStereoDataset
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, car_rows, choose_frames
 from directshape_torch.report.frame_details import DetailSettings, FrameMaterial, frame_details
 from directshape_torch.report.frame_inputs import InputReader
-from directshape_torch.report.page_assets import data_block, page_frame
-from directshape_torch.report.page_data import mesh_data
+from directshape_torch.report.page_parts import data_block, mesh_data, page_frame
 from directshape_torch.report.run_facts import run_facts
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.visualize.drawn_car import mean_car

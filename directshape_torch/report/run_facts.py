@@ -13,7 +13,7 @@ from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_manifest import flatten
 from directshape_torch.report.car_rows import CarRow
-from directshape_torch.report.page_data import data_url
+from directshape_torch.report.page_parts import data_url
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
 from directshape_torch.status import Status
 

@@ -14,8 +14,7 @@ from helpers.finished_run import unpacked
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from directshape_torch.report.page_assets import data_block, page_frame
-from directshape_torch.report.page_data import mesh_data, packed
+from directshape_torch.report.page_parts import data_block, mesh_data, packed, page_frame
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.visualize.drawn_car import mean_car
 
