@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -85,6 +86,16 @@ class CarView:
         du, dv = math.ceil(_SURROUNDINGS * (u1 - u0)), math.ceil(_SURROUNDINGS * (v1 - v0))
         return max(u0 - du, 0), max(v0 - dv, 0), min(u1 + du, width), min(v1 + dv, height)
 
+    def show(self, axes: Any, side: Side, title: str = "", *, dimmed: bool = False) -> None:
+        """The window on axes of matplotlib, in pixels; grey and pale where something is to be drawn over it."""
+        u0, v0, u1, v1 = self.window(side)
+        part = self.image(side)[v0:v1, u0:u1]
+        if dimmed:
+            part = np.repeat(part.mean(axis=2, keepdims=True) * 0.55 + 20, 3, axis=2).astype(np.uint8)
+        axes.imshow(part, extent=(u0 - 0.5, u1 - 0.5, v1 - 0.5, v0 - 0.5), interpolation="nearest")
+        axes.set(xlim=(u0 - 0.5, u1 - 0.5), ylim=(v1 - 0.5, v0 - 0.5), xticks=[], yticks=[])
+        axes.set_title(title, fontsize=9)
+
     def panel_aspect(self) -> float:
         """Height over width of a panel that either window fits into, within reason."""
         windows = self.window("left"), self.window("right")
@@ -142,6 +153,13 @@ class CarView:
         if not bool(present[self.car]):
             return []
         return [line - 1 for line in _level_lines(np.pad(mask[self.car].double().cpu().numpy(), 1), 0.5)]
+
+
+def draw_lines(axes: Any, lines: Iterable[Array], ink: Any, label: str | None = None, **style: Any) -> None:
+    """Lines (n, 2) as one entry of the legend."""
+    for line in lines:
+        axes.plot(line[:, 0], line[:, 1], color=ink, label=label, **style)
+        label = None
 
 
 def footprint_of_corners(corners_cam: Array) -> Array:

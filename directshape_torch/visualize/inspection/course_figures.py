@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +12,7 @@ from numpy.typing import NDArray
 from directshape_torch.io.figure_files import figure_picture, new_figure, write_animation, write_figure
 from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.visualize.drawing import Picture
-from directshape_torch.visualize.inspection.car_view import CarView, footprint_of_corners
-from directshape_torch.visualize.inspection.panels import (
-    draw_footprint,
-    draw_lines,
-    iteration_inks,
-    show_birds_eye,
-    show_crop,
-)
+from directshape_torch.visualize.inspection.car_view import CarView, draw_lines, footprint_of_corners
 
 
 def costs_of_car(view: CarView) -> dict[str, NDArray[np.float64]]:
@@ -29,6 +22,7 @@ def costs_of_car(view: CarView) -> dict[str, NDArray[np.float64]]:
     return {**named, "sum": costs.sum(axis=1)}
 
 
+_BIRDS_EYE_MARGIN_M = 0.7
 _ANIMATION_INCHES = (13.5, 3.3)
 _SECONDS_A_STEP, _SECONDS_AT_END = 0.35, 2.5
 
@@ -45,7 +39,7 @@ def animation_frames(view: CarView) -> list[Picture]:
     panels = figure.subplots(1, 4, width_ratios=[2.7, 2.7, 1.9, 1.7])
     *images, above, costs = panels
     for axes, side in zip(images, SIDES, strict=True):
-        show_crop(axes, view.image(side), view.window(side), side)
+        view.show(axes, side, side)
         draw_lines(axes, view.mask_lines(side), "white", linewidth=1.2, linestyle=":")
     figure.suptitle(view.title, fontsize=9)
     show_birds_eye(above, view, view.footprints[view.steps])
@@ -132,7 +126,7 @@ def _draw_contours(row: Any, view: CarView) -> None:
     # The first, an early and the last state: most is done in the first few steps.
     for axes, place in zip(row, (0, min(max(len(inks) // 4, 1), last), last), strict=True):
         title = f"iteration {view.steps[place]}"
-        show_crop(axes, view.image("left"), view.window("left"), title)
+        view.show(axes, "left", title)
         draw_lines(axes, view.mask_lines("left"), "white", "mask", linewidth=1.3, linestyle=":")
         draw_lines(axes, view.contours("left", view.steps[place]), inks[place], linewidth=1.8)
 
@@ -162,3 +156,33 @@ def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:
     axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
+
+
+def iteration_inks(count: int) -> list[Any]:
+    """Colours from dark (the first) to bright (the last)."""
+    from matplotlib import colormaps
+
+    return [tuple(colour) for colour in colormaps["plasma"](np.linspace(0.0, 0.92, max(count, 1)))]
+
+
+def draw_footprint(axes: Any, corners: NDArray[np.float64], ink: Any, label: str | None = None, **style: Any) -> None:
+    """A box seen from above, (4, 2) with the front first, and a stroke from its middle to its front."""
+    closed = np.concatenate([corners, corners[:1]])
+    axes.plot(closed[:, 0], closed[:, 1], color=ink, label=label, **style)
+    stroke = np.stack([corners.mean(axis=0), corners[:2].mean(axis=0)])
+    axes.plot(stroke[:, 0], stroke[:, 1], color=ink, **style)
+
+
+def show_birds_eye(axes: Any, view: CarView, others: Iterable[NDArray[np.float64]]) -> None:
+    """Ground around a car, with the true box where it is known; other footprints (4, 2) must fit in."""
+    shown = [*view.footprints[[0, -1]], footprint_of_corners(view.detector_corners_cam), *others]
+    if view.truth_corners_cam is not None:
+        shown.append(footprint_of_corners(view.truth_corners_cam))
+        draw_footprint(axes, shown[-1], "limegreen", "ground truth", linewidth=2.5)
+    corners = np.concatenate(shown)
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    half = np.ptp(corners, axis=0).max() / 2 + _BIRDS_EYE_MARGIN_M
+    axes.set_aspect("equal")
+    axes.set(xlim=middle[0] + np.array([-half, half]), ylim=middle[1] + np.array([-half, half]))
+    axes.set(xlabel="x [m]", ylabel="z [m]")
+    axes.grid(alpha=0.3)

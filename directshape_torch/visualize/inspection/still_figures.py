@@ -16,8 +16,7 @@ from directshape_torch.observation.occlusion import Side, occlusion_map
 from directshape_torch.observation.packing import car_regions
 from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.observation.sampling import sampled_pixels
-from directshape_torch.visualize.inspection.car_view import CarView
-from directshape_torch.visualize.inspection.panels import draw_lines, show_crop
+from directshape_torch.visualize.inspection.car_view import CarView, draw_lines
 from directshape_torch.visualize.inspection.pixel_residuals import PixelResiduals, car_residuals
 
 _SAMPLING_INCHES, _SAMPLING_ROOM_INCHES = 6.0, 0.8
@@ -71,7 +70,7 @@ def write_sampling_figure(path: Path | str, view: CarView) -> None:
     figure.suptitle(view.title)
     for axes, side in zip(figure.subplots(1, 2), SIDES, strict=True):
         pixels = sampled_pixels_of(view, side)
-        show_crop(axes, view.image(side), view.window(side), f"{side}: {pixels.in_words}")
+        view.show(axes, side, f"{side}: {pixels.in_words}")
         draw_lines(axes, view.mask_lines(side), "white", "mask", linewidth=1.0)
         axes.plot(*pixels.uv.T, ".", color=_INKS[pixels.mode], markersize=4, label=_CHOSEN[pixels.mode])
         axes.legend(loc="lower right", fontsize=8, facecolor="0.3", labelcolor="white")
@@ -108,7 +107,7 @@ def _mean(values: PixelResiduals) -> str:
 
 
 def _backdrop(axes: Any, view: CarView, side: Side, number: int, title: str) -> None:
-    show_crop(axes, view.image(side), view.window(side), title, dimmed=True)
+    view.show(axes, side, title, dimmed=True)
     draw_lines(axes, view.contours(side, number), "cyan", linewidth=0.8)
 
 
