@@ -57,6 +57,7 @@ class CarOfFrame:
         track: of the label.
         given_track: of the detection, another one with `--swap`.
         part: see `RefinementResult.track_part`.
+        not_worse: probability of that against the input, NaN where none is known.
     """
 
     sequence: str
@@ -69,6 +70,7 @@ class CarOfFrame:
     alpha: float
     refined: bool
     status: str
+    not_worse: float
     iou_input: float
     iou: float
     length_m: float
@@ -149,6 +151,7 @@ def _cars(
             alpha=label.alpha,
             refined=status[row].is_refined,
             status=status[row].name,
+            not_worse=float(result.quality.probability_not_worse[row]),
             iou_input=float(before.bev_iou[number]),
             iou=float(errors.bev_iou[number]),
             length_m=float(errors.length_m[number]),
@@ -222,8 +225,8 @@ def table(found: Sequence[CarOfFrame], turn_deg: float) -> list[str]:
 
 
 _HEADING = (
-    "| frames | refined | BEV IoU, input | BEV IoU | worse than input | worse than alone | length, rms "
-    "| near face, rms | far face, rms | s a car and frame |",
+    "| frames | refined | BEV IoU, input | BEV IoU | worse than input, promised and found | worse than alone "
+    "| length, rms | near face, rms | far face, rms | s a car and frame |",
     "|---|---|---|---|---|---|---|---|---|---|",
 )
 _DISTANCE_NAMES = ("0 to 12 m", "12 to 20 m", "20 to 30 m", "beyond")
@@ -249,6 +252,8 @@ def _line(cars: Sequence[CarOfFrame], alone: Sequence[CarOfFrame]) -> str:
     iou, iou_alone = (np.array([car.iou for car in some]) for some in (cars, alone))
     iou_input = np.array([car.iou_input for car in cars])
     shares = [f"{np.mean(iou < other - _WORSE):.1%}" for other in (iou_input, iou_alone)]
+    trusted = [car.not_worse for car in cars if car.refined]
+    shares[0] = f"{np.sum(1 - np.array(trusted)) / len(cars):.1%}, {shares[0]}"
     rms = [f"{_rms([getattr(car, name) for car in cars]):.3f} m" for name in ("length_m", "near_m", "far_m")]
     seconds = np.mean([car.seconds for car in cars])
     refined = f"{np.mean([car.refined for car in cars]):.1%}"

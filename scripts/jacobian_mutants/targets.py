@@ -241,6 +241,7 @@ _IN_PAIRS = "enters as a square, or twice as a factor"
 EQUIVALENTS: tuple[Equivalent, ...] = (
     Equivalent("exp", "torch.bmm(X2, X)", "(torch.bmm(X, X2))", "powers of one matrix commute"),
     Equivalent("tilt_prior_normal", "zero", "(-zero)", _OF_ZERO),
+    Equivalent("NextView.linear", "others", "(-others)", _OF_ZERO),
     Equivalent("_higher_exp_coefficients", "0.5 * angle", "(-(0.5 * angle))", "only the square of its sine is used"),
     Equivalent(
         "project",

@@ -78,6 +78,7 @@ def test_derivatives_are_those_of_autograd_and_of_differences(num_offsets: int, 
     state = disturbed(state)
     at = term.linear(field_of(problem.prior.bind(state.code)), state, term.where(sight))
     J = at.J_residual_inner[..., None] * at.J_inner_state[:, :, None]
+    assert (at.J_residual_inner > 0).double().mean() > 0.5
     ((residual, expected),) = by_autograd([term], problem.prior, state, [at.where])
     torch.testing.assert_close(at.residual, residual, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(J, expected, rtol=1e-9, atol=1e-9)
