@@ -42,7 +42,7 @@ def animation_frames(view: CarView) -> list[Picture]:
         view.show(axes, side, side)
         draw_lines(axes, view.mask_lines(side), "white", linewidth=1.2, linestyle=":")
     figure.suptitle(view.title, fontsize=9)
-    show_birds_eye(above, view, view.footprints[view.steps])
+    _show_from_above(above, view, view.footprints[view.steps])
     _draw_cost_curves(costs, view)
     # The parts find their places once: they would dance if every picture were laid out anew.
     figure_picture(figure)
@@ -51,15 +51,15 @@ def animation_frames(view: CarView) -> list[Picture]:
 
 
 def _frame(figure: Any, panels: Sequence[Any], view: CarView, place: int) -> Picture:
-    inks, number = iteration_inks(len(view.steps)), view.steps[place]
+    inks, number = _inks(len(view.steps)), view.steps[place]
     known = [(axes, len(axes.lines)) for axes in panels]
     *images, above, costs = panels
     figure.suptitle(f"{view.title}, iteration {number}", fontsize=9)
     for axes, side in zip(images, SIDES, strict=True):
         draw_lines(axes, view.contours(side, number), inks[place], linewidth=2.0)
     for earlier in range(place):
-        draw_footprint(above, view.footprints[view.steps[earlier]], inks[earlier], linewidth=0.5)
-    draw_footprint(above, view.footprints[number], inks[place], linewidth=2.0)
+        _draw_footprint(above, view.footprints[view.steps[earlier]], inks[earlier], linewidth=0.5)
+    _draw_footprint(above, view.footprints[number], inks[place], linewidth=2.0)
     costs.axvline(number, color="crimson", linewidth=1.0)
     picture = figure_picture(figure)
     for axes, count in known:
@@ -113,15 +113,15 @@ def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) ->
 
 
 def _draw_from_above(axes: Any, name: str, view: CarView, others: list[Any]) -> None:
-    show_birds_eye(axes, view, others)
+    _show_from_above(axes, view, others)
     names = {view.steps[0]: "input", view.steps[-1]: "last iteration"}
-    for number, ink in zip(view.steps, iteration_inks(len(view.steps)), strict=True):
-        draw_footprint(axes, view.footprints[number], ink, names.get(number), linewidth=1.1)
+    for number, ink in zip(view.steps, _inks(len(view.steps)), strict=True):
+        _draw_footprint(axes, view.footprints[number], ink, names.get(number), linewidth=1.1)
     axes.set_title(name, fontsize=10, color=_INKS[name])
 
 
 def _draw_contours(row: Any, view: CarView) -> None:
-    inks = iteration_inks(len(view.steps))
+    inks = _inks(len(view.steps))
     last = len(inks) - 1
     # The first, an early and the last state: most is done in the first few steps.
     for axes, place in zip(row, (0, min(max(len(inks) // 4, 1), last), last), strict=True):
@@ -158,14 +158,14 @@ def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:
     axes.legend(fontsize=8)
 
 
-def iteration_inks(count: int) -> list[Any]:
+def _inks(count: int) -> list[Any]:
     """Colours from dark (the first) to bright (the last)."""
     from matplotlib import colormaps
 
     return [tuple(colour) for colour in colormaps["plasma"](np.linspace(0.0, 0.92, max(count, 1)))]
 
 
-def draw_footprint(axes: Any, corners: NDArray[np.float64], ink: Any, label: str | None = None, **style: Any) -> None:
+def _draw_footprint(axes: Any, corners: NDArray[np.float64], ink: Any, label: str | None = None, **style: Any) -> None:
     """A box seen from above, (4, 2) with the front first, and a stroke from its middle to its front."""
     closed = np.concatenate([corners, corners[:1]])
     axes.plot(closed[:, 0], closed[:, 1], color=ink, label=label, **style)
@@ -173,12 +173,12 @@ def draw_footprint(axes: Any, corners: NDArray[np.float64], ink: Any, label: str
     axes.plot(stroke[:, 0], stroke[:, 1], color=ink, **style)
 
 
-def show_birds_eye(axes: Any, view: CarView, others: Iterable[NDArray[np.float64]]) -> None:
+def _show_from_above(axes: Any, view: CarView, others: Iterable[NDArray[np.float64]]) -> None:
     """Ground around a car, with the true box where it is known; other footprints (4, 2) must fit in."""
     shown = [*view.footprints[[0, -1]], footprint_of_corners(view.detector_corners_cam), *others]
     if view.truth_corners_cam is not None:
         shown.append(footprint_of_corners(view.truth_corners_cam))
-        draw_footprint(axes, shown[-1], "limegreen", "ground truth", linewidth=2.5)
+        _draw_footprint(axes, shown[-1], "limegreen", "ground truth", linewidth=2.5)
     corners = np.concatenate(shown)
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     half = np.ptp(corners, axis=0).max() / 2 + _BIRDS_EYE_MARGIN_M
