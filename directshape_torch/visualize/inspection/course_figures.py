@@ -51,7 +51,7 @@ def animation_frames(view: CarView) -> list[Picture]:
 
 
 def _frame(figure: Any, panels: Sequence[Any], view: CarView, place: int) -> Picture:
-    inks, number = _inks(len(view.steps)), view.steps[place]
+    inks, number = _step_inks(len(view.steps)), view.steps[place]
     known = [(axes, len(axes.lines)) for axes in panels]
     *images, above, costs = panels
     figure.suptitle(f"{view.title}, iteration {number}", fontsize=9)
@@ -115,13 +115,13 @@ def write_drift_figure(path: Path | str, full: CarView, silhouettes: CarView) ->
 def _draw_from_above(axes: Any, name: str, view: CarView, others: list[Any]) -> None:
     _show_from_above(axes, view, others)
     names = {view.steps[0]: "input", view.steps[-1]: "last iteration"}
-    for number, ink in zip(view.steps, _inks(len(view.steps)), strict=True):
+    for number, ink in zip(view.steps, _step_inks(len(view.steps)), strict=True):
         _draw_footprint(axes, view.footprints[number], ink, names.get(number), linewidth=1.1)
     axes.set_title(name, fontsize=10, color=_INKS[name])
 
 
 def _draw_contours(row: Any, view: CarView) -> None:
-    inks = _inks(len(view.steps))
+    inks = _step_inks(len(view.steps))
     last = len(inks) - 1
     # The first, an early and the last state: most is done in the first few steps.
     for axes, place in zip(row, (0, min(max(len(inks) // 4, 1), last), last), strict=True):
@@ -158,7 +158,7 @@ def _draw_distances(axes: Any, views: dict[str, CarView]) -> None:
     axes.legend(fontsize=8)
 
 
-def _inks(count: int) -> list[Any]:
+def _step_inks(count: int) -> list[Any]:
     """Colours from dark (the first) to bright (the last)."""
     from matplotlib import colormaps
 
