@@ -62,24 +62,15 @@ class GridSpec:
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How a mesh file is to be read and made solid.
+    """How a mesh file is to be read and made solid."""
 
-    Attributes:
-        forward_axis, up_axis: the file's axes that point to the car's front and up: "+x", "-x", "+y", ...
-        scale: metres per unit of the file.
-        length_m: scale the car to this length (after `scale`); None keeps it.
-        symmetrise: average the field with its left-right mirror image.
-        voxel_m: fine voxel size.
-        closing_m: gaps up to twice this wide are closed. Narrower closings are tried first.
-    """
-
-    forward_axis: str = "+x"
+    forward_axis: str = "+x"  # the file's axes that point to the car's front and up: "+x", "-x", "+y",
     up_axis: str = "+z"
-    scale: float = 1.0
-    length_m: float | None = None
-    symmetrise: bool = True
-    voxel_m: float = 0.025
-    closing_m: float = 0.2
+    scale: float = 1.0  # metres per unit of the file
+    length_m: float | None = None  # scale the car to this length (after `scale`); None keeps it
+    symmetrise: bool = True  # average the field with its left-right mirror image
+    voxel_m: float = 0.025  # fine voxel size
+    closing_m: float = 0.2  # gaps up to twice this wide are closed. Narrower closings are tried first
 
     def __post_init__(self) -> None:
         for name, axis in (("forward_axis", self.forward_axis), ("up_axis", self.up_axis)):

@@ -25,16 +25,11 @@ _CONVERGED_PX = 0.02
 
 
 class PatchLimits(NamedTuple):
-    """Size of the patches, and what a reliable alignment is.
+    """Size of the patches, and what a reliable alignment is."""
 
-    Attributes:
-        radius_px: patches are 2 radius + 1 pixels wide.
-        change_px: from the start at most, in u and in v.
-        sigma_px: standard deviations of u and v at most, for residuals of one grey level; a weaker patch says little.
-    """
-
-    radius_px: int
-    change_px: float
+    radius_px: int  # patches are 2 radius + 1 pixels wide
+    change_px: float  # from the start at most, in u and in v
+    # Standard deviations of u and v at most, for residuals of one grey level; a weaker patch says little.
     sigma_px: tuple[float, float]
 
 

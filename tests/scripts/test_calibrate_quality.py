@@ -155,8 +155,8 @@ def test_runs_learn_of_rig_and_detector_before_they_refine() -> None:
 
 
 def test_cars_that_are_kept_make_model_and_report(tmp_path: Path) -> None:
-    simulated(480).save(tmp_path / "out" / "cars_masks_0.npz")
-    simulated(48).save(tmp_path / "out" / "cars_kitti_noisy.npz")
+    simulated(480, frames=4).save(tmp_path / "out" / "cars_masks_0.npz")
+    simulated(48, frames=4).save(tmp_path / "out" / "cars_kitti_noisy.npz")
     arguments = ["--data", ".", "--exact", ".", "--masks", "masks", "--seeds", "0"]
     arguments += ["--other", "kitti", "noisy", "m", "--out"]
     model = tmp_path / "model.json"
