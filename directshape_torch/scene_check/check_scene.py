@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene import Detections, FrameBatch
@@ -19,6 +18,7 @@ from directshape_torch.scene_check.check_pair import SPOILS_PAIR, check_images
 from directshape_torch.scene_check.check_stereo import check_distances, check_swapped, measure_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 from directshape_torch.scene_check.finding import found as found_mistake
+from directshape_torch.stereo_matching.disparity import rgb8
 
 # Left and right image, (H, W, 3) RGB.
 Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
@@ -72,7 +72,7 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
         as_numbers = {side: K.detach().double().cpu().numpy() for side, K in matrices.items()}
         found += check_calibration(as_numbers, float(camera.baseline[number]), (height, width), where)
         left, right = (images[number, :, :height, :width] for images in (frames.images_left, frames.images_right))
-        pairs.append((_bytes(left), _bytes(right)))
+        pairs.append((rgb8(left), rgb8(right)))
     found = _once(found)
     usable = not names(found) & SPOILS_CAMERA
     evidence = evidence_of_scene(frames, detections)
@@ -107,13 +107,6 @@ def check_cars(frames: Sequence[FrameEvidence], pairs: Sequence[Pair | None]) ->
         return [*of_boxes, *(found for found in of_masks if found.check != "masks_elsewhere" or not explained)]
     found = [*of_boxes, *check_corners(frames), *check_masks(frames)]
     return [*found, *check_distances(cars), *check_heading(frames)]
-
-
-def _bytes(
-    image: Tensor,  # (3, H, W)
-) -> NDArray[np.uint8]:  # (H, W, 3)
-    values = (255 * image.detach().float().nan_to_num(nan=0.0)).clamp(0, 255).round().byte()
-    return np.ascontiguousarray(values.permute(1, 2, 0).cpu().numpy())
 
 
 def _once(findings: Sequence[Finding]) -> list[Finding]:
