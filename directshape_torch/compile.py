@@ -336,7 +336,7 @@ def _compiled(function: Callable[_P, _R], on_compilation: Callable[[int], None])
 
     def keep_all(guards: Sequence[object]) -> list[bool]:
         on_compilation(len(guards))
-        return [True] * len(guards)
+        return [not guard.is_global for guard in guards]
 
     options = _OPTIONS | {"guard_filter_fn": keep_all}
     return torch.compile(function, fullgraph=True, dynamic=False, options=options, recompile_limit=_MOST_FORMS)  # type: ignore[call-overload, no-any-return]
