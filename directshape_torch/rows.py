@@ -140,8 +140,9 @@ class Rays(NamedTuple):
 
     def in_objects(self, T_obj_cam: Tensor) -> ObjectRays:
         """The rays in the frames of their cars, by the poses (B, 4, 4) of the cars."""
-        # Columns of R and the translation, (3, M, 1) each.
-        x_axis, y_axis, z_axis, moved = T_obj_cam[self.owner, :3].permute(2, 1, 0)[..., None].unbind(0)
+        # Columns of R and the translation, (3, M, 1) each. One coordinate after the other in memory, for all that is made
+        # of them lies likewise: else each operation goes through it in runs of 64.
+        x_axis, y_axis, z_axis, moved = T_obj_cam[self.owner, :3].permute(2, 1, 0).contiguous()[..., None].unbind(0)
         (cx, cy, cz), (x, y, z) = self.centre_cam.mT[..., None].unbind(0), self.ray_cam.unbind(0)
         centre = torch.addcmul(torch.addcmul(torch.addcmul(moved, x_axis, cx), y_axis, cy), z_axis, cz)
         direction = torch.addcmul(torch.addcmul(x_axis * x, y_axis, y), z_axis, z)
