@@ -140,8 +140,8 @@ class Rays(NamedTuple):
 
     def in_objects(self, T_obj_cam: Tensor) -> ObjectRays:
         """The rays in the frames of their cars, by the poses (B, 4, 4) of the cars."""
-        # Columns of R and the translation, (3, M, 1) each. One coordinate after the other in memory, for all that is made
-        # of them lies likewise: else each operation goes through it in runs of 64.
+        # Columns of R and the translation, (3, M, 1) each. One coordinate after the other in memory: what is made of
+        # them lies likewise, and else each operation would go through it in runs of 64.
         x_axis, y_axis, z_axis, moved = T_obj_cam[self.owner, :3].permute(2, 1, 0).contiguous()[..., None].unbind(0)
         (cx, cy, cz), (x, y, z) = self.centre_cam.mT[..., None].unbind(0), self.ray_cam.unbind(0)
         centre = torch.addcmul(torch.addcmul(torch.addcmul(moved, x_axis, cx), y_axis, cy), z_axis, cz)
@@ -170,7 +170,7 @@ class ObjectRays(NamedTuple):
     def interval(self, bounds_obj: Tensor) -> Interval:
         """Where the rays are inside bounds (2, 3), in front of their camera."""
         direction = self.direction_obj
-        inverse = 1 / torch.where(direction.abs() < _LEAST_DIRECTION, _LEAST_DIRECTION, direction)
+        inverse = 1 / torch.copysign(direction.abs().clamp_min(_LEAST_DIRECTION), direction)
         to_lower, to_upper = (bounds_obj[..., None, None] - self.centre_obj) * inverse
         enters, leaves = torch.minimum(to_lower, to_upper), torch.maximum(to_lower, to_upper)
         near, far = enters.amax(0).clamp_min(0), leaves.amin(0)

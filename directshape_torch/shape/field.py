@@ -29,8 +29,8 @@ class Field(Protocol):
         """Gradient (3, ..., M, R), a constant."""
         ...
 
-    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
-        """Value, gradient and code derivative; `constant`: nothing will be differentiated again."""
+    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
+        """Value, gradient and code derivative; `constant`: nothing will be differentiated again; `inside` as above."""
         ...
 
     def minimum_along(
@@ -62,8 +62,8 @@ class Grids(NamedTuple):
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
         return gradient_at(self.grids, points_obj, owner[:, None])
 
-    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
-        return derivatives_at(self.grids, points_obj, owner[:, None], constant)
+    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
+        return derivatives_at(self.grids, points_obj, owner[:, None], constant, inside)
 
     def minimum_along(
         self,
@@ -92,7 +92,7 @@ class PackedField(NamedTuple):
     def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
         return self.derivatives(points_obj, owner, constant=True).gradient.detach()
 
-    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False) -> Lookup:
+    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
         at = self.shape.value_and_derivatives(*_packed(points_obj, owner))
         leading = points_obj.shape[1:]
         return Lookup(

@@ -113,7 +113,7 @@ def _cells_along(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Cells per metre of depth (3, M, R), lower node (M, R) of the cell at a depth, and the place (3, M, R) in it."""
     step = direction_obj * (1 / field.spacing_m)
-    step = torch.where(step.abs() < _NO_STEP, _NO_STEP, step)
+    step = torch.copysign(step.abs().clamp_min(_NO_STEP), step)
     position = torch.addcmul(field.positions(centre_obj), depth, step)
     lower = (position + _ON_FACE).floor().clamp_min(0).minimum(field.last_nodes(position) - 1)
     return step, field.nodes_of(field.lower_nodes(lower), owner[:, None]), position - lower

@@ -111,7 +111,8 @@ class GridField(NamedTuple):
 
     def steps(self, cells: Tensor) -> Tensor:
         """What moves (3, ...) by whole cells, in floating point, add to the flat index (...) of a node."""
-        return (cells * self.along_axes(self._strides, cells)).sum(0).int()
+        (of_x, of_y, _), (x, y, z) = self._strides, cells.unbind(0)
+        return torch.add(torch.add(z, y, alpha=of_y), x, alpha=of_x).int()
 
     def lower_nodes(self, cells: Tensor) -> Tensor:
         """Flat index (...), within one grid, of the lower corners of cells (3, ...); a valid one of a NaN cell too."""
@@ -124,7 +125,7 @@ class GridField(NamedTuple):
 
     def nodes_of(self, node: Tensor, object_index: Tensor) -> Tensor:
         """Flat index (...) among the nodes of all grids, from that within the grid of an object; 32 bits, for speed."""
-        return node + (object_index * self.num_nodes).int()
+        return torch.add(node, object_index.int(), alpha=self.num_nodes)
 
     def at_corners(self, node: Tensor) -> Ends:
         """Flat indices (8, ...) of the corners of cells, z outermost: 000, 100, 010, 110, 001, 101, 011, 111."""
@@ -215,13 +216,16 @@ def value_at(field: GridField, points_obj: Tensor, object_index: Tensor, inside:
     return value if inside else torch.add(value, cells.outward[1], alpha=field.spacing_m)
 
 
-def derivatives_at(field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False) -> Lookup:
+def derivatives_at(
+    field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False, inside: bool = False
+) -> Lookup:
     """Value, exact gradient of the trilinear lookup and of its continuation, and code derivative, in one pass.
 
-    With `constant` nothing will be differentiated again, which allows a faster sum over the corners' basis vectors.
+    With `constant` nothing will be differentiated again, which allows a faster sum over the corners' basis vectors;
+    `inside` as in `value_at`.
     """
     cells = cells_at(field, points_obj)
-    value, gradient = _value_and_gradient(field, cells, object_index)
+    value, gradient = _value_and_gradient(field, cells, object_index, inside)
     table, corners = field.basis.flatten(0, 2), field.at_corners(cells.lower_node)
     if constant and isinstance(corners, Tensor):
         return Lookup(value, gradient, _summed(table, corners, cells.fraction))
@@ -234,7 +238,9 @@ def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> T
     return _value_and_gradient(field, cells_at(field, points_obj), object_index)[1]
 
 
-def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor) -> tuple[Tensor, Tensor]:
+def _value_and_gradient(
+    field: GridField, cells: Cells, object_index: Tensor, in_grid: bool = False
+) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
     lower, along_z = halves(corner_values(field, field.nodes_of(cells.lower_node, object_index)))
     lower, along_y = halves(moved(lower, fz, along_z))
@@ -242,8 +248,11 @@ def _value_and_gradient(field: GridField, cells: Cells, object_index: Tensor) ->
     inside = moved(lowest, fx, along_x)[0]
     along_z = _between(along_z, fy)
     slope = torch.stack([x[0] for x in (along_x, _between(along_y, fx), _between(along_z, fx))])
+    slope = slope * (1 / field.spacing_m)
+    if in_grid:
+        return inside, slope
     outward, distance = cells.outward
-    gradient = torch.where(outward == 0, slope * (1 / field.spacing_m), outward / distance)
+    gradient = torch.where(outward == 0, slope, outward / distance)
     return torch.add(inside, distance, alpha=field.spacing_m), gradient
 
 

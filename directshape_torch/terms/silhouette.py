@@ -29,7 +29,6 @@ from directshape_torch.depth import (
     tracked_closest,
 )
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
-from directshape_torch.numerics.tensors import cross
 from directshape_torch.rows import Blocks, CarSums, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.shape.sdf_grid import Lookup
@@ -222,7 +221,7 @@ class Silhouettes:
         constant = nothing_is_differentiated()
         depth = now.depth if constant else attached_closest_depth(field, self.rows.rays.owner, rays, now)
         points = rays.at(depth)
-        at = field.derivatives(points, self.rows.rays.owner, constant)
+        at = field.derivatives(points, self.rows.rays.owner, constant, inside=True)
         gradient = along_face(at.gradient, rays.direction_obj, now.face_obj)
         residual, J_residual_sdf = self._of_distance(at.value, now.crosses)
         return Linear(residual[..., None], J_residual_sdf[..., None], sdf_state_jacobian(points, gradient, at), now)
@@ -291,8 +290,9 @@ def sdf_state_jacobian(
     T_obj_cam`, so a point fixed in the camera frame moves in the object frame by `v + omega x X` (paper, supplement,
     generators of SE(3)).
     """
-    points, gradient = points_obj.movedim(0, -1), gradient.movedim(0, -1)
-    return torch.cat([gradient, cross(points, gradient), at.J_value_code], dim=-1)
+    (x, y, z), (u, v, w) = points_obj.unbind(0), gradient.unbind(0)
+    J_sdf_pose = torch.stack([u, v, w, y * w - z * v, z * u - x * w, x * v - y * u], dim=-1)
+    return torch.cat([J_sdf_pose, at.J_value_code], dim=-1)
 
 
 class Samples(NamedTuple):
