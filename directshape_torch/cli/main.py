@@ -19,7 +19,7 @@ EXIT_OUTPUT_CLOSED = 141
 EXIT_TERMINATED = 143
 
 # Each module has a docstring that is the command's help, `add_options(parser)` and `run(args) -> int`, whose errors
-# `main` shows; it imports what is heavy inside `run`.
+# `main` shows.
 COMMANDS = (
     "refine",
     "status",

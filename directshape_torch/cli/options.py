@@ -242,11 +242,12 @@ def prior_of_run(source: str | None, run: RunFolder) -> ShapePrior | None:
 
 def _fields_of_run(rig: str, run: RunFolder) -> tuple[DisparityField, ...]:
     """The disparity fields that a run was made with, of its own folder or of the file that `--rig` names, no others."""
-    own = run.path / RIG_FILE
-    if rig == "none" and not own.is_file():
+    own, wanted = run.path / RIG_FILE, run.manifest.sha256["stereo_bias"]
+    # An estimate of an earlier run may still lie in the folder of one that was made without.
+    if rig == "none" and (wanted is None or not own.is_file()):
         return ()
     path = own if rig == "none" else Path(rig)
     fields = load_fields(path)
-    if hash_fields(fields) != run.manifest.sha256["stereo_bias"]:
+    if hash_fields(fields) != wanted:
         raise InputError("--rig", "the disparity fields that the run was made with", f"others in {path}")
     return fields

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,11 +113,11 @@ def run(args: argparse.Namespace) -> int:
         )
     dataset = dataset_of(args)
     refiner.config = _warned_of(dataset, refiner.config)
-    rigs = _rigs_of_run(dataset, args.rig, args.out, args.fresh)
+    rigs, are_new = _rigs_of_run(dataset, args.rig, args.out, args.fresh)
     if rigs:
         dataset = dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
         refiner.rig = RigEstimates(rigs)
-    with ProgressBar() as progress:
+    with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, workers, fresh=args.fresh)
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
@@ -138,22 +139,35 @@ def _warned_of(dataset: FileStereoDataset, config: RefinerConfig) -> RefinerConf
     return replace(config, check="off")
 
 
-def _rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool) -> list[RigEstimate]:
-    """The estimates that `--rig` names: those of a file, or of the run's folder, made where there are none."""
+def _rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool) -> tuple[list[RigEstimate], bool]:
+    """The estimates that `--rig` names, and whether they are new: those of a file, or of the run's folder, made where
+    there are none."""
     if rig != "auto":
-        return load_rigs(rig) if rig != "none" and holds_rigs(rig) else []
+        return load_rigs(rig) if rig != "none" and holds_rigs(rig) else [], False
     path = out_dir / RIG_FILE
     # Whatever lies there is not overwritten, unless it is an estimate.
     kept = load_rigs(path) if path.is_file() else None
     if kept is not None and not fresh:
         for estimate in kept:
             print(f"{estimate} (kept)")
-        return kept
+        return kept, False
     with Bar(desc="rig", unit="frame", file=sys.stderr) as bar:
         rigs = estimate_rigs(dataset, lambda _: bar.update())
-    save_rigs(path, rigs)
-    if rigs:
-        write_png(out_dir / RIG_PICTURE, draw_rigs(rigs))
     for estimate in rigs:
         print(estimate)
-    return rigs
+    return rigs, True
+
+
+class _Progress(ProgressBar):
+    """Also writes new estimates, once the folder is this run's: one that is refused leaves it as it was."""
+
+    def __init__(self, out_dir: Path, new_rigs: list[RigEstimate] | None) -> None:
+        super().__init__()
+        self._out_dir, self._new_rigs = out_dir, new_rigs
+
+    def started(self, frame_ids: Sequence[str]) -> None:
+        if self._new_rigs is not None:
+            save_rigs(self._out_dir / RIG_FILE, self._new_rigs)
+        if self._new_rigs:
+            write_png(self._out_dir / RIG_PICTURE, draw_rigs(self._new_rigs))
+        super().started(frame_ids)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from directshape_torch.evaluation.comparison import WORSE_BY_BEV_IOU
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.io.run_manifest import flatten
+from directshape_torch.io.run_manifest import flatten, hash_fields
 from directshape_torch.report.car_rows import CarRow
 from directshape_torch.report.page_parts import data_url
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, load_rigs
@@ -39,17 +38,19 @@ def run_facts(
         "settings": {name: str(value) for name, value in sorted(flatten(manifest.config).items())},
         "errors": _mean_errors(rows),
         "notes": list(notes),
-        "rig": _rig(run.path),
+        "rig": _rig(run),
     }
 
 
-def _rig(out_dir: Path) -> dict[str, Any] | None:
+def _rig(run: RunFolder) -> dict[str, Any] | None:
     """What the run estimated of its rigs, in words and as a picture; None where it did not."""
-    words, picture = out_dir / RIG_FILE, out_dir / RIG_PICTURE
-    if not words.is_file():
+    words, picture, wanted = run.path / RIG_FILE, run.path / RIG_PICTURE, run.manifest.sha256["stereo_bias"]
+    if wanted is None or not words.is_file():
         return None
-    url = data_url(read_rgb(picture)) if picture.is_file() else None
-    return {"words": [str(rig) for rig in load_rigs(words)], "picture": url}
+    rigs = load_rigs(words)
+    if hash_fields([rig.field for rig in rigs]) != wanted:  # an earlier run's
+        return None
+    return {"words": [str(rig) for rig in rigs], "picture": data_url(read_rgb(picture)) if picture.is_file() else None}
 
 
 def _statuses(rows: Sequence[CarRow]) -> list[dict[str, Any]]:

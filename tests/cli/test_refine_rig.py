@@ -75,3 +75,21 @@ def test_what_is_no_estimate_is_not_overwritten(
     assert main(command(source, tmp_path, "--fresh")) == 2
     assert "is no file of rigs" in capsys.readouterr().err
     assert (tmp_path / "rig.json").read_text() == "{}"
+
+
+def test_a_refused_run_leaves_the_folder_as_it_was(source: Path, tmp_path: Path) -> None:
+    out, none = tmp_path / "out", ("--rig", "none")
+    assert main(command(source, out, *none)) == 0
+    assert main(command(source, out)) == 2
+    assert main(command(source, source / "detections")) == 2
+    assert not list(tmp_path.rglob("rig.*"))
+    assert main(command(source, out, *none)) == 0
+
+
+def test_a_run_without_a_rig_has_none_of_an_earlier_run(source: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert main(command(source, out)) == 0
+    line = str(load_rigs(out / "rig.json")[0]).partition(";")[0]
+    assert main(command(source, out, "--rig", "none", "--fresh")) == 0
+    assert main(["report", str(out), "--data", str(source)]) == 0
+    assert line not in (out / "report.html").read_text()

@@ -16,6 +16,8 @@ from helpers.synthetic_scene import cached_street
 
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.result_files import read_shapes, write_shapes
+from directshape_torch.io.run_folder import read_record, summary_path
+from directshape_torch.io.run_manifest import hash_fields, write_manifest
 from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, save_rigs
@@ -35,11 +37,17 @@ PATIENCE_S = 40.0
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = finished_run(tmp_path_factory.mktemp("browser"), FRAMES, out_name=OUT_NAME, car_type=CAR_TYPE)
+    _, scene = cached_street()
+    rig = RigEstimate.of_frames(scene.frames)
+    save_rigs(run.out / RIG_FILE, [rig])
+    known = run.folder().manifest
+    manifest = replace(known, sha256={**known.sha256, "stereo_bias": hash_fields([rig.field])})
+    write_manifest(summary_path(run.out), manifest)
     # The first car goes through all frames, in the last one as somebody else.
     for path, part in zip(sorted((run.out / "shapes").iterdir()), (0, 0, 1), strict=True):
-        write_shapes(path, replace(read_shapes(path), tracks=(TRACK, ""), track_parts=np.array([part, -1])))
-    _, scene = cached_street()
-    save_rigs(run.out / RIG_FILE, [RigEstimate.of_frames(scene.frames)])
+        shapes = read_shapes(path)
+        made_of = replace(read_record(path, shapes), run=manifest.hash).text()
+        write_shapes(path, replace(shapes, tracks=(TRACK, ""), track_parts=np.array([part, -1]), made_of=made_of))
     write_png(run.out / RIG_PICTURE, np.zeros((40, 3000, 3), np.uint8))
     return make_report(run.folder(), run.out.parent / "a page#1.html", run.dataset, run.prior).path
 
