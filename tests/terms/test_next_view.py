@@ -135,6 +135,17 @@ def test_pixels_count_that_the_next_view_shows() -> None:
     torch.testing.assert_close(hidden.block_weight[:1], term.block_weight[:1])
 
 
+@pytest.mark.parametrize("unread", [0.0, 1.0, torch.nan])
+def test_a_next_view_without_a_left_mask_shows_nothing(unread: float) -> None:
+    frames, detections = drive()
+    masks, has_mask = detections.mask_left.clone(), detections.has_mask_left.clone()
+    masks[2], has_mask[2] = unread, False
+    term, _ = begun(*at_truth(frames, replace(detections, mask_left=masks, has_mask_left=has_mask)))
+    counted = term.row_weight[..., 0].sum(dim=1)
+    assert (counted[term.blocks.owner == 0] == 0).all()
+    assert (counted[term.blocks.owner == 1] > 0).any()
+
+
 def test_the_exposure_of_the_next_frame_does_not_matter() -> None:
     frames, detections = drive()
     darker = frames.images_left.clone()
