@@ -232,6 +232,9 @@ class Detections(TensorRecord):
             with values above 1.5 (logits, 0..255) are refused when they are read, in a refinement.
     """
 
+    # Other instances may hide any of the cars.
+    shared = frozenset({"occluders"})
+
     frame_index: Annotated[Tensor, Dense("B", kind="index")]
     T_cam_obj: Annotated[Tensor, Dense("B", 4, 4)]
     dimensions_hwl: Annotated[Tensor, Dense("B", 3)]

@@ -358,6 +358,16 @@ def test_occluders_have_as_many_masks_as_depths() -> None:
         Occluders(torch.zeros(2).long(), torch.zeros(2, 4, 4), torch.zeros(2, 4, 4), torch.zeros(3), torch.zeros(2))
 
 
+def test_whoever_hides_cars_hides_whichever_are_chosen() -> None:
+    masks = torch.zeros(3, 120, 160)
+    occluders = Occluders(torch.zeros(3).long(), masks, masks, torch.ones(3), torch.ones(3))
+    detections = replace(cached_street()[1].detections.to(torch.float32), occluders=occluders)
+    second = detections.rows(torch.tensor([1]))
+    assert second.T_cam_obj.equal(detections.T_cam_obj[1:])
+    assert second.occluders is not None
+    assert len(second.occluders.depth_m) == 3
+
+
 def test_letters_stand_for_any_size() -> None:
     check_shape("points", torch.zeros(0, 3), ("P", 3))
     with pytest.raises(InputError, match=r"points: expected shape \(P, 3\), got \(3,\); stack them"):

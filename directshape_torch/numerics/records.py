@@ -74,13 +74,15 @@ class Record:
         return self._with(lambda value: value.index_select(0, index.to(value.device)), by_row=True)
 
     def _with(self, change: Callable[..., Tensor], *others: Self, by_row: bool = False) -> Self:
-        """A copy with all tensors changed, each with its counterparts; `by_row`, but those that are shared."""
+        """A copy with all tensors changed, each with its counterparts; `by_row`, but what is shared."""
         changed: dict[str, Any] = {}
         for each in fields(self):  # type: ignore[arg-type]
             value, *theirs = (getattr(record, each.name) for record in (self, *others))
+            if by_row and each.name in self.shared:
+                continue
             if isinstance(value, Record):
                 changed[each.name] = value._with(change, *theirs, by_row=by_row)
-            elif isinstance(value, Tensor) and not (by_row and each.name in self.shared):
+            elif isinstance(value, Tensor):
                 changed[each.name] = change(value, *theirs)
         return replace(self, **changed)  # type: ignore[type-var]
 
