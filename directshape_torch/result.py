@@ -363,7 +363,8 @@ def _chosen_rows(index: object, count: int) -> Tensor:
         raise InputError("index", _cars_in_words(count), shown(index)) from error
     if rows.ndim > 1:
         raise InputError("index", _cars_in_words(count), shown(index))
-    return torch.from_numpy(rows)
+    # PyTorch knows no strides below 0.
+    return torch.from_numpy(rows.copy())
 
 
 def _cars_in_words(count: int) -> str:

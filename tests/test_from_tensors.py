@@ -132,7 +132,8 @@ def test_masks_are_asked_for_by_name() -> None:
 def test_results_are_indexed_like_tensors() -> None:
     result = refined()
     assert len(result) == 2
-    for index, rows in ((1, [1]), (-1, [1]), (slice(None), [0, 1]), (slice(0, 0), []), ([1, 0], [1, 0])):
+    turned, nothing = (slice(None, None, -1), [1, 0]), (slice(0, 0), [])
+    for index, rows in ((1, [1]), (-1, [1]), (slice(None), [0, 1]), turned, nothing, ([1, 0], [1, 0])):
         part = result[index]
         torch.testing.assert_close(part.T_cam_obj, result.T_cam_obj[rows])
         torch.testing.assert_close(part.quality.mask_iou_left, result.quality.mask_iou_left[rows])
