@@ -46,7 +46,7 @@ def load_rigs(path: Path | str) -> list[RigEstimate]:
     try:
         return [RigEstimate.of_content(entry) for entry in content["rigs"]]
     except (KeyError, TypeError, InputError) as error:
-        raise DataFormatError(path, f"is damaged ({error!r})", cure=_CURE) from error
+        raise DataFormatError(path, f"is damaged ({error.__cause__ or error!r})", cure=_CURE) from error
 
 
 def save_field(field: DisparityField, path: Path | str) -> None:

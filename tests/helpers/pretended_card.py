@@ -200,7 +200,7 @@ _constants: dict[Any, Any] = {}
 
 
 def _kept(constants: Any, values: Any, like: Tensor, make: Callable[[torch.dtype, torch.device], Any]) -> Any:
-    """As `device_constants` keeps constants of plain tensors, which those of a real card are."""
+    """As `numerics.tensors` keeps constants of plain tensors, which those of a real card are."""
     key = (id(constants), values, like.dtype, like.device)
     if key not in _constants:
         _constants[key] = make(like.dtype, like.device)

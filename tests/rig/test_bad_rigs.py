@@ -94,8 +94,9 @@ def test_a_damaged_file_is_named(tmp_path: Path, damage: Callable[[dict[str, Any
     content = json.loads(path.read_text())
     damage(content)
     path.write_text(json.dumps(content))
-    with pytest.raises(DataFormatError, match=r"rig\.json.*calibrate-rig"):
+    with pytest.raises(DataFormatError, match=r"rig\.json.*calibrate-rig") as raised:
         load_rigs(path)
+    assert "another" not in str(raised.value), "what is wrong, not what it was taken for"
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{"])
