@@ -91,6 +91,8 @@ def make_report(
             for part, value in frame_details(material, settings).items():
                 file.write(data_block(f"{part}-{number}", value))
             observer.finished(run.frame_ids[number], None)
+        for what in reader.problems:  # said of all frames
+            detail_reader.problems.pop(what, None)
         notes = [
             *_notes(run, reader, prior, prior_was_given, len(detailed)),
             *reader.notes(len(run.frame_ids)),
