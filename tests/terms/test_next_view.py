@@ -146,6 +146,47 @@ def test_a_next_view_without_a_left_mask_shows_nothing(unread: float) -> None:
     assert (counted[term.blocks.owner == 1] > 0).any()
 
 
+def shifted(values: Tensor, row: int, by: int) -> Tensor:
+    """Values (N, ..., W) of which one row has lost its first columns, padded behind."""
+    values = values.clone()
+    values[row] = torch.nn.functional.pad(values[row, ..., by:], (0, by))
+    return values
+
+
+@pytest.mark.parametrize("stage", [0, 1])
+def test_the_next_frame_may_have_another_camera_and_size(stage: int) -> None:
+    frames, detections = drive()
+    whole, sight = begun(*at_truth(frames, detections), stage)
+    K_left, K_right = frames.camera.K_left.clone(), frames.camera.K_right.clone()
+    K_left[1, 0, 2] -= 8
+    K_right[1, 0, 2] -= 8
+    images = {name: shifted(getattr(frames, name), 1, 8) for name in ("images_left", "images_right")}
+    sizes = frames.sizes - torch.tensor([[0, 0], [0, 8], [0, 0]])
+    cut = replace(frames, camera=replace(frames.camera, K_left=K_left, K_right=K_right), sizes=sizes, **images)
+    masks = {name: getattr(detections, name) for name in ("mask_left", "mask_right")}
+    masks = {name: shifted(shifted(mask, 2, 8), 3, 8) for name, mask in masks.items()}
+    term, there = begun(*at_truth(cut, replace(detections, **masks)), stage)
+    of_first = [x.blocks.owner < 2 for x in (whole, term)]
+    residuals = [
+        x.linear(s.field, s.state, x.where(s)).residual[rows]
+        for x, s, rows in ((whole, sight, of_first[0]), (term, there, of_first[1]))
+    ]
+    torch.testing.assert_close(residuals[1], residuals[0])
+    assert torch.equal(term.row_weight[of_first[1]], whole.row_weight[of_first[0]])
+
+
+@pytest.mark.parametrize("stage", [0, 1])
+def test_points_are_looked_up_where_the_next_camera_sees_them(stage: int) -> None:
+    problem, state = at_truth(*drive())
+    term, _ = begun(problem, state, stage)
+    owner, scale = term.blocks.owner, 0.5 ** problem.stages()[stage].image_level
+    points = torch.rand(3, len(owner), 64, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    at = term._looked_up(state, points)
+    seen = se3.transform(se3.inverse(state.T_obj_next[:, 0])[owner][:, None], points.movedim(0, -1))
+    uv = (seen @ term.next_views.K_left[owner].mT)[..., :2] / seen[..., 2:]
+    torch.testing.assert_close(torch.stack([at.u, at.v], dim=-1), (uv + 0.5) * scale - 0.5)
+
+
 def test_the_exposure_of_the_next_frame_does_not_matter() -> None:
     frames, detections = drive()
     darker = frames.images_left.clone()
