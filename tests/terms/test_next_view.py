@@ -12,6 +12,7 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, Street, joined_detections, joined_frames, street
 from torch import Tensor
 
+from directshape_torch.config import RefinerConfig
 from directshape_torch.geometry import se3
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refiner import DirectShapeRefiner
@@ -19,7 +20,7 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms.cars import CarState, retract
 from directshape_torch.terms.next_view import NextView, NextViews
-from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.photometric import Brightness, Photometric
 from directshape_torch.terms.term import Sight, by_autograd
 
 # Three views of two cars.
@@ -45,10 +46,12 @@ def drive() -> tuple[FrameBatch, Detections]:
     )
 
 
-def at_truth(frames: FrameBatch, detections: Detections, num_offsets: int = 0) -> tuple[CarProblem, CarState]:
+def at_truth(
+    frames: FrameBatch, detections: Detections, num_offsets: int = 0, config: RefinerConfig = DEFAULT
+) -> tuple[CarProblem, CarState]:
     """The problem of the next views alone, and the true state."""
     detections = replace(detections, offset_sigma_px=torch.full((6,), 0.3).double() if num_offsets else None)
-    problem, state = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).problem(frames, detections)
+    problem, state = DirectShapeRefiner(ellipsoid_prior(), config).problem(frames, detections)
     stereo = next(term for term in problem.terms if isinstance(term, Photometric))
     term = NextView(1.0, stereo, NextViews.of(stereo.cars, NEXT))
     path = state.code.new_zeros(6, 9)
@@ -135,6 +138,18 @@ def test_pixels_count_that_the_next_view_shows() -> None:
     torch.testing.assert_close(hidden.block_weight[:1], term.block_weight[:1])
 
 
+def test_a_side_that_has_turned_away_does_not_count() -> None:
+    frames, detections = drive()
+    # Nothing but the way that the surface faces keeps its pixels out.
+    everywhere = torch.ones_like(detections.mask_left)
+    masks = torch.where(torch.arange(6)[:, None, None] == 2, everywhere, detections.mask_left)
+    problem, state = at_truth(frames, replace(detections, mask_left=masks))
+    half_turn = se3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, torch.pi, 0.0], dtype=torch.float64))
+    turned = state._replace(T_obj_next=half_turn @ state.T_obj_next)
+    counts = [(x.row_weight[x.blocks.owner == 0] > 0).sum() for x, _ in (begun(problem, state), begun(problem, turned))]
+    assert counts[1] < 0.3 * counts[0]
+
+
 @pytest.mark.parametrize("unread", [0.0, 1.0, torch.nan])
 def test_a_next_view_without_a_left_mask_shows_nothing(unread: float) -> None:
     frames, detections = drive()
@@ -194,6 +209,29 @@ def test_the_exposure_of_the_next_frame_does_not_matter() -> None:
     greys = [begun(*at_truth(f, detections))[0] for f in (frames, replace(frames, images_left=darker))]
     ratio = (greys[1].image.grey / greys[0].image.grey)[greys[0].blocks.owner == 0]
     torch.testing.assert_close(ratio, torch.full_like(ratio, 0.9), rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("brightness", ["none", "gain"])
+def test_what_images_change_is_differentiable(brightness: Brightness) -> None:
+    frames, detections = drive()
+    config = replace(DEFAULT, photometric=replace(DEFAULT.photometric, brightness=brightness))
+    noise = torch.randn(frames.images_left.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+
+    def slopes(by: Tensor | float) -> Tensor:
+        changed = replace(frames, images_left=frames.images_left + 0.02 * by * noise)
+        problem, state = at_truth(changed, detections, config=config)
+        with torch.no_grad():
+            sight = problem.look(state)
+        # The state at which a stage begins is a constant.
+        stage = problem.begin(problem.stages()[1], sight)
+        return stage.linearise_differentiably(disturbed(state)).gradient.square().sum()
+
+    by = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(slopes(by), by)
+    with torch.no_grad():
+        numeric = (slopes(1e-6) - slopes(-1e-6)) / 2e-6
+    assert abs(numeric) > 1e-3
+    torch.testing.assert_close(slope, numeric, rtol=1e-3, atol=0)
 
 
 def test_cars_keep_their_rows_when_others_leave() -> None:
