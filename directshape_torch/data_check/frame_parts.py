@@ -69,6 +69,12 @@ def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, l
         "P2 and P3, 12 finite numbers each, or rig.json as in docs/inputs.md",
         lambda: layout.calibration(frame_id),
     )
+    if pair is not None and calibration is not None:
+        try:
+            calibration.check_size((pair[0].shape[1], pair[0].shape[0]))
+        except DataFormatError as error:
+            findings.append(_unreadable("image_size", frame_id, "the size that the calibration is of", error))
+            pair = None  # what rests on both would only say the same again
     objects = attempt(
         "detection_file", "lines of 15 or 16 columns, or JSON as in docs/inputs.md", lambda: dataset.objects(frame_id)
     )

@@ -60,6 +60,8 @@ def _words(hint: Any) -> str:
         return " or ".join(map(_words, arguments))
     if origin is tuple:
         return f"a list of {len(arguments)}"
+    if origin in (list, Sequence):
+        return "a list"
     if typing.is_typeddict(hint):
         return f"an object with {' and '.join(map(repr, sorted(hint.__required_keys__)))}".removesuffix(" with ")
     return "nothing" if hint is type(None) else hint.__name__ if isinstance(hint, type) else str(hint)

@@ -85,7 +85,8 @@ class FolderLayout(FrameLayout):
 
     def calibration(self, frame_id: str) -> KittiCalibration:
         """The projections of the rig, with the left camera's frame as `ref`."""
-        return KittiCalibration(self.root / "rig.json", *self.rig.projections())
+        width, height = self.rig.image_size_wh
+        return KittiCalibration(self.root / "rig.json", *self.rig.projections(), size_wh=(width, height))
 
     def plane_path(self, frame_id: str) -> Path | None:
         return None if self._frame(frame_id).ground_plane is None else self.detection_path(frame_id)

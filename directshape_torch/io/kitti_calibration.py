@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -41,6 +42,14 @@ class KittiCalibration:
     P3: NDArray[np.float64]
     R0_rect: NDArray[np.float64] | None = None  # camera 0 to rectified camera 0, (3, 3), or None
     Tr_velo_to_cam: NDArray[np.float64] | None = None  # LiDAR to camera 0, (3, 4), metres, or None
+    size_wh: tuple[int, int] | None = None  # of the images, where the file says
+
+    def check_size(self, size_wh: tuple[int, int]) -> None:
+        """Raise `DataFormatError` where the file says that images are of another size."""
+        if self.size_wh not in (None, size_wh):
+            said, got = (" x ".join(map(str, size)) for size in (self.size_wh or (), size_wh))
+            problem = f"is of images of {said} pixels, they have {got}"
+            raise DataFormatError(self.path, problem, cure="give size and intrinsics of the images as they are")
 
 
 def read_calibration(path: Path | str) -> KittiCalibration:
@@ -52,7 +61,7 @@ def read_calibration(path: Path | str) -> KittiCalibration:
     Raises:
         DataFormatError: a line does not hold as many numbers as its matrix, or P2 or P3 is missing.
     """
-    matrices: dict[str, NDArray[np.float64]] = {}
+    matrices: dict[str, Any] = {}
     for line in read_lines(path):
         words = line.text.split()
         name, shape = _LAYOUTS.get(words[0].rstrip(":"), (None, (0, 0)))
@@ -126,9 +135,10 @@ def camera_of_rig(
     """The stereo camera of a frame, with the disparity field of its rig where there are fields.
 
     Raises:
-        DataFormatError: see `to_stereo_camera`.
+        DataFormatError: see `to_stereo_camera`; or the calibration is of images of another size.
         InputError: all fields are of other rigs.
     """
+    calibration.check_size(size_wh)
     rig = to_stereo_camera([calibration], dtype=torch.float64)
     field = _field_of_rig(fields, size_wh, rig)
     return replace(rig, disparity_field=field).to(dtype=dtype)
@@ -196,7 +206,7 @@ def upright_plane(path: Path | str, plane: NDArray[np.float64], line: Line | Non
             "the normal is not near the vertical y axis",
             line_number=None if line is None else line.number,
             line=" ".join(map(str, plane)) if line is None else line.text,
-            cure=_PLANE_CURE,
+            cure="see docs/inputs.md" if line is None else _PLANE_CURE,
         )
     return np.asarray(plane / (-np.sign(plane[1]) * length))
 

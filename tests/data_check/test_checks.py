@@ -176,6 +176,15 @@ def test_a_damaged_frame_of_a_folder_is_one_finding_and_hides_no_other(kitti: Pa
     assert report.num_cars == 2
 
 
+def test_a_rig_file_of_images_of_another_size_is_one_finding(kitti: Path, tmp_path: Path) -> None:
+    write_folder(kitti, tmp_path, ("000000",))
+    path = tmp_path / "rig.json"
+    path.write_text(path.read_text().replace("[160, 120]", "[80, 60]"))
+    (finding,) = check_dataset(open_dataset("folder", tmp_path)).findings
+    assert (finding.check, finding.severity) == ("image_size", "error")
+    assert finding.measured.endswith("rig.json: is of images of 80 x 60 pixels, they have 160 x 120")
+
+
 def test_report_in_words() -> None:
     first = Finding("images_swapped", "error", "frame 1", "m", "e", "c")
     report = CheckReport((first, Finding("images_swapped", "error", "frame 2", "m", "e", "c")), 9, 2, 5)

@@ -80,7 +80,7 @@ def write_folder(kitti: Path, root: Path, frame_ids: tuple[str, ...]) -> None:
     t_cam_ref = [float(value) for value in camera.t_cam_ref[0].double()]
     rig = {
         "schema_version": FOLDER_SCHEMA_VERSION,
-        "image_size_wh": [240, 96],
+        "image_size_wh": [160, 120],
         "K_left": calibration.P2[:, :3].tolist(),
         "t_right_cam_m": [float(value) for value in camera.T_right_cam[0, :3, 3].double()],
     }

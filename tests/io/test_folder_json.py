@@ -15,6 +15,7 @@ from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.folder_json import read_frame, read_rig
 from directshape_torch.io.folder_layout import FolderLayout, FolderMasks
 from directshape_torch.io.instance_masks import MaskSizeError
+from directshape_torch.io.kitti_calibration import camera_of_rig
 
 RIG: dict[str, Any] = {
     "schema_version": 1,
@@ -74,6 +75,9 @@ def test_rig(root: Path) -> None:
     # P3[0, 3] = -fx b.
     assert calibration.P3[0, 3] == -25.0
     assert not calibration.P2[:, 3].any()
+    assert camera_of_rig(calibration, [], (60, 40)).K_left[0, 0, 0] == 50
+    with pytest.raises(DataFormatError, match=r"rig\.json: is of images of 60 x 40 pixels, they have 40 x 60"):
+        camera_of_rig(calibration, [], (40, 60))
 
 
 def test_objects_become_lines_of_results(root: Path) -> None:
@@ -105,7 +109,7 @@ def test_plane_and_labels(root: Path) -> None:
     assert labels is not None
     assert labels[0].score is None
     write(root, "frames/a.json", {**FRAME, "ground_plane": [1, 0, 0, -3]})
-    with pytest.raises(DataFormatError, match="the normal is not near the vertical"):
+    with pytest.raises(DataFormatError, match=r"the normal is not near the vertical.*docs/inputs\.md"):
         layout.plane_ref("a")
     write(root, "frames/a.json", FRAME)
     with pytest.raises(DataFormatError, match="holds no 'ground_plane'"):
@@ -135,6 +139,7 @@ def test_damaged_rig(root: Path, path: str, value: object, message: str) -> None
     ("path", "value", "message"),
     [
         ("objects", ..., "'objects' is missing"),
+        ("objects", {}, "objects: expected a list, got {}"),
         ("objects.0", "Car", r"objects\[0\] expected an object, got 'Car'"),
         ("objects.0.class", "a car", r"objects\[0\].class is 'a car', expected one word"),
         ("objects.0.rotation_y_rad", ..., r"objects\[0\]: a 3D box needs rotation_y_rad too"),
