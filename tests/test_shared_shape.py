@@ -27,6 +27,7 @@ from torch import Tensor
 from directshape_torch.compile import num_forms
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
+from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.refinement import outcome as outcomes
 from directshape_torch.refinement import tracks
 from directshape_torch.refinement.outcome import Outcome
@@ -108,6 +109,19 @@ def test_views_of_a_track_get_one_shape_that_is_nearer_to_the_truth() -> None:
     variances = [result.covariance.diagonal(dim1=1, dim2=2)[:, 6:] for result in (alone, together)]
     assert (variances[1] < variances[0]).all()
     assert (together.observability.sigmas_m.amax(dim=1) < alone.observability.sigmas_m.amax(dim=1)).all()
+
+
+@pytest.mark.parametrize("time_s", [None, (0.0, 0.1, 0.2)])
+def test_the_evidence_of_a_view_is_that_of_its_own_unknowns(time_s: tuple[float, ...] | None) -> None:
+    frames, detections, _ = drive()
+    if time_s is not None:
+        frames = replace(frames, time_s=torch.tensor(time_s, dtype=torch.float64))
+    track = replace(detections, track_id=torch.tensor([0, 1] * 3))
+    result = DirectShapeRefiner(ellipsoid_prior(), DEFAULT)(frames, track)
+    assert result.track_part.tolist() == [0] * 6
+    # Nobody said how good the detector is.
+    unknown = [name for name, x in zip(EVIDENCE_NAMES, result.quality.evidence.mT, strict=True) if x.isnan().any()]
+    assert unknown == ["log_detector_sigma"]
 
 
 def test_a_batch_of_tracks_equals_a_loop() -> None:

@@ -223,7 +223,7 @@ def _costs(course: Course) -> dict[str, Tensor]:
         "silhouette_decrease": decrease[0],
         "photometric_decrease": decrease[2],
         "relative_decrease": decrease[3],
-        "log_conflict": _conflict(course.figures, photometric, everything[1]),
+        "log_conflict": _conflict(course, photometric, everything[1]),
     }
 
 
@@ -250,11 +250,16 @@ def _profile(profile: DisparityProfile) -> dict[str, Tensor]:
     }
 
 
-def _conflict(at_end: Figures, photometric: list[bool], cost: Tensor) -> Tensor:
-    """log(1 + 100 g_p^T H^-1 g_p / 2 / cost): what photometry alone asks for at the minimum of the sum."""
+def _conflict(course: Course, photometric: list[bool], cost: Tensor) -> Tensor:
+    """log(1 + 100 g_p^T H^-1 g_p / 2 / cost): what photometry alone asks for at the minimum of the sum.
+
+    Path and next view of a track stand still: a view by itself does not know them.
+    """
     if not any(photometric):
         return torch.zeros_like(cost)
-    gain = 0.5 * _mahalanobis(at_end.gradient[:, photometric.index(True)], at_end.hessian.sum(dim=1)).square()
+    own = 6 + course.after.code.shape[1] + course.after.offset_px.shape[1]
+    gradient, hessian = course.figures.gradient[..., :own], course.figures.hessian[..., :own, :own]
+    gain = 0.5 * _mahalanobis(gradient[:, photometric.index(True)], hessian.sum(dim=1)).square()
     return torch.log1p(100 * gain / cost.clamp_min(_TINY))
 
 
