@@ -17,11 +17,15 @@ from directshape_torch.numerics.tensors import length, occurrences
 from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
+from directshape_torch.refinement.tracks import in_tracks, own_and_shared
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.solver.sharing import Groups
 from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
+from directshape_torch.terms.motion import MOTION_NAMES, timed
+from directshape_torch.terms.next_view import NEXT_VIEW_NAME
 from directshape_torch.terms.silhouette import contour_zeta
 from directshape_torch.terms.term import Linear, Sight, Term, linear_of
 
@@ -29,6 +33,8 @@ TERM_NAMES = (
     "silhouettes", "silhouettes_product", "photometric", "photometric_normalised", "point_cloud",
     "shape", "height", "tilt_normal", "tilt_cosine", "dimensions", "pose",
 )  # fmt: skip
+TRACK_NAMES = (*MOTION_NAMES, NEXT_VIEW_NAME)
+"""Of views of a track, in whose regime alone they are."""
 
 # Each look begins where the last one ended: tracked depths converge to the last digit.
 _LOOKS = 3
@@ -95,10 +101,13 @@ class Bench:
             priors=replace(config.priors, tilt_form="cosine"),
         )
         # Pixel sets are fixed where a refinement would begin, so that rows get lost on the way to the state.
-        start = CarState.of(se3.inverse(detections.T_cam_obj), drawn.state.code, cars.num_offsets)
+        no_offset = torch.zeros_like(drawn.state.offset_px)
+        start = drawn.state._replace(T_obj_cam=se3.inverse(detections.T_cam_obj), offset_px=no_offset)
         stages = []
         for c in (config, other_forms):
             problem = problem_of_scene(c, prior, frame, detections, cars, observation, points, own_terms)
+            if drawn.state.path.shape[1]:
+                problem = _of_a_track(problem, cars, drawn.state)
             stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))
         terms = _named(*stages)
         sight = stages[0].problem.look(drawn.state)
@@ -133,6 +142,16 @@ def _settings(regime: Regime, pixels_per_car: int) -> RefinerConfig:
     )
     cloud = replace(config.point_cloud, min_points=1)
     return replace(config, priors=priors, sampling=sampling, point_cloud=cloud)
+
+
+def _of_a_track(problem: CarProblem, cars: CarBatch, state: CarState) -> CarProblem:
+    """The problem of cars that are views of one track, a tenth of a second apart, from a camera that drives a curve."""
+    number = torch.arange(len(cars))
+    time_s = 0.1 * number.to(state.code)
+    T_world_cam = se3.exp(time_s[:, None] * time_s.new_tensor([0.5, 0.0, 10.0, 0.0, 0.2, 0.0]))
+    sharing = Groups.of([0] * len(cars), *own_and_shared(problem, state.code.device))
+    views = timed(sharing, replace(cars, time_s=time_s, T_world_cam=T_world_cam))
+    return in_tracks(problem, sharing, views, state, (number + 1).clamp_max(len(cars) - 1))
 
 
 def _named(stage: CarStage, other_forms: CarStage) -> dict[str, Term]:

@@ -20,6 +20,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.terms.motion import NUM_PATH
 
 Pixels = Literal["sampled", "contour", "grazing", "grid_border"]
 _GROUND_Y_M = 1.65
@@ -133,6 +134,15 @@ def _with_offset(d: Draw) -> DrawnStates:
     return DrawnStates(detections, drawn.state._replace(offset_px=d.uniform(-1, 1)[:, None]))
 
 
+def _track(d: Draw) -> DrawnStates:
+    """One car over and over, each state the next view of the one before; what the picture shows there is no matter."""
+    detections = d.scene.detections
+    drawn = d.of_frame(detections.T_cam_obj[:1], d.prior.initial_code(1), 0.15, 2.0, 0.8)
+    path = torch.randn(1, NUM_PATH, generator=d.generator, dtype=torch.float64).repeat(d.num_states, 1)
+    T_obj_next = drawn.state.T_obj_cam.roll(-1, 0)[:, None]
+    return drawn._replace(state=drawn.state._replace(path=path, T_obj_next=T_obj_next))
+
+
 def _with_code(size: float) -> Callable[[Draw], DrawnStates]:
     def draw(d: Draw) -> DrawnStates:
         sign = torch.randint(0, 2, (d.num_states, d.prior.num_codes), generator=d.generator) * 2 - 1
@@ -170,6 +180,7 @@ REGIMES: Mapping[str, Regime] = {
         Regime("grid_border", "points within a cell of the border of the shape's grid", _anywhere,
                pixels="grid_border", stage=0),
         Regime("disparity_offset", "the rig's disparity off by an unknown of up to 1 px", _with_offset),
+        Regime("track", "views of one car, off by 0.15 m, 2 deg, code N(0, 0.8), with any path", _track),
     )
 }  # fmt: skip
 

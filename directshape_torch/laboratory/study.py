@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 
 import torch
 
-from directshape_torch.laboratory.bench import TERM_NAMES, Bench
+from directshape_torch.errors import InputError
+from directshape_torch.laboratory.bench import TERM_NAMES, TRACK_NAMES, Bench
 from directshape_torch.laboratory.comparison import Comparison, compare
 from directshape_torch.laboratory.experiments import AT_FIXED_DEPTHS, FACTORS, gradient_experiment, term_experiment
 from directshape_torch.laboratory.regimes import Regime, checked_name, regimes_named
@@ -15,7 +16,7 @@ from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
-SUBJECT_NAMES = (*FACTORS, *TERM_NAMES)
+SUBJECT_NAMES = (*FACTORS, *TERM_NAMES, *TRACK_NAMES)
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,11 @@ def run_study(
     plan: StudyPlan,
     report: Callable[[str], None] = lambda _: None,
 ) -> StudyResult:
-    """Examine everything that a plan names; `report` hears one line for each regime."""
+    """Examine everything that a plan names; `report` hears one line for each regime.
+
+    Raises:
+        InputError: none of the regimes has any of the terms; those of a track are in its regime alone.
+    """
     comparisons: list[Comparison] = []
     without: dict[str, int] = {}
     for regime in plan.regimes:
@@ -71,10 +76,13 @@ def run_study(
         if empty:
             without[regime.name] = empty
             report(f"{regime.name}: {empty} of {plan.num_states} states see no valid pixel; only their priors count")
-        own = [name for name in bench.terms if name not in TERM_NAMES]
+        own = [name for name in bench.terms if name not in SUBJECT_NAMES]
         found = compare_subjects(bench, [*plan.subjects, *own], plan.second)
         comparisons += found
         report(f"{regime.name}: {_in_a_line(found)}")
+    if not comparisons:
+        names = ", ".join(regime.name for regime in plan.regimes)
+        raise InputError("regime", f"one that has {', '.join(plan.subjects)}", names, "examine it in track")
     return StudyResult(tuple(comparisons), without)
 
 
@@ -91,7 +99,7 @@ def compare_subjects(bench: Bench, names: Sequence[str], second: bool = False) -
 
 def _in_a_line(found: Sequence[Comparison]) -> str:
     if not found:
-        return "done"
+        return "nothing to compare"
     worst = {
         pair: max(found, key=lambda c: c.errors[pair].maximum) for pair in ("analytic-autograd", "analytic-numeric")
     }

@@ -163,7 +163,7 @@ def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], jo
     group, place, after, parts = zip(*(views_of_parts[row] for row in numbers), strict=True)
     index = torch.tensor(numbers, device=hessian.device)
     keep = torch.zeros_like(solvable).index_fill(0, index, True)
-    own, shared = _unknowns(problem, hessian.device)
+    own, shared = own_and_shared(problem, hessian.device)
     sharing = Groups.of(group, own, shared, place=place)
     part_number = torch.tensor(parts, device=hessian.device)
     next_view = torch.tensor([numbers.index(row) for row in after], device=hessian.device)
@@ -173,11 +173,11 @@ def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], jo
     gradient = ((once - 1)[:, :, None] * slopes).sum(dim=1)
     hessian = (once[:, :, None, None] * curvatures).sum(dim=1)
     timed_views = timed(sharing, cars.of_cars(keep))
-    of_track = _in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index), next_view)
+    of_track = in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index), next_view)
     return Together(keep, of_track, sharing, timed_views, gradient, hessian, part_number, next_view)
 
 
-def _unknowns(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
+def own_and_shared(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
     """Numbers of a view's own unknowns, and of those of the shape."""
     number = torch.arange(6 + problem.prior.num_codes + problem.num_offsets, device=device)
     of_shape = (number >= 6) & (number < 6 + problem.prior.num_codes)
@@ -212,7 +212,7 @@ class _Quadratics:
     @classmethod
     def of(cls, problem: CarProblem, minimum: Minimum[CarState]) -> tuple[_Quadratics, Tensor]:
         """And where (B,) there are any."""
-        own, shared = _unknowns(problem, minimum.status.device)
+        own, shared = own_and_shared(problem, minimum.status.device)
         is_known = torch.tensor([name == _KNOWN_ONCE for name in problem.term_names], device=own.device)
         curvatures, slopes = minimum.after.hessian, minimum.after.gradient
         # All slopes of a minimum add up to nothing.
@@ -261,7 +261,7 @@ def _share(sharing: Groups) -> Tensor:
     return 1 / sharing.total(everybody.to(torch.float64), everybody)
 
 
-def _in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, next_view: Tensor) -> CarProblem:
+def in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, next_view: Tensor) -> CarProblem:
     """The last stage of a problem of R views: one shape in each group, a path where times are known, each view seen in
     the next."""
     factors = _once(problem, sharing) if problem.factors is None else _once(problem, sharing) * problem.factors

@@ -43,6 +43,15 @@ def test_cars_are_cut_by_the_image_border(bench_of: BenchOf, scene: LaboratorySc
     assert torch.minimum(u.abs(), (u - width).abs()).max() < 20
 
 
+def test_views_of_a_track_are_seen_in_the_next(bench_of: BenchOf) -> None:
+    at = bench_of("track", states=3)
+    assert torch.equal(at.state.T_obj_next[:2, 0], at.state.T_obj_cam[1:])
+    term = at.terms["next_view"]
+    counts = [int((term.row_weight[term.blocks.owner == car] > 0).sum()) for car in range(3)]
+    assert min(counts[:2]) > 0
+    assert counts[2] == 0
+
+
 def test_pixels_of_a_regime(bench_of: BenchOf, prior: PCAShapePrior) -> None:
     at = bench_of("contour")
     filled = at.problem.masks.filled > 0

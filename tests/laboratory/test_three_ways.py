@@ -10,7 +10,7 @@ import torch
 
 from directshape_torch.depth import Closest
 from directshape_torch.geometry import se3
-from directshape_torch.laboratory.bench import TERM_NAMES, Bench
+from directshape_torch.laboratory.bench import TERM_NAMES, TRACK_NAMES, Bench
 from directshape_torch.laboratory.comparison import compare
 from directshape_torch.laboratory.experiments import (
     AT_FIXED_DEPTHS,
@@ -26,6 +26,7 @@ from directshape_torch.shape.field import field_of
 from directshape_torch.terms import photometric
 
 BenchOf = Callable[..., Bench]
+_MORE = {"disparity_offset": ("rig",), "track": TRACK_NAMES}
 _EMPTY = {"grid_border": ("photometric", "photometric_normalised")}
 
 
@@ -34,7 +35,7 @@ def test_linear_is_the_derivative_of_residual_in_every_regime(bench_of: BenchOf,
     """Hand-derived against autograd to 1e-9, and both ways to compute a residual give the same value."""
     bench = bench_of(regime)
     subjects = term_experiment(bench, list(bench.terms)).subjects
-    assert [subject.name for subject in subjects] == [*TERM_NAMES, *(["rig"] if regime == "disparity_offset" else [])]
+    assert [subject.name for subject in subjects] == [*TERM_NAMES, *_MORE.get(regime, ())]
     for subject in subjects:
         norm = subject.norm
         assert len(norm) > 0 or subject.name in _EMPTY[regime]
@@ -45,10 +46,10 @@ def test_linear_is_the_derivative_of_residual_in_every_regime(bench_of: BenchOf,
         assert subject.value_error < 1e-12
 
 
-@pytest.mark.parametrize("regime", ["typical", "contour", "grid_border"])
+@pytest.mark.parametrize("regime", ["typical", "contour", "grid_border", "track"])
 def test_terms_against_differences(bench_of: BenchOf, regime: str) -> None:
     """Differences look anew at each displaced state: the cost that is compared has the gradient that is followed."""
-    for found in compare(term_experiment(bench_of(regime), TERM_NAMES), regime):
+    for found in compare(term_experiment(bench_of(regime), [*TERM_NAMES, *_MORE.get(regime, ())]), regime):
         assert found.broken_bounds() == []
         assert found.compared > 0 or found.name in _EMPTY[regime]
 
@@ -141,10 +142,10 @@ def test_factors(bench_of: BenchOf, factor: str) -> None:
         assert found.compared > 0
 
 
-@pytest.mark.parametrize("regime", ["typical", "disparity_offset"])
+@pytest.mark.parametrize("regime", ["typical", "disparity_offset", "track"])
 def test_gradients_can_be_differentiated(bench_of: BenchOf, regime: str) -> None:
     """What gradients through a refinement are made of: the derivatives of every row's gradient, by autograd."""
-    names = [name for name in TERM_NAMES if name not in AT_FIXED_DEPTHS]
+    names = [name for name in (*TERM_NAMES, *_MORE.get(regime, ())) if name not in AT_FIXED_DEPTHS]
     with torch.no_grad():
         for found in compare(gradient_experiment(bench_of(regime), names), regime):
             assert found.broken_bounds() == []

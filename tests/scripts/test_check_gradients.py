@@ -76,12 +76,13 @@ def test_a_term_of_ones_own(
 @pytest.mark.parametrize(("option", "message"), [
     (["--term", "fotometric"], "term: expected one of exp, .*photometric, .*got 'fotometric'.*nearest is photometric"),
     (["--regime", "mars"], "regime: expected one of typical, .*got 'mars'"),
+    (["--regime", "code_zero", "--term", "path"], "regime: expected one that has path, got code_zero.*track"),
     (["--states", "0"], "--states: expected at least 1"),
     (["--data", "nowhere"], "nowhere/detections: holds no folder"),
 ])  # fmt: skip
 def test_wrong_use(capsys: pytest.CaptureFixture[str], option: list[str], message: str) -> None:
     assert script.main(option) == 2
-    assert re.match(f"error: .*{message}", capsys.readouterr().err)
+    assert re.search(f"error: .*{message}", capsys.readouterr().err)
 
 
 def _without_masks(scene: LaboratoryScene) -> LaboratoryScene:
