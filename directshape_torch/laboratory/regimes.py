@@ -137,6 +137,7 @@ def _with_offset(d: Draw) -> DrawnStates:
 def _track(d: Draw) -> DrawnStates:
     """One car over and over, each state the next view of the one before; what the picture shows there is no matter."""
     detections = d.scene.detections
+    d = d._replace(num_states=max(2, d.num_states))  # one view has no path
     drawn = d.of_frame(detections.T_cam_obj[:1], d.prior.initial_code(1), 0.15, 2.0, 0.8)
     path = torch.randn(1, NUM_PATH, generator=d.generator, dtype=torch.float64).repeat(d.num_states, 1)
     T_obj_next = drawn.state.T_obj_cam.roll(-1, 0)[:, None]
@@ -180,7 +181,7 @@ REGIMES: Mapping[str, Regime] = {
         Regime("grid_border", "points within a cell of the border of the shape's grid", _anywhere,
                pixels="grid_border", stage=0),
         Regime("disparity_offset", "the rig's disparity off by an unknown of up to 1 px", _with_offset),
-        Regime("track", "views of one car, off by 0.15 m, 2 deg, code N(0, 0.8), with any path", _track),
+        Regime("track", "two or more views of one car, off by 0.15 m, 2 deg, code N(0, 0.8), with any path", _track),
     )
 }  # fmt: skip
 

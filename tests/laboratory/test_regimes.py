@@ -44,6 +44,7 @@ def test_cars_are_cut_by_the_image_border(bench_of: BenchOf, scene: LaboratorySc
 
 
 def test_views_of_a_track_are_seen_in_the_next(bench_of: BenchOf) -> None:
+    assert len(bench_of("track", states=1).state.code) == 2
     at = bench_of("track", states=3)
     assert torch.equal(at.state.T_obj_next[:2, 0], at.state.T_obj_cam[1:])
     term = at.terms["next_view"]
