@@ -64,7 +64,7 @@ class GridSpec:
 class MeshOptions:
     """How a mesh file is to be read and made solid."""
 
-    forward_axis: str = "+x"  # the file's axes that point to the car's front and up: "+x", "-x", "+y",
+    forward_axis: str = "+x"  # the file's axes that point to the car's front and up, as "-y"
     up_axis: str = "+z"
     scale: float = 1.0  # metres per unit of the file
     length_m: float | None = None  # scale the car to this length (after `scale`); None keeps it
