@@ -174,7 +174,8 @@ def _closest_from(
     start = torch.minimum(torch.maximum(start, inside.near), far)
     found = field.minimum_along(owner, rays.centre_obj, rays.direction_obj, start, inside.near, far, max_cells)
     # At an end of the interval the point slides along the plane through which the ray comes or goes.
-    # Chosen by weights of 0 and 1: a choice by a condition costs as much as ten sums.
+    # Weights of 0 and 1 choose (others only where a ray misses, whose face nobody asks for): a choice by a condition
+    # costs as much as ten sums.
     comes, goes = 1 - (inside.near - inside.enters).sign(), 1 - (inside.leaves - inside.far).sign()
     face = torch.lerp(found.face_obj, comes, (found.depth <= inside.near + _AT_END_M).to(start.dtype))
     face = torch.lerp(face, goes, (found.depth >= inside.far - _AT_END_M).to(start.dtype))
