@@ -18,7 +18,7 @@ from torch import Tensor
 from directshape_torch.config import StageConfig
 from directshape_torch.geometry import se3
 from directshape_torch.image.interpolate import bilinear_patch
-from directshape_torch.numerics.tensors import cross
+from directshape_torch.numerics.tensors import constant_like, cross
 from directshape_torch.rows import Blocks
 from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust
@@ -32,7 +32,7 @@ from directshape_torch.terms.photometric import (
     near_surface,
     photometric_norm,
 )
-from directshape_torch.terms.photometric_rows import CENTRE, frame_view
+from directshape_torch.terms.photometric_rows import CENTRE, frame_view, is_on_mask
 from directshape_torch.terms.term import Linear, Sight
 
 NEXT_VIEW_NAME = "next_view"
@@ -127,9 +127,10 @@ class NextView:
         rows, owner, left = stereo.pixel_set.rows, stereo.blocks.owner, stereo.left
         assert left is not None
         images = left.pyramid[stage.image_level]
-        K = self.next_views.K_left[owner] * images.scale
-        K[:, 0, 2], K[:, 1, 2] = K[:, 0, 2] + 0.5 * images.scale - 0.5, K[:, 1, 2] + 0.5 * images.scale - 0.5
-        K[:, 2, 2] = 1
+        scale, shift = images.scale, 0.5 * images.scale - 0.5
+        K_left = self.next_views.K_left
+        to_level = constant_like((scale, 0, shift, 0, scale, shift, 0, 0, 1), K_left).view(3, 3)
+        K = (to_level @ K_left)[owner]
         frame = torch.cat(frame_view(images, self.next_views.frame_index[owner]), dim=1)
         grey = rows.intensity_left[CENTRE]
         begun = replace(
@@ -142,20 +143,15 @@ class NextView:
         at = begun._looked_up(sight.state, points)
         centre = sight.state.T_obj_next[:, 0, :3, 3][owner].mT[..., None]
         towards = points - centre
-        is_turned = ((surface.normal_obj * towards).sum(0) < 0) & ~is_grazing(surface.normal_obj, towards)
-        shown = surface.found & at.inside & is_turned & self._is_on_mask(left.mask_left, at, images.scale, owner)
+        faces_it = ((surface.normal_obj * towards).sum(0) < 0) & ~is_grazing(surface.normal_obj, towards)
+        u, v = ((x.detach() + 0.5) / scale - 0.5 for x in (at.u, at.v))
+        on_car = is_on_mask(left.mask_left, self.next_views.detection_row[owner], u, v)
+        shown = surface.found & at.inside & faces_it & on_car
         weight = rows.pixel_weight * (shown & self.next_views.exists[owner, None]).to(grey.dtype)
         counted = (weight > 0).to(grey.dtype)[None]
         form, right = stereo.config.brightness, at.value[None]
         matched = matched_brightness(form, grey[None], right, counted, owner, len(self.next_views.exists))[0]
         return replace(begun, fixed=begun.image._replace(grey=matched, weight=weight))
-
-    def _is_on_mask(self, mask_left: Tensor, at: LookedUp, scale: float, owner: Tensor) -> Tensor:
-        """Where points (M, 64) are on the mask of their car in the next image."""
-        u, v = ((x.detach() + 0.5) / scale - 0.5 for x in (at.u, at.v))
-        height, width = mask_left.shape[-2:]
-        column, row = (x.round().long().clamp(0, last - 1) for x, last in ((u, width), (v, height)))
-        return mask_left[self.next_views.detection_row[owner][:, None], row, column] > 0.5
 
     def _looked_up(self, state: CarState, points_obj: Tensor) -> LookedUp:
         image, owner = self.image, self.blocks.owner

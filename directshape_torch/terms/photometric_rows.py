@@ -190,9 +190,7 @@ class LeftPixels:
         """
         last_row, last_column = (self.pyramid[0].sizes[cars.frame_index[owner]] - 1)[:, :, None].unbind(1)
         inside = (u >= -0.5) & (v >= -0.5) & (u <= last_column + 0.5) & (v <= last_row + 0.5)
-        column, row = (x.round().long().clamp_min(0).minimum(last) for x, last in ((u, last_column), (v, last_row)))
-        on_car = self.mask_left[cars.detection_row[owner][:, None], row, column] > 0.5
-        return (inside & on_car).to(u.dtype)
+        return (inside & is_on_mask(self.mask_left, cars.detection_row[owner], u, v)).to(u.dtype)
 
     def _right_view(self, cars: CarBatch, images: GreyPair, frame: Tensor, owner: Tensor) -> RightView:
         per_level = 1 / images.scale
@@ -206,6 +204,13 @@ class LeftPixels:
         else:
             covered = hidden.crop[row], hidden.in_front[row], hidden.covering
         return RightView(images.right.reshape(-1), view, to_full, *covered)
+
+
+def is_on_mask(mask_left: Tensor, row: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Where points (..., M, 64) of left images are on the masks of the detections in rows (M,), or beside the image."""
+    height, width = mask_left.shape[-2:]
+    at_u, at_v = (x.round().long().clamp(0, last - 1) for x, last in ((u, width), (v, height)))
+    return mask_left[row[:, None], at_v, at_u] > 0.5
 
 
 def frame_view(images: GreyPair, frame: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -10,14 +10,14 @@ const COUNT = 4;
 
 export function showHighlights() {
   const value = (car) => gain(car, hasErrorsBefore);
-  const ranked = cars.filter((car) => value(car) !== null).sort((a, b) => value(b) - value(a));
+  const ranked = cars.filter((car) => value(car) !== null && (car.counts || !hasErrorsBefore)).sort((a, b) => value(b) - value(a));
   const place = byId("highlights");
   if (!ranked.length) {
     place.append(element("p", {}, "No car can be ranked."));
     return;
   }
   const rule = hasErrorsBefore
-    ? "By the change of the bird's-eye IoU with the label."
+    ? "By the change of the bird's-eye IoU with the label, of the cars that the summary counts."
     : "By the calibrated probability that the result is better than the input.";
   const better = ranked.filter((car) => !hasErrorsBefore || value(car) > 0).length;
   const half = Math.min(COUNT, Math.ceil(ranked.length / 2));
