@@ -21,8 +21,8 @@ from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.evaluation.matching import match_to_labels
 from directshape_torch.evaluation.pose_error import PoseErrors, boxes_of, pose_errors
 from directshape_torch.evaluation.tables import align
-from directshape_torch.export.gltf_scene import frame_glb
 from directshape_torch.export.painted_cars import PaintedFrame
+from directshape_torch.export.surface_files import frame_glb
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.run_folder import FrameResult, RunFolder

@@ -14,21 +14,17 @@ from pathlib import Path
 from directshape_torch.cli.options import add_run_inputs, dataset_of_run, has_detections, mask_source, prior_of_run
 from directshape_torch.cli.progress import ProgressBar
 from directshape_torch.errors import InputError
-from directshape_torch.export.export_run import export_run
+from directshape_torch.export.export_run import FORMATS, export_run
 from directshape_torch.export.frame_source import ExportInputs
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
 
-_FORMATS = ("glb", "ply", "points", "kitti", "coco3d", "nuscenes", "rerun")
-
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The run, formats, inputs of the run, appearance."""
     parser.add_argument("run_folder", type=Path, metavar="OUT", help="output folder of 'refine'")
-    parser.add_argument(
-        "--format", nargs="+", required=True, choices=_FORMATS, metavar="NAME", help=", ".join(_FORMATS)
-    )
+    parser.add_argument("--format", nargs="+", required=True, choices=FORMATS, metavar="NAME", help=", ".join(FORMATS))
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets the files")
     parser.add_argument("--frames", nargs="+", metavar="ID", help="only these frames (default: all that are finished)")
     inputs = parser.add_argument_group("input")

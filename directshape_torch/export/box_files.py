@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,23 +14,25 @@ from directshape_torch.export.frame_source import Exporter, FrameSource
 from directshape_torch.files.atomic_files import write_bytes, write_json
 from directshape_torch.files.read_files import read_bytes
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.run_folder import COPIED, FrameResult, ResultObject, RunFolder, result_path
+from directshape_torch.io.run_folder import COPIED, FrameResult, ResultObject, result_path
 
 _KITTI_FRAME = "ref: KITTI's rectified camera 0, x right, y down, z forward, metres and radians"
 
 
-def write_kitti(folder: Path, source: FrameSource) -> None:
+class KittiExporter(Exporter):
     """`kitti/data/NNNNNN.txt`, the result file byte for byte, and all its lines as `kitti/json/NNNNNN.json`."""
-    frame, frame_id = source.refined, source.frame_id
-    write_bytes(folder / "kitti" / "data" / f"{frame_id}.txt", read_bytes(result_path(source.run.path, frame_id)))
-    content = {
-        "schema": "directshape kitti results",
-        "schema_version": 1,
-        "frame_id": frame_id,
-        "coordinates": _KITTI_FRAME,
-        "objects": [{**_columns(line), **_refinement(frame, line)} for line in frame.lines],
-    }
-    write_json(folder / "kitti" / "json" / f"{frame_id}.json", content)
+
+    def add(self, source: FrameSource) -> None:
+        frame, frame_id, folder = source.refined, source.frame_id, self.folder / "kitti"
+        write_bytes(folder / "data" / f"{frame_id}.txt", read_bytes(result_path(self.run.path, frame_id)))
+        content = {
+            "schema": "directshape kitti results",
+            "schema_version": 1,
+            "frame_id": frame_id,
+            "coordinates": _KITTI_FRAME,
+            "objects": [{**_columns(line), **_refinement(frame, line)} for line in frame.lines],
+        }
+        write_json(folder / "json" / f"{frame_id}.json", content)
 
 
 def _columns(line: KittiObject) -> dict[str, Any]:
@@ -54,20 +55,22 @@ def _refinement(frame: FrameResult, line: KittiObject) -> dict[str, Any]:
     car = next((car for car, number in enumerate(shapes.input_lines) if number == line.line_number), None)
     if car is None:
         return {"status": COPIED}
-    return {
-        "status": shapes.statuses[car],
-        "sigma_xyz_yaw": [_number(value) for value in shapes.sigmas_ref[car]],
-        "probability_better": _number(shapes.probabilities_better[car]),
-        "probability_not_worse": _number(shapes.probabilities_not_worse[car]),
-        "mask_iou_left": _number(shapes.mask_iou_left[car]),
-        "mask_iou_right": _number(shapes.mask_iou_right[car]),
-        "code": [_number(value) for value in shapes.codes[car]],
+    known = {
+        "sigma_xyz_yaw": shapes.sigmas_ref[car],
+        "probability_better": shapes.probabilities_better[car],
+        "probability_not_worse": shapes.probabilities_not_worse[car],
+        "mask_iou_left": shapes.mask_iou_left[car],
+        "mask_iou_right": shapes.mask_iou_right[car],
+        "code": shapes.codes[car],
     }
+    return {"status": shapes.statuses[car], **{name: _numbers(value.tolist()) for name, value in known.items()}}
 
 
-def _number(value: float) -> float | None:
+def _numbers(values: float | list[float]) -> Any:
     """JSON has no NaN."""
-    return float(value) if math.isfinite(value) else None
+    if isinstance(values, list):
+        return [_numbers(value) for value in values]
+    return values if math.isfinite(values) else None
 
 
 # Omni3D's order of the eight corners, in units of half (length, height, width) along x, y (down), z of the object.
@@ -91,10 +94,11 @@ _INFO = {
 
 
 class Coco3dExporter(Exporter):
-    """Collects the frames of a run, and writes them at the end."""
+    """`coco3d.json`: all frames, written at the end."""
 
-    def __init__(self, path: Path, run: RunFolder) -> None:
-        self.path, self.image_ids = path, image_numbers(run.frame_ids)
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self.image_ids = image_numbers(self.run.frame_ids)
         self.category_ids = {name: number for number, name in enumerate(KITTI_TYPES, start=1)}
         self.images: list[dict[str, Any]] = []
         self.annotations: list[dict[str, Any]] = []
@@ -114,12 +118,10 @@ class Coco3dExporter(Exporter):
             self.annotations.append({**ids, "category_name": name.lower(), **_detection_fields(one), **box})
 
     def finish(self) -> None:
-        categories = [
-            {"id": number, "name": name.lower(), "supercategory": "object"}
-            for name, number in self.category_ids.items()
-        ]
+        ids = self.category_ids.items()
+        categories = [{"id": number, "name": name.lower(), "supercategory": "object"} for name, number in ids]
         content = {"info": _INFO, "images": self.images, "categories": categories, "annotations": self.annotations}
-        write_json(self.path, content)
+        write_json(self.folder / "coco3d.json", content)
 
 
 def _image_path(source: FrameSource) -> str:
@@ -197,10 +199,10 @@ _NUSCENES_FRAME = (
 
 
 class NuscenesExporter(Exporter):
-    """Collects the frames of a run, one sample a frame, its id as token; writes them at the end."""
+    """`nuscenes.json`: all frames, one sample a frame, its id as token; written at the end."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self.samples: dict[str, list[dict[str, Any]]] = {}
 
     def add(self, source: FrameSource) -> None:
@@ -210,7 +212,8 @@ class NuscenesExporter(Exporter):
 
     def finish(self) -> None:
         sensors = {"use_camera": True, "use_lidar": False, "use_radar": False, "use_map": False, "use_external": False}
-        write_json(self.path, {"meta": {**sensors, "coordinates": _NUSCENES_FRAME}, "results": self.samples})
+        content = {"meta": {**sensors, "coordinates": _NUSCENES_FRAME}, "results": self.samples}
+        write_json(self.folder / "nuscenes.json", content)
 
 
 def _box(token: str, one: ResultObject) -> dict[str, Any]:

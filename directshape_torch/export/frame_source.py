@@ -77,7 +77,10 @@ class FrameSource:
 
 
 class Exporter:
-    """Writes a run in one format."""
+    """Writes a run in one format, below a folder."""
+
+    def __init__(self, folder: Path, run: RunFolder, inputs: ExportInputs) -> None:
+        self.folder, self.run, self.inputs = folder, run, inputs
 
     def add(self, source: FrameSource) -> None:
         """Take the next frame."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.evaluation.shape_error import EstimatedCar
@@ -19,7 +20,7 @@ from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.stereo_matching.disparity import with_disparity
 from directshape_torch.terms.car_points import car_points
-from directshape_torch.visualize.drawing import Array, View
+from directshape_torch.visualize.drawing import View
 
 if TYPE_CHECKING:
     import trimesh
@@ -41,14 +42,16 @@ _SAME_SURFACE_M = 0.03
 _LEAST_RAY_COSINE = 0.2
 _SEED = 0
 _ALL_POINTS = 10_000_000
+# Of the grid on the ground.
+_SPACING_M, _STRIP_WIDTH_M = 5.0, 0.04
+_X_M, _Z_M = (-20.0, 20.0), (0.0, 50.0)
 
 
 @dataclass(frozen=True)
 class FrameView:
     """The left image of a frame and the refined cars that it shows."""
 
-    image: NDArray[np.uint8]  # (H, W, 3) RGB
-    K_left: Array  # (3, 3) pixels
+    left: View
     cars: Sequence[EstimatedCar]  # which hide themselves and one another
     masks: Sequence[NDArray[np.bool_] | None]  # (H, W) left pixels known to show each car, None where nothing is known
 
@@ -61,8 +64,8 @@ class FrameView:
         """Which points the camera sees: turned towards it, in the image, on the car's mask, and hidden by no car."""
         distance = np.linalg.norm(points_cam, axis=1)
         cosine = -(points_cam * normals_cam).sum(axis=1) / np.maximum(distance, 1e-9)
-        height, width = self.image.shape[:2]
-        uv, mask = self._project(points_cam), self.masks[car]
+        height, width = self.left.picture.shape[:2]
+        uv, mask = self.left.project(points_cam), self.masks[car]
         seen = (cosine > _LEAST_RAY_COSINE) & (points_cam[:, 2] > 0)
         seen &= ((uv >= 0) & (uv <= np.array([width - 1, height - 1]))).all(axis=1)
         if mask is not None:
@@ -70,7 +73,7 @@ class FrameView:
             seen[seen] = mask[row, column]
         for other in (car, *(row for row in range(len(self.cars)) if row != car)):
             rows = np.flatnonzero(seen)
-            depth = self.cars[other].points_at_pixels(uv[rows], torch.from_numpy(self.K_left))[:, 2]
+            depth = self.cars[other].points_at_pixels(uv[rows].astype(np.float64), torch.from_numpy(self.left.K))[:, 2]
             # A ray that passes a car by has depth NaN, which hides nothing.
             seen[rows[depth < points_cam[rows, 2] - _SAME_SURFACE_M]] = False
         return np.asarray(seen)
@@ -79,15 +82,9 @@ class FrameView:
         """The image's colours (N, 3) at the points, sRGB, between the four nearest pixels."""
         from scipy.ndimage import map_coordinates
 
-        at = self._project(points_cam).T[::-1]
-        channels = [map_coordinates(self.image[..., k], at, np.float64, order=1, mode="nearest") for k in range(3)]
+        at, image = self.left.project(points_cam).T[::-1], self.left.picture
+        channels = [map_coordinates(image[..., k], at, np.float64, order=1, mode="nearest") for k in range(3)]
         return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
-
-    def _project(self, points_cam: Points) -> NDArray[np.float64]:
-        """Pixels (N, 2) of points; meaningless behind the camera."""
-        homogeneous = points_cam @ self.K_left.T
-        depth = homogeneous[:, 2:]
-        return np.asarray(homogeneous[:, :2] / np.where(depth > 0, depth, 1.0))
 
 
 class Paint(NamedTuple):
@@ -116,16 +113,14 @@ class PaintedFrame:
         ]
         self.view = None
         if loaded is not None:
-            image, masks = View.of_frame(loaded.frame), _masks_of_lines(loaded)
+            masks = _masks_of_lines(loaded)
             of_cars = [masks.get(one.line.line_number) for one in self.objects]
-            self.view = FrameView(image.picture, image.K, self.cars, of_cars)
+            self.view = FrameView(View.of_frame(loaded.frame), self.cars, of_cars)
 
     def mesh(self, index: int, finer: bool = False) -> tuple[trimesh.Trimesh, Paint]:
-        """Surface of the refined car `index` in the left camera frame, and the colours of its vertices.
+        """Surface of `objects[index]` in the left camera frame, and the colours of its vertices.
 
-        Args:
-            index: place among `objects`.
-            finer: divide the triangles, without moving the surface, until the colours are as fine as the image.
+        If `finer`, the triangles are divided, without moving the surface, until colours are as fine as the image.
         """
         mesh = self._mesh(index)
         if finer and self.view is not None:
@@ -133,11 +128,8 @@ class PaintedFrame:
         return mesh, self._paint(index, mesh.vertices, mesh.vertex_normals)
 
     def samples(self, index: int, count: int) -> tuple[Points, Points, Paint]:
-        """Points spread evenly by area over the whole surface of the refined car `index`, always the same ones.
-
-        Returns:
-            Points (count, 3), metres, left camera frame; outward normals of their triangles (count, 3); colours.
-        """
+        """Points (count, 3) spread evenly by area over the surface of `objects[index]`, always the same ones; the
+        outward normals of their triangles (count, 3); colours."""
         from trimesh.sample import sample_surface
 
         mesh = self._mesh(index)
@@ -148,9 +140,7 @@ class PaintedFrame:
     def stereo_points(self) -> dict[int, tuple[Points, NDArray[np.uint8]]]:
         """What dense stereo measures on each car, by its line number: points (N, 3), metres, and colours (N, 3).
 
-        A car's pixels are those of its left mask, of its 2D box where it has none; kept are those above the ground and
-        near the car, as the point cloud methods of the refinement take them. The rig's bias is taken off where it is
-        known.
+        They are chosen as the point cloud methods of the refinement choose them, the rig's known bias taken off.
         """
         if self.loaded is None or self.view is None:
             return {}
@@ -202,7 +192,7 @@ def _subdivided(mesh: trimesh.Trimesh, view: FrameView) -> trimesh.Trimesh:
     subdivide: Callable[..., tuple[NDArray[Any], ...]] = trimesh.remesh.subdivide
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     depth = max(float(mesh.vertices[:, 2].mean()), 1.0)
-    edge_px = float(mesh.edges_unique_length.mean()) * float(view.K_left[0, 0]) / depth
+    edge_px = float(mesh.edges_unique_length.mean()) * float(view.left.K[0, 0]) / depth
     times = int(np.clip(np.ceil(np.log2(edge_px / _EDGE_PX)), 0, _MOST_SUBDIVISIONS))
     for _ in range(times):
         vertices, faces = subdivide(vertices, faces)[:2]
@@ -222,3 +212,24 @@ def _mirror(paint: Paint, points_obj: Points) -> None:
     found = np.isfinite(distance)
     paint.rgb[unseen[found]] = paint.rgb[seen[nearest[found]]]
     paint.source[unseen[found]] = MIRRORED
+
+
+def ground_grid(
+    normal: Tensor,  # (3,) pointing up
+    offset: float,  # metres
+) -> trimesh.Trimesh:
+    """Strips of constant x and z, 5 m apart, on the plane `normal . x_cam + offset = 0`, seen from both sides."""
+    import trimesh
+
+    n = normal.detach().double().cpu().numpy()
+    half = _STRIP_WIDTH_M / 2
+    strips = [(x - half, x + half, *_Z_M) for x in np.arange(_X_M[0], _X_M[1] + _SPACING_M / 2, _SPACING_M)]
+    strips += [(*_X_M, z - half, z + half) for z in np.arange(_Z_M[0], _Z_M[1] + _SPACING_M / 2, _SPACING_M)]
+    xz = np.array([[(x0, z0), (x1, z0), (x1, z1), (x0, z1)] for x0, x1, z0, z1 in strips]).reshape(-1, 2)
+    y = -(n[0] * xz[:, 0] + n[2] * xz[:, 1] + offset) / n[1]
+    vertices = np.stack([xz[:, 0], y, xz[:, 1]], axis=1)
+    # Two triangles a strip and the same two from behind; of these the normals would cancel.
+    upper = 4 * np.arange(len(strips))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
+    faces = np.concatenate([upper, upper[..., ::-1]]).reshape(-1, 3)
+    up = np.tile(n / np.linalg.norm(n), (len(vertices), 1))
+    return trimesh.Trimesh(vertices, faces, vertex_normals=up, process=False)

@@ -1,7 +1,4 @@
-"""A run as a Rerun recording: frames on one timeline, the iterations of their refinements on another.
-
-A frame is its images, masks, boxes, surfaces, ground; an iteration the surfaces, boxes, residuals and costs of a state.
-"""
+"""A run as a Rerun recording: frames on one timeline, the iterations of their refinements on another."""
 
 from __future__ import annotations
 
@@ -16,20 +13,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError, MissingDependencyError
+from directshape_torch.errors import MissingDependencyError
 from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
+from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
-from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.status import Status
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour, blue_white_red, picture_of
-from directshape_torch.visualize.ground_grid import ground_grid
 from directshape_torch.visualize.inspection.pixel_residuals import CarResiduals, PixelResiduals, car_residuals
 from directshape_torch.visualize.inspection.still_figures import WORST_SILHOUETTE
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
@@ -53,42 +49,31 @@ _STATE_RGB = (120, 220, 235)
 
 
 class RerunExporter(Exporter):
-    """All frames in one recording.
-
-    Args:
-        path: of the .rrd file.
-        run: the frames that will come.
-        with_iterations: whether frames will come with a refiner.
+    """`recording.rrd`: all frames, and with a refiner the states that they go through when it refines them again.
 
     Raises:
         MissingDependencyError: Rerun is not installed.
     """
 
-    def __init__(self, path: Path, run: RunFolder, with_iterations: bool) -> None:
+    def __init__(self, *args: Any) -> None:
         _import_rerun()
-        self.path, self.with_iterations = path, with_iterations
-        self.numbers = image_numbers(run.frame_ids)
-        self.iteration = 0
+        super().__init__(*args)
+        self.numbers, self.iteration = image_numbers(self.run.frame_ids), 0
         self._stream: _Stream | None = None
 
     def add(self, source: FrameSource) -> None:
-        """Log a frame; with a refiner also the states that it goes through when it refines the frame again.
-
-        Raises:
-            InputError: the frame has no images.
-        """
-        loaded = source.with_images("the pictures of a recording")
+        loaded, refiner = source.with_images("the pictures of a recording"), self.inputs.refiner
         if self._stream is None:
             # The images of the first frame say what the viewer's views are fitted to.
             height, width = loaded.frame.sizes[0].tolist()
-            self._stream = _Stream(self.path, (width, height), self.with_iterations)
+            self._stream = _Stream(self.folder / "recording.rrd", (width, height), refiner is not None)
             _log_conventions(self._stream)
-        stream, frame, refiner = self._stream, self.numbers[source.frame_id], source.inputs.refiner
+        stream, frame = self._stream, self.numbers[source.frame_id]
         stream.at(frame, None if refiner is None else self.iteration)
         _log_images(stream, loaded)
         _log_boxes(stream, source, loaded)
         ground = ground_grid(loaded.frame.ground.normal[0], float(loaded.frame.ground.offset[0]))
-        stream.log_mesh("world/ground", ground, colour=GREY)
+        stream.log_mesh("world/ground", ground, GREY)
         stream.at(frame)
         _clear_cars(stream)
         for index, one in enumerate(source.painted.objects):
@@ -114,14 +99,12 @@ class RerunExporter(Exporter):
         self.iteration += len(trace)
 
     def finish(self) -> None:
-        """Move the file to its place."""
         if self._stream is not None:
             self._stream.close()
             # What is in its place is not for `abandon`.
             self._stream = None
 
     def abandon(self) -> None:
-        """Leave no file behind."""
         if self._stream is not None:
             self._stream.close(keep=False)
 
@@ -146,8 +129,6 @@ def _clear_cars(stream: _Stream) -> None:
 
 def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
     """Both images with the camera, and on them the pixels of each car by the number of its line, 0 for none."""
-    import cv2
-
     rr, frame, detections = stream.rr, loaded.frame, loaded.detections
     height, width = frame.sizes[0].tolist()
     K_image = frame.camera.K_left[0].double().cpu().numpy().copy()
@@ -157,11 +138,7 @@ def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
     stream.log("world/cam", rr.Pinhole(image_from_camera=K_image, resolution=[width, height], camera_xyz=axes))
     sides = ((_LEFT, frame.images_left, detections.mask_left), (_RIGHT, frame.images_right, detections.mask_right))
     for entity, images, masks in sides:
-        bgr = picture_of(images[0])[..., ::-1]
-        encoded, content = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-        if not encoded:
-            raise DataFormatError("image", f"OpenCV cannot encode shape {bgr.shape} as JPEG")
-        stream.log(entity, rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
+        stream.log(entity, rr.Image(picture_of(images[0])).compress(jpeg_quality=_JPEG_QUALITY))
         numbers = np.zeros(tuple(masks.shape[1:]), dtype=np.uint16)
         for mask, detected in zip(masks, loaded.detected_objects, strict=True):
             numbers[(mask > MASK_THRESHOLD).cpu().numpy()] = detected.line_number
@@ -210,7 +187,7 @@ class _IterationLog:
             if car in moved:
                 values = prior.values(state.code[car : car + 1])[0]
                 surface = sdf_to_mesh(values, prior.origin, prior.spacing_m, se3.inverse(state.T_obj_cam[car]))
-                self.stream.log_mesh(f"world/cars/{self.line(car)}", surface, colour=_STATE_RGB)
+                self.stream.log_mesh(f"world/cars/{self.line(car)}", surface, _STATE_RGB)
                 self.log_residuals(car, residuals[car])
             self._log_costs(car, number)
 
@@ -255,11 +232,6 @@ def _blue_red(values: PixelResiduals) -> NDArray[np.uint8]:
 
 
 def _import_rerun() -> Any:
-    """The package `rerun`.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-    """
     try:
         import rerun
     except ImportError as error:
@@ -268,18 +240,9 @@ def _import_rerun() -> Any:
 
 
 class _Stream:
-    """Writes a recording beside its place, and moves it there when it is whole.
+    """Writes a recording beside its place, and moves it there when it is whole."""
 
-    Args:
-        path: of the .rrd file; its folder is made where it is missing.
-        size_wh: of the images, which the viewer fits its views to.
-        with_iterations: whether there is a timeline of iterations to look at.
-
-    Raises:
-        MissingDependencyError: Rerun is not installed.
-    """
-
-    def __init__(self, path: Path, size_wh: tuple[int, int], with_iterations: bool = False) -> None:
+    def __init__(self, path: Path, size_wh: tuple[int, int], with_iterations: bool) -> None:
         self.rr, self.path = _import_rerun(), path
         self._temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -297,27 +260,18 @@ class _Stream:
                 self._stream.set_time(timeline, sequence=place)
 
     def log(self, entity: str, *archetypes: Any, static: bool = False) -> None:
-        """Log at the present places; `static` for what holds at all times.
-
-        Raises:
-            ValueError: Rerun does not take the data; its own default is a line on stderr.
-        """
+        """Log at the present places; `static` for what holds at all times. What Rerun does not take raises."""
         self._stream.log(entity, *archetypes, static=static, strict=True)
 
-    def log_mesh(
-        self,
-        entity: str,
-        mesh: trimesh.Trimesh,
-        colours: NDArray[np.uint8] | None = None,
-        colour: tuple[int, int, int] | None = None,
-    ) -> None:
+    def log_mesh(self, entity: str, mesh: trimesh.Trimesh, colours: NDArray[np.uint8] | Colour) -> None:
         """Triangles with a colour for each vertex, or one for all."""
+        of_all = isinstance(colours, tuple)
         made = self.rr.Mesh3D(
             vertex_positions=np.asarray(mesh.vertices, dtype=np.float32),
             triangle_indices=np.asarray(mesh.faces, dtype=np.uint32),
             vertex_normals=np.asarray(mesh.vertex_normals, dtype=np.float32),
-            vertex_colors=colours,
-            albedo_factor=None if colour is None else [*colour, 255],
+            vertex_colors=None if of_all else colours,
+            albedo_factor=[*colours, 255] if of_all else None,
         )
         self.log(entity, made)
 

@@ -77,10 +77,10 @@ class View:
         return View(np.ascontiguousarray(picture, dtype=np.uint8), to_view @ self.K)
 
     def project(self, points_cam: Array) -> Array:
-        """Pixels (N, 2) of points (N, 3) in front of the camera."""
+        """Pixels (N, 2) of points (N, 3); meaningless behind the camera."""
         pixels = points_cam @ self.K.T
-        projected: Array = np.clip(pixels[:, :2] / pixels[:, 2:], -_FARTHEST_PX, _FARTHEST_PX)
-        return projected
+        depth = np.where(pixels[:, 2:] > 0, pixels[:, 2:], 1.0)
+        return np.asarray(np.clip(pixels[:, :2] / depth, -_FARTHEST_PX, _FARTHEST_PX))
 
     def bounds(self, points_cam: Array) -> tuple[float, float, float, float] | None:
         """u_min, v_min, u_max, v_max around points as far as they are seen, or None where they are not."""

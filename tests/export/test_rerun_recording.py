@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from directshape_torch.config import RefinerConfig
 from directshape_torch.config_files import config_from_mapping
 from directshape_torch.errors import DataFormatError, InputError, MissingDependencyError
-from directshape_torch.export.export_run import ExportFormat, export_run
+from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.kitti_dataset import KittiStereoDataset
@@ -271,7 +271,7 @@ def test_an_end_that_fails_leaves_nothing_half_written(
     finished: FinishedRun, tmp_path: Path, recording_first: bool
 ) -> None:
     (tmp_path / "coco3d.json").mkdir()
-    formats: list[ExportFormat] = ["rerun", "coco3d"] if recording_first else ["coco3d", "rerun"]
+    formats = ["rerun", "coco3d"] if recording_first else ["coco3d", "rerun"]
     with pytest.raises(OSError, match=r"coco3d\.json"):
         export_run(RunFolder(finished.out, [0]), tmp_path, formats, finished.inputs())
     left = {path.name for path in tmp_path.iterdir()}

@@ -14,6 +14,7 @@ from directshape_torch.evaluation.shape_error import EstimatedCar
 from directshape_torch.export.painted_cars import FrameView
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
+from directshape_torch.visualize.drawing import View
 
 K = np.array([[150.0, 0.0, 77.0], [0.0, 150.0, 50.0], [0.0, 0.0, 1.0]])
 PRIOR = ellipsoid_prior(spacing_m=0.1)
@@ -24,7 +25,8 @@ T_CAM_OBJ = [pose_from_kitti(torch.tensor(place).double(), torch.tensor(yaw).dou
 
 def view(image: NDArray[np.uint8] | None = None) -> FrameView:
     cars = [EstimatedCar(PRIOR, torch.zeros(3).double(), T) for T in T_CAM_OBJ]
-    return FrameView(np.zeros((120, 160, 3), np.uint8) if image is None else image, K, cars, [None] * len(cars))
+    left = View(np.zeros((120, 160, 3), np.uint8) if image is None else image, K)
+    return FrameView(left, cars, [None] * len(cars))
 
 
 def surface(car: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, Surface, View
 from directshape_torch.visualize.drawn_car import DrawnCar
-from directshape_torch.visualize.ground_grid import ground_grid
 from directshape_torch.visualize.overlay import Footprint, birds_eye_picture, overlay_picture
 
 K = np.array([[700.0, 0.0, 500.0], [0.0, 700.0, 150.0], [0.0, 0.0, 1.0]])

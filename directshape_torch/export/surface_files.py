@@ -1,9 +1,8 @@
-"""Painted cars as binary glTF scenes: those of a frame, and one that moves through the frames of its track."""
+"""Painted cars as files: glTF scenes of a frame and of a car that moves along its track; surfaces and points as PLY."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, MutableMapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, MutableMapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,36 +10,35 @@ from numpy.typing import NDArray
 
 from directshape_torch.export.box_files import image_numbers
 from directshape_torch.export.frame_source import Exporter, FrameSource
-from directshape_torch.export.painted_cars import Paint, PaintedFrame
+from directshape_torch.export.painted_cars import Paint, PaintedFrame, Points, ground_grid
 from directshape_torch.files.atomic_files import write_bytes
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.io.run_folder import FrameResult, ResultObject
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.visualize.ground_grid import ground_grid
 
 if TYPE_CHECKING:
     import trimesh
 
-_LINEAR = "_LINEAR"
-_SOURCE = "_COLOR_SOURCE"
+_LINEAR, _SOURCE = "_LINEAR", "_COLOR_SOURCE"
 _GREY_OF_GROUND = (120, 120, 120)
 _UNSIGNED_SHORT, _FLOAT = 5123, 5126
 _SECONDS_A_FRAME = 0.1
 _CAR, _CAMERA = "car", "left camera"
+_PLY_HEADER = "ply\nformat binary_little_endian 1.0\ncomment left camera frame: x right, y down, z forward, metres\n"
 
 
 class GlbExporter(Exporter):
-    """A scene of each frame, and one of each car that shares its shape over several frames."""
+    """`glb/NNNNNN.glb`, a scene of each frame, and one of each car that shares its shape over several frames."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self._moving: dict[tuple[str, int], _MovingCar] = {}
 
     def add(self, source: FrameSource) -> None:
         # Frames come sequence by sequence; a car keeps the picture of its nearest view until its own is over.
         self._write([key for key in self._moving if not source.frame_id.startswith(_sequence(key[0]))])
         painted = source.painted
-        write_bytes(self.folder / f"{source.frame_id}.glb", frame_glb(painted, source.loaded))
+        write_bytes(self.folder / "glb" / f"{source.frame_id}.glb", frame_glb(painted, source.loaded))
         for index, one in enumerate(painted.objects):
             shapes = painted.frame.shapes
             key = shapes.tracks[one.car], int(shapes.track_parts[one.car])
@@ -50,20 +48,19 @@ class GlbExporter(Exporter):
     def finish(self) -> None:
         self._write(list(self._moving))
 
-    def _write(self, over: Sequence[tuple[str, int]]) -> None:
+    def _write(self, over: list[tuple[str, int]]) -> None:
         for track, part in over:
             car = self._moving.pop((track, part))
             if len(car.T_cam_obj) > 1:
                 # The later parts of a track that was split are other cars.
                 name = f"track_{track}_part{part}" if part else f"track_{track}"
-                write_bytes(self.folder / f"{name}.glb", car.glb(_sequence(track)))
+                write_bytes(self.folder / "glb" / f"{name}.glb", car.glb(_sequence(track)))
 
 
 def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
     """All refined cars of a frame, painted, on a grid of 5 m where the frame's ground is known.
 
-    Returns:
-        A file in glTF's axes, y up: its nodes turn vertices that are in the left camera frame, metres.
+    Nodes turn the vertices, which are in the left camera frame, metres, to glTF's axes (y up).
     """
     import trimesh
 
@@ -140,14 +137,9 @@ def _animate(
 def _accessor(buffers: MutableMapping[str, bytes], tree: dict[str, Any], name: str, values: NDArray[np.float64]) -> int:
     """The number of a new accessor to some numbers."""
     buffers[name] = values.astype("<f4").tobytes()
+    of = {"bufferView": len(buffers) - 1, "componentType": _FLOAT, "count": len(values)}
     kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
-    tree["accessors"][name] = {
-        "bufferView": len(buffers) - 1,
-        "componentType": _FLOAT,
-        "count": len(values),
-        "type": kind,
-        "byteOffset": 0,
-    }
+    tree["accessors"][name] = {**of, "type": kind, "byteOffset": 0}
     return len(tree["accessors"]) - 1
 
 
@@ -163,13 +155,8 @@ def _extras(one: ResultObject, frame: FrameResult) -> dict[str, Any]:
     }
 
 
-def srgb_to_linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Image colours as the linear ones (0..65535) that glTF asks for at vertices.
-
-    Examples:
-        >>> srgb_to_linear(np.array([0, 188, 255], dtype=np.uint8)).tolist()
-        [0, 32957, 65535]
-    """
+def _srgb_to_linear(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Image colours as the linear ones (0..65535) that glTF asks for at vertices."""
     s = rgb.astype(np.float64) / 255
     linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     return np.asarray(np.round(65535 * linear).astype(np.uint16))
@@ -185,7 +172,7 @@ def _glb(scene: trimesh.Scene, extend: Callable[..., None] | None = None) -> byt
 def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, paint: Paint, below: str | None = None) -> None:
     """Below a node, or in the left camera frame."""
     opaque = np.full((len(paint.rgb), 1), 65535, dtype=np.uint16)
-    mesh.vertex_attributes[_LINEAR] = np.concatenate([srgb_to_linear(paint.rgb), opaque], axis=1)
+    mesh.vertex_attributes[_LINEAR] = np.concatenate([_srgb_to_linear(paint.rgb), opaque], axis=1)
     mesh.vertex_attributes[_SOURCE] = paint.source.astype(np.float32)
     transform = T_GLTF_CAM if below is None else None
     scene.add_geometry(mesh, node_name=name, geom_name=name, parent_node_name=below, transform=transform)
@@ -195,9 +182,8 @@ def _finish(tree: dict[str, Any]) -> None:
     """Colours of 16 bits, which trimesh has no way to ask for, and a material that is no metal."""
     if "meshes" not in tree:
         return
-    tree["materials"] = [
-        {"name": "image", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}, "doubleSided": False}
-    ]
+    looks = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    tree["materials"] = [{"name": "image", "pbrMetallicRoughness": looks, "doubleSided": False}]
     for mesh in tree["meshes"]:
         for primitive in mesh["primitives"]:
             attributes = primitive["attributes"]
@@ -206,3 +192,53 @@ def _finish(tree: dict[str, Any]) -> None:
             accessor["normalized"] = True
             assert accessor["componentType"] == _UNSIGNED_SHORT, "colours of 16 bits"
             primitive["material"] = 0
+
+
+class PlyExporter(Exporter):
+    """`ply/NNNNNN_LINE.ply`: the surface of each refined car, with normals, sRGB and `color_source` (see `Paint`)."""
+
+    def add(self, source: FrameSource) -> None:
+        from trimesh.exchange.ply import export_ply
+        from trimesh.visual import ColorVisuals
+
+        for index, one in enumerate(source.painted.objects):
+            mesh, paint = source.painted.mesh(index)
+            opaque = np.full((len(paint.rgb), 1), 255, dtype=np.uint8)
+            mesh.visual = ColorVisuals(mesh, vertex_colors=np.concatenate([paint.rgb, opaque], axis=1))
+            mesh.vertex_attributes["color_source"] = paint.source
+            content: bytes = export_ply(mesh, vertex_normal=True)
+            write_bytes(self.folder / "ply" / f"{source.frame_id}_{one.line.line_number}.ply", content)
+
+
+class PointsExporter(Exporter):
+    """`points/NNNNNN_LINE.ply` of each refined car, and beside it `.._stereo.ply` where stereo saw any."""
+
+    def add(self, source: FrameSource) -> None:
+        painted, measured = source.painted, source.painted.stereo_points()
+        for index, one in enumerate(painted.objects):
+            stem = self.folder / "points" / f"{source.frame_id}_{one.line.line_number}"
+            points_cam, normals_cam, paint = painted.samples(index, self.inputs.points_per_car)
+            write_bytes(f"{stem}.ply", _points_ply(points_cam, paint.rgb, normals_cam, paint.source))
+            if one.line.line_number in measured:
+                write_bytes(f"{stem}_stereo.ply", _points_ply(*measured[one.line.line_number]))
+
+
+def _points_ply(
+    points_cam: Points,  # (N, 3) metres
+    rgb: NDArray[np.uint8],  # (N, 3) sRGB
+    normals_cam: Points | None = None,  # (N, 3) unit length
+    source: NDArray[np.uint8] | None = None,  # (N,) see `Paint`
+) -> bytes:
+    """x y z, normals where there are any, red green blue, `color_source` where it is known."""
+    columns: list[tuple[str, str, NDArray[Any]]] = [(name, "<f4", points_cam[:, k]) for k, name in enumerate("xyz")]
+    if normals_cam is not None:
+        columns += [(f"n{name}", "<f4", normals_cam[:, k]) for k, name in enumerate("xyz")]
+    columns += [(name, "u1", rgb[:, k]) for k, name in enumerate(("red", "green", "blue"))]
+    if source is not None:
+        columns.append(("color_source", "u1", source))
+    table = np.empty(len(points_cam), dtype=[(name, kind) for name, kind, _ in columns])
+    for name, _, values in columns:
+        table[name] = values
+    types = {"<f4": "float", "u1": "uchar"}
+    properties = "".join(f"property {types[kind]} {name}\n" for name, kind, _ in columns)
+    return f"{_PLY_HEADER}element vertex {len(table)}\n{properties}end_header\n".encode() + table.tobytes()
