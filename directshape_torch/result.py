@@ -93,9 +93,9 @@ class RefinementResult(CarRecord):
     Examples:
         >>> import pathlib
         >>> import directshape_torch as ds
-        >>> from directshape_torch.io.kitti_dataset import KittiStereoDataset
+        >>> from directshape_torch.io.stereo_dataset import open_dataset
         >>> demo = pathlib.Path(ds.__file__).parent / "assets" / "demo"
-        >>> inputs = KittiStereoDataset(demo, demo / "detections" / "noisy_stereo", demo / "training" / "masks")
+        >>> inputs = open_dataset("kitti", demo, demo / "detections" / "noisy_stereo", demo / "training" / "masks")
         >>> frame = inputs.load("000000")
         >>> result = ds.DirectShapeRefiner(config=ds.load_config("fast"))(frame.frame, frame.detections)
         >>> len(result), len(result[0]), len(result[result.refined])

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 import directshape_torch
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, GroundPlane, RefinementResult, StereoCamera
 from directshape_torch.geometry.box_formats import poses_to_boxes
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import poses_cam
+from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
@@ -78,7 +78,7 @@ class RefinedDetector(nn.Module):
 class StoredDetector(nn.Module):
     """Stands in for a network: gives the detections and masks of the bundled frame, whatever it is shown."""
 
-    def __init__(self, dataset: KittiStereoDataset) -> None:
+    def __init__(self, dataset: StereoDataset) -> None:
         super().__init__()
         loaded = dataset.load(dataset.frame_ids[0])
         lines = [loaded.input_objects[row] for row in loaded.row_of_detection]
@@ -99,7 +99,7 @@ class StoredDetector(nn.Module):
 
 def main() -> tuple[DetectorOutput, RefinementResult]:
     """Refine the bundled frame and print what came out."""
-    dataset = KittiStereoDataset(DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks")
+    dataset = open_dataset("kitti", DEMO, DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks")
     frame = dataset.load(dataset.frame_ids[0]).frame
     P_left, P_right = _projections(frame.camera)
     pipeline = RefinedDetector(StoredDetector(dataset), DirectShapeRefiner())

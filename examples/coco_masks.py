@@ -19,8 +19,8 @@ from pycocotools import mask as coco_mask
 
 import directshape_torch
 from directshape_torch import DirectShapeRefiner, RefinementResult
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.mask_files import CocoFileMasks
+from directshape_torch.io.stereo_dataset import open_dataset
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
 DETECTIONS = ROOT / "detections" / "noisy_stereo"
@@ -40,7 +40,7 @@ def coco_results(image_id: int, masks: Iterable[tuple[NDArray[np.bool_], float]]
 def main(out_dir: Path) -> RefinementResult:
     """Write the lists of both images of the bundled frame, then refine its boxes with them."""
     out_dir.mkdir(parents=True, exist_ok=True)
-    given = KittiStereoDataset(ROOT, DETECTIONS, ROOT / "training" / "masks").load("000000").detections
+    given = open_dataset("kitti", ROOT, DETECTIONS, ROOT / "training" / "masks").load("000000").detections
     files = {}
     for side, masks in (("left", given.mask_left), ("right", given.mask_right)):
         network_output = [(mask.numpy() > 0.5, 0.9) for mask in masks if mask.any()]
@@ -48,7 +48,7 @@ def main(out_dir: Path) -> RefinementResult:
         files[side].write_text(json.dumps(coco_results(0, network_output)), encoding="utf-8")
 
     # Which mask is of which box is found by the boxes' projections into both images.
-    dataset = KittiStereoDataset(ROOT, DETECTIONS, CocoFileMasks(files["left"], files["right"]))
+    dataset = open_dataset("kitti", ROOT, DETECTIONS, CocoFileMasks(files["left"], files["right"]))
     loaded = dataset.load("000000")
     result = DirectShapeRefiner()(loaded.frame, loaded.detections)
     for car, status in enumerate(result.status):

@@ -13,17 +13,18 @@ from pathlib import Path
 import directshape_torch
 from directshape_torch import DirectShapeRefiner
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
+from directshape_torch.io.stereo_dataset import open_dataset
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"  # holds training/image_2, image_3, calib, ...
 
 
 def main(out_dir: Path) -> list[str]:
     """Refine every frame, and say of every car of the first one where it is now."""
-    dataset = KittiStereoDataset(
+    dataset = open_dataset(
+        "kitti",
         ROOT,
         ROOT / "detections" / "noisy_stereo",  # KITTI result files: NNNNNN.txt, here or in data/
         ROOT / "training" / "masks",  # COCO results a frame: NNNNNN.json

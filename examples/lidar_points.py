@@ -16,8 +16,8 @@ from torch import Tensor
 
 import directshape_torch
 from directshape_torch import Detections, DirectShapeRefiner, FrameBatch, RefinementResult
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import poses_cam
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.terms.lidar import LidarPoints
 
 ROOT = Path(directshape_torch.__file__).parent / "assets" / "demo"
@@ -36,7 +36,8 @@ def made_up_scan(frames: FrameBatch, truth: Detections) -> Tensor:
 
 def main() -> tuple[RefinementResult, RefinementResult, Tensor]:
     """Refine the bundled frame without and with points; also the true poses."""
-    loaded = KittiStereoDataset(ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks").load("000000")
+    dataset = open_dataset("kitti", ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks")
+    loaded = dataset.load("000000")
     frames, detections = loaded.frame, loaded.detections
     T_cam_obj = poses_cam(loaded.labels or [], frames.camera.t_cam_ref[0])
 

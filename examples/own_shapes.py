@@ -16,7 +16,7 @@ import torch
 
 import directshape_torch
 from directshape_torch import DirectShapeRefiner, PCAShapePrior, RefinementResult
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.mesh_to_sdf import GridSpec, MeshOptions, load_mesh_obj, mesh_to_sdf
 from directshape_torch.shape.parametric_cars import car_mesh
@@ -53,7 +53,8 @@ def main(out_dir: Path, meshes: Path | None = None) -> RefinementResult:
     print(f"{prior.provenance.num_samples} meshes, variance explained by each component: {shares}")
     prior.save(out_dir / "own_prior.npz")
 
-    loaded = KittiStereoDataset(ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks").load("000000")
+    dataset = open_dataset("kitti", ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks")
+    loaded = dataset.load("000000")
     result = DirectShapeRefiner(prior=load_prior(out_dir / "own_prior.npz"))(loaded.frame, loaded.detections)
     for car, status in enumerate(result.status):
         print(f"car {car}: {status.name}, code {', '.join(f'{z:+.1f}' for z in result.code[car].tolist())}")

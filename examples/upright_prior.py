@@ -13,7 +13,7 @@ import torch
 
 import directshape_torch
 from directshape_torch import DirectShapeRefiner, RefinementResult
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarBatch, CarState
@@ -41,7 +41,8 @@ def upright_prior(frames: FrameBatch, detections: Detections, cars: CarBatch, pr
 
 def main() -> RefinementResult:
     """Refine the bundled frame with it."""
-    loaded = KittiStereoDataset(ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks").load("000000")
+    dataset = open_dataset("kitti", ROOT, ROOT / "detections" / "noisy_stereo", ROOT / "training" / "masks")
+    loaded = dataset.load("000000")
     result = DirectShapeRefiner(extra_terms=[upright_prior])(loaded.frame, loaded.detections)
     column = result.term_names.index("upright")
     for car, status in enumerate(result.status):

@@ -42,7 +42,7 @@ from directshape_torch.cli.options import frame_id_of
 from directshape_torch.config import AcceptanceConfig
 from directshape_torch.config_files import load_config
 from directshape_torch.figures.quality import TrustModel
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refiner import DirectShapeRefiner, KnownRig
 from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.of_dataset import estimate_rigs
@@ -65,7 +65,7 @@ def development_cars(args: argparse.Namespace) -> Observations:
     for masks in args.masks:
         kept = args.out / f"{'_'.join(['cars', masks.name, *map(str, args.seeds), *args.set])}.npz"
         if not kept.is_file():
-            dataset = KittiStereoDataset(args.data, args.exact, masks, frames=args.frames)
+            dataset = open_dataset("kitti", args.data, args.exact, masks, frames=args.frames)
             make = partial(refiner, args.set)
             observe_noisy(dataset, make, LEVELS, args.seeds, masks.name, _tell).save(kept)
         parts.append(Observations.load(kept))
@@ -77,7 +77,7 @@ def other_cars(args: argparse.Namespace, root: Path, detections: Path, masks: Pa
     name = f"{root.name} {detections.name}"
     kept = args.out / f"{'_'.join(['cars', root.name, detections.name, *args.set])}.npz"
     if not kept.is_file():
-        dataset = KittiStereoDataset(root, detections, masks)
+        dataset = open_dataset("kitti", root, detections, masks)
         rigs = RigEstimates(estimate_rigs(dataset, lambda frame: _tell(f"{name}: {frame} looked at")))
         observe_dataset(dataset, refiner(args.set, rigs), name).save(kept)
     return name, Observations.load(kept)

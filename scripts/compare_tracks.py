@@ -38,8 +38,7 @@ from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.open_dataset import open_dataset
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.rig.estimate import RigEstimates
@@ -92,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
     refiner = DirectShapeRefiner(config=load_config(None, args.set))
     if args.rig is not None:
         rigs = load_rigs(args.rig)
-        dataset = dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
+        dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
         refiner.rig = RigEstimates(rigs)
     found: list[CarOfFrame] = []
     for _, ids in groupby(dataset.frame_ids, dataset.sequence_of):

@@ -21,7 +21,7 @@ from torch import Tensor
 from directshape_torch import Detections, FrameBatch, check_scene
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.scene import boxes_around
 from directshape_torch.scene_check.finding import CheckReport
 
@@ -218,7 +218,7 @@ MISTAKES: dict[str, Mistake] = {
 
 def scene(root: Path, detections: Path, masks: Path, count: int = 6, first: int = 0) -> Scene:
     """Some frames of a data set as one batch."""
-    dataset = KittiStereoDataset(root, detections, masks, ground="camera_height")
+    dataset = open_dataset("kitti", root, detections, masks, ground="camera_height")
     frames, found = collate([dataset.load(frame_id) for frame_id in dataset.frame_ids[first : first + count]])
     # As `Detections.from_boxes` makes them: boxes of a file may be projections of the labels, and tell too much.
     return frames, replace(found, box_2d=boxes_around(found.mask_left).to(found.box_2d))

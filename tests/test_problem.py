@@ -22,7 +22,7 @@ from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import ConfigError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refinement.problem import CarProblem, CarStage, method_stages
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch
@@ -75,7 +75,7 @@ def _first_frame_of(name: str) -> tuple[FrameBatch, Detections]:
         pytest.skip("DIRECTSHAPE_DATA is not set: real frames needed")
     root = DEMO if name == "demo" else Path(os.environ["DIRECTSHAPE_DATA"]) / name
     masks = root / "training" / "masks"
-    dataset = KittiStereoDataset(root, root / "detections" / SETS[name], masks, dtype=torch.float64)
+    dataset = open_dataset("kitti", root, root / "detections" / SETS[name], masks, dtype=torch.float64)
     loaded = dataset.load(dataset.frame_ids[0])
     seen = loaded.detections.mask_left.flatten(1).sum(dim=1) > 200
     return loaded.frame, select(loaded.detections, seen.nonzero()[:, 0])

@@ -20,8 +20,7 @@ from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig
 from directshape_torch.io.run_manifest import FrameEntry, hash_files
-from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 
@@ -33,7 +32,7 @@ _STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)
 class RunJob:
     """All that a process needs for its share of a run."""
 
-    dataset: FileStereoDataset
+    dataset: StereoDataset
     refiner: DirectShapeRefiner
     out_dir: Path
     options: RefineOptions  # kinds of outputs

@@ -23,7 +23,7 @@ from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import FrameEntry, RunManifest, SharedHashes, hash_fields, hash_prior
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.io.track_files import write_tracks
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
@@ -34,7 +34,7 @@ _TIMINGS = "timings.json"
 
 
 def refine_dataset(
-    dataset: FileStereoDataset,
+    dataset: StereoDataset,
     refiner: DirectShapeRefiner,
     out_dir: Path | str,
     options: RefineOptions | None = None,
@@ -79,7 +79,7 @@ class _Run:
 
     def __init__(
         self,
-        dataset: FileStereoDataset,
+        dataset: StereoDataset,
         refiner: DirectShapeRefiner,
         earlier: EarlierResults,
         log: RunLog,
@@ -226,7 +226,7 @@ def _some(frame_ids: Sequence[str]) -> str:
     return ", ".join(frame_ids[:5]) + (" .." if len(frame_ids) > 5 else "")
 
 
-def expected_cars(dataset: FileStereoDataset, frame_ids: Sequence[str]) -> int:
+def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
     """About how many cars frames have, from the detection files of some of them: whether compiling will pay."""
     looked_at = frame_ids[:: max(1, len(frame_ids) // _FRAMES_COUNTED)]
     count = 0
@@ -238,13 +238,13 @@ def expected_cars(dataset: FileStereoDataset, frame_ids: Sequence[str]) -> int:
     return round(count * len(frame_ids) / max(1, len(looked_at)))
 
 
-def has_tracks(dataset: FileStereoDataset) -> bool:
+def has_tracks(dataset: StereoDataset) -> bool:
     """Whether its cars are numbered over the frames of sequences."""
     return dataset.sequence_of(dataset.frame_ids[0]) is not None
 
 
 def run_manifest(
-    dataset: FileStereoDataset, refiner: DirectShapeRefiner, prior_sha256: str, batch_frames: int = 1
+    dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha256: str, batch_frames: int = 1
 ) -> RunManifest:
     """What the results of a run depend on, besides the files of each frame.
 
@@ -279,12 +279,12 @@ def package_version() -> str:
         return "not installed"
 
 
-def _check_out_dir(dataset: FileStereoDataset, out_dir: Path) -> None:
+def _check_out_dir(dataset: StereoDataset, out_dir: Path) -> None:
     for link in (out_dir / name for name in OUTPUT_FOLDERS if (out_dir / name).is_symlink()):
         cure = "remove the link; the output folder itself may be one"
         raise InputError("out", "folders of its own in it, where results are written and removed", f"link {link}", cure)
     written = (out_dir / "data").resolve()
-    for read in (dataset.detections_dir, dataset.detections_dir / "data"):
+    for read in (dataset.layout.detections_dir, dataset.layout.detections_dir / "data"):
         if written == read.resolve():
             raise InputError(
                 "out", "a folder other than that of the detections", str(out_dir), "it would overwrite its own input"

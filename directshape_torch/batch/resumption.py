@@ -31,7 +31,7 @@ from directshape_torch.io.run_manifest import (
     read_manifest,
     write_manifest,
 )
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 
 # Hashing waits for the disk most of the time, and for a network's even longer.
 _READING_THREADS = 8
@@ -69,7 +69,7 @@ class EarlierResults:
         self.manifest = manifest
         self.write()
 
-    def finished_frames(self, dataset: FileStereoDataset) -> list[str]:
+    def finished_frames(self, dataset: StereoDataset) -> list[str]:
         """Frames of the data set that need no work: done, with all the outputs whole, from the files as they are now.
 
         Raises:
@@ -111,7 +111,7 @@ class EarlierResults:
         """Write `summary.json`."""
         write_manifest(summary_path(self.out_dir), self.manifest)
 
-    def _checked(self, dataset: FileStereoDataset, frame_id: str) -> tuple[FrameEntry | None, bool]:
+    def _checked(self, dataset: StereoDataset, frame_id: str) -> tuple[FrameEntry | None, bool]:
         """The entry of a frame that is finished, and whether one that is not has lost something."""
         try:
             path = shapes_path(self.out_dir, frame_id)
@@ -122,7 +122,7 @@ class EarlierResults:
         entry = self.entry(frame_id)
         return entry, entry is None and set(self.outputs) <= set(record.outputs)
 
-    def _check_inputs(self, dataset: FileStereoDataset, frame_id: str, inputs: Mapping[str, str]) -> None:
+    def _check_inputs(self, dataset: StereoDataset, frame_id: str, inputs: Mapping[str, str]) -> None:
         try:
             hashes = hash_files(dataset.input_files(frame_id))
         except DataFormatError as error:

@@ -14,7 +14,7 @@ from directshape_torch.geometry.box_formats import poses_to_boxes
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.io.result_files import write_result_text
 from directshape_torch.io.run_folder import mesh_path, result_path, shapes_path
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.shape.shape_prior import ShapePrior
 
 
@@ -28,11 +28,11 @@ class ScanFit:
     fit: ShapeFit  # of these, in the left camera frame
 
 
-def fit_scan(dataset: FileStereoDataset, frame_id: str, prior: ShapePrior | None = None) -> ScanFit:
+def fit_scan(dataset: StereoDataset, frame_id: str, prior: ShapePrior | None = None) -> ScanFit:
     """Fit a pose and a shape to the points in each box of a frame.
 
     Args:
-        dataset: opened with `lidar_dir` (`io.open_dataset`); its detections are the boxes, labels among them.
+        dataset: opened with `lidar_dir` (`open_dataset`); its detections are the boxes, labels among them.
         frame_id: one of `dataset.frame_ids`.
         prior: the shapes; default the bundled ones.
 

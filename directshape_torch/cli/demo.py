@@ -24,17 +24,16 @@ from directshape_torch.evaluation.tables import align
 from directshape_torch.export.painted_cars import PaintedFrame
 from directshape_torch.export.surface_files import frame_glb
 from directshape_torch.files.atomic_files import write_bytes
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.run_folder import FrameResult, RunFolder
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset, open_dataset
 
 DEMO_FOLDER = Path(__file__).parent.parent / "assets" / "demo"
 
 
-def demo_dataset(frames: Iterable[int | str] | None = None) -> KittiStereoDataset:
+def demo_dataset(frames: Iterable[int | str] | None = None) -> StereoDataset:
     """The bundled frame, with noisy detections."""
     folder = DEMO_FOLDER
-    return KittiStereoDataset(folder, folder / "detections/noisy_stereo", folder / "training/masks", frames=frames)
+    return open_dataset("kitti", folder, folder / "detections/noisy_stereo", folder / "training/masks", frames=frames)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

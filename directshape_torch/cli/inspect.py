@@ -14,8 +14,7 @@ from directshape_torch.cli.inspect_cars import inspect_frame, inspect_tracks
 from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, frame_id_of, make_refiner
 from directshape_torch.errors import InputError
 from directshape_torch.io.figure_files import check_figures
-from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _dataset(args: argparse.Namespace) -> FileStereoDataset:
+def _dataset(args: argparse.Namespace) -> StereoDataset:
     if args.tracks and args.car is not None:
         raise InputError("--tracks", "all cars of several frames", f"--car {args.car} too", "leave one of them out")
     if args.demo:

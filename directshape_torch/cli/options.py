@@ -17,11 +17,9 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.mask_files import CocoFileMasks
-from directshape_torch.io.open_dataset import LayoutName, open_dataset
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.run_manifest import hash_fields, hash_prior
-from directshape_torch.io.stereo_dataset import GroundSource
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import GroundSource, LayoutName, StereoDataset, open_dataset
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.rig_file import RIG_FILE, load_fields
@@ -122,7 +120,7 @@ def add_interval_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--draws", type=int, default=2000, help="of the bootstrap (default 2000)")
 
 
-def dataset_of(args: argparse.Namespace) -> FileStereoDataset:
+def dataset_of(args: argparse.Namespace) -> StereoDataset:
     """The data set that the options describe."""
     masks = mask_source(args)
     if masks is None and args.layout != "folder":
@@ -202,7 +200,7 @@ def add_run_inputs(group: argparse._ActionsContainer, needed_for: str) -> None:
     group.add_argument("--prior", metavar="FILE|NAME", help="shape prior of the run, where it was not a bundled one")
 
 
-def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> FileStereoDataset | None:
+def dataset_of_run(args: argparse.Namespace, run: RunFolder) -> StereoDataset | None:
     """The chosen frames of a run; None without `--data`."""
     if args.data is None:
         names = ("detections", "masks", "masks_left", "masks_right", "disparity", "rig")

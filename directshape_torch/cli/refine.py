@@ -28,7 +28,7 @@ from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, RigEstimates
 from directshape_torch.rig.of_dataset import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, holds_rigs, load_rigs, save_rigs
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
     refiner.config = _warned_of(dataset, refiner.config)
     rigs, are_new = _rigs_of_run(dataset, args.rig, args.out, args.fresh)
     if rigs:
-        dataset = dataset.changed(ground=dataset.ground, disparity_field=[rig.field for rig in rigs])
+        dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
         refiner.rig = RigEstimates(rigs)
     with _Progress(args.out, rigs if are_new else None) as progress:
         summary = refine_dataset(dataset, refiner, args.out, options, progress, workers, fresh=args.fresh)
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     return summary.exit_code
 
 
-def _warned_of(dataset: FileStereoDataset, config: RefinerConfig) -> RefinerConfig:
+def _warned_of(dataset: StereoDataset, config: RefinerConfig) -> RefinerConfig:
     """Print what the first frames show to be wrong; settings with which calls do not look again."""
     if config.check == "off":
         return config
@@ -139,7 +139,7 @@ def _warned_of(dataset: FileStereoDataset, config: RefinerConfig) -> RefinerConf
     return replace(config, check="off")
 
 
-def _rigs_of_run(dataset: FileStereoDataset, rig: str, out_dir: Path, fresh: bool) -> tuple[list[RigEstimate], bool]:
+def _rigs_of_run(dataset: StereoDataset, rig: str, out_dir: Path, fresh: bool) -> tuple[list[RigEstimate], bool]:
     """The estimates that `--rig` names, and whether they are new: those of a file, or of the run's folder, made where
     there are none."""
     if rig != "auto":

@@ -10,7 +10,7 @@ from typing import Any
 from directshape_torch.data_check.check_rig import check_rig
 from directshape_torch.data_check.frame_parts import gather_evidence, numbers_of, read_parts
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_calibration import SPOILS_CAMERA, check_calibration
 from directshape_torch.scene_check.check_pair import SPOILS_PAIR, check_images
@@ -23,7 +23,7 @@ _NAMED = 3
 
 
 def check_dataset(
-    dataset: FileStereoDataset,
+    dataset: StereoDataset,
     max_frames: int | None = DEFAULT_MAX_FRAMES,
     tell: Callable[[str], None] = lambda _: None,
 ) -> CheckReport:
@@ -74,7 +74,7 @@ class _Seen:
     num_cars: int = 0
 
 
-def _check_frame(dataset: FileStereoDataset, frame_id: str, seen: _Seen) -> list[Finding]:
+def _check_frame(dataset: StereoDataset, frame_id: str, seen: _Seen) -> list[Finding]:
     parts, findings = read_parts(dataset, frame_id)
     where = f"frame {frame_id}"
     if parts.calibration is not None:
@@ -102,7 +102,7 @@ def _no_cars() -> Finding:
     )
 
 
-def check_files(dataset: FileStereoDataset) -> list[Finding]:
+def check_files(dataset: StereoDataset) -> list[Finding]:
     """One finding for each kind of file that is missing; looks at names only, so all frames can be asked."""
     missing: dict[str, list[str]] = {}
     for frame_id in dataset.frame_ids:
@@ -112,7 +112,7 @@ def check_files(dataset: FileStereoDataset) -> list[Finding]:
     return [_finding(role, paths, len(dataset)) for role, paths in missing.items()]
 
 
-def _files(dataset: FileStereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
+def _files(dataset: StereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
     try:
         return [(role.rstrip("_0123456789"), path) for role, path in dataset.input_files(frame_id).items()]
     except DataFormatError as error:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from directshape_torch.errors import DirectShapeError
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, rig_among
 from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.finding import Finding
@@ -17,9 +18,9 @@ LARGEST_OFFSET_PX, LARGEST_BIAS = 0.15, 0.03
 _SURE = 2.0  # standard deviations
 
 
-def check_rig(dataset: FileStereoDataset, frame_ids: Sequence[str]) -> list[Finding]:
+def check_rig(dataset: StereoDataset, frame_ids: Sequence[str]) -> list[Finding]:
     """What the detections of some frames say of their rigs beyond the disparity fields that the data set has."""
-    plain, rigs = dataset.changed(ground="camera_height", disparity_field=None), list[RigEstimate]()
+    plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), list[RigEstimate]()
     for frame_id in frame_ids:
         # What cannot be read was found before.
         with suppress(DirectShapeError, OSError):
@@ -29,7 +30,7 @@ def check_rig(dataset: FileStereoDataset, frame_ids: Sequence[str]) -> list[Find
     return [found for rig in enough for found in (*_offset(rig, dataset), *_bias(rig))]
 
 
-def _offset(rig: RigEstimate, dataset: FileStereoDataset) -> list[Finding]:
+def _offset(rig: RigEstimate, dataset: StereoDataset) -> list[Finding]:
     place = rig.rows[:, :2].median(dim=0).values
     offset, sigma = (float(x) for x in rig.offset_at(place))
     known = sum(float(field.bias(place)) for field in dataset.disparity_fields if rig.is_of(*field.rig))

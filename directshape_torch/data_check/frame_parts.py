@@ -16,7 +16,7 @@ from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError, match_masks
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
 from directshape_torch.scene_check.check_scene import Pair
 from directshape_torch.scene_check.finding import Finding, unreadable
@@ -41,7 +41,7 @@ class FrameParts:
         return None if self.pair is None else (self.pair[0].shape[0], self.pair[0].shape[1])
 
 
-def read_parts(dataset: FileStereoDataset, frame_id: str) -> tuple[FrameParts, list[Finding]]:
+def read_parts(dataset: StereoDataset, frame_id: str) -> tuple[FrameParts, list[Finding]]:
     """Read a frame part by part; what fails is a finding."""
     findings: list[Finding] = []
 

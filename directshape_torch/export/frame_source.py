@@ -9,8 +9,7 @@ from pathlib import Path
 from directshape_torch.errors import InputError
 from directshape_torch.export.painted_cars import PaintedFrame
 from directshape_torch.io.run_folder import FrameResult, RunFolder
-from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.shape_prior import ShapePrior
 
@@ -22,7 +21,7 @@ class ExportInputs:
     prior: ShapePrior | None = None  # the shapes of the run; None: exports without surfaces
     # Images, calibrations, masks and detections of the run's frames; None: exports without colours, and none that need
     # an image.
-    dataset: FileStereoDataset | None = None
+    dataset: StereoDataset | None = None
     data_root: Path | None = None  # folder that names of images begin in, where a file lists them
     # Whether the detections of that data set are those of the run; else its results stand for them.
     has_detections: bool = False

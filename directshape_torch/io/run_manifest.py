@@ -113,7 +113,7 @@ def _hash_in_state(path: Path, _size_bytes: int, _changed_ns: int) -> str:
 
 
 def hash_files(files: Mapping[str, Path]) -> dict[str, str]:
-    """The sha256 of several files by their role, such as those of `KittiStereoDataset.input_files`."""
+    """The sha256 of several files by their role, such as those of `StereoDataset.input_files`."""
     return {role: hash_file(path) for role, path in files.items()}
 
 

@@ -1,14 +1,45 @@
-"""A frame of a data set, ready for a refinement."""
+"""Stereo data sets of any layout, with detections and masks, frame by frame as the tensors a refinement takes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+import contextlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, get_args
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.errors import DirectShapeError, InputError, shown
+from directshape_torch.files.names import is_frame_id
+from directshape_torch.files.text_files import read_lines
+from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.folder_layout import FolderLayout
+from directshape_torch.io.frame_detections import build_detections
+from directshape_torch.io.frame_layout import FrameLayout, existing_folder
+from directshape_torch.io.image_files import read_disparity, read_pair
+from directshape_torch.io.instance_masks import MaskSource
+from directshape_torch.io.kitti_calibration import camera_of_rig, plane_ref_to_cam, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.scene import Detections, FrameBatch
+from directshape_torch.io.kitti_layout import object_layout, raw_layout, stereo2015_layout, tracking_layout
+from directshape_torch.io.track_association import associate
+from directshape_torch.io.velodyne import in_image, read_scan
+from directshape_torch.scene import Detections, FrameBatch, GroundPlane
+from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane
 
 GroundSource = Literal["auto", "file", "stereo", "camera_height"]
+LayoutName = Literal["kitti", "raw", "tracking", "stereo2015", "folder"]
+_LAYOUTS: dict[LayoutName, Callable[..., FrameLayout]] = {
+    "kitti": object_layout,
+    "raw": raw_layout,
+    "tracking": tracking_layout,
+    "stereo2015": stereo2015_layout,
+    "folder": FolderLayout,
+}
 
 
 @dataclass(frozen=True)
@@ -21,7 +52,7 @@ class LoadedFrame:
         input_objects: every line of the detection file, in its order.
         refined_rows: for each input line the index of its detection, or -1 for lines to copy as they are.
         labels: the ground truth, or None where there is no label file.
-        sequence: whose frames the tracks of the detections go through; see `FileStereoDataset.sequence_of`.
+        sequence: whose frames the tracks of the detections go through; see `StereoDataset.sequence_of`.
     """
 
     frame: FrameBatch
@@ -44,3 +75,284 @@ class LoadedFrame:
     def detected_objects(self) -> tuple[KittiObject, ...]:
         """For each detection its input line."""
         return tuple(self.input_objects[row] for row in self.row_of_detection)
+
+
+def open_dataset(
+    layout: LayoutName | FrameLayout,
+    root: Path | str = ".",
+    detections_dir: Path | str | None = None,
+    masks: Path | str | MaskSource | None = None,
+    *,
+    split: Path | str | None = None,
+    frames: Iterable[str | int] | None = None,
+    classes: Sequence[str] = ("Car",),
+    ground: GroundSource = "auto",
+    camera_height_m: float = 1.65,
+    disparity_field: DisparityField | Sequence[DisparityField] | None = None,
+    disparity_dir: Path | str | None = None,
+    lidar_dir: Path | str | None = None,
+    tracks: bool = False,
+    dtype: torch.dtype = torch.float32,
+) -> StereoDataset:
+    """The data set of a layout (docs/inputs.md).
+
+    Args:
+        layout: "kitti" (object benchmark), "raw", "tracking", "stereo2015" or "folder"; or one of your own, which needs
+            neither `root` nor `detections_dir`.
+        root: folder of the data.
+        detections_dir: folder of detections; None for "folder" only: `root/frames`.
+        masks: folder of masks (see `mask_source`), a `MaskSource`, or None: those of a "folder", else none.
+        split: file with one frame id a line; default every frame that has detections.
+        frames: ids of the frames to use, of those.
+        classes: object types to refine; other lines are copied.
+        ground: where ground planes come from: "auto" is file, else stereo, else camera height; with a disparity
+            field stereo comes first, for plane files share the bias of the disparities they were made from.
+        camera_height_m: height of the camera above a level ground, the last resort.
+        disparity_field: residual disparity of the rig, of several rigs, or None.
+        disparity_dir: folder of `NNNNNN.png` (or `NNNNNN_10.png`) with the disparity maps of any stereo method, for the
+            methods that fit a point cloud; None: they match the images themselves.
+        lidar_dir: folder of KITTI's LiDAR scans `NNNNNN.bin`, which the calibration of the frames places; None: frames
+            come without points.
+        tracks: number the cars over the frames of a sequence (`Detections.track_id`): by the detection files, else by
+            the masks of KITTI MOTS, else by `associate`; with times and camera poses of the frames where there are any.
+        dtype: of the tensors.
+
+    Raises:
+        DataFormatError: a folder or the split file is missing, or the data are not laid out so.
+        InputError: an unknown layout or `ground`, no detections, no frames, or tracks in a layout without sequences.
+    """
+    if isinstance(layout, str):
+        if layout not in _LAYOUTS:
+            raise InputError("layout", f"one of {', '.join(_LAYOUTS)}", repr(layout))
+        if detections_dir is None and layout != "folder":
+            expected = f"a folder of detections for the layout {layout!r}"
+            raise InputError("detections", expected, "none", "--detections DIR")
+        layout = _LAYOUTS[layout](root, detections_dir)
+    if ground not in get_args(GroundSource):
+        raise InputError("ground", f"one of {', '.join(get_args(GroundSource))}", repr(ground))
+    frame_ids = _chosen_frames(layout, split, frames)
+    if tracks and layout.sequence_of(frame_ids[0]) is None:
+        raise InputError("tracks", "a layout of sequences: tracking, raw or folder", "frames by themselves")
+    # Masks from elsewhere know nothing of the layout's own links between masks and detections.
+    has_own_masks = masks is None
+    if masks is None or isinstance(masks, (str, Path)):
+        masks = layout.masks(None if masks is None else Path(masks))
+    return StereoDataset(
+        layout,
+        masks,
+        frame_ids,
+        frozenset(classes),
+        ground,
+        camera_height_m,
+        (disparity_field,) if isinstance(disparity_field, DisparityField) else tuple(disparity_field or ()),
+        _folder(disparity_dir, "disparity maps"),
+        _folder(lidar_dir, "LiDAR scans"),
+        tracks,
+        dtype,
+        has_own_masks,
+    )
+
+
+def _folder(path: Path | str | None, what: str) -> Path | None:
+    return None if path is None else existing_folder(Path(path), f"is no folder of {what}")
+
+
+@dataclass(eq=False)
+class StereoDataset:
+    """Frames with detections and masks, whose files a layout finds; see `open_dataset`."""
+
+    layout: FrameLayout
+    masks: MaskSource | None
+    frame_ids: tuple[str, ...]
+    classes: frozenset[str]
+    ground: GroundSource
+    camera_height_m: float
+    disparity_fields: tuple[DisparityField, ...]
+    disparity_dir: Path | None
+    lidar_dir: Path | None
+    tracks: bool
+    dtype: torch.dtype
+    has_own_masks: bool  # the masks are the layout's
+    # By sequence and frame, made when they are first asked for.
+    _tracks: dict[str | None, dict[str, list[int]]] = field(default_factory=dict, init=False, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    def load(self, frame_id: str) -> LoadedFrame:
+        """Read everything of one frame.
+
+        Raises:
+            DataFormatError: a file is missing or damaged; names file and reason.
+        """
+        left, right = read_pair(*self.layout.images(frame_id))
+        height, width = left.shape[:2]
+        camera = camera_of_rig(self.layout.calibration(frame_id), self.disparity_fields, (width, height), self.dtype)
+        time_s, T_world_cam = self._motion(frame_id, camera)
+        frame = FrameBatch(
+            images_left=_to_tensor(left, self.dtype),
+            images_right=_to_tensor(right, self.dtype),
+            sizes=torch.tensor([[height, width]]),
+            camera=camera,
+            ground=self._ground(frame_id, left, right, camera),
+            frame_ids=(frame_id,),
+            disparity=self._disparity(frame_id, (height, width)),
+            points_cam=self._points(frame_id, (height, width)),
+            time_s=time_s,
+            T_world_cam=T_world_cam,
+        )
+        objects = self.objects(frame_id)
+        masks = [] if self.masks is None else self.masks.read(frame_id, (height, width))
+        given = self.layout.given_masks(frame_id) if self.has_own_masks else None
+        detections, rows, mask_tracks = build_detections(objects, masks, camera, (height, width), self.classes, given)
+        if self.tracks:
+            detections = replace(detections, track_id=self._track_id(frame_id, rows, mask_tracks))
+        sequence = self.sequence_of(frame_id)
+        return LoadedFrame(frame, detections, objects, rows, self.layout.labels(frame_id), sequence)
+
+    def scan(self, frame_id: str) -> tuple[Tensor, StereoCamera]:
+        """All points (P, 3) of the LiDAR scan of a frame in its left camera, metres, float64, and that camera.
+
+        The camera has no disparity field: a scan has no part in the rig's error.
+
+        Raises:
+            DataFormatError: the scan is missing or damaged, or the calibration does not say where the scanner is.
+            InputError: the data set was opened without scans.
+        """
+        if self.lidar_dir is None:
+            raise InputError("dataset", "one with LiDAR scans", "none", "open it with lidar_dir=..")
+        calibration = self.layout.lidar_calibration(frame_id)
+        camera = to_stereo_camera([calibration], dtype=torch.float64)
+        return read_scan(self.layout.lidar_files(self.lidar_dir, frame_id)["lidar"], calibration, camera), camera
+
+    def objects(self, frame_id: str) -> list[KittiObject]:
+        """The detections of a frame alone, without its images."""
+        return self.layout.objects(frame_id)
+
+    def sequence_of(self, frame_id: str) -> str | None:
+        """The sequence through which the tracks of a frame go, "" where there is but one; None: it has no tracks."""
+        return self.layout.sequence_of(frame_id) if self.tracks else None
+
+    def input_files(self, frame_id: str) -> dict[str, Path]:
+        """The files that `load` reads for a frame and that bear on its result, by their role."""
+        left, right = self.layout.images(frame_id)
+        files = {
+            "image_left": left,
+            "image_right": right,
+            "calibration": self.layout.calibration_path(frame_id),
+            "detections": self.layout.detection_path(frame_id),
+        }
+        if self.disparity_dir is not None:
+            files["disparity"] = self.layout.disparity_path(self.disparity_dir, frame_id)
+        if self.lidar_dir is not None:
+            files |= self.layout.lidar_files(self.lidar_dir, frame_id)
+        if self.tracks:
+            files |= self.layout.motion_files(frame_id)
+        plane = self.layout.plane_path(frame_id)
+        if self.ground in ("auto", "file") and plane is not None:
+            files["ground_plane"] = plane
+        if self.masks is not None:
+            files |= {f"masks_{index}": path for index, path in enumerate(self.masks.files(frame_id))}
+        return files
+
+    def _track_id(self, frame_id: str, rows: tuple[int, ...], mask_tracks: tuple[int, ...]) -> Tensor:
+        """(B,) of the detections: by the masks, else by the detections themselves."""
+        if any(track >= 0 for track in mask_tracks):
+            return torch.tensor(mask_tracks)
+        sequence = self.sequence_of(frame_id)
+        if sequence not in self._tracks:
+            self._tracks[sequence] = self._tracks_of(sequence)
+        ids = self._tracks[sequence][frame_id]
+        return torch.tensor([track for track, row in zip(ids, rows, strict=True) if row >= 0], dtype=torch.int64)
+
+    def _tracks_of(self, sequence: str | None) -> dict[str, list[int]]:
+        """Of all frames of a sequence, whichever of them are used: those of its files, or associated."""
+        objects: dict[str, list[KittiObject]] = {}
+        for frame_id in self.layout.frame_ids():
+            if self.layout.sequence_of(frame_id) == sequence:
+                # A file that cannot be read is reported when its turn comes.
+                with contextlib.suppress(DirectShapeError, OSError):
+                    objects[frame_id] = self.objects(frame_id)
+        given = {frame_id: [found.track_id for found in frame] for frame_id, frame in objects.items()}
+        if any(track >= 0 for ids in given.values() for track in ids):
+            return given
+        return dict(zip(objects, associate(list(objects.values())), strict=True))
+
+    def _disparity(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
+        if self.disparity_dir is None:
+            return None
+        disparity = read_disparity(self.layout.disparity_path(self.disparity_dir, frame_id), size_hw)
+        return torch.from_numpy(disparity)[None].to(self.dtype)
+
+    def _points(self, frame_id: str, size_hw: tuple[int, int]) -> Tensor | None:
+        if self.lidar_dir is None:
+            return None
+        points, camera = self.scan(frame_id)
+        return in_image(points, size_hw, camera)[None].to(self.dtype)
+
+    def _motion(self, frame_id: str, camera: StereoCamera) -> tuple[Tensor | None, Tensor | None]:
+        """Time (1,) and pose (1, 4, 4) of the left camera, where cars have numbers and that is known."""
+        time_s, T_world_ref = self.layout.motion(frame_id) if self.tracks else (None, None)
+        T_world_cam = None
+        if T_world_ref is not None:
+            T_world_cam = torch.from_numpy(T_world_ref)[None].clone()
+            T_world_cam[:, :3, 3] -= (T_world_cam[:, :3, :3] @ camera.t_cam_ref[0].double()[:, None])[:, :, 0]
+            T_world_cam = T_world_cam.to(self.dtype)
+        return None if time_s is None else torch.tensor([time_s], dtype=self.dtype), T_world_cam
+
+    def _ground(
+        self, frame_id: str, left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera
+    ) -> GroundPlane:
+        """The plane of the first source that has one, of those that `self.ground` allows.
+
+        Plane files are commonly made from raw disparity and share its bias, so with a disparity field "auto" asks the
+        corrected stereo pair first.
+        """
+        orders: dict[GroundSource, tuple[GroundSource, ...]] = {
+            "auto": ("file", "stereo") if not self.disparity_fields else ("stereo", "file"),
+            "file": ("file",),
+            "stereo": ("stereo",),
+            "camera_height": (),
+        }
+        for source in orders[self.ground]:
+            if source == "file":
+                plane_cam = self._plane_from_file(frame_id, camera)
+            else:
+                plane_cam = estimate_ground_plane(left, right, camera)
+            if plane_cam is not None:
+                normal, offset = (torch.as_tensor(part).double().to(self.dtype) for part in plane_cam)
+                return GroundPlane(normal.reshape(1, 3), offset.reshape(1), (source,))
+        return GroundPlane.from_camera_height(self.camera_height_m).to(dtype=self.dtype)
+
+    def _plane_from_file(self, frame_id: str, camera: StereoCamera) -> tuple[Tensor, Tensor] | None:
+        if self.ground == "auto" and self.layout.plane_path(frame_id) is None:
+            return None
+        plane_ref = torch.from_numpy(self.layout.plane_ref(frame_id))
+        return plane_ref[:3], plane_ref_to_cam(plane_ref[:3], plane_ref[3], camera.t_cam_ref[0].double())
+
+
+def _to_tensor(rgb: NDArray[np.uint8], dtype: torch.dtype) -> Tensor:
+    """(1, 3, H, W) in [0, 1] from uint8 (H, W, 3)."""
+    return torch.from_numpy(rgb).permute(2, 0, 1)[None].to(dtype).contiguous() / 255
+
+
+def _chosen_frames(
+    layout: FrameLayout, split: Path | str | None, frames: Iterable[str | int] | None
+) -> tuple[str, ...]:
+    known = layout.frame_ids() if split is None else list(dict.fromkeys(line.text for line in read_lines(split)))
+    if frames is not None:
+        names = (layout.frame_id(frame) if isinstance(frame, int) else frame for frame in frames)
+        # A frame that is named twice is one frame.
+        wanted = list(dict.fromkeys(names))
+        if missing := [frame for frame in wanted if frame not in set(known)]:
+            where = split if split is not None else layout.detections_dir
+            raise InputError("frames", f"ids that occur in {where}", ", ".join(missing[:5]))
+        known = wanted
+    if not known:
+        files = f"detection file {layout.detection_file_name} in {layout.detections_dir}"
+        raise InputError("frames", f"at least one {files if split is None else f'frame in {split}'}", "none")
+    for frame_id in known:
+        if not is_frame_id(frame_id):
+            where = "frames" if split is None else f"{split}, frames"
+            raise InputError(where, "names without folders", shown(frame_id), "rename the files")
+    return tuple(known)

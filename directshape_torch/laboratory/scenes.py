@@ -14,7 +14,7 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.geometry.projection import project
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.rows import Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
@@ -60,7 +60,7 @@ def load_scene(
     """
     root = DEMO_FOLDER if data is None else data
     detections_dir = detections_dir or _detections_folder(root)
-    dataset = KittiStereoDataset(root, detections_dir, masks or root / "training" / "masks", dtype=torch.float64)
+    dataset = open_dataset("kitti", root, detections_dir, masks or root / "training" / "masks", dtype=torch.float64)
     frames = dataset.frame_ids if frame_id is None else (frame_id,)
     best, most = None, 0
     for name in frames:

@@ -11,8 +11,7 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.io.run_manifest import hash_file
-from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 
 _WORDS = {"image_left": "left image", "image_right": "right image", "ground_plane": "ground plane"}
 
@@ -21,7 +20,7 @@ _WORDS = {"image_left": "left image", "image_right": "right image", "ground_plan
 class InputReader:
     """Reads inputs of the frames of a run and keeps in mind what it could not use."""
 
-    dataset: FileStereoDataset | None = None  # the frames of the run, or None where nobody said where they lie
+    dataset: StereoDataset | None = None  # the frames of the run, or None where nobody said where they lie
     has_detections: bool = False  # whether its detections are those that went in; else others stand in for them
     # What is wrong, and with which frames.
     problems: defaultdict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
@@ -34,7 +33,7 @@ class InputReader:
         """All lines that went in."""
         if self.dataset is None or not self.has_detections:
             return None
-        usable = self._are_unchanged(result, {"detections": self.dataset.detection_path(result.frame_id)})
+        usable = self._are_unchanged(result, {"detections": self.dataset.layout.detection_path(result.frame_id)})
         return self.dataset.objects(result.frame_id) if usable else None
 
     def labels(self, frame_id: str) -> list[KittiObject] | None:

@@ -14,7 +14,7 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import replaced_file
 from directshape_torch.io.run_folder import RunFolder, shapes_path
 from directshape_torch.io.run_manifest import hash_prior
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.report.car_rows import CAR_COLUMNS, CarRow, car_rows, choose_frames
 from directshape_torch.report.frame_details import DetailSettings, FrameMaterial, frame_details
 from directshape_torch.report.frame_inputs import InputReader
@@ -39,7 +39,7 @@ class ReportOutcome:
 def make_report(
     run: RunFolder,
     page: Path,
-    dataset: FileStereoDataset | None = None,
+    dataset: StereoDataset | None = None,
     prior: ShapePrior | None = None,
     *,
     has_detections: bool = True,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 import torch
 
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.image_files import read_rgb
 from directshape_torch.io.kitti_calibration import to_stereo_camera
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, rig_among
 from directshape_torch.rig.rig import Rig
 
@@ -20,7 +21,7 @@ _SIGMA_PX = 0.06
 
 
 def estimate_rigs(
-    dataset: FileStereoDataset,
+    dataset: StereoDataset,
     tell: Callable[[str], object] = lambda _: None,
     rigs: list[RigEstimate] | None = None,
 ) -> list[RigEstimate]:
@@ -34,13 +35,13 @@ def estimate_rigs(
         tell: called with the name of each frame that was looked at.
         rigs: what is known already; the evidence is added to these, and new rigs join the list.
     """
-    plain, rigs = dataset.changed(ground="camera_height", disparity_field=None), [] if rigs is None else rigs
+    plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), [] if rigs is None else rigs
     for frame_ids in _frames_by_rig(plain):
         _take_in(plain, frame_ids, tell, rigs)
     return rigs
 
 
-def _frames_by_rig(dataset: FileStereoDataset) -> list[list[str]]:
+def _frames_by_rig(dataset: StereoDataset) -> list[list[str]]:
     """All frames that have detections, chosen or not, those of one calibration together.
 
     Frames whose calibration cannot be read are left out.
@@ -54,7 +55,7 @@ def _frames_by_rig(dataset: FileStereoDataset) -> list[list[str]]:
 
 
 def _take_in(
-    dataset: FileStereoDataset, frame_ids: Sequence[str], tell: Callable[[str], object], rigs: list[RigEstimate]
+    dataset: StereoDataset, frame_ids: Sequence[str], tell: Callable[[str], object], rigs: list[RigEstimate]
 ) -> None:
     rig, num_seen = _rig_of_first(dataset, frame_ids, rigs), 0
     if rig is None:
@@ -71,7 +72,7 @@ def _take_in(
                 break
 
 
-def _rig_of_first(dataset: FileStereoDataset, frame_ids: Sequence[str], rigs: list[RigEstimate]) -> RigEstimate | None:
+def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[RigEstimate]) -> RigEstimate | None:
     """That of the first frame whose left image can be read; a rig whose frames have no cars is one too."""
     for frame_id in frame_ids:
         with suppress(DirectShapeError, OSError):

@@ -10,8 +10,7 @@ from pathlib import Path
 import directshape_torch
 from directshape_torch.errors import InputError
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.scene import Detections, FrameBatch
 
 _DETECTORS = {"rendered": "stereo", "kitti": "noisy_stereo"}
@@ -50,7 +49,7 @@ def demo_scene() -> Scene:
 
 
 def _scene(root: Path, detector: str, max_frames: int | None) -> Scene:
-    dataset = KittiStereoDataset(root, root / "detections" / detector, root / "training" / "masks")
+    dataset = open_dataset("kitti", root, root / "detections" / detector, root / "training" / "masks")
     loaded = (dataset.load(frame_id) for frame_id in dataset.frame_ids)
     with_cars = (frame for frame in loaded if len(frame.detections))
     return Scene(root.name, tuple(itertools.islice(with_cars, max_frames)))

@@ -15,9 +15,8 @@ from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.files.npz_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.rig.estimate import RigEstimate
@@ -93,7 +92,7 @@ _FRAMES_OF_RIG = 12
 
 
 def observe_noisy(
-    dataset: KittiStereoDataset,
+    dataset: StereoDataset,
     refiner: Callable[[RigEstimate], DirectShapeRefiner],
     levels: Sequence[NoiseLevel],
     seeds: Sequence[int],
@@ -114,7 +113,7 @@ def observe_noisy(
     return Observations.joined(parts)
 
 
-def _rig_of_run(dataset: KittiStereoDataset, level: NoiseLevel, seed: int) -> RigEstimate:
+def _rig_of_run(dataset: StereoDataset, level: NoiseLevel, seed: int) -> RigEstimate:
     rig: RigEstimate | None = None
     for number in range(0, len(dataset.frame_ids), max(1, len(dataset.frame_ids) // _FRAMES_OF_RIG)):
         loaded, drawn = _drawn(dataset, number, level, seed)
@@ -124,7 +123,7 @@ def _rig_of_run(dataset: KittiStereoDataset, level: NoiseLevel, seed: int) -> Ri
     return rig
 
 
-def _drawn(dataset: KittiStereoDataset, number: int, level: NoiseLevel, seed: int) -> tuple[LoadedFrame, Detections]:
+def _drawn(dataset: StereoDataset, number: int, level: NoiseLevel, seed: int) -> tuple[LoadedFrame, Detections]:
     """A frame as the rig of that seed shows it, with what a detector says of it."""
     loaded, now = dataset.load(dataset.frame_ids[number]), CONDITIONS[seed % len(CONDITIONS)]
     drawn = noisy(loaded.detections, level, 10_000 * seed + 100 * number + LEVELS.index(level))
@@ -138,7 +137,7 @@ def _drawn(dataset: KittiStereoDataset, number: int, level: NoiseLevel, seed: in
     return loaded, drawn
 
 
-def observe_dataset(dataset: KittiStereoDataset, refiner: DirectShapeRefiner, source: str) -> Observations:
+def observe_dataset(dataset: StereoDataset, refiner: DirectShapeRefiner, source: str) -> Observations:
     """Refine the detections of a data set as they are."""
     frames: Iterable[LoadedFrame] = (dataset.load(frame_id) for frame_id in dataset.frame_ids)
     return Observations.joined([part for f in frames for part in observe(f, f.detections, refiner, source)])

@@ -26,8 +26,8 @@ from directshape_torch.batch.run_log import RunLog, log_path
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import DirectShapeError, RunInProgressError
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.run_folder import done_frames
+from directshape_torch.io.stereo_dataset import open_dataset
 
 FRAMES = tuple(f"{number:06d}" for number in range(6))
 TESTS = Path(__file__).parent.parent
@@ -42,7 +42,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def refine(root: Path, out: Path, options: RefineOptions | None = None, fresh: bool = False) -> RunSummary:
-    dataset = KittiStereoDataset(root, root / "detections", root / "masks")
+    dataset = open_dataset("kitti", root, root / "detections", root / "masks")
     return refine_dataset(dataset, QuickRefiner(root), out, options, workers=WorkerOptions(threads=1), fresh=fresh)
 
 
@@ -187,7 +187,7 @@ def test_frames_without_an_entry_in_the_summary_are_finished(root: Path, tmp_pat
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     summary = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
-    one = KittiStereoDataset(root, root / "detections", root / "masks", frames=FRAMES[:1])
+    one = open_dataset("kitti", root, root / "detections", root / "masks", frames=FRAMES[:1])
     assert refine_dataset(one, QuickRefiner(root), out, workers=WorkerOptions(threads=1)).resumed == FRAMES[:1]
     assert result_files(out) == result_files(undisturbed)
 

@@ -19,7 +19,7 @@ from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.batch.workers import GroupDispatch, WorkerDiedError
 from directshape_torch.errors import DirectShapeError
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 
 
@@ -142,7 +142,7 @@ def refine(
     who: WorkerOptions,
     listener: RunObserver | None = None,
 ) -> RunSummary:
-    dataset = KittiStereoDataset(root, root / "detections", root / "masks")
+    dataset = open_dataset("kitti", root, root / "detections", root / "masks")
     return refine_dataset(dataset, refiner, out, RefineOptions("ply", batch_frames=batch_frames), listener, who)
 
 

@@ -13,7 +13,7 @@ from directshape_torch.cli.main import main
 from directshape_torch.cli.options import find_device
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.rig.rig_file import save_field
 
 QUICK = ("--set", "stages=[{max_iterations: 2}]")
@@ -99,7 +99,7 @@ def test_masks_are_needed_in_one_form(kitti: Path, tmp_path: Path, capsys: pytes
 
 
 def test_stereo_bias_is_used_and_hashed(kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    dataset = KittiStereoDataset(kitti, kitti / "detections", dtype=torch.float64)
+    dataset = open_dataset("kitti", kitti, kitti / "detections", dtype=torch.float64)
     camera = dataset.load("000000").frame.camera
     coefficients = torch.zeros(10, dtype=torch.float64)
     coefficients[0] = -0.8

@@ -13,9 +13,9 @@ from helpers.output_folders import result_files
 from test_refine_command import command
 
 from directshape_torch.cli.main import main
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.stereo_dataset import open_dataset
 
 FRAMES = ("000000", "000001")
 # The scanner stands in camera 0: x forward, y left, z up becomes x right, y down, z forward.
@@ -56,7 +56,7 @@ def refine(root: Path, out: Path, *extra: object) -> int:
 def test_scans_are_read_in_the_left_camera_and_batched(source: Path) -> None:
     from directshape_torch.io.frame_collation import collate
 
-    dataset = KittiStereoDataset(source, source / "detections", source / "masks", lidar_dir=source / "velodyne")
+    dataset = open_dataset("kitti", source, source / "detections", source / "masks", lidar_dir=source / "velodyne")
     loaded = [dataset.load(frame_id) for frame_id in FRAMES]
     points = loaded[0].frame.points_cam
     assert points is not None

@@ -14,9 +14,9 @@ from helpers.kitti_folder import CODE, write_data_set
 from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.stereo_dataset import open_dataset
 
 QUICK = ("--set", "point_cloud.rounds=1", "point_cloud.min_points=50", "stages=[{max_iterations: 2}]")
 
@@ -78,12 +78,12 @@ def test_a_bad_map_fails_its_frame_alone(source: Path, tmp_path: Path, capsys: p
 def test_frames_of_several_sizes_keep_their_maps(source: Path) -> None:
     from directshape_torch.io.frame_collation import collate
 
-    dataset = KittiStereoDataset(source, source / "detections", source / "masks", disparity_dir=source / "disparity")
+    dataset = open_dataset("kitti", source, source / "detections", source / "masks", disparity_dir=source / "disparity")
     loaded = [dataset.load(frame_id) for frame_id in dataset.frame_ids]
     together = collate(loaded)[0].disparity
     assert together is not None
     np.testing.assert_array_equal(together[1], loaded[1].frame.disparity[0])  # type: ignore[index]
-    bare = KittiStereoDataset(source, source / "detections", source / "masks").load("000000")
+    bare = open_dataset("kitti", source, source / "detections", source / "masks").load("000000")
     assert collate([bare])[0].disparity is None
     with pytest.raises(ValueError, match="loaded: expected frames with disparity maps, or frames without, got 1 of 2"):
         collate([bare, loaded[1]])

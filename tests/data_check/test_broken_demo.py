@@ -12,7 +12,7 @@ from helpers.broken_data import BREAKS, copy_data
 
 import directshape_torch
 from directshape_torch.data_check import check_dataset as checks
-from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.scene_check import check_pair
 from directshape_torch.scene_check.finding import CheckReport
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.open_dataset import LayoutName, open_dataset
+from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.scene_check.car_evidence import CarBoxes
 from directshape_torch.scene_check.check_calibration import check_calibration
 from directshape_torch.scene_check.check_pair import PairMatches, check_pair, fit_rows, match_pair
@@ -230,12 +230,12 @@ DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 def test_a_field_that_the_cars_contradict(bias_px: float, expected: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The bundled frame is exact, so a field of 1.5 px is what is wrong; it has six cars."""
     monkeypatch.setattr(module, "FEWEST_CARS", 4)
-    dataset = KittiStereoDataset(DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks")
+    dataset = open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks")
     frame = dataset.load("000000").frame
     height, width = frame.sizes[0].tolist()
     matrices = (frame.camera.K_left[0], frame.camera.K_right[0], frame.camera.T_right_cam[0])
     field = DisparityField.constant(bias_px, (width, height), *matrices)
-    found = module.check_rig(dataset.changed(ground="file", disparity_field=field), ["000000"])
+    found = module.check_rig(replace(dataset, ground="file", disparity_fields=(field,)), ["000000"])
     assert [finding.check for finding in found] == expected
     for finding in found:
         assert "m at 30 m" in finding.measured

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import get_args
 
 from directshape_torch.io import folder_json
-from directshape_torch.io.open_dataset import LayoutName
+from directshape_torch.io.stereo_dataset import LayoutName
 from directshape_torch.scene_check.conventions import all_conventions
 from directshape_torch.scene_check.finding import MISTAKES
 

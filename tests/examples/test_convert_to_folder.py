@@ -20,10 +20,8 @@ from helpers.layouts import put
 import directshape_torch
 from directshape_torch.cli.main import main
 from directshape_torch.data_check.check_dataset import check_dataset
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import poses_cam
-from directshape_torch.io.open_dataset import open_dataset
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.scene_check.image_boxes import box_iou
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
@@ -67,7 +65,7 @@ def write_rig(demo: LoadedFrame, root: Path) -> None:
 @pytest.fixture(scope="module")
 def kitti() -> LoadedFrame:
     detections, masks = DEMO / "detections" / "noisy_stereo", DEMO / "training" / "masks"
-    return KittiStereoDataset(DEMO, detections, masks, dtype=torch.float64).load("000000")
+    return open_dataset("kitti", DEMO, detections, masks, dtype=torch.float64).load("000000")
 
 
 @pytest.fixture(scope="module")

@@ -96,6 +96,6 @@ def test_lidar_points_bring_cars_to_where_they_are() -> None:
 
 def _demo(of: dict[str, Any]) -> tuple[Any, Any]:
     root = of["ROOT"]
-    loaded = of["KittiStereoDataset"](root, root / "detections" / "noisy_stereo", root / "training" / "masks")
+    loaded = of["open_dataset"]("kitti", root, root / "detections" / "noisy_stereo", root / "training" / "masks")
     frame = loaded.load("000000")
     return frame.frame, frame.detections

@@ -23,10 +23,10 @@ from directshape_torch.errors import DataFormatError, InputError, MissingDepende
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
@@ -260,7 +260,7 @@ def test_a_car_moves_under_the_name_of_its_track(finished: FinishedRun, tmp_path
 def test_a_damaged_image_leaves_no_file(finished: FinishedRun, tmp_path: Path) -> None:
     root = Path(shutil.copytree(finished.root, tmp_path / "kitti"))
     (root / "training" / "image_2" / "000001.png").write_bytes(b"no image")
-    dataset = KittiStereoDataset(root, root / "detections", root / "masks")
+    dataset = open_dataset("kitti", root, root / "detections", root / "masks")
     with pytest.raises(DataFormatError, match="000001"):
         export_run(finished.folder(), tmp_path / "out", ["rerun"], replace(finished.inputs(), dataset=dataset))
     assert list((tmp_path / "out").iterdir()) == []

@@ -20,9 +20,9 @@ from scipy.spatial.transform import Rotation
 
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.stereo_dataset import open_dataset
 
 Floats = NDArray[np.float64]
 LINES = (1, 3)
@@ -263,7 +263,8 @@ def test_points_lie_evenly_on_the_surface(finished: FinishedRun, exported: Path)
 def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp_path: Path) -> None:
     """A map of constant disparity puts every point of a mask at the depth f b / d."""
     write_disparity(tmp_path / "maps" / "000000.png", np.full((120, 160), 10.0))
-    dataset = KittiStereoDataset(
+    dataset = open_dataset(
+        "kitti",
         finished.root,
         finished.root / "detections",
         finished.root / "masks",

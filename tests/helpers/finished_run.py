@@ -15,8 +15,8 @@ from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.config_files import load_config
 from directshape_torch.export.frame_source import ExportInputs
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
 from directshape_torch.io.run_folder import RunFolder
+from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.kitti_folder import write_data_set
@@ -41,7 +41,7 @@ class FinishedRun:
         return PCAShapePrior.load(self.root / "prior.npz")
 
     @property
-    def dataset(self) -> KittiStereoDataset:
+    def dataset(self) -> StereoDataset:
         return dataset_of(self.root, self.folder().classes)
 
     def folder(self, *frames: str) -> RunFolder:
@@ -62,8 +62,8 @@ class FinishedRun:
         return ExportInputs(self.prior, self.dataset if with_images else None, self.root, **options)
 
 
-def dataset_of(root: Path, classes: tuple[str, ...] = ("Car",)) -> KittiStereoDataset:
-    return KittiStereoDataset(root, root / "detections", root / "masks", classes=classes)
+def dataset_of(root: Path, classes: tuple[str, ...] = ("Car",)) -> StereoDataset:
+    return open_dataset("kitti", root, root / "detections", root / "masks", classes=classes)
 
 
 def refined(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
 
 
-def instances(dataset: FileStereoDataset, loaded: LoadedFrame) -> tuple[list[int], list[int]]:
+def instances(dataset: StereoDataset, loaded: LoadedFrame) -> tuple[list[int], list[int]]:
     """Numbers of the file for the left and for the right image, -1 for none."""
     height, width = loaded.frame.sizes[0].tolist()
     masks = [] if dataset.masks is None else dataset.masks.read(loaded.frame_id, (height, width))

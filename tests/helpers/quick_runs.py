@@ -9,14 +9,14 @@ from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.config import RefinerConfig
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.faulty_refiners import few_steps
 
 
-def dataset(root: Path, **options: Any) -> KittiStereoDataset:
-    return KittiStereoDataset(root, root / "detections", root / "masks", **options)
+def dataset(root: Path, **options: Any) -> StereoDataset:
+    return open_dataset("kitti", root, root / "detections", root / "masks", **options)
 
 
 def refiner(root: Path, config: RefinerConfig | None = None) -> DirectShapeRefiner:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from directshape_torch.batch.options import WorkerOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from helpers.faulty_refiners import SlowRefiner
 
 
 def main(root: Path, out_dir: Path) -> None:
-    dataset = KittiStereoDataset(root, root / "detections", root / "masks")
+    dataset = open_dataset("kitti", root, root / "detections", root / "masks")
     refine_dataset(dataset, SlowRefiner(root), out_dir, workers=WorkerOptions(workers=2))
 
 

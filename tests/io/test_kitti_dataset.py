@@ -18,7 +18,7 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
+from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.scene_check.image_boxes import project_boxes
 
 P2 = torch.tensor([[500.0, 0, 60, 30], [0, 500, 30, 0], [0, 0, 1, 0.003]], dtype=torch.float64)
@@ -92,8 +92,8 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def dataset(root: Path, **options: Any) -> KittiStereoDataset:
-    return KittiStereoDataset(root, root / "detections", root / "masks", **options)
+def dataset(root: Path, **options: Any) -> StereoDataset:
+    return open_dataset("kitti", root, root / "detections", root / "masks", **options)
 
 
 def test_frame_and_detections(root: Path) -> None:
@@ -140,7 +140,7 @@ def test_a_mask_in_one_image_only_and_none_at_all(root: Path) -> None:
     assert detections.has_mask_left.tolist() == [False, True]
     assert detections.has_mask_right.tolist() == [True, False]
     assert detections.mask_left[0].sum() == 0
-    without = KittiStereoDataset(root, root / "detections").load("000000").detections
+    without = open_dataset("kitti", root, root / "detections").load("000000").detections
     assert not without.has_mask_left.any()
     assert not without.has_mask_right.any()
 
@@ -219,7 +219,7 @@ def fake_estimator(monkeypatch: pytest.MonkeyPatch, answer: object) -> list[tupl
         calls.append(arguments)
         return answer
 
-    monkeypatch.setattr("directshape_torch.io.stereo_files.estimate_ground_plane", estimate_ground_plane)
+    monkeypatch.setattr("directshape_torch.io.stereo_dataset.estimate_ground_plane", estimate_ground_plane)
     return calls
 
 
@@ -295,12 +295,12 @@ def cut(path: Path) -> None:
 
 def test_missing_folders(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DataFormatError, match="holds no folder 'training' in KITTI's layout"):
-        KittiStereoDataset(root / "training", root / "detections")
+        open_dataset("kitti", root / "training", root / "detections")
     with pytest.raises(DataFormatError, match="nowhere: is no folder of detections"):
-        KittiStereoDataset(root, root / "nowhere")
+        open_dataset("kitti", root, root / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"frames: expected at least one detection file NNNNNN\.txt in .*empty"):
-        KittiStereoDataset(root, tmp_path / "empty")
+        open_dataset("kitti", root, tmp_path / "empty")
 
 
 def test_input_files_are_those_that_load_reads(root: Path) -> None:

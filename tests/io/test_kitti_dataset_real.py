@@ -9,17 +9,16 @@ from pathlib import Path
 import pytest
 from helpers.matched_masks import instances
 
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset, open_dataset
 
 pytestmark = pytest.mark.skipif(
     not os.environ.get("DIRECTSHAPE_DATA"), reason="DIRECTSHAPE_DATA does not name the folder of the data"
 )
 
 
-def load_all(data: str, detections: str, masks: str) -> tuple[KittiStereoDataset, list[LoadedFrame]]:
+def load_all(data: str, detections: str, masks: str) -> tuple[StereoDataset, list[LoadedFrame]]:
     root = Path(os.environ["DIRECTSHAPE_DATA"])
-    frames = KittiStereoDataset(root / data, root / data / "detections" / detections, root / data / masks)
+    frames = open_dataset("kitti", root / data, root / data / "detections" / detections, root / data / masks)
     return frames, [frames.load(frame_id) for frame_id in frames.frame_ids]
 
 
@@ -27,7 +26,7 @@ def with_left_mask(loaded: list[LoadedFrame]) -> int:
     return sum(int(frame.detections.has_mask_left.sum()) for frame in loaded)
 
 
-def pairs(dataset: KittiStereoDataset, loaded: list[LoadedFrame]) -> list[tuple[int, int]]:
+def pairs(dataset: StereoDataset, loaded: list[LoadedFrame]) -> list[tuple[int, int]]:
     """Instance ids of cars matched in both images; in these data the ids of the two images agree."""
     found = [pair for frame in loaded for pair in zip(*instances(dataset, frame), strict=True)]
     return [(left, right) for left, right in found if left >= 0 and right >= 0]
@@ -72,7 +71,7 @@ def test_ground_of_a_real_stereo_pair_is_near_the_plane_of_its_file() -> None:
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
     folders = root, root / "detections" / "noisy_stereo"
     from_stereo, from_file = (
-        KittiStereoDataset(*folders, ground=source).load("000107").frame.ground for source in ("stereo", "file")
+        open_dataset("kitti", *folders, ground=source).load("000107").frame.ground for source in ("stereo", "file")
     )
     assert (from_stereo.source, from_file.source) == (("stereo",), ("file",))
     assert float((from_stereo.normal * from_file.normal).sum()) > math.cos(math.radians(1.0))

@@ -13,7 +13,7 @@ from helpers.layouts import DRIVE, SEQUENCE, put, write, write_folder, write_raw
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.motion_files import of_line, read_poses, read_times
-from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.stereo_dataset import open_dataset
 
 FRAMES = ("000000", "000001")
 TURNED = "0.8 0 0.6 1 0 1 0 2 -0.6 0 0.8 3"

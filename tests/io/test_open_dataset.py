@@ -23,17 +23,14 @@ from helpers.layouts import (
 from helpers.matched_masks import instances
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.open_dataset import LayoutName, open_dataset
-from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.io.stereo_files import FileStereoDataset
+from directshape_torch.io.stereo_dataset import LayoutName, LoadedFrame, StereoDataset, open_dataset
 
 FRAMES = ("000000", "000001")
 
 
 @pytest.fixture(scope="module")
 def expected(kitti: Path) -> LoadedFrame:
-    return KittiStereoDataset(kitti, kitti / "detections", kitti / "masks", dtype=torch.float64).load("000001")
+    return open_dataset("kitti", kitti, kitti / "detections", kitti / "masks", dtype=torch.float64).load("000001")
 
 
 def renamed(kitti: Path, to: Path, names: tuple[str, ...]) -> tuple[Path, Path]:
@@ -44,7 +41,7 @@ def renamed(kitti: Path, to: Path, names: tuple[str, ...]) -> tuple[Path, Path]:
     return to / "detections", to / "masks"
 
 
-def assert_same(dataset: FileStereoDataset, frame_id: str, expected: LoadedFrame) -> None:
+def assert_same(dataset: StereoDataset, frame_id: str, expected: LoadedFrame) -> None:
     """Also for a copy as other processes get it."""
     dataset = pickle.loads(pickle.dumps(dataset))
     loaded = dataset.load(frame_id)

@@ -15,7 +15,7 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.text_files import Line
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.kitti_labels import KittiObject, parse_object
-from directshape_torch.io.open_dataset import open_dataset
+from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.io.track_association import associate
 from directshape_torch.io.tracking_files import read_tracking_objects
 

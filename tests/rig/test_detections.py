@@ -12,8 +12,7 @@ from torch import Tensor
 import directshape_torch
 from directshape_torch import DirectShapeRefiner, RigEstimate
 from directshape_torch.errors import InputError
-from directshape_torch.io.kitti_dataset import KittiStereoDataset
-from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
 from directshape_torch.rig.detections import observe_detections, size_error
 from directshape_torch.scene import Detections, FrameBatch
 
@@ -24,7 +23,7 @@ OFFSET, ROW_OFFSET = 3, 5
 @pytest.fixture(scope="module")
 def demo() -> LoadedFrame:
     """The six cars with their true boxes."""
-    return KittiStereoDataset(DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
+    return open_dataset("kitti", DEMO, DEMO / "training" / "label_2", DEMO / "training" / "masks").load("000000")
 
 
 def warped(frames: FrameBatch, disparity_px: float, rows_px: float) -> FrameBatch:
