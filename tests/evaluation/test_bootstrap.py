@@ -25,14 +25,11 @@ def test_a_change_is_that_of_the_same_cars():
     assert (change.value, change.low, change.high) == pytest.approx((0.5, 0.5, 0.5))
 
 
-def test_one_car_has_no_interval():
-    assert CarBootstrap(1).estimate(np.array([3.0])) == Estimate(3.0, None, None)
-
-
 def test_seed_decides_the_interval():
     values = np.random.default_rng(6).normal(size=30)
     means = [CarBootstrap(30, BootstrapSettings(seed=seed)).estimate(values) for seed in (1, 1, 2)]
     assert means[0] == means[1] != means[2]
+    assert CarBootstrap(1).estimate(np.array([3.0])) == Estimate(3.0, None, None)
 
 
 def test_wrong_input_is_named():

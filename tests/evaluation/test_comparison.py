@@ -98,10 +98,7 @@ def test_every_figure(folders: tuple[Path, Path, Path]):
     assert overall.worse_share is not None
     assert overall.worse_share.value == pytest.approx(1 / 3)
     assert overall.worse_share.low == 0
-
-
-def test_depth_bins_partition_the_cars(folders: tuple[Path, Path, Path]):
-    groups = {group.name: group.num_detections for group in compare_results(*folders).by_depth}
+    groups = {group.name: group.num_detections for group in comparison.by_depth}
     assert groups == {"0-10 m": 1, "10-20 m": 0, "20-30 m": 1, "30-45 m": 1, "over 45 m": 0}
 
 

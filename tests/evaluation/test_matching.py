@@ -31,11 +31,6 @@ def test_each_detection_takes_its_largest_free_overlap():
     assert match_to_labels([far, near], labels[:1]) == [-1, 0]
 
 
-def test_nothing_to_match():
-    assert match_to_labels([], [_object((0, 0, 9, 9))]) == []
-    assert match_to_labels([_object((0, 0, 9, 9))], []) == [-1]
-
-
 def test_a_van_keeps_its_detection_and_dontcare_takes_none():
     box = (100, 100, 200, 200)
     labels = [_object((100, 100, 150, 200)), _object(box, "Van"), _object(box, "DontCare")]

@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from directshape_torch.errors import InputError
-from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
-from directshape_torch.files.text_files import Line
-from directshape_torch.io.kitti_labels import parse_object
+from directshape_torch.evaluation.pose_error import pose_errors
 
 TRUE = torch.tensor([[1.0, 1.6, 20.0, 1.5, 1.7, 4.0, 0.2]], dtype=torch.float64)
 
@@ -53,20 +51,6 @@ def test_yaw_errors_are_symmetric_and_bounded(a: float, b: float):
     assert there.yaw_deg.item() == pytest.approx(back.yaw_deg.item(), abs=1e-6)
     assert 0 <= there.yaw_axis_deg.item() <= 90 + 1e-9
     assert there.yaw_axis_deg.item() <= there.yaw_deg.item() <= 180 + 1e-9
-
-
-def test_overlaps_of_a_half_length_shift():
-    level = TRUE * torch.tensor([1, 1, 1, 1, 1, 1, 0])
-    found = level.clone()
-    found[:, 0] += 2.0
-    errors = pose_errors(found, level)
-    assert errors.bev_iou.item() == pytest.approx(1 / 3, abs=1e-12)
-    assert errors.iou_3d.item() == pytest.approx(1 / 3, abs=1e-12)
-
-
-def test_boxes_of_reads_columns_in_order():
-    line = Line(1, "Car 0 0 0 10 10 60 40 1.5 1.6 3.9 1 1.7 20 0.4", "")
-    assert boxes_of([parse_object("labels", line)]).tolist() == [[1, 1.7, 20, 1.5, 1.6, 3.9, 0.4]]
 
 
 def test_wrong_shape_is_named():

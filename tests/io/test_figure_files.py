@@ -5,13 +5,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from directshape_torch.errors import InputError, MissingDependencyError
-from directshape_torch.io.figure_files import check_figures, figure_picture, figure_png, new_figure, write_animation
+from directshape_torch.errors import MissingDependencyError
+from directshape_torch.io.figure_files import check_figures, figure_png, new_figure, write_animation
 
 
 def _png(last_value: float) -> bytes:
@@ -24,12 +23,6 @@ def test_bytes_depend_on_the_figure_alone() -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     assert _png(1.0) == _png(1.0)
     assert _png(1.0) != _png(2.0)
-
-
-def test_size() -> None:
-    pytest.importorskip("matplotlib", reason="matplotlib is not installed")
-    height, width = cv2.imdecode(np.frombuffer(_png(1.0), np.uint8), cv2.IMREAD_COLOR).shape[:2]
-    assert width == 2 * height
 
 
 def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -54,30 +47,7 @@ def test_animation_read_back(tmp_path: Path) -> None:
             np.testing.assert_allclose(np.asarray(animation.convert("RGB")), picture, atol=8)
 
 
-def test_equal_animations_have_equal_bytes(tmp_path: Path) -> None:
-    for name in ("a.gif", "b.gif"):
-        write_animation(tmp_path / name, [_RED, _BLUE], [0.1, 0.1])
-    assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("frames", "seconds", "name"),
-    [([], [], "frames"), ([_RED, _BLUE[:5]], [1, 1], "frames"), ([_RED, _BLUE], [1], "seconds")],
-)
-def test_what_is_no_animation(frames: list[np.ndarray], seconds: list[float], name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=name):
-        write_animation(tmp_path / "a.gif", frames, seconds)
-
-
 def test_without_pillow_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(MissingDependencyError, match=r"pillow.*directshape_torch\[plot\]"):
         write_animation(tmp_path / "a.gif", [_RED], [1.0])
-
-
-def test_picture_of_a_figure_shows_it() -> None:
-    figure = new_figure(2, 1, "a test")
-    figure.set_facecolor("red")
-    picture = figure_picture(figure)
-    assert picture.shape == (80, 160, 3)
-    assert (picture == (255, 0, 0)).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import read_calibration, read_plane, to_stereo_camera
 
 # The projections of KITTI's first recording day.
@@ -35,13 +35,6 @@ def test_layouts_give_the_same_projections(tmp_path: Path, text: str) -> None:
     assert calibration.P3[1, 3] == 2.199936
     assert calibration.R0_rect is not None
     assert calibration.R0_rect.shape == (3, 3)
-
-
-def test_velodyne_is_none_where_the_file_has_none(tmp_path: Path) -> None:
-    assert read_calibration(write(tmp_path, RAW)).Tr_velo_to_cam is None
-    tracking = read_calibration(write(tmp_path, TRACKING))
-    assert tracking.Tr_velo_to_cam is not None
-    assert tracking.Tr_velo_to_cam[:, 3].tolist() == [0.1, 0.2, 0.3]
 
 
 def test_offsets_by_hand(tmp_path: Path) -> None:
@@ -79,11 +72,6 @@ def test_flipped_baseline_names_the_file(tmp_path: Path) -> None:
     text = f"P2: {P3}\nP3: {P2}\n"
     with pytest.raises(DataFormatError, match=r"000000\.txt: the camera of P3 is not to the right .*-0\.53\d\d m"):
         to_stereo_camera([read_calibration(write(tmp_path, text))])
-
-
-def test_no_frames() -> None:
-    with pytest.raises(InputError, match="calibrations: expected at least one frame"):
-        to_stereo_camera([])
 
 
 HEADER = "# Plane\nWidth 4\nHeight 1\n"

@@ -45,15 +45,6 @@ def test_kitti_frames_with_simulated_stereo_detections() -> None:
     assert all(left == right for left, right in both)
 
 
-def test_json_and_png_masks_of_the_same_frames_agree() -> None:
-    _, from_json = load_all("kitti", "pointrcnn", "training/masks")
-    _, from_png = load_all("kitti", "pointrcnn", "training")
-    assert with_left_mask(from_json) == with_left_mask(from_png) == 37
-    for a, b in zip(from_json, from_png, strict=True):
-        assert a.detections.mask_left.equal(b.detections.mask_left)
-        assert a.detections.mask_right.equal(b.detections.mask_right)
-
-
 @pytest.mark.parametrize(("detections", "masks", "num_left", "num_both"), [
     ("gt", "training/masks", 117, 116),
     ("stereo", "masks_degraded", 99, 96),

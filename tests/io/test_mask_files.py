@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.coco_segmentation import decode_segmentation
-from directshape_torch.io.instance_masks import tight_box
 from directshape_torch.io.mask_files import CocoFileMasks, FrameJsonMasks, InstancePngMasks, mask_source
 
 SIZE_HW = (6, 9)
@@ -120,6 +119,8 @@ def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
+        (None, r"000000\.json: cannot be read"),
+        ("[{", r"000000\.json: is not valid JSON"),
         ({}, r"000000\.json: is not a list of COCO results"),
         ([entry(image="middle")], "entry 0: 'image' is 'middle', expected 'left' or 'right'"),
         ([{"image": "left", "segmentation": {"size": [6, 9], "counts": RUNS}}], "entry 0: bad or missing field .*cat"),
@@ -131,24 +132,24 @@ def test_empty_mask_is_no_instance(tmp_path: Path) -> None:
     ],
 )
 def test_bad_frame_json(tmp_path: Path, content: Any, message: str) -> None:
-    write_json(tmp_path / "000000.json", content)
+    if isinstance(content, str):
+        (tmp_path / "000000.json").write_text(content)
+    elif content is not None:
+        write_json(tmp_path / "000000.json", content)
     with pytest.raises(DataFormatError, match=message):
         FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
 
 
-def test_soft_mask_of_another_size(tmp_path: Path) -> None:
+def test_masks_of_another_size(tmp_path: Path) -> None:
     write_png(tmp_path / "a.png", np.zeros((3, 4), np.uint8))
     write_json(tmp_path / "000000.json", [entry(image="left", soft_probability="a.png")])
     with pytest.raises(DataFormatError, match=r"a\.png: the soft mask has 4 x 3 pixels .* its image 9 x 6"):
         FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
-
-
-def test_broken_and_missing_json(tmp_path: Path) -> None:
-    (tmp_path / "000000.json").write_text("[{")
-    with pytest.raises(DataFormatError, match=r"000000\.json: is not valid JSON"):
-        FrameJsonMasks(tmp_path).read("000000", SIZE_HW)
-    with pytest.raises(DataFormatError, match=r"000001\.json: cannot be read"):
-        FrameJsonMasks(tmp_path).read("000001", SIZE_HW)
+    write_png(tmp_path / "instance_2" / "000000.png", np.zeros((3, 4), np.uint16))
+    with pytest.raises(DataFormatError, match=r"000000\.png: the instance image has 4 x 3 pixels .*its image 9 x 6"):
+        InstancePngMasks(tmp_path).read("000000", SIZE_HW)
+    with pytest.raises(DataFormatError, match="nowhere: is not a folder of masks"):
+        mask_source(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(("car", "other", "nothing"), [(1003, 2001, 10000), (26003, 24000, 7)])
@@ -169,13 +170,6 @@ def test_instance_png_of_mots_and_cityscapes(tmp_path: Path, car: int, other: in
     np.testing.assert_array_equal(found[car].probability, MASK)
     cars_of_another_class = InstancePngMasks(tmp_path, frozenset([other // 1000])).read("000000", SIZE_HW)
     assert [mask.instance_id for mask in cars_of_another_class if mask.is_car] == [other]
-
-
-def test_instance_png_of_another_size(tmp_path: Path) -> None:
-    for folder in ("instance_2", "instance_3"):
-        write_png(tmp_path / folder / "000000.png", np.zeros((3, 4), np.uint16))
-    with pytest.raises(DataFormatError, match=r"000000\.png: the instance image has 4 x 3 pixels .*its image 9 x 6"):
-        mask_source(tmp_path).read("000000", SIZE_HW)
 
 
 def test_instance_png_of_the_left_images_alone(tmp_path: Path) -> None:
@@ -204,12 +198,3 @@ def test_plain_coco_files_that_do_not_fit(tmp_path: Path) -> None:
         source.read("first", SIZE_HW)
     with pytest.raises(InputError, match="at least one COCO result file"):
         CocoFileMasks(None, None)
-
-
-def test_mask_folder_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(DataFormatError, match="nowhere: is not a folder of masks"):
-        mask_source(tmp_path / "nowhere")
-
-
-def test_tight_box_of_nothing_is_none() -> None:
-    assert tight_box(np.full(SIZE_HW, 0.5, np.float32)) is None

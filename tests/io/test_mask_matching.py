@@ -81,11 +81,6 @@ def test_second_opinion_is_used_where_it_is_there() -> None:
     assert match_masks(boxes, [mask((300, 50, 400, 90))], second).mask_of_detection.tolist() == [-1, 0]
 
 
-def test_no_detections_and_no_masks() -> None:
-    assert len(match_masks(np.zeros((0, 4)), [mask((1, 1, 5, 5))]).mask_of_detection) == 0
-    assert match_masks(np.array([[0.0, 0, 9, 9]]), []).mask_of_detection.tolist() == [-1]
-
-
 def test_projected_boxes_by_hand() -> None:
     T = pose_from_kitti(torch.tensor([[1.0, 1.5, 20.0]]).double(), torch.zeros(1).double())
     left, right = project_boxes(T, torch.tensor([[1.5, 2.0, 4.0]]), camera(), SIZE_HW)

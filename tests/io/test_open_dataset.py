@@ -139,13 +139,6 @@ def test_folder(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
     assert open_dataset("folder", tmp_path, frames=[1]).frame_ids == ("000001",)
 
 
-def test_masks_of_a_folder_may_come_from_elsewhere(kitti: Path, tmp_path: Path, expected: LoadedFrame) -> None:
-    write_folder(kitti, tmp_path, FRAMES)
-    dataset = open_dataset("folder", tmp_path, masks=kitti / "masks", dtype=torch.float64)
-    assert instances(dataset, dataset.load("000001"))[0] == [0, 1]
-    torch.testing.assert_close(dataset.load("000001").detections.mask_left, expected.detections.mask_left)
-
-
 def test_a_mask_stays_with_its_object_wherever_it_is(kitti: Path, tmp_path: Path) -> None:
     """Two objects with each other's masks: overlap would set that right, the file is believed."""
     write_folder(kitti, tmp_path, FRAMES)
@@ -167,12 +160,15 @@ def test_another_layout_is_refused_with_the_cure(layout: LayoutName, kitti: Path
         open_dataset(layout, kitti, kitti / "detections")
 
 
-def test_wrong_words(kitti: Path) -> None:
-    with pytest.raises(
-        InputError, match="layout: expected one of kitti, raw, tracking, stereo2015, folder, got 'coco'"
-    ):
-        open_dataset("coco", kitti)  # type: ignore[arg-type]
-    with pytest.raises(
-        InputError, match="detections: expected a folder of detections for the layout 'kitti', got none"
-    ):
-        open_dataset("kitti", kitti)
+def test_wrong_words_and_folders_that_are_not_there(kitti: Path, tmp_path: Path) -> None:
+    detections = kitti / "detections"
+    cases: list[tuple[str, Path, Path | None, str]] = [
+        ("coco", kitti, None, "layout: expected one of kitti, raw, tracking, stereo2015, folder, got 'coco'"),
+        ("kitti", kitti, None, "detections: expected a folder of detections for the layout 'kitti', got none"),
+        ("kitti", kitti / "training", detections, "holds no folder 'training' in KITTI's layout"),
+        ("kitti", kitti, kitti / "nowhere", "nowhere: is no folder of detections"),
+        ("kitti", kitti, tmp_path, r"frames: expected at least one detection file NNNNNN\.txt in"),
+    ]
+    for layout, root, given, message in cases:
+        with pytest.raises((InputError, DataFormatError), match=message):
+            open_dataset(layout, root, given)  # type: ignore[arg-type]

@@ -12,8 +12,6 @@ from directshape_torch.errors import DataFormatError, ResumeError
 from directshape_torch.io.run_manifest import (
     RunManifest,
     check_resume,
-    hash_file,
-    hash_files,
     read_manifest,
     write_manifest,
 )
@@ -83,16 +81,3 @@ def test_what_all_frames_share_is_needed(tmp_path: Path, hashes: dict[str, str |
     path.write_text(json.dumps(json.loads(path.read_text()) | {"sha256": hashes}))
     with pytest.raises(DataFormatError, match=r"summary\.json: sha256.*expected (an object with 'prior'|str)"):
         read_manifest(path)
-
-
-def test_hashes(tmp_path: Path) -> None:
-    path = tmp_path / "a"
-    path.write_bytes(b"abc")
-    # FIPS 180-2, appendix B.1
-    assert hash_file(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert hash_files({"one": path}) == {"one": hash_file(path)}
-    path.write_bytes(b"")
-    # FIPS 180-2 for the empty message: the changed file is hashed anew.
-    assert hash_file(path) == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
-    with pytest.raises(DataFormatError, match="missing: cannot be read"):
-        hash_file(tmp_path / "missing")
