@@ -12,11 +12,11 @@ from directshape_torch.errors import (
     MissingDependencyError,
     ResumeError,
 )
-from directshape_torch.figures.disparity_profile import DisparityProfile
-from directshape_torch.figures.observability import Observability
-from directshape_torch.figures.quality import FitQuality
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.refinement.disparity_profile import DisparityProfile
+from directshape_torch.refinement.observability import Observability
+from directshape_torch.refinement.quality import FitQuality
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import KittiBoxes, RefinementResult
 from directshape_torch.rig.estimate import RigEstimate

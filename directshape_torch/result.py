@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from directshape_torch.errors import InputError, MissingDependencyError, shown
-from directshape_torch.figures.disparity_profile import DisparityProfile
-from directshape_torch.figures.observability import Observability
-from directshape_torch.figures.quality import FitQuality, bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import alpha_from_kitti, box_corners, rotation_y_from_pose
 from directshape_torch.numerics.checks import check_alike
 from directshape_torch.numerics.records import CarRecord, Dense
+from directshape_torch.refinement.disparity_profile import DisparityProfile
+from directshape_torch.refinement.observability import Observability
+from directshape_torch.refinement.quality import FitQuality, bundled_trust_model
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior

@@ -27,11 +27,11 @@ from torch import Tensor
 from directshape_torch.compile import num_forms
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
-from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.refinement import outcome as outcomes
 from directshape_torch.refinement import tracks
 from directshape_torch.refinement.outcome import Outcome
 from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch

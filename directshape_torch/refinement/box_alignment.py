@@ -14,10 +14,14 @@ import torch
 from torch import Tensor
 
 from directshape_torch.depth import Hits
-from directshape_torch.figures.disparity_profile import profile_figures, profile_offsets
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.tensors import constant_like
-from directshape_torch.refinement.disparity_profile import disparity_profile, shifted_costs
+from directshape_torch.refinement.disparity_profile import (
+    disparity_profile,
+    profile_figures,
+    profile_offsets,
+    shifted_costs,
+)
 from directshape_torch.refinement.outcome import Outcome
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.rows import CarSums, ObjectRays, Rays

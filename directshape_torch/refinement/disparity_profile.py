@@ -1,26 +1,215 @@
-"""How the curves of a `DisparityProfile` are made: the surface under a car's pixels, moved by offsets of the disparity.
+"""The photometric cost of a car over offsets of its disparity: is its state in the right valley, and is there another?
 
-The hits of a state are moved along their rays together, as if the whole visible surface had another disparity; shape
-and contour stay.
+One curve at the input and one at the end, with the same pixels, say how far the images pull each of them, how sharply,
+and whether a repeated texture offers a second place. The hits of a state are moved along their rays together, as if the
+whole visible surface had another disparity; shape and contour stay.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from directshape_torch.compile import compilable
 from directshape_torch.config import PhotometricConfig
-from directshape_torch.figures.disparity_profile import DisparityProfile, default_offsets
+from directshape_torch.errors import InputError
+from directshape_torch.numerics.records import CarRecord, Dense
+from directshape_torch.numerics.tensors import made_once
 from directshape_torch.rows import CarSums, Rays
 from directshape_torch.terms.photometric import Photometric, Surface, photometric_norm
 from directshape_torch.terms.photometric_rows import PhotometricRows, residuals_at
 
+# Two minima nearer than this are one with a dent.
+_APART_PX = 0.75
+# A rise on the way that is a smaller share of the lowest cost is noise and no ridge.
+_RIDGE_SHARE = 0.02
+# A second minimum less than this factor above the first could be the true one.
+AMBIGUOUS_BELOW = 1.25
 MAX_PIXELS = 100
 """Pixels of each car that a curve is made of by default: enough for its shape at half the time of all."""
-
 # Residuals of several offsets at once: 1 MB in single precision, for what does not stay in the caches takes longer.
 _RESIDUALS_AT_ONCE = 250_000
+
+
+class ProfileFigures(NamedTuple):
+    """What one curve says of each of B cars; NaN and False where there is no curve.
+
+    Attributes:
+        offset_px: (B,) of the lowest cost, by the parabola through its neighbours; at an end of the range the end.
+        sigma_px: (B,) standard deviation of that offset, from the curvature there and the cost that is left; infinite
+            where the curve is flat, or falls to an end.
+        distinctness: (B,) cost of the best other minimum, at least 0.75 px away, over the lowest; infinite without one.
+        in_basin: (B,) bool: from the state downhill one comes to the lowest cost.
+        ambiguous: (B,) bool: the other minimum is nearly as low.
+    """
+
+    offset_px: Tensor
+    sigma_px: Tensor
+    distinctness: Tensor
+    in_basin: Tensor
+    ambiguous: Tensor
+
+
+class CostPair(NamedTuple):
+    """Costs (B,) on the two curves."""
+
+    before: Tensor
+    after: Tensor
+
+
+@dataclass(frozen=True)
+class DisparityProfile(CarRecord):
+    """Photometric cost of B cars over n offsets of their disparity, with the pixels of the final stage.
+
+    Attributes:
+        offsets_px: (n,) evenly spaced, full-resolution pixels; a positive one is nearer.
+        cost_before, cost_after: (B, n) cost at the input and at the end, of the photometric term without the factors of
+            single cars; NaN for cars without pixels, or that were not refined.
+        num_pixels: (B,) of the curves.
+    """
+
+    shared = frozenset({"offsets_px"})
+
+    offsets_px: Annotated[Tensor, Dense("n")]
+    cost_before: Annotated[Tensor, Dense("B", "n")]
+    cost_after: Annotated[Tensor, Dense("B", "n")]
+    num_pixels: Annotated[Tensor, Dense("B")]
+
+    @classmethod
+    def nothing(cls, like: Tensor, count: int) -> DisparityProfile:
+        """Curves of `count` cars of which nothing is known: NaN."""
+        offsets = default_offsets(like)
+        nan = torch.full((count, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)
+        return cls(offsets, nan, nan, nan[:, 0])
+
+    @property
+    def range_px(self) -> Tensor:
+        """The largest offset, a number without axes."""
+        return self.offsets_px[-1]
+
+    @property
+    def lowest(self) -> CostPair:
+        """The least cost of each curve; NaN where there is none."""
+        return CostPair(self.cost_before.amin(dim=1), self.cost_after.amin(dim=1))
+
+    def cost_at(self, offset_px: float) -> CostPair:
+        """Costs at the sample next to an offset."""
+        column = (self.offsets_px - offset_px).abs().argmin(dim=0, keepdim=True)
+        return CostPair(*(cost.index_select(1, column)[:, 0] for cost in (self.cost_before, self.cost_after)))
+
+    @property
+    def before(self) -> ProfileFigures:
+        """Figures of the curve at the input."""
+        return profile_figures(self.offsets_px, self.cost_before, self.num_pixels)
+
+    @property
+    def after(self) -> ProfileFigures:
+        """Figures of the curve at the end; a good fit has its minimum near 0 and no other that is as low."""
+        return profile_figures(self.offsets_px, self.cost_after, self.num_pixels)
+
+    @property
+    def figures(self) -> tuple[ProfileFigures, ProfileFigures]:
+        """`before` and `after` in one go."""
+        cost, pixels = torch.cat([self.cost_before, self.cost_after]), torch.cat([self.num_pixels, self.num_pixels])
+        both = [figure.tensor_split(2) for figure in profile_figures(self.offsets_px, cost, pixels)]
+        return ProfileFigures(*(x[0] for x in both)), ProfileFigures(*(x[1] for x in both))
+
+
+def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
+    """Offsets (n,) from minus to plus the range, 0 in the middle, float64.
+
+    Raises:
+        InputError: no positive range and step, or a range below two steps.
+
+    Examples:
+        >>> profile_offsets(1.0, 0.5)
+        tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
+    """
+    if not (step_px > 0 and range_px >= 2 * step_px):
+        raise InputError("range_px, step_px", "a positive step and at least two of them", f"{range_px}, {step_px}")
+    steps = int(range_px / step_px + 1e-9)
+    return step_px * torch.arange(-steps, steps + 1, dtype=torch.float64)
+
+
+@made_once
+def _constant_offsets(_: torch.dtype, device: torch.device) -> Tensor:
+    return profile_offsets().to(device)
+
+
+def default_offsets(like: Tensor) -> Tensor:
+    """`profile_offsets` on the device of a tensor; a copy, for results are their owners' to write to."""
+    return _constant_offsets(like).clone()
+
+
+def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:
+    """Figures of curves.
+
+    Args:
+        offsets_px: (n,) evenly spaced, 0 among them.
+        cost: (B, n).
+        num_pixels: (B,) whose mean the cost is.
+
+    Examples:
+        >>> offsets = profile_offsets()
+        >>> figures = profile_figures(offsets, 2 + (offsets - 0.4)[None] ** 2, torch.tensor([100.0]))
+        >>> figures.offset_px, figures.sigma_px, figures.in_basin
+        (tensor([0.4000], dtype=torch.float64), tensor([0.1414], dtype=torch.float64), tensor([True]))
+    """
+    known = cost.isfinite().all(dim=1)
+    cost = torch.where(known[:, None], cost, 0.0)
+    best = cost.argmin(dim=1)
+    lowest = cost.gather(1, best[:, None])[:, 0]
+    offset, sigma = _vertex(offsets_px, cost, best, num_pixels)
+    other = _other_minimum(offsets_px, cost, best)
+    # Of a cost of zero as well, another that is as low is as low.
+    distinctness = torch.where(other > lowest, other / lowest, torch.ones_like(lowest))
+    nan = torch.full_like(lowest, torch.nan)
+    offset, sigma, distinctness = (torch.where(known, x, nan) for x in (offset, sigma, distinctness))
+    in_basin = known & _is_downhill(offsets_px, cost, best, _RIDGE_SHARE * lowest)
+    return ProfileFigures(offset, sigma, distinctness, in_basin, known & (distinctness < AMBIGUOUS_BELOW))
+
+
+def _vertex(offsets_px: Tensor, cost: Tensor, best: Tensor, num_pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """Offset (B,) and its standard deviation (B,), by the parabola through the lowest cost and its neighbours.
+
+    With a mean squared residual of twice the cost, `sigma^2 = 2 cost / (curvature num_pixels)`.
+    """
+    inner = best.clamp(1, cost.shape[1] - 2)
+    left, here, right = cost.gather(1, torch.stack([inner - 1, inner, inner + 1], dim=1)).unbind(dim=1)
+    step = offsets_px[1] - offsets_px[0]
+    curvature = (left - 2 * here + right) / step**2
+    is_valley = (inner == best) & (curvature > 0)
+    safe = torch.where(is_valley, curvature, torch.ones_like(curvature))
+    shift = torch.where(is_valley, (left - right) / (2 * step * safe), torch.zeros_like(here))
+    lowest = (here - 0.5 * safe * shift**2).clamp_min(0)
+    sigma = (2 * lowest / (safe * num_pixels.clamp_min(1))).sqrt()
+    return offsets_px[best] + shift, torch.where(is_valley, sigma, torch.full_like(sigma, torch.inf))
+
+
+def _other_minimum(offsets_px: Tensor, cost: Tensor, best: Tensor) -> Tensor:
+    """Lowest local minimum (B,) that is not the lowest one; one at an end counts, infinite where there is none."""
+    padded = torch.nn.functional.pad(cost, (1, 1), value=torch.inf)
+    is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
+    is_apart = (offsets_px - offsets_px[best][:, None]).abs() > _APART_PX - 1e-6
+    return torch.where(is_minimum & is_apart, cost, torch.inf).amin(dim=1)
+
+
+def _is_downhill(offsets_px: Tensor, cost: Tensor, best: Tensor, tolerance: Tensor) -> Tensor:
+    """Whether (B,) the cost falls all the way from offset 0 to the lowest one, but for rises within the tolerance."""
+    start = offsets_px.abs().argmin()
+    last = len(offsets_px) - 1
+    index = torch.arange(last + 1, device=cost.device)
+    # Rightwards from the start, by way of the mirrored curve where the lowest cost lies on the left.
+    rightwards = best >= start
+    ahead = torch.where(rightwards[:, None], cost, cost.flip(1))
+    begin, end = torch.where(rightwards, start, last - start), torch.where(rightwards, best, last - best)
+    is_on_way = (index >= begin[:, None]) & (index <= end[:, None])
+    lowest_so_far = torch.where(is_on_way, ahead, torch.inf).cummin(dim=1).values
+    rise = torch.where(is_on_way, ahead - lowest_so_far, -torch.inf).amax(dim=1)
+    return rise <= tolerance
 
 
 @torch.no_grad()

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.figures.disparity_profile import DisparityProfile
-from directshape_torch.figures.quality import EVIDENCE_NAMES, FitQuality, bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
 from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.observability import cholesky_of_regular
 from directshape_torch.refinement.problem import CarStage
+from directshape_torch.refinement.quality import EVIDENCE_NAMES, FitQuality, bundled_trust_model
 from directshape_torch.rows import CarSums
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.terms.cars import CarState

@@ -8,20 +8,19 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import AcceptanceConfig
-from directshape_torch.figures.disparity_profile import DisparityProfile
-from directshape_torch.figures.observability import Observability
-from directshape_torch.figures.quality import FitQuality, bundled_trust_model
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import CarRecord, placed
-from directshape_torch.refinement.disparity_profile import disparity_profile
+from directshape_torch.refinement.disparity_profile import DisparityProfile, disparity_profile
 from directshape_torch.refinement.evidence import Course, fit_quality
 from directshape_torch.refinement.observability import (
+    Observability,
     covariance_of,
     covariance_xyz_yaw,
     observability_of,
     without_offset,
 )
 from directshape_torch.refinement.problem import CarProblem, CarStage
+from directshape_torch.refinement.quality import FitQuality, bundled_trust_model
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined

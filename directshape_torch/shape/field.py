@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
-from directshape_torch.shape.ray_minimum import (
-    RayMinimum,
-    curvature_by_values,
-    curvature_in_grids,
-    minimum_by_values,
-    minimum_in_grids,
-)
-from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup, derivatives_at, gradient_at, value_at
+from directshape_torch.numerics.tensors import length
+from directshape_torch.shape.sdf_grid import GridShape, Lookup, RayMinimum
 from directshape_torch.shape.shape_prior import BoundShape
+
+# Distance of the three samples that begin a search along a ray where nothing but values is known.
+_FIRST_SAMPLES_M = 0.06
+# Each round is so many times as fine as the one before.
+_FINER = 4.0
+_ROUNDS = 3
+# A vertex of a parabola further away, in distances of its samples, is a guess.
+_MAX_SAMPLE_DISTANCES = 1.5
+# Second difference of three samples below which it is rounding.
+_LEAST_CURVATURE_M = 1e-6
 
 
 class Field(Protocol):
@@ -51,36 +56,6 @@ class Field(Protocol):
         ...
 
 
-class Grids(NamedTuple):
-    """The field of grids."""
-
-    grids: GridField
-
-    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
-        return value_at(self.grids, points_obj, owner[:, None], inside)
-
-    def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
-        return gradient_at(self.grids, points_obj, owner[:, None])
-
-    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
-        return derivatives_at(self.grids, points_obj, owner[:, None], constant, inside)
-
-    def minimum_along(
-        self,
-        owner: Tensor,
-        centre_obj: Tensor,
-        direction_obj: Tensor,
-        depth: Tensor,
-        near: Tensor,
-        far: Tensor,
-        max_cells: int,
-    ) -> RayMinimum:
-        return minimum_in_grids(self.grids, owner, centre_obj, direction_obj, depth, near, far, max_cells)
-
-    def curvature_along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor) -> Tensor:
-        return curvature_in_grids(self.grids, owner, centre_obj, direction_obj, depth)
-
-
 class PackedField(NamedTuple):
     """The field of any shape that takes packed points."""
 
@@ -111,10 +86,25 @@ class PackedField(NamedTuple):
         far: Tensor,
         max_cells: int,
     ) -> RayMinimum:
-        return minimum_by_values(self._along(owner, centre_obj, direction_obj), direction_obj, depth, near, far)
+        """By vertices of ever narrower parabolas: nothing but smoothness is known."""
+        value_at = self._along(owner, centre_obj, direction_obj)
+        step = _FIRST_SAMPLES_M / length(direction_obj, dim=0)
+        for _ in range(_ROUNDS):
+            before, here, after = value_at(torch.stack([depth - step, depth, depth + step]))
+            second, slope = before - 2 * here + after, 0.5 * (after - before)
+            # Where the field does not curve upwards the slope tells the side, and no more.
+            vertex = -slope / second.clamp_min(_LEAST_CURVATURE_M)
+            depth = depth + vertex.clamp(-_MAX_SAMPLE_DISTANCES, _MAX_SAMPLE_DISTANCES) * step
+            depth = torch.minimum(torch.maximum(depth, near), far)
+            step = step / _FINER
+        return RayMinimum(depth, torch.zeros_like(direction_obj))
 
     def curvature_along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor) -> Tensor:
-        return curvature_by_values(self._along(owner, centre_obj, direction_obj), direction_obj, depth)
+        step = _FIRST_SAMPLES_M / _FINER**2 / length(direction_obj, dim=0)
+        samples = torch.stack([depth - step, depth, depth + step])
+        before, here, after = self._along(owner, centre_obj, direction_obj)(samples)
+        curvature: Tensor = (before - 2 * here + after) / (step * step)
+        return curvature
 
     def _along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor) -> Callable[[Tensor], Tensor]:
         """Signed distances (n, M, R) at depths (n, M, R) of rays."""
@@ -125,7 +115,7 @@ def field_of(shape: BoundShape) -> Field:
     """The field of a bound shape: that of its grids, where it looks up in them as a `GridShape` does."""
     looks_up = type(shape).value, type(shape).value_and_derivatives
     if isinstance(shape, GridShape) and looks_up == (GridShape.value, GridShape.value_and_derivatives):
-        return Grids(shape.field)
+        return shape.field
     return PackedField(shape)
 
 

@@ -1,10 +1,15 @@
-"""Stacked signed distance grids: a shape of them, where points lie in them, and what they find there.
+"""Stacked signed distance grids: a shape of them, what points find in them, where rays come closest to their surface.
 
 Lookups take points (3, ...): coordinates apart, so that each arithmetic step runs over memory without a jump, and of
 any shape behind that, so that several depths of the same rays are one lookup. The corners of a cell are the axis before
 (8, ...), of which each interpolation takes the two halves: few and large operations, whose number is what a call of few
 cars costs. Outside the grid the field continues as the value at the nearest point of the grid plus the distance to it:
 continuous, growing, with a defined gradient. (It overestimates the true distance, so ray marching never steps by it.)
+
+Between the faces of cells the signed distance along a ray is a polynomial of degree 3, so its minimum is found exactly,
+cell by cell. It lies inside a cell, where the slope along the ray vanishes, or on a face, where the slope changes sign
+by a jump. There the closest point slides along the face as the car moves, which is what makes the derivative of the
+least distance that of the point (the envelope theorem) with the gradient that `RayMinimum.face_obj` corrects.
 """
 
 from __future__ import annotations
@@ -24,6 +29,12 @@ from directshape_torch.shape.shape_prior import SdfDerivatives
 
 # Beside any distance nothing, and a normal number in single precision.
 _TINY = 2e-38
+# A start so near to the face in front of it, in cells, begins behind it: where a search has ended on a face, rounding
+# does not choose the cell in which the next one begins.
+_ON_FACE = 1e-4
+_NO_STEP = 1e-12
+# Beside a slope of a thousandth, this one below a fraction bar is beyond all grids.
+_BEYOND_GRIDS = 1e-20
 
 
 class GridShape:
@@ -44,43 +55,29 @@ class GridShape:
     """
 
     def __init__(self, values: Tensor, basis: Tensor, origin: Tensor, spacing_m: float) -> None:
-        self.values = values
-        self.field = GridField(values.reshape(-1), basis, origin, spacing_m)
+        self.values, self.basis, self.origin, self.spacing_m = values, basis, origin, spacing_m
 
     @property
-    def basis(self) -> Tensor:
-        """Derivative of the nodes by the code, (nx, ny, nz, K), metres per standard deviation."""
-        return self.field.basis
-
-    @property
-    def origin(self) -> Tensor:
-        """Position of node (0, 0, 0), (3,), metres."""
-        return self.field.origin
-
-    @property
-    def spacing_m(self) -> float:
-        """Distance between nodes, metres."""
-        return self.field.spacing_m
+    def field(self) -> GridField:
+        """What terms look up in."""
+        return GridField(self.values.reshape(-1), self.basis, self.origin, self.spacing_m)
 
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
-        return value_at(self.field, points_obj.mT.contiguous(), object_index)
+        return self.field.value(points_obj.mT.contiguous()[..., None], object_index)[:, 0]
 
     def value_and_derivatives(self, points_obj: Tensor, object_index: Tensor) -> SdfDerivatives:
         """Value (P,), gradient (P, 3) and code derivative (P, K) at points (P, 3) of objects (P,).
 
         The gradient is the exact derivative of the trilinear lookup and of its continuation.
         """
-        at = derivatives_at(self.field, points_obj.mT.contiguous(), object_index, nothing_is_differentiated())
-        return SdfDerivatives(at.value, at.gradient.mT.contiguous(), at.J_value_code)
-
-    def gradient(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
-        """That gradient (P, 3) by itself, for what is not differentiated again."""
-        return gradient_at(self.field, points_obj.mT.contiguous(), object_index).mT.contiguous()
+        points, constant = points_obj.mT.contiguous()[..., None], nothing_is_differentiated()
+        at = self.field.derivatives(points, object_index, constant)
+        return SdfDerivatives(at.value[:, 0], at.gradient[..., 0].mT.contiguous(), at.J_value_code[:, 0])
 
 
 class GridField(NamedTuple):
-    """B signed distance grids of one geometry and the basis that they are made of."""
+    """B signed distance grids of one geometry and the basis that they are made of: a `Field`."""
 
     values: Tensor  # (B * nx * ny * nz,) metres
     basis: Tensor  # (nx, ny, nz, K) metres per standard deviation
@@ -123,9 +120,9 @@ class GridField(NamedTuple):
         """From the flat index of the lower corner of a cell to that of its upper one."""
         return sum(self._strides)
 
-    def nodes_of(self, node: Tensor, object_index: Tensor) -> Tensor:
-        """Flat index (...) among the nodes of all grids, from that within the grid of an object; 32 bits, for speed."""
-        return torch.add(node, object_index.int(), alpha=self.num_nodes)
+    def nodes_of(self, node: Tensor, owner: Tensor) -> Tensor:
+        """Flat index (..., M, R) among the nodes of all grids, from that within one; 32 bits, for speed."""
+        return torch.add(node, owner[..., None].int(), alpha=self.num_nodes)
 
     def at_corners(self, node: Tensor) -> Ends:
         """Flat indices (8, ...) of the corners of cells, z outermost: 000, 100, 010, 110, 001, 101, 011, 111."""
@@ -136,6 +133,77 @@ class GridField(NamedTuple):
             return [node + offset for offset in offsets]
         return node + constant_like(offsets, node).view(8, *[1] * node.ndim)
 
+    def value(self, points_obj: Tensor, owner: Tensor, inside: bool = False) -> Tensor:
+        cells = cells_at(self, points_obj)
+        value = _interpolated(corner_values(self, self.nodes_of(cells.lower_node, owner)), cells.fraction)
+        return value if inside else torch.add(value, cells.outward[1], alpha=self.spacing_m)
+
+    def gradient(self, points_obj: Tensor, owner: Tensor) -> Tensor:
+        return _value_and_gradient(self, cells_at(self, points_obj), owner)[1]
+
+    def derivatives(self, points_obj: Tensor, owner: Tensor, constant: bool = False, inside: bool = False) -> Lookup:
+        """In one pass; with `constant` the basis vectors of the corners are added in a faster way."""
+        cells = cells_at(self, points_obj)
+        value, gradient = _value_and_gradient(self, cells, owner, inside)
+        table, corners = self.basis.flatten(0, 2), self.at_corners(cells.lower_node)
+        if constant and isinstance(corners, Tensor):
+            return Lookup(value, gradient, _summed(table, corners, cells.fraction))
+        rows = [embedding(corner, table) for corner in corners]
+        return Lookup(value, gradient, _interpolated(rows, cells.fraction[..., None]))
+
+    def minimum_along(
+        self,
+        owner: Tensor,
+        centre_obj: Tensor,
+        direction_obj: Tensor,
+        depth: Tensor,
+        near: Tensor,
+        far: Tensor,
+        max_cells: int,
+    ) -> RayMinimum:
+        """Downhill from cell to cell until the distance grows again, `max_cells` at most.
+
+        A minimum at `near` or `far` counts as smooth here: the caller knows what lies there. What is not found by
+        then waits on the face that it came to, and goes on from there when the ray is tracked next. A ray whose `near`
+        is its `far` stays there.
+        """
+        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth)
+        along = _derivatives_along(self, node, place, step)
+        # From here on a ray is seen the way the distance falls from where it begins, by how far it has come. There is
+        # no choice between two values by a condition in what follows: on a processor one costs as much as ten sums.
+        sign = -torch.copysign(torch.ones_like(depth), along.first)
+        limit = torch.maximum(sign * (far - depth), sign * (near - depth))
+        along = _AlongRay(-along.first.abs(), along.second, along.third * sign)
+        heading = step * sign
+        into_next = heading.sign()
+        to_face, per_cell = (0.5 + 0.5 * into_next - place) / heading, into_next / heading
+        face = crossed = torch.zeros_like(heading)  # the last one, 1 at its axis; crossed now
+        come, running = torch.zeros_like(depth), limit > 0
+        is_kink = torch.zeros_like(running)
+        for number in range(max_cells):
+            if number:
+                moves = crossed * into_next
+                # Rounding may lead a ray that ends at the border beyond it, of which nothing is used.
+                node = (node + self.steps(moves)).clamp(0, len(self.values) - 1 - self.steps_to_last_corner)
+                place = place - moves
+                to_face = torch.addcmul(to_face, crossed, per_cell)
+                # Who has arrived is where the slope vanishes, or grows: he stays.
+                along = _derivatives_along(self, node, torch.addcmul(place, come, heading), heading)
+            # Where it grows from the face on through which the ray came, the minimum is a kink on that face.
+            is_kink = is_kink | ((along.first > 0) & running)
+            root, exit_at = come + _first_root(along), to_face.amin(0)
+            reach = torch.minimum(exit_at, limit)
+            running = running & (root > reach) & (limit > exit_at)
+            come = torch.minimum(root, reach)
+            goes_on = running.to(depth.dtype)
+            crossed = ((exit_at - to_face).sign() + 1) * goes_on
+            face = torch.addcmul(crossed, face, 1 - goes_on)
+        return RayMinimum(torch.addcmul(depth, sign, come), face * (is_kink | running).to(depth.dtype))
+
+    def curvature_along(self, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor) -> Tensor:
+        step, node, place = _cells_along(self, owner, centre_obj, direction_obj, depth)
+        return 2 * _derivatives_along(self, node, place, step).second
+
 
 class Lookup(NamedTuple):
     """Value and derivatives at points (3, ...)."""
@@ -143,6 +211,21 @@ class Lookup(NamedTuple):
     value: Tensor  # (...) metres
     gradient: Tensor  # (3, ...)
     J_value_code: Tensor  # (..., K)
+
+
+class RayMinimum(NamedTuple):
+    """The least signed distance along rays (M, R), near where it was looked for."""
+
+    depth: Tensor  # (M, R) metres
+    face_obj: Tensor  # (3, M, R) normal of the face on which the minimum is a kink; zero where it is smooth
+
+
+class _AlongRay(NamedTuple):
+    """Coefficients (M, R) of the derivative by the distance, `first + 2 second t + 3 third t^2`, inside a cell."""
+
+    first: Tensor
+    second: Tensor
+    third: Tensor
 
 
 class Cells(NamedTuple):
@@ -206,43 +289,9 @@ def scaled(factor: Tensor, ends: Ends) -> Ends:
     return [factor * end for end in ends] if isinstance(ends, list) else factor * ends
 
 
-def value_at(field: GridField, points_obj: Tensor, object_index: Tensor, inside: bool = False) -> Tensor:
-    """Signed distance (...) at points (3, ...) of the objects with index broadcastable to (...).
-
-    With `inside` no point that counts lies outside of the grid, which takes fewer steps.
-    """
-    cells = cells_at(field, points_obj)
-    value = _interpolated(corner_values(field, field.nodes_of(cells.lower_node, object_index)), cells.fraction)
-    return value if inside else torch.add(value, cells.outward[1], alpha=field.spacing_m)
-
-
-def derivatives_at(
-    field: GridField, points_obj: Tensor, object_index: Tensor, constant: bool = False, inside: bool = False
-) -> Lookup:
-    """Value, exact gradient of the trilinear lookup and of its continuation, and code derivative, in one pass.
-
-    With `constant` nothing will be differentiated again, which allows a faster sum over the corners' basis vectors;
-    `inside` as in `value_at`.
-    """
-    cells = cells_at(field, points_obj)
-    value, gradient = _value_and_gradient(field, cells, object_index, inside)
-    table, corners = field.basis.flatten(0, 2), field.at_corners(cells.lower_node)
-    if constant and isinstance(corners, Tensor):
-        return Lookup(value, gradient, _summed(table, corners, cells.fraction))
-    rows = [embedding(corner, table) for corner in corners]
-    return Lookup(value, gradient, _interpolated(rows, cells.fraction[..., None]))
-
-
-def gradient_at(field: GridField, points_obj: Tensor, object_index: Tensor) -> Tensor:
-    """The gradient (3, ...) of `derivatives_at` by itself, for what is not differentiated again."""
-    return _value_and_gradient(field, cells_at(field, points_obj), object_index)[1]
-
-
-def _value_and_gradient(
-    field: GridField, cells: Cells, object_index: Tensor, in_grid: bool = False
-) -> tuple[Tensor, Tensor]:
+def _value_and_gradient(field: GridField, cells: Cells, owner: Tensor, in_grid: bool = False) -> tuple[Tensor, Tensor]:
     fx, fy, fz = cells.fraction
-    lower, along_z = halves(corner_values(field, field.nodes_of(cells.lower_node, object_index)))
+    lower, along_z = halves(corner_values(field, field.nodes_of(cells.lower_node, owner)))
     lower, along_y = halves(moved(lower, fz, along_z))
     lowest, along_x = halves(moved(lower, fy, along_y))
     inside = moved(lowest, fx, along_x)[0]
@@ -275,6 +324,43 @@ def _summed(table: Tensor, corners: Tensor, fraction: Tensor) -> Tensor:
     node, share = (per_corner.reshape(8, -1).mT.contiguous() for per_corner in (corners, weight))
     rows = torch.nn.functional.embedding_bag(node, table, mode="sum", per_sample_weights=share)
     return rows.view(*fraction.shape[1:], rows.shape[-1])
+
+
+def _cells_along(
+    field: GridField, owner: Tensor, centre_obj: Tensor, direction_obj: Tensor, depth: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cells per metre of depth (3, M, R), lower node (M, R) of the cell at a depth, and the place (3, M, R) in it."""
+    step = direction_obj * (1 / field.spacing_m)
+    step = torch.copysign(step.abs().clamp_min(_NO_STEP), step)
+    position = torch.addcmul(field.positions(centre_obj), depth, step)
+    lower = (position + _ON_FACE).floor().clamp_min(0).minimum(field.last_nodes(position) - 1)
+    return step, field.nodes_of(field.lower_nodes(lower), owner), position - lower
+
+
+def _derivatives_along(field: GridField, node: Tensor, place: Tensor, step: Tensor) -> _AlongRay:
+    """Coefficients of the polynomial along a ray in the cell with lower node (M, R), at a place (3, M, R) in it."""
+    (ux, uy, uz), (dx, dy, dz) = place, step
+    # Interpolated along z, then y, then x: each time a polynomial of the distance gains a degree.
+    lower, rise = halves(corner_values(field, node))
+    (a0, rise_0), (a1, rise_1) = halves(moved(lower, uz, rise)), halves(scaled(dz, rise))
+    b1 = moved(moved(a1, uy, rise_1), dy, rise_0)
+    (_, rise_0), (b1, rise_1), (b2, rise_2) = map(halves, (moved(a0, uy, rise_0), b1, scaled(dy, rise_1)))
+    first = moved(moved(b1, ux, rise_1), dx, rise_0)
+    second = moved(moved(b2, ux, rise_2), dx, rise_1)
+    return _AlongRay(first[0], second[0], scaled(dx, rise_2)[0])
+
+
+def _first_root(along: _AlongRay) -> Tensor:
+    """Distance (M, R) downhill to where the slope vanishes: 0 where it has done so already, huge where it never does.
+
+    With `c + 2 b s + 3 a s^2` the slope at a distance s downhill (c < 0), its first root is `-c / (b + sqrt(b^2 -
+    3 a c))`, without cancellation.
+    """
+    first, second, third = along
+    discriminant = torch.addcmul(second * second, third, first, value=-3)
+    # The root of a negative number takes many times as long as that of another.
+    below = (second + discriminant.clamp_min(0).sqrt()).clamp_min(0) * discriminant.sign().clamp_min(0)
+    return (-first).clamp_min(0) / (below + _BEYOND_GRIDS)
 
 
 def zero_level_extents(

@@ -33,7 +33,7 @@ from directshape_torch.terms.photometric import (
     photometric_norm,
 )
 from directshape_torch.terms.photometric_rows import CENTRE, frame_view, is_on_mask
-from directshape_torch.terms.term import Linear, Sight
+from directshape_torch.terms.term import Linear, Sight, Term
 
 NEXT_VIEW_NAME = "next_view"
 # What is not so far in front of the next camera is not seen by it.
@@ -76,7 +76,7 @@ class LookedUp(NamedTuple):
 
 
 @dataclass(frozen=True)
-class NextView:
+class NextView(Term):
     """The term; see module.
 
     Attributes:
@@ -92,7 +92,6 @@ class NextView:
     fixed: NextImage | None = None
 
     names = (NEXT_VIEW_NAME,)
-    is_prior = False
 
     @property
     def image(self) -> NextImage:
@@ -104,10 +103,6 @@ class NextView:
     @property
     def blocks(self) -> Blocks:
         return self.stereo.blocks
-
-    @property
-    def column(self) -> Tensor:
-        return self.stereo.column
 
     @property
     def block_weight(self) -> Tensor:

@@ -34,7 +34,7 @@ from directshape_torch.terms.photometric_rows import (
     warped_pixels,
 )
 from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.term import Linear, Sight
+from directshape_torch.terms.term import Linear, Sight, Term
 
 Brightness = Literal["none", "gain", "affine"]
 
@@ -71,7 +71,7 @@ class Surface(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Photometric:
+class Photometric(Term):
     """The term; see module. Before the first stage the pixel set is empty.
 
     Attributes:
@@ -87,7 +87,6 @@ class Photometric:
     fixed: PixelSet | None = None
 
     names = ("photometric",)
-    is_prior = False
 
     @property
     def pixel_set(self) -> PixelSet:
@@ -99,10 +98,6 @@ class Photometric:
     @property
     def blocks(self) -> Blocks:
         return self.pixel_set.blocks
-
-    @property
-    def column(self) -> Tensor:
-        return torch.zeros_like(self.blocks.owner)
 
     @property
     def block_weight(self) -> Tensor:
@@ -152,8 +147,7 @@ class Photometric:
         )
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Photometric, Surface, Tensor]:
-        nothing = torch.zeros(len(self.cars), 1, dtype=torch.float64, device=self.cars.frame_index.device)
-        return replace(self, left=None), self.where(sight), nothing
+        return super(Photometric, replace(self, left=None)).moving(sight, after_wider)
 
     def where(self, sight: Sight) -> Surface:
         place = self.pixel_set.sight_place

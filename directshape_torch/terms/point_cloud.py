@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from directshape_torch.config import PointCloudConfig, StageConfig
+from directshape_torch.config import PointCloudConfig
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import occurrences
 from directshape_torch.rows import Blocks, Rays, Rows
@@ -22,11 +22,11 @@ from directshape_torch.terms import robust
 from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.silhouette import sdf_state_jacobian
-from directshape_torch.terms.term import Linear, Sight, Where
+from directshape_torch.terms.term import Linear, Term, Where
 
 
 @dataclass(frozen=True)
-class PointCloud:
+class PointCloud(Term):
     """See module. Build with `of_points`; the points are those of the whole refinement.
 
     Attributes:
@@ -44,8 +44,6 @@ class PointCloud:
     points_cam: Rays
     filled: Tensor
     weight: Tensor
-
-    is_prior = False
 
     @classmethod
     def of_points(cls, config: PointCloudConfig, points: PointSamples, name: str = "point_cloud") -> PointCloud:
@@ -70,10 +68,6 @@ class PointCloud:
         return self.all_blocks
 
     @property
-    def column(self) -> Tensor:
-        return torch.zeros_like(self.points_cam.owner)
-
-    @property
     def block_weight(self) -> Tensor:
         return self.weight
 
@@ -85,15 +79,6 @@ class PointCloud:
     @property
     def row_weight(self) -> Tensor:
         return self.filled[..., None]
-
-    def begin(self, stage: StageConfig, sight: Sight) -> PointCloud:
-        return self
-
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[PointCloud, Where, Tensor]:
-        return self, (), torch.zeros_like(sight.state.T_obj_cam[:, 0, :1], dtype=torch.float64)
-
-    def where(self, sight: Sight) -> Where:
-        return ()
 
     def linear(self, field: Field, state: CarState, where: Where) -> Linear:
         points = self._points_obj(state)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.config import PriorConfig, StageConfig
+from directshape_torch.config import PriorConfig
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import viewing_axes
 from directshape_torch.numerics.tensors import constant_like
@@ -23,7 +23,7 @@ from directshape_torch.shape.field import Field
 from directshape_torch.shape.shape_prior import DimensionsDerivative, ShapePrior
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.term import Linear, Sight, Where
+from directshape_torch.terms.term import Linear, Term, Where
 
 RIG_WEIGHT = 0.2
 """Of the offset of the disparity, in its standard deviations: that of the detector's pose, with which it is weighed."""
@@ -37,7 +37,7 @@ class PriorResidual(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PriorTerm:
+class PriorTerm(Term):
     """`weight * sum_i r_i^2 / 2` of a residual of the state alone: one block of R rows for each car.
 
     Attributes:
@@ -65,10 +65,6 @@ class PriorTerm:
         return Blocks.one_each(len(self.cars), self.cars.frame_index.device)
 
     @property
-    def column(self) -> Tensor:
-        return torch.zeros_like(self.cars.frame_index)
-
-    @property
     def block_weight(self) -> Tensor:
         return torch.full_like(self.cars.input_depth, self.weight, dtype=torch.float64)
 
@@ -79,15 +75,6 @@ class PriorTerm:
     @property
     def row_weight(self) -> Tensor:
         return torch.ones_like(self.cars.input_depth, dtype=torch.float64).expand(self.num_rows, 1, -1).movedim(-1, 0)
-
-    def begin(self, stage: StageConfig, sight: Sight) -> PriorTerm:
-        return self
-
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[PriorTerm, Where, Tensor]:
-        return self, (), torch.zeros_like(self.cars.input_depth[:, None], dtype=torch.float64)
-
-    def where(self, sight: Sight) -> Where:
-        return ()
 
     def linear(self, field: Field, state: CarState, where: Where) -> Linear:
         at = self.residual_of(self.cars, state)

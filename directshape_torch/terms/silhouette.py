@@ -34,7 +34,7 @@ from directshape_torch.shape.field import Field
 from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.term import Linear, Sight, Where
+from directshape_torch.terms.term import Linear, Sight, Term, Where
 
 if TYPE_CHECKING:
     from directshape_torch.observation.packing import PixelSamples
@@ -153,7 +153,7 @@ def contour_zeta(cars: CarBatch, stage: StageConfig) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Silhouettes:
+class Silhouettes(Term):
     """The term of both images, with the projection by closest approach; see module.
 
     Attributes:
@@ -171,7 +171,6 @@ class Silhouettes:
     zeta: Tensor
 
     names = ("silhouette_left", "silhouette_right")
-    is_prior = False
 
     @property
     def blocks(self) -> Blocks:
@@ -310,11 +309,7 @@ class SilhouetteProducts(Silhouettes):
     fixed shares of its interval with the prior's bounds, constants of a linearisation.
     """
 
-    def moving(self, sight: Sight, after_wider: bool) -> tuple[SilhouetteProducts, Where, Tensor]:
-        return self, (), torch.zeros(len(self.cars), 2, dtype=torch.float64, device=self.zeta.device)
-
-    def where(self, sight: Sight) -> Where:
-        return ()
+    moving, where = Term.moving, Term.where
 
     def linear(self, field: Field, state: CarState, where: Where) -> Linear:
         owner = self.rows.rays.owner

@@ -47,34 +47,48 @@ class Linear(NamedTuple):
 class Term(Protocol):
     """One summand of the energy, for B cars. Terms never change: a new stage makes a new term.
 
-    Attributes:
-        names: of the columns of costs that it fills; most terms have one.
-        is_prior: whether it says what is known beforehand, and not what was measured.
-        blocks: M blocks of R rows.
-        column: (M,) which of the names each block belongs to.
-        block_weight: (M,) float64, factor of the rows of each block.
-        information: (M,) float64, the same in the Fisher matrix: residuals in standard deviations, not means.
-        row_weight: (M, R, N) of single residuals; zero in empty places.
+    A subclass need not write what is here: a measurement of one column, whose rows are the same in all stages, may all
+    change, and look nowhere.
     """
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Of the C columns of costs that it fills."""
+        ...
+
     @property
-    def is_prior(self) -> bool: ...
+    def is_prior(self) -> bool:
+        """Whether it says what is known beforehand, and not what was measured."""
+        return False
+
     @property
-    def blocks(self) -> Blocks: ...
+    def blocks(self) -> Blocks:
+        """M blocks of R rows."""
+        ...
+
     @property
-    def column(self) -> Tensor: ...
+    def column(self) -> Tensor:
+        """Which (M,) of the names each block belongs to."""
+        return torch.zeros_like(self.blocks.owner)
+
     @property
-    def block_weight(self) -> Tensor: ...
+    def block_weight(self) -> Tensor:
+        """Factor (M,) of the rows of each block, float64."""
+        ...
+
     @property
-    def information(self) -> Tensor: ...
+    def information(self) -> Tensor:
+        """The same (M,) in the Fisher matrix, float64: residuals in standard deviations, not means."""
+        ...
+
     @property
-    def row_weight(self) -> Tensor: ...
+    def row_weight(self) -> Tensor:
+        """Of single residuals (M, R, N); zero in empty places."""
+        ...
 
     def begin(self, stage: StageConfig, sight: Sight) -> Self:
         """The term with everything fixed that must not change during a stage: pixel sets, counts, widths."""
-        ...
+        return self
 
     def moving(self, sight: Sight, after_wider: bool) -> tuple[Self, Where, Tensor]:
         """The rows that can change while the stage's iterations move the cars, where they look, and the others' cost
@@ -82,11 +96,12 @@ class Term(Protocol):
 
         `after_wider`: an earlier stage had a wider contour, so that this one has less to move.
         """
-        ...
+        by_car = len(self.blocks.counts), len(self.names)
+        return self, self.where(sight), torch.zeros(by_car, dtype=torch.float64, device=self.blocks.owner.device)
 
     def where(self, sight: Sight) -> Where:
         """Where the rows look at a state at which every ray was marched."""
-        ...
+        return ()
 
     def linear(self, field: Field, state: CarState, where: Where) -> Linear:
         """Residuals with their hand-derived Jacobian, looking near `where`, which is that of a state nearby.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.figures.quality import EVIDENCE_NAMES, LogisticHead
+from directshape_torch.refinement.quality import EVIDENCE_NAMES, LogisticHead
 from quality_calibration.observations import Array, Observations
 
 # Median of |x| of a standard normal variable.

@@ -11,15 +11,15 @@ import torch
 
 from directshape_torch.batch.frame_outputs import write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.figures.disparity_profile import DisparityProfile
-from directshape_torch.figures.observability import Observability
-from directshape_torch.figures.quality import FitQuality
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import result_path, shapes_path
 from directshape_torch.io.stereo_dataset import LoadedFrame
+from directshape_torch.refinement.disparity_profile import DisparityProfile
+from directshape_torch.refinement.observability import Observability
+from directshape_torch.refinement.quality import FitQuality
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance

@@ -25,7 +25,6 @@ from directshape_torch import load_config
 from directshape_torch.batch.run_status import format_status, read_status
 from directshape_torch.cli.fit_shape import read_boxes
 from directshape_torch.errors import MeshError
-from directshape_torch.figures.quality import load_trust_model
 from directshape_torch.files.mesh_files import MESH_SUFFIXES, read_mesh
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import read_disparity
@@ -38,6 +37,7 @@ from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.io.tracking_files import read_tracking_objects
 from directshape_torch.io.velodyne import read_points, read_scan
+from directshape_torch.refinement.quality import load_trust_model
 from directshape_torch.report.make_report import make_report
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.rig_file import load_field, load_rigs, save_field, save_rigs

@@ -11,7 +11,7 @@ from helpers.problems import DEFAULT
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import AcceptanceConfig, BackwardConfig, RefinerConfig, RigConfig
-from directshape_torch.figures.quality import EVIDENCE_NAMES
+from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections

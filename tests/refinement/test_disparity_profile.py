@@ -16,8 +16,13 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import InputError
-from directshape_torch.figures.disparity_profile import DisparityProfile, profile_figures, profile_offsets
-from directshape_torch.refinement.disparity_profile import _thinned, disparity_profile
+from directshape_torch.refinement.disparity_profile import (
+    DisparityProfile,
+    _thinned,
+    disparity_profile,
+    profile_figures,
+    profile_offsets,
+)
 from directshape_torch.refinement.problem import CarStage
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import FrameBatch

@@ -12,13 +12,12 @@ from helpers.problems import begun_stage, photometric_of
 from helpers.synthetic_scene import cached_street
 from torch import Tensor
 
-from directshape_torch.figures.disparity_profile import DisparityProfile, profile_offsets
-from directshape_torch.figures.quality import EVIDENCE_NAMES
 from directshape_torch.geometry import se3
 from directshape_torch.refinement import evidence
-from directshape_torch.refinement.disparity_profile import disparity_profile
+from directshape_torch.refinement.disparity_profile import DisparityProfile, disparity_profile, profile_offsets
 from directshape_torch.refinement.evidence import Agreement, Course, evidence_of
 from directshape_torch.refinement.observability import covariance_of, covariance_xyz_yaw
+from directshape_torch.refinement.quality import EVIDENCE_NAMES
 from directshape_torch.terms.cars import CarState
 
 

@@ -14,16 +14,17 @@ from helpers.problems import DEFAULT, begun_stage, figures_at
 from helpers.synthetic_scene import CAMERA_HEIGHT_M, street
 from torch import Tensor
 
-from directshape_torch.figures.observability import (
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
+from directshape_torch.refinement.observability import (
     CAR_QUANTITIES,
     HEADING_LEVER_M,
     Observability,
     direction_in_words,
+    observability_of,
+    quantities_jacobian,
     view_in_words,
 )
-from directshape_torch.geometry import se3
-from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
-from directshape_torch.refinement.observability import observability_of, quantities_jacobian
 from directshape_torch.terms.cars import CarState
 
 LENGTH, DEPTH, WIDTH = (CAR_QUANTITIES.index(name) for name in ("length", "depth", "width"))

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from directshape_torch.errors import DataFormatError
-from directshape_torch.figures.quality import (
+from directshape_torch.refinement.quality import (
     EVIDENCE_NAMES,
     LogisticHead,
     TrustModel,

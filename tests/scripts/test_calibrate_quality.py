@@ -15,9 +15,9 @@ from quality_calibration.bend import Bend
 
 import directshape_torch
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.figures.quality import EVIDENCE_NAMES, load_trust_model
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import polynomial_basis
+from directshape_torch.refinement.quality import EVIDENCE_NAMES, load_trust_model
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimate
 

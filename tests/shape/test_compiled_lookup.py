@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.lookup import derivatives_at, value_at
 from torch import Tensor
 
-from directshape_torch.shape.sdf_grid import GridField, GridShape, derivatives_at, value_at
+from directshape_torch.shape.sdf_grid import GridField, GridShape
 
 COUNT = 50
 

@@ -7,8 +7,8 @@ import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.priors import KINDS, prior_of
 
-from directshape_torch.shape.field import Grids, PackedField, field_of
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.field import PackedField, field_of
+from directshape_torch.shape.sdf_grid import GridField, GridShape
 
 OWNER = torch.tensor([0, 2, 1])
 
@@ -21,7 +21,7 @@ def test_blocks_are_packed_points(kind: str, leading: tuple[int, ...]) -> None:
     shape = prior.bind(0.5 * torch.randn(3, prior.num_codes, dtype=torch.float64))
     points = 2 * torch.randn(3, *leading, 3, 64, dtype=torch.float64)
     field, packed = field_of(shape), PackedField(shape)
-    assert isinstance(field, Grids) is isinstance(shape, GridShape)
+    assert isinstance(field, GridField) is isinstance(shape, GridShape)
     at, expected = field.derivatives(points, OWNER), packed.derivatives(points, OWNER)
     for x, y in zip(at, expected, strict=True):
         torch.testing.assert_close(x, y, rtol=1e-9, atol=1e-9)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.lookup import derivatives_at, value_at
 from torch import Tensor
 
-from directshape_torch.shape.sdf_grid import GridShape, derivatives_at, value_at
+from directshape_torch.shape.sdf_grid import GridShape
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
 COUNTS, SPACING = (6, 5, 4), 0.4
@@ -43,11 +44,10 @@ def test_any_shape_of_points_is_the_packed_one(leading: tuple[int, ...]) -> None
 
 
 def test_objects_are_broadcast_over_the_points_of_their_block() -> None:
-    shape, at = shape_of(4), points(3, 4, 64)
-    owner = torch.tensor([2, 0, 3, 3])[:, None]
-    expanded = owner.expand(3, 4, 64)
-    assert torch.equal(value_at(shape.field, at, owner), value_at(shape.field, at, expanded))
-    assert torch.equal(derivatives_at(shape.field, at, owner).gradient, derivatives_at(shape.field, at, expanded)[1])
+    field, at, owner = shape_of(4).field, points(3, 4, 64), torch.tensor([2, 0, 3, 3])
+    expanded = owner[:, None].expand(3, 4, 64)
+    assert torch.equal(field.value(at, owner), value_at(field, at, expanded))
+    assert torch.equal(field.derivatives(at, owner).gradient, derivatives_at(field, at, expanded).gradient)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.lookup import derivatives_at, value_at
 
-from directshape_torch.shape.sdf_grid import GridShape, derivatives_at, value_at
+from directshape_torch.shape.sdf_grid import GridShape
 
 # More than are ever looked up corner by corner at once.
 MANY, PART = 20_000, 50

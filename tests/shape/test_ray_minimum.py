@@ -14,7 +14,7 @@ from directshape_torch.depth import along_face, closest_of_march, first_hits, ma
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.field import Field, PackedField, field_of
-from directshape_torch.shape.ray_minimum import RayMinimum
+from directshape_torch.shape.sdf_grid import RayMinimum
 from directshape_torch.shape.shape_prior import BoundShape
 
 PRIOR = ellipsoid_prior()
