@@ -23,7 +23,7 @@ from directshape_torch.batch.scan_fits import fit_scan, write_scan_fit
 from directshape_torch.cli.options import add_layout_options
 from directshape_torch.errors import InputError
 from directshape_torch.files.atomic_files import write_bytes, write_npz, write_text
-from directshape_torch.files.text_files import finite_numbers, read_lines
+from directshape_torch.files.read_files import finite_numbers, read_lines
 from directshape_torch.geometry.box_formats import BoxFormat
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.io.velodyne import read_points

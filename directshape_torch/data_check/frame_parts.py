@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, DirectShapeError
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.frame_detections import match_masks
 from directshape_torch.io.image_files import read_rgb
-from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError, match_masks
+from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import StereoDataset
@@ -117,9 +118,7 @@ def gather_evidence(parts: FrameParts) -> FrameEvidence | None:
     )
     of_cars = {side: [mask for mask in parts.masks or [] if mask.is_car and mask.side == side] for side in SIDES}
     matches = {side: match_masks(boxes.box_2d, of_side) for side, of_side in of_cars.items()}
-    own = {
-        side: [None if k < 0 else of_cars[side][k] for k in matches[side].mask_of_detection.tolist()] for side in SIDES
-    }
+    own = {side: [None if k < 0 else of_cars[side][k] for k in matches[side][0].tolist()] for side in SIDES}
     nothing = (np.nan,) * 4
     seen = _columns([box for mask in of_cars["left"] for box in (mask.mask_box, mask.box)], 4)
     return FrameEvidence(
@@ -128,7 +127,7 @@ def gather_evidence(parts: FrameParts) -> FrameEvidence | None:
         mask_boxes={
             side: _columns([nothing if mask is None else mask.mask_box for mask in own[side]], 4) for side in SIDES
         },
-        overlap={side: matches[side].overlap for side in SIDES},
+        overlap={side: matches[side][1] for side in SIDES},
         num_masks={side: len(of_cars[side]) for side in SIDES},
         seen=(seen,) * len(boxes),
         masks=tuple(None if mask is None else np.asarray(mask.probability > 0.5) for mask in own["left"]),

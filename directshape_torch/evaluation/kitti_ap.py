@@ -12,7 +12,7 @@ import numpy as np
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.kitti_rules import DIFFICULTIES, Curve, Difficulty, Floats, KittiScene, Metric
 from directshape_torch.evaluation.matching import files_of_frames
-from directshape_torch.files.text_files import read_lines
+from directshape_torch.files.read_files import read_lines
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 
 MINIMUM_IOUS = (0.7, 0.5)
@@ -84,7 +84,7 @@ def evaluate_kitti(
 
     Example: one car, found with perfect overlap.
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.files.text_files import Line
+        >>> from directshape_torch.files.read_files import Line
         >>> text = "Car 0 0 0 100 100 200 180 1.5 1.6 3.9 1 1.6 20 0"
         >>> label, result = (parse_object("a file", Line(1, t, t)) for t in (text, text + " 0.9"))
         >>> evaluate_kitti({"000007": [label]}, {"000007": [result]}).score("3d", 0.7, "easy").ap_area

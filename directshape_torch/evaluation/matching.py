@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.text_files import read_lines
+from directshape_torch.files.read_files import read_lines
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.scene_check.image_boxes import box_iou
 

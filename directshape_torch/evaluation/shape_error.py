@@ -17,8 +17,9 @@ from directshape_torch.geometry import se3
 from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.frame_detections import match_masks
 from directshape_torch.io.image_files import read_disparity, read_single_channel
-from directshape_torch.io.instance_masks import MaskSource, match_masks
+from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.refinement.ray_cast import cast
 from directshape_torch.shape.shape_prior import ShapePrior
@@ -209,7 +210,7 @@ class SegmentSource:
         masks = [mask for mask in self.masks.read(frame_id, depth.shape) if mask.side == "left"]
         boxes = np.array([label.box_2d for label in labels], dtype=np.float64).reshape(-1, 4)
         found: dict[int, SegmentTruth] = {}
-        for label, index in zip(labels, match_masks(boxes, masks).mask_of_detection, strict=True):
+        for label, index in zip(labels, match_masks(boxes, masks)[0], strict=True):
             if index >= 0:
                 inside = np.asarray(masks[index].probability) > 0.5
                 truth = segment_truth(f"left mask {masks[index].instance_id}", depth, inside, camera)

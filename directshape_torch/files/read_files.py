@@ -1,36 +1,61 @@
-"""Open what a user names: regular files only, of bounded size, with errors that name the file.
+"""Open what a user names: regular files only, of bounded size, with errors that name file and line.
 
-Whatever comes may be hostile: sizes and numbers are checked before a decoder allocates anything for them.
+Whatever comes may be hostile: sizes and numbers are checked before a decoder allocates anything for them, and no object
+is ever unpickled.
 """
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import os
 import stat
-from pathlib import Path
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, shown
 
-MOST_BYTES = 2**29
+_MOST_BYTES = 2**29
 # A line of one letter takes two hundred bytes once it is numbered.
-MOST_TEXT_BYTES = 2**24
+_MOST_TEXT_BYTES = 2**24
 # Parsed JSON takes some twenty times its size.
-MOST_JSON_BYTES = 2**28
+_MOST_JSON_BYTES = 2**28
 _MOST_DIGITS = 18
+_ENCRYPTED = 1
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# What is left of the 255 that file systems take belongs to endings and to the names of temporary files.
+_MOST_NAME_BYTES = 200
 
 
-def read_bytes(path: Path | str, most: int = MOST_BYTES, cure: str = "check the path") -> bytes:
-    """The content of a regular file.
+def is_frame_id(frame_id: object) -> bool:
+    """Whether a frame's name can be that of its files, and is no path.
 
-    Args:
-        path: the file; links are followed.
-        most: bytes that it may have.
-        cure: what to do about a file that cannot be opened, for the message.
+    Examples:
+        >>> is_frame_id("000107"), is_frame_id("/etc/passwd"), is_frame_id("..")
+        (True, False, False)
+    """
+    return (
+        isinstance(frame_id, str)
+        and frame_id.isprintable()
+        and len(frame_id.encode()) <= _MOST_NAME_BYTES
+        and "\\" not in frame_id
+        and frame_id not in ("", "..")
+        and frame_id == PurePath(frame_id).name
+    )
+
+
+def read_bytes(path: Path | str, most: int = _MOST_BYTES, cure: str = "check the path") -> bytes:
+    """The content of a regular file of at most that many bytes; links are followed.
 
     Raises:
-        DataFormatError: it is missing, cannot be read, is a folder, a pipe or a device, or larger than `most`.
+        DataFormatError: it is missing, cannot be read, is a folder, a pipe or a device, or too large; with the cure.
 
     Examples:
         >>> read_bytes("/dev/zero")
@@ -62,37 +87,65 @@ def _open_at_once(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
-def read_text(path: Path | str, most: int = MOST_TEXT_BYTES, cure: str = "check the path") -> str:
-    """The content of a UTF-8 text file; arguments and errors as of `read_bytes`.
-
-    Raises:
-        DataFormatError: it is not UTF-8 text, too.
-    """
+def read_text(path: Path | str, most: int = _MOST_TEXT_BYTES, cure: str = "check the path") -> str:
+    """The content of a UTF-8 text file; raises like `read_bytes`, and where it is no such text."""
     try:
         return read_bytes(path, most, cure).decode("utf-8")
     except UnicodeDecodeError as error:
         raise DataFormatError(path, f"is not UTF-8 text ({error.reason} at byte {error.start})") from error
 
 
-def read_json(path: Path | str, cure: str = "") -> Any:
-    """The value in a JSON file.
+@dataclass(frozen=True)
+class Line:
+    """One line: its number from 1, its text without outer white space, and all of it but the newline."""
+
+    number: int
+    text: str
+    raw: str
+
+    def error(self, path: Path | str, problem: str, cure: str = "") -> DataFormatError:
+        """A complaint about the line that names it."""
+        return DataFormatError(path, problem, line_number=self.number, line=self.text, cure=cure)
+
+
+def read_lines(path: Path | str) -> list[Line]:
+    """The lines of a text file that are not blank; raises like `read_text`."""
+    lines = (Line(number, raw.strip(), raw) for number, raw in enumerate(read_text(path).split("\n"), start=1))
+    return [line for line in lines if line.text]
+
+
+def finite_numbers(
+    path: Path | str, line: Line, count: int, words: Sequence[str] | None = None, cure: str = ""
+) -> NDArray[np.float64]:
+    """The numbers (count,) of a line, or of some of its words.
 
     Raises:
-        DataFormatError: it cannot be read, or see `parse_json`.
+        DataFormatError: it holds something else, or not as many; names file and line.
+
+    Examples:
+        >>> finite_numbers("calib.txt", Line(3, "1 2.5", "1 2.5"), 2)
+        array([1. , 2.5])
     """
-    return parse_json(path, read_bytes(path, MOST_JSON_BYTES), cure)
+    try:
+        values = np.array([float(word) for word in (line.text.split() if words is None else words)])
+    except ValueError as error:
+        raise line.error(path, f"expected {count} numbers ({error})", cure) from error
+    if len(values) != count or not np.isfinite(values).all():
+        raise line.error(path, f"expected {count} finite numbers, got {len(values)}", cure)
+    return values
+
+
+def read_json(path: Path | str, cure: str = "") -> Any:
+    """The value in a JSON file; raises like `read_bytes` and `parse_json`."""
+    return parse_json(path, read_bytes(path, _MOST_JSON_BYTES), cure)
 
 
 def parse_json(path: Path | str, text: str | bytes, cure: str = "", problem: str = "is not valid JSON") -> Any:
     """The value of a JSON text that stands in the file `path`.
 
-    Args:
-        path, cure, problem: for the message.
-        text: the JSON.
-
     Raises:
         DataFormatError: it is no JSON, nested too deeply, or holds a number that is not finite or has more than 18
-            digits before its point.
+            digits before its point; with the problem and the cure.
 
     Examples:
         >>> parse_json("a.json", "[1, 1e999]")
@@ -117,3 +170,65 @@ def _decimal(text: str) -> float:
     if not abs(number) < float("inf"):
         raise ValueError(f"the number {text} is out of range")
     return number
+
+
+def read_npz(path: Path | str, cure: str = "") -> dict[str, NDArray[Any]]:
+    """All arrays of an npz file by name.
+
+    Raises:
+        DataFormatError: the file is missing, damaged, no npz, larger than 512 MiB unpacked, or holds Python objects.
+
+    Examples:
+        >>> import tempfile
+        >>> from directshape_torch.files.atomic_files import write_npz
+        >>> file = Path(tempfile.mkdtemp()) / "a.npz"
+        >>> write_npz(file, {"codes": np.zeros((2, 5))})
+        >>> read_npz(file)["codes"].shape
+        (2, 5)
+    """
+    # From memory: numpy leaves the file open when it turns out to be no archive.
+    content = io.BytesIO(read_bytes(path, cure=cure))
+    try:
+        _check_entries(content)
+        with np.load(content, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        # Of an entry without the ending ".npy" numpy gives the bytes.
+        if others := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
+            raise ValueError(f"{others[0]} is no array")
+        return arrays
+    # Of an archive damaged on purpose numpy and zipfile raise whatever they come across.
+    except Exception as error:
+        raise DataFormatError(path, f"is no readable npz file ({error})", cure=cure) from error
+
+
+def _check_entries(content: io.BytesIO) -> None:
+    """Raise `ValueError` where an archive is larger than its budget, or packed as `numpy` never does."""
+    with zipfile.ZipFile(content) as archive:
+        entries = archive.infolist()
+    total = sum(entry.file_size for entry in entries)
+    if total > _MOST_BYTES:
+        raise ValueError(f"unpacked it has {total} bytes, at most {_MOST_BYTES} are read")
+    for entry in entries:
+        if entry.flag_bits & _ENCRYPTED or entry.compress_type not in _COMPRESSIONS:
+            raise ValueError(f"{entry.filename} is encrypted or not compressed by deflation")
+
+
+def read_npy(path: Path | str) -> NDArray[Any]:
+    """The array of an npy file, read-only.
+
+    Raises:
+        DataFormatError: the file is missing, damaged, no npy, larger than 512 MiB, or holds Python objects.
+    """
+    cure = "save it with numpy.save"
+    content = read_bytes(path, cure=cure)
+    stream = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(stream)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, is_fortran, dtype = header(stream)
+        # What the header promises is asked of the bytes that are there: nothing is allocated for it.
+        array = np.frombuffer(content, dtype, math.prod(shape), stream.tell())
+        return array.reshape(shape, order="F" if is_fortran else "C")
+    # As above.
+    except Exception as error:
+        raise DataFormatError(path, f"is no readable npy file ({error})", cure=cure) from error

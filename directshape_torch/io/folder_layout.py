@@ -14,8 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError, shown
-from directshape_torch.files.text_files import Line
-from directshape_torch.io.coco_segmentation import decode_segmentation
+from directshape_torch.files.read_files import Line
 from directshape_torch.io.folder_json import FolderFrame, FolderObject, FolderRig, read_frame, read_rig
 from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
@@ -26,6 +25,7 @@ from directshape_torch.io.instance_masks import (
     MaskSource,
     Side,
     check_count,
+    decode_segmentation,
     instance_of,
     read_soft_mask,
 )

@@ -1,4 +1,8 @@
-"""From the lines of a detection file and the masks of a frame to `Detections`."""
+"""From the lines of a detection file and the masks of a frame to `Detections`: which mask belongs to which line.
+
+Left image: overlap of 2D boxes. Right image: overlap with the initial 3D box projected into it, never the instance
+numbers of the file, which few tools share between the two images.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.instance_masks import SIDES, InstanceMask, Side, match_masks, without_duplicates
+from directshape_torch.io.instance_masks import SIDES, InstanceMask, Side
 from directshape_torch.io.kitti_labels import KittiObject, poses_cam
 from directshape_torch.scene import Detections, Occluders
-from directshape_torch.scene_check.image_boxes import project_boxes
+from directshape_torch.scene_check.image_boxes import box_iou, project_boxes
 
+MIN_OVERLAP = 0.3
+# Two masks of one image that share more than this are the same object seen twice by the segmentation.
+DUPLICATE_MASK_IOU = 0.5
 # For each input line the instance that its file gives it in either image, -1 for none.
 GivenMasks = Mapping[Side, Sequence[int]]
 # The mask of each of B objects.
@@ -86,8 +93,8 @@ def _match(
 
 def _matched(masks: Sequence[InstanceMask], side: Side, *boxes: NDArray[np.float64]) -> _Found:
     of_side = [mask for mask in masks if mask.side == side]
-    index = match_masks(boxes[0], of_side, *boxes[1:]).mask_of_detection.tolist()
-    return [of_side[k] if k >= 0 else None for k in index]
+    index, _ = match_masks(boxes[0], of_side, *boxes[1:])
+    return [of_side[k] if k >= 0 else None for k in index.tolist()]
 
 
 def _moved_to_right(
@@ -141,3 +148,61 @@ def _occluders(
         depth_m=torch.tensor([depths.get(id(mask), np.nan) for mask in rest], dtype=dtype),
         bottom_v=torch.tensor([mask.box[3] for mask in rest], dtype=dtype),
     )
+
+
+def match_one_to_one(
+    overlap: NDArray[np.float64],  # (B, M)
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # (B,), (B,)
+    """The assignment of largest total overlap (Hungarian) that uses pairs of at least 0.3 only.
+
+    Returns for each row its column, or -1, and their overlap, or 0.
+
+    Examples:
+        >>> match_one_to_one(np.array([[0.9, 0.8], [0.7, 0.1]]))[0].tolist()
+        [1, 0]
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    allowed = np.where(overlap >= MIN_OVERLAP, overlap, 0.0)
+    rows, columns = linear_sum_assignment(allowed, maximize=True)
+    used = allowed[rows, columns] > 0
+    index = np.full(len(overlap), -1, dtype=np.int64)
+    value = np.zeros(len(overlap))
+    index[rows[used]] = columns[used]
+    value[rows[used]] = allowed[rows[used], columns[used]]
+    return index, value
+
+
+def match_masks(
+    boxes_2d: NDArray[np.float64],  # (B, 4) where each detection is expected in the image of the masks, pixels
+    masks: Sequence[InstanceMask],
+    further_boxes_2d: NDArray[np.float64] | None = None,  # (B, 4) a second opinion, NaN where there is none
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # (B,), (B,)
+    """Match masks of one image to 2D boxes; returns as `match_one_to_one`.
+
+    The file's box (that of the 2D detector) may reach over parts that are hidden, as a 3D detector's box does; the
+    mask's own box fits detectors whose boxes enclose what is visible. The larger overlap of either counts.
+    """
+    file_boxes, mask_boxes = (
+        np.array([getattr(mask, name) for mask in masks], dtype=np.float64).reshape(-1, 4)
+        for name in ("box", "mask_box")
+    )
+    expected = [boxes_2d] if further_boxes_2d is None else [boxes_2d, further_boxes_2d]
+    overlaps = [np.nan_to_num(box_iou(a, b)) for a in expected for b in (file_boxes, mask_boxes)]
+    return match_one_to_one(np.maximum.reduce(overlaps))
+
+
+def without_duplicates(masks: Sequence[InstanceMask], matched: Sequence[InstanceMask]) -> list[InstanceMask]:
+    """Those of some masks that belong to no detection which are no second mask of a matched car."""
+    return [
+        mask
+        for mask in masks
+        if not any(mask.side == k.side and _mask_iou(mask, k) > DUPLICATE_MASK_IOU for k in matched)
+    ]
+
+
+def _mask_iou(a: InstanceMask, b: InstanceMask) -> float:
+    if box_iou(np.array([a.mask_box]), np.array([b.mask_box]))[0, 0] == 0.0:
+        return 0.0
+    in_a, in_b = a.probability > 0.5, b.probability > 0.5
+    return float((in_a & in_b).sum() / max(1, (in_a | in_b).sum()))

@@ -1,12 +1,8 @@
-"""Instances of one image, their masks, and which detection each belongs to, one to one in each image.
-
-Left image: overlap of 2D boxes. Right image: overlap with the initial 3D box projected into it, never the instance
-numbers of the file, which few tools share between the two images.
-"""
+"""Instances of one image and their masks, as files encode them: soft PNG, COCO's run lengths and polygons."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -14,17 +10,17 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.errors import DataFormatError
+from directshape_torch.errors import DataFormatError, shown
 from directshape_torch.io.image_files import read_single_channel
-from directshape_torch.scene_check.image_boxes import box_iou
 
 Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
 # All masks of an image together: four bytes each where they are soft.
 _MOST_PIXELS = 2**30
-SIDES: tuple[Side, Side] = ("left", "right")
-MIN_OVERLAP = 0.3
-# Two masks of one image that share more than this are the same object seen twice by the segmentation.
-DUPLICATE_MASK_IOU = 0.5
+# More than any outline has; rasterising takes memory for each pixel of it, wherever it lies.
+_LONGEST_OUTLINE_PX = 1e6
+# Five bits each, of runs that fit into 32.
+_MOST_GROUPS = 7
 
 
 class MaskSizeError(DataFormatError):
@@ -129,70 +125,117 @@ def check_size(path: Path, what: str, got_hw: Iterable[int], expected_hw: tuple[
         )
 
 
-@dataclass(frozen=True)
-class MaskMatches:
-    """Masks of B detections in one image."""
-
-    mask_of_detection: NDArray[np.int64]  # (B,) index into the list of masks, -1 for none
-    overlap: NDArray[np.float64]  # (B,) the overlap of the matched boxes, 0 for none
-
-
-def match_one_to_one(
-    overlap: NDArray[np.float64],  # (B, M)
-) -> MaskMatches:
-    """The assignment of largest total overlap (Hungarian) that uses pairs of at least 0.3 only.
-
-    Examples:
-        >>> match_one_to_one(np.array([[0.9, 0.8], [0.7, 0.1]])).mask_of_detection.tolist()
-        [1, 0]
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    allowed = np.where(overlap >= MIN_OVERLAP, overlap, 0.0)
-    rows, columns = linear_sum_assignment(allowed, maximize=True)
-    used = allowed[rows, columns] > 0
-    index = np.full(len(overlap), -1, dtype=np.int64)
-    value = np.zeros(len(overlap))
-    index[rows[used]] = columns[used]
-    value[rows[used]] = allowed[rows[used], columns[used]]
-    return MaskMatches(index, value)
-
-
-def match_masks(
-    boxes_2d: NDArray[np.float64],  # (B, 4) in the image of the masks, pixels
-    masks: Sequence[InstanceMask],
-    further_boxes_2d: NDArray[np.float64] | None = None,  # (B, 4) a second opinion, NaN where there is none
-) -> MaskMatches:
-    """Match masks of one image to 2D boxes, by the larger of the overlaps with the file's box and the mask's own.
-
-    The file's box (that of the 2D detector) may reach over parts that are hidden, as a 3D detector's box does; the
-    mask's own box fits detectors whose boxes enclose what is visible. Either is evidence enough.
+def decode_segmentation(path: Path, where: str, segmentation: Any, size_hw: tuple[int, int]) -> NDArray[np.bool_]:
+    """A binary mask from the `segmentation` of a COCO result.
 
     Args:
-        boxes_2d: where each detection is expected.
-        masks: instances of one side.
-        further_boxes_2d: another expectation for each detection; the larger overlap counts.
+        path, where: the file and the entry's place in it, named in errors.
+        segmentation: RLE `{"size": [H, W], "counts": str | bytes | list}`, or polygons `[x0, y0, x1, y1, ..]`.
+        size_hw: size of the image.
+
+    Raises:
+        MaskSizeError: run lengths of another size than the image.
+        DataFormatError: neither form, runs that do not add up to the size, or polygons far beyond the image.
+
+    Examples:
+        >>> rle = {"size": [2, 3], "counts": [2, 3, 1]}  # down the columns: 2 off, 3 on, 1 off
+        >>> decode_segmentation(Path("masks.json"), "entry 0", rle, (2, 3)).astype(int).tolist()
+        [[0, 1, 1], [0, 1, 0]]
     """
-    file_boxes, mask_boxes = (
-        np.array([getattr(mask, name) for mask in masks], dtype=np.float64).reshape(-1, 4)
-        for name in ("box", "mask_box")
+    if isinstance(segmentation, Mapping) and "counts" in segmentation and "size" in segmentation:
+        size = segmentation["size"]
+        if not isinstance(size, (list, tuple)) or len(size) != 2 or not all(map(_is_whole, size)):
+            raise DataFormatError(path, f"{where}: bad run lengths ('size' is {shown(size)}, expected [height, width])")
+        check_size(path, f"{where}: the mask", size, size_hw)
+        return _from_runs(path, where, segmentation["counts"], size_hw)
+    if isinstance(segmentation, list) and segmentation and _are_polygons(segmentation):
+        return _from_runs(path, where, _outlined(path, where, segmentation, size_hw), size_hw)
+    raise DataFormatError(
+        path,
+        f"{where}: 'segmentation' is neither RLE nor a list of polygons",
+        cure='write {"size": [H, W], "counts": ..}, or [[x0, y0, x1, y1, x2, y2, ..]]',
     )
-    expected = [boxes_2d] if further_boxes_2d is None else [boxes_2d, further_boxes_2d]
-    overlaps = [np.nan_to_num(box_iou(a, b)) for a in expected for b in (file_boxes, mask_boxes)]
-    return match_one_to_one(np.maximum.reduce(overlaps))
 
 
-def without_duplicates(masks: Sequence[InstanceMask], matched: Sequence[InstanceMask]) -> list[InstanceMask]:
-    """Those of some masks that belong to no detection which are no second mask of a matched car."""
-    return [
-        mask
-        for mask in masks
-        if not any(mask.side == k.side and _mask_iou(mask, k) > DUPLICATE_MASK_IOU for k in matched)
-    ]
+def _from_runs(path: Path, where: str, counts: Any, size_hw: tuple[int, int]) -> NDArray[np.bool_]:
+    height, width = size_hw
+    try:
+        runs = _runs(counts)
+    except ValueError as error:
+        raise DataFormatError(path, f"{where}: bad run lengths ({error})") from error
+    if sum(runs) != height * width:
+        raise DataFormatError(
+            path,
+            f"{where}: run lengths cover {sum(runs)} pixels, expected {height} x {width} = {height * width}",
+            cure="the file is damaged, or 'size' is not [height, width]",
+        )
+    is_on = np.arange(len(runs)) % 2 == 1
+    return np.ascontiguousarray(np.repeat(is_on, runs).reshape(width, height).T)
 
 
-def _mask_iou(a: InstanceMask, b: InstanceMask) -> float:
-    if box_iou(np.array([a.mask_box]), np.array([b.mask_box]))[0, 0] == 0.0:
-        return 0.0
-    in_a, in_b = a.probability > 0.5, b.probability > 0.5
-    return float((in_a & in_b).sum() / max(1, (in_a | in_b).sum()))
+def _runs(counts: Any) -> Sequence[int]:
+    """Run lengths as numbers of at least 0; `ValueError` where they are something else."""
+    if isinstance(counts, (str, bytes)):
+        runs = _run_lengths(counts.encode("ascii") if isinstance(counts, str) else counts)
+    elif isinstance(counts, list) and all(map(_is_whole, counts)):
+        runs = counts
+    else:
+        raise ValueError(f"'counts' is {shown(counts)}, expected text or a list of whole numbers")
+    if min(runs, default=0) < 0:
+        raise ValueError(f"a run of {min(runs)} pixels")
+    return runs
+
+
+def _outlined(path: Path, where: str, polygons: Sequence[Sequence[float]], size_hw: tuple[int, int]) -> bytes:
+    """The run lengths of what polygons cover."""
+    import pycocotools.mask
+
+    for polygon in polygons:
+        corners = np.array(polygon, dtype=np.float64).reshape(-1, 2)
+        outline_px = np.abs(np.diff(corners, axis=0, append=corners[:1])).sum()
+        # `not <=`, so that NaN is refused too.
+        if not max(outline_px, np.abs(corners).max()) <= _LONGEST_OUTLINE_PX:
+            raise DataFormatError(
+                path,
+                f"{where}: a polygon whose outline is longer or farther away than {_LONGEST_OUTLINE_PX:g} pixels",
+                cure="give finite corners (x, y) in pixels of the image",
+            )
+    merged: bytes = pycocotools.mask.merge(pycocotools.mask.frPyObjects(polygons, *size_hw))["counts"]
+    return merged
+
+
+def _run_lengths(data: bytes) -> list[int]:
+    """Runs of COCO's compressed counts: little-endian groups of five bits, each run after the third a difference."""
+    runs: list[int] = []
+    value, shift = 0, 0
+    for byte in data:
+        group = byte - 48
+        if not 0 <= group < 64:
+            raise ValueError(f"letter {chr(byte)!r} is not part of the encoding")
+        value |= (group & 31) << shift
+        shift += 5
+        if shift > 5 * _MOST_GROUPS:
+            raise ValueError("a number of more than 32 bits")
+        if not group & 32:
+            if group & 16:
+                value -= 1 << shift
+            runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+            value, shift = 0, 0
+    if shift:
+        raise ValueError("text ends inside a number")
+    return runs
+
+
+def _are_polygons(segmentation: list[Any]) -> bool:
+    return all(
+        isinstance(polygon, list) and len(polygon) >= 6 and len(polygon) % 2 == 0 and all(map(_is_number, polygon))
+        for polygon in segmentation
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float)
+
+
+def _is_whole(value: Any) -> bool:
+    return type(value) is int

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from directshape_torch.files.text_files import Line, read_lines
+from directshape_torch.files.read_files import Line, read_lines
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 
 _CURE = "write one object a line: type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.read_files import read_json
-from directshape_torch.io.coco_segmentation import decode_segmentation
 from directshape_torch.io.image_files import find_image, read_single_channel
 from directshape_torch.io.instance_masks import (
     SIDES,
@@ -20,6 +19,7 @@ from directshape_torch.io.instance_masks import (
     Side,
     check_count,
     check_size,
+    decode_segmentation,
     file_of_frame,
     instance_of,
     read_soft_mask,

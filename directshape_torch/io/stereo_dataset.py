@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.errors import DirectShapeError, InputError, shown
-from directshape_torch.files.names import is_frame_id
-from directshape_torch.files.text_files import read_lines
+from directshape_torch.files.read_files import is_frame_id, read_lines
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.folder_layout import FolderLayout

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from directshape_torch.io.instance_masks import match_one_to_one
+from directshape_torch.io.frame_detections import match_one_to_one
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.scene_check.image_boxes import box_iou
 
@@ -43,7 +43,7 @@ def associate(frames: Sequence[Sequence[KittiObject]]) -> list[list[int]]:
 
     Examples:
         >>> from directshape_torch.io.kitti_labels import parse_object
-        >>> from directshape_torch.files.text_files import Line
+        >>> from directshape_torch.files.read_files import Line
         >>> def car(u): return parse_object("f", Line(1, f"Car 0 0 0 {u} 9 {u + 40} 49 1.5 1.6 3.9 1 1.6 20 0", ""))
         >>> associate([[car(100), car(300)], [car(290), car(110)], [car(120), car(600)]])
         [[0, 1], [1, 0], [0, 2]]
@@ -54,7 +54,7 @@ def associate(frames: Sequence[Sequence[KittiObject]]) -> list[list[int]]:
     for frame, objects in enumerate(frames):
         tracks = [track for track in tracks if frame - track.frame <= _LONGEST_GAP + 1]
         found = [number for number, each in enumerate(objects) if each.has_box_3d]
-        partners = match_one_to_one(_overlaps([objects[number] for number in found], tracks, frame)).mask_of_detection
+        partners, _ = match_one_to_one(_overlaps([objects[number] for number in found], tracks, frame))
         ids = [-1] * len(objects)
         for number, partner in zip(found, partners.tolist(), strict=True):
             if partner >= 0:

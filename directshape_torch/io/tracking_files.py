@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from directshape_torch.errors import InputError
-from directshape_torch.files.text_files import Line, read_lines
+from directshape_torch.files.read_files import Line, read_lines
 from directshape_torch.io.instance_masks import file_of_frame
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, read_objects
 

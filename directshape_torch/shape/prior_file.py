@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import replaced_file
-from directshape_torch.files.npz_files import read_npz
-from directshape_torch.files.read_files import parse_json
+from directshape_torch.files.read_files import parse_json, read_npz
 from directshape_torch.shape.pca_prior import PCAShapePrior, PriorProvenance
 
 SCHEMA = "directshape_torch.pca_shape_prior/1"

@@ -9,7 +9,7 @@ import pytest
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_npz
-from directshape_torch.files.npz_files import read_npz
+from directshape_torch.files.read_files import read_npz
 
 
 def test_all_arrays_with_their_types(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pycocotools import mask as coco
 
-from directshape_torch.io.coco_segmentation import decode_segmentation
+from directshape_torch.io.instance_masks import decode_segmentation
 
 Image = NDArray[np.uint8]
 Row = list[str]  # the words of a detection line: h w l at 8, x y z at 11, rotation_y at 14

@@ -19,11 +19,9 @@ from safetensors.torch import load_file, save_file
 from directshape_torch.config_files import load_config
 from directshape_torch.errors import ConfigError, DataFormatError, DirectShapeError
 from directshape_torch.files.mesh_files import read_mesh
-from directshape_torch.files.npz_files import read_npy, read_npz
-from directshape_torch.files.read_files import read_bytes, read_json, read_text
-from directshape_torch.files.text_files import read_lines
-from directshape_torch.io.coco_segmentation import decode_segmentation
+from directshape_torch.files.read_files import read_bytes, read_json, read_lines, read_npy, read_npz, read_text
 from directshape_torch.io.image_files import read_rgb
+from directshape_torch.io.instance_masks import decode_segmentation
 from directshape_torch.shape import load_prior as priors
 
 SIZE_HW = (60, 80)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.coco_segmentation import decode_segmentation
+from directshape_torch.io.instance_masks import decode_segmentation
 from directshape_torch.io.mask_files import CocoFileMasks, FrameJsonMasks, InstancePngMasks, mask_source
 
 SIZE_HW = (6, 9)

@@ -13,12 +13,8 @@ from hypothesis import strategies as st
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.io.instance_masks import (
-    InstanceMask,
-    match_masks,
-    match_one_to_one,
-    without_duplicates,
-)
+from directshape_torch.io.frame_detections import match_masks, match_one_to_one, without_duplicates
+from directshape_torch.io.instance_masks import InstanceMask
 from directshape_torch.scene_check.image_boxes import box_iou, project_boxes
 
 SIZE_HW = (200, 600)
@@ -53,32 +49,32 @@ def test_iou_by_hand() -> None:
 @given(st.integers(0, 10_000), st.integers(0, 4), st.integers(0, 4))
 def test_assignment_equals_the_best_of_all(seed: int, num_detections: int, num_masks: int) -> None:
     overlap = np.random.default_rng(seed).random((num_detections, num_masks))
-    matches = match_one_to_one(overlap)
-    used = matches.mask_of_detection[matches.mask_of_detection >= 0]
+    partners, overlaps = match_one_to_one(overlap)
+    used = partners[partners >= 0]
     assert len(set(used.tolist())) == len(used)
-    assert (matches.overlap[matches.mask_of_detection >= 0] >= 0.3).all()
+    assert (overlaps[partners >= 0] >= 0.3).all()
     padded = np.hstack([np.where(overlap >= 0.3, overlap, 0.0), np.zeros((num_detections, num_detections))])
     best = max(
         sum(padded[row, column] for row, column in enumerate(columns))
         for columns in itertools.permutations(range(padded.shape[1]), num_detections)
     )
-    assert matches.overlap.sum() == pytest.approx(best)
+    assert overlaps.sum() == pytest.approx(best)
 
 
 def test_the_larger_of_file_box_and_mask_box_counts() -> None:
     box = np.array([[100.0, 50, 200, 100]])
     hidden_half = mask((100, 50, 120, 100))  # a fifth is visible: IoU 0.2 alone
-    assert match_masks(box, [hidden_half]).mask_of_detection.tolist() == [-1]
+    assert match_masks(box, [hidden_half])[0].tolist() == [-1]
     with_box = mask((100, 50, 120, 100), file_box=(100, 50, 200, 100))
-    assert match_masks(box, [with_box]).overlap.tolist() == [1.0]
+    assert match_masks(box, [with_box])[1].tolist() == [1.0]
     wrong_file_box = mask((100, 50, 200, 100), file_box=(0, 0, 10, 10))
-    assert match_masks(box, [wrong_file_box]).overlap.tolist() == [1.0]
+    assert match_masks(box, [wrong_file_box])[1].tolist() == [1.0]
 
 
 def test_second_opinion_is_used_where_it_is_there() -> None:
     boxes = np.array([[0.0, 0, 10, 10], [0, 0, 10, 10]])
     second = np.array([[np.nan] * 4, [300, 50, 400, 90]])
-    assert match_masks(boxes, [mask((300, 50, 400, 90))], second).mask_of_detection.tolist() == [-1, 0]
+    assert match_masks(boxes, [mask((300, 50, 400, 90))], second)[0].tolist() == [-1, 0]
 
 
 def test_projected_boxes_by_hand() -> None:
