@@ -18,7 +18,7 @@ from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
 from directshape_torch.batch.resumption import EarlierResults
 from directshape_torch.errors import DirectShapeError
-from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_manifest import hash_prior
 from directshape_torch.result import RefinementResult
 from directshape_torch.scene import FrameBatch
@@ -47,27 +47,15 @@ def test_a_truncated_image_is_reported_and_the_others_go_on(kitti_copy: Path, tm
 def test_a_line_of_14_columns_is_reported_with_its_text(kitti_copy: Path, tmp_path: Path) -> None:
     path = kitti_copy / "detections" / "data" / "000002.txt"
     path.write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1.6 20\n")
+    # A blank line counts as one.
+    other = kitti_copy / "detections" / "data" / "000000.txt"
+    other.write_text(other.read_text().replace("\n", "\n\n", 1))
     reason = refine(kitti_copy, tmp_path / "out").failed["000002"]
+    assert read_shapes(tmp_path / "out" / "shapes" / "000000.npz").input_lines.tolist() == [1, 4]
     assert f"{path}, line 1" in reason
     assert "14" in reason
     (kitti_copy / "training" / "label_2" / "000001.txt").write_text("Car 0 0 0 1 2 3 4 1.5 1.6 3.9 1 1.6 20\n")
     assert "label_2/000001.txt, line 1" in refine(kitti_copy, tmp_path / "other").failed["000001"]
-
-
-def test_a_field_of_another_rig_fails_its_frames(shared_kitti: Path, tmp_path: Path) -> None:
-    camera = dataset(shared_kitti).load("000000").frame.camera
-    rig = DisparityField(
-        coefficients=torch.zeros(10),
-        hull_uv=torch.tensor([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0]]),
-        size_wh=(1242, 375),
-        K_left=camera.K_left[0],
-        K_right=camera.K_right[0],
-        T_right_cam=camera.T_right_cam[0],
-    )
-    summary = refine_dataset(dataset(shared_kitti, disparity_field=rig), refiner(shared_kitti), tmp_path)
-    assert list(summary.failed) == list(FRAMES)
-    assert "1242" in summary.failed["000000"]
-    assert not (tmp_path / "data").exists()
 
 
 def test_an_unforeseen_error_fails_its_frame_alone(shared_kitti: Path, tmp_path: Path) -> None:

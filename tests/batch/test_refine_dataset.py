@@ -48,9 +48,16 @@ def test_cars_come_nearer_to_the_truth(shared_kitti: Path, tmp_path: Path) -> No
     assert after_m < 0.5 * before_m
 
 
-def test_lines_keep_their_order_and_other_classes_their_bytes(shared_kitti: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path)
-    lines = (tmp_path / "data" / "000000.txt").read_text().split("\n")
+@pytest.fixture(scope="module")
+def out(shared_kitti: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with everything that it may write."""
+    out = tmp_path_factory.mktemp("out")
+    refine(shared_kitti, out, meshes="ply", overlays=True)
+    return out
+
+
+def test_lines_keep_their_order_and_other_classes_their_bytes(shared_kitti: Path, out: Path) -> None:
+    lines = (out / "data" / "000000.txt").read_text().split("\n")
     given = (shared_kitti / "detections" / "data" / "000000.txt").read_text().split("\n")
     assert len(lines) == len(given) == 4
     assert lines[1] == PEDESTRIAN
@@ -60,43 +67,41 @@ def test_lines_keep_their_order_and_other_classes_their_bytes(shared_kitti: Path
         assert new[:3] + new[4:8] + new[15:] == old[:3] + old[4:8] + old[15:]
 
 
-def test_shapes_hold_states_of_the_refined_lines(shared_kitti: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path)
-    shapes = read_shapes(tmp_path / "shapes" / "000001.npz")
+def test_shapes_hold_states_of_the_refined_lines(out: Path) -> None:
+    shapes = read_shapes(out / "shapes" / "000001.npz")
     assert shapes.input_lines.tolist() == [1, 3]
     assert shapes.codes.shape == np.shape(CODE)
     assert shapes.ground_source == "file"
     assert np.isfinite(shapes.covariances).all()
-    summary = json.loads((tmp_path / "summary.json").read_text())
+    summary = json.loads((out / "summary.json").read_text())
     assert summary["sha256"]["prior"] == shapes.prior_sha256
+    # The boxes of the lines, of which the second is a pedestrian's.
+    for car, line in zip((0, 1), read_objects(out / "data" / "000001.txt")[::2], strict=True):
+        assert line.hwl == pytest.approx(shapes.boxes_hwl[car], abs=1e-4)
+        assert line.location_ref == pytest.approx(shapes.boxes_location_ref[car], abs=1e-4)
+        assert line.rotation_y == pytest.approx(shapes.boxes_rotation_y[car], abs=1e-4)
+        assert line.alpha == pytest.approx(
+            line.rotation_y - np.arctan2(line.location_ref[0], line.location_ref[2]), abs=1e-3
+        )
 
 
-def test_equal_runs_write_equal_bytes(shared_kitti: Path, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        refine(shared_kitti, tmp_path / name, meshes="ply", overlays=True)
-    first = result_files(tmp_path / "a")
-    assert first == result_files(tmp_path / "b")
-    assert {
-        "data/000000.txt",
-        "shapes/000000.npz",
-        "meshes/000000_3.ply",
-        "overlays/000000.png",
-        "summary.json",
-    } <= set(first)
+def test_equal_runs_write_equal_bytes(shared_kitti: Path, out: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path, meshes="ply", overlays=True)
+    first = result_files(tmp_path)
+    assert first == result_files(out)
+    names = ("data/000000.txt", "shapes/000000.npz", "meshes/000000_3.ply", "overlays/000000.png", "summary.json")
+    assert set(names) <= set(first)
     picture = cv2.imdecode(np.frombuffer(first["overlays/000000.png"], np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] > 1000
 
 
-def test_frames_in_one_call_give_the_results_of_single_calls(shared_kitti: Path, tmp_path: Path) -> None:
-    refine(shared_kitti, tmp_path / "single")
-    refine(shared_kitti, tmp_path / "together", batch_frames=2)
+def test_frames_in_one_call_give_the_results_of_single_calls(shared_kitti: Path, out: Path, tmp_path: Path) -> None:
+    refine(shared_kitti, tmp_path, batch_frames=2)
     for frame_id in FRAMES:
-        single, together = (
-            read_shapes(tmp_path / name / "shapes" / f"{frame_id}.npz") for name in ("single", "together")
-        )
+        single, together = (read_shapes(each / "shapes" / f"{frame_id}.npz") for each in (out, tmp_path))
         np.testing.assert_allclose(together.T_cam_obj, single.T_cam_obj, atol=2e-4)
         assert together.statuses == single.statuses
-    calls = json.loads((tmp_path / "together" / "timings.json").read_text())["calls"]
+    calls = json.loads((tmp_path / "timings.json").read_text())["calls"]
     assert [call["frames"] for call in calls] == [["000000", "000001"], ["000002"]]
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import platform
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -48,19 +46,6 @@ def test_a_second_run_is_told_who_is_there_and_a_killed_one_holds_nothing(tmp_pa
         now = read_log(tmp_path)
         assert now is not None
         assert (now.beginning.pid, now.beginning.host) == (os.getpid(), platform.node())
-
-
-def test_within_one_process_too(tmp_path: Path) -> None:
-    with RunLog(tmp_path / "new"), pytest.raises(RunInProgressError, match="its owner is not known"):
-        RunLog(tmp_path / "new").__enter__()
-    assert not log_path(tmp_path / "new").exists()
-    with RunLog(tmp_path / "new"):
-        pass
-
-
-def test_processes_of_other_machines_are_not_judged() -> None:
-    assert RunBeginning({}, 1, host="elsewhere", pid=1).is_alive is None
-    assert RunBeginning({}, 1, pid=2**40).is_alive is False
 
 
 def written(out: Path) -> bytes:
@@ -149,15 +134,3 @@ def test_what_a_full_disk_took_of_a_line_is_taken_back(tmp_path: Path) -> None:
     assert found is not None
     assert found.refining is not None
     assert found.refining.resumed == 2
-
-
-def test_a_beginning_comes_back(tmp_path: Path) -> None:
-    assert read_log(tmp_path) is None
-    beginning = RunBeginning({"threads": 1, "outputs": ["data"]}, 5)
-    with RunLog(tmp_path) as log:
-        log.begin(beginning)
-        log.begin(replace(beginning, num_frames=6))
-    found = read_log(tmp_path)
-    assert found is not None
-    assert found.beginning == replace(beginning, num_frames=6)
-    assert len([json.loads(line) for line in log_path(tmp_path).read_text().splitlines()]) == 1

@@ -60,15 +60,6 @@ def test_a_run_that_is_stuck_becomes_slower(tmp_path: Path) -> None:
     assert rates == pytest.approx([0.5, 0.5, 4 / 18, 4 / 106])
 
 
-def test_a_line_that_is_being_written_is_not_yet_there(tmp_path: Path) -> None:
-    begun(tmp_path, *frames([1002.0, 1004.0]))
-    log_path(tmp_path).write_bytes(log_path(tmp_path).read_bytes()[:-7])
-    before = {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")}
-    status = read_status(tmp_path, 1005.0)
-    assert (status.num_done, status.num_left) == (3, 9)
-    assert {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*")} == before, "a status only reads"
-
-
 def test_states(tmp_path: Path) -> None:
     begun(tmp_path)
     assert read_status(tmp_path, 1000.0).state == "checking"

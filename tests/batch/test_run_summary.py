@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -17,11 +16,9 @@ from directshape_torch.batch.run_summary import (
     CallTiming,
     RunSummary,
     RunTimings,
-    count_statuses,
     find_warnings,
     format_summary,
     peak_memory_mb,
-    write_timings,
 )
 
 
@@ -37,11 +34,6 @@ FAILED = {"state": "failed", "reason": "cut short"}
 def timings(forms: int = 0) -> RunTimings:
     calls = [CallTiming(("000000",), 2, 0.3, forms), CallTiming(("000001", "000002"), 4, 0.6)]
     return RunTimings(torch.device("cpu"), calls)
-
-
-def test_statuses_are_counted_over_frames_in_a_fixed_order() -> None:
-    frames = {"a": done(no_mask=1, converged=2), "b": FAILED, "c": done(converged=1, max_iterations=4)}
-    assert list(count_statuses(frames).items()) == [("converged", 3), ("max_iterations", 4), ("no_mask", 1)]
 
 
 @pytest.mark.parametrize(
@@ -92,32 +84,7 @@ def test_a_call_counts_what_was_compiled_in_it(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_run_without_work_has_no_time() -> None:
     nothing = RunTimings(torch.device("cpu"))
-    assert nothing.ms_per_car is None
-    assert nothing.ms_per_frame is None
     assert "time" not in format_summary(RunSummary({}, (), {}, (), nothing))
-
-
-def test_timings_file(tmp_path: Path) -> None:
-    write_timings(tmp_path / "timings.json", timings())
-    content = json.loads((tmp_path / "timings.json").read_text())
-    assert content["schema_version"] == 1
-    assert content["ms_per_car"] == 150.0
-    assert content["calls"][1] == {"frames": ["000001", "000002"], "cars": 4, "refine_ms": 600.0}
-
-
-def test_measuring_adds_a_call_even_when_cars_are_none() -> None:
-    run = RunTimings(torch.device("cpu"))
-    with run.measure(("000007",), 0):
-        torch.ones(10).sum()
-    assert run.calls[0].frame_ids == ("000007",)
-    assert run.calls[0].refine_s > 0
-    assert run.ms_per_car is None
-
-
-def test_peak_memory_is_that_of_this_process() -> None:
-    peak = peak_memory_mb()
-    # A process that has loaded torch needs between 50 MB and what a machine has.
-    assert peak is None or 50 < peak < 1e6
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="of Linux")

@@ -67,15 +67,6 @@ def test_every_frame_is_refined_once(capacity: int) -> None:
     assert (run.num_deaths, run.lost) == (0, {})
 
 
-def test_a_death_costs_one_more_try() -> None:
-    workers = Imagined(2, lambda group, before: "c" in group.frame_ids and before == 0)
-    run = dispatch(workers, size=2)
-    list(run.reports())
-    assert sorted(workers.written) == list("abcdefgh")
-    assert workers.calls.count(("c", "d")) == 2
-    assert (run.num_deaths, run.lost) == (1, {})
-
-
 @pytest.mark.parametrize("retries", [0, 1, 2])
 def test_the_frame_that_kills_is_found_among_its_companions(retries: int) -> None:
     workers = Imagined(2, lambda group, _: "c" in group.frame_ids)
@@ -106,14 +97,6 @@ def test_workers_that_never_finish_anything_end_the_run() -> None:
     with pytest.raises(DirectShapeError, match=r"workers die before they finish any frame \(killed\)"):
         list(run.reports())
     assert run.num_deaths == 6
-
-
-def test_groups_are_those_of_the_data_set_whatever_is_left() -> None:
-    groups = frame_groups("abcdefg", 3, finished="abcf")
-    assert [group.frame_ids for group in groups] == [("d", "e", "f"), ("g",)]
-    assert [sorted(group.wanted) for group in groups] == [["d", "e"], ["g"]]
-    assert frame_groups("ab", 3, finished="ab") == []
-    assert [half.frame_ids for half in groups[0].halves()] == [("d", "e")]
 
 
 FRAMES = tuple(f"{number:06d}" for number in range(5))

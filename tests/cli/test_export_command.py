@@ -8,14 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from helpers.finished_run import FinishedRun, finished_run
+from helpers.finished_run import FinishedRun
 
 from directshape_torch.cli.main import main
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    return finished_run(tmp_path_factory.mktemp("run"))
 
 
 def command(run: FinishedRun, out: Path, *words: str | Path) -> list[str]:

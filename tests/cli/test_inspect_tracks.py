@@ -12,11 +12,15 @@ from PIL import Image
 from directshape_torch.cli.main import main
 
 
+def command(kitti: Path, root: Path, *extra: str) -> list[str]:
+    write_sequence(kitti, root, FRAMES, single=True)
+    words = ["inspect", "--layout", "tracking", "--data", root, "--detections", kitti / "detections", "--tracks"]
+    words += ["--masks", kitti / "masks", "--prior", kitti / "prior.npz", "--config", "fast", "--out", root / "figures"]
+    return [*map(str, words), *extra]
+
+
 def test_each_car_of_several_frames_moves(shared_kitti: Path, tmp_path: Path) -> None:
-    write_sequence(shared_kitti, tmp_path, FRAMES, single=True)
-    words = ["inspect", "--layout", "tracking", "--data", tmp_path, "--detections", shared_kitti / "detections"]
-    words += ["--masks", shared_kitti / "masks", "--prior", shared_kitti / "prior.npz", "--config", "fast"]
-    assert main([str(word) for word in (*words, "--tracks", "--frames", 0, 1, "--out", tmp_path / "figures")]) == 0
+    assert main(command(shared_kitti, tmp_path, "--frames", "0", "1")) == 0
     found = sorted((tmp_path / "figures").iterdir())
     # By association, in which the pedestrian's line is counted too.
     assert [path.name for path in found] == ["track_000000.gif", "track_000002.gif"]
@@ -27,20 +31,8 @@ def test_each_car_of_several_frames_moves(shared_kitti: Path, tmp_path: Path) ->
 def test_a_car_of_one_frame_alone_has_nothing_to_move(
     shared_kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_sequence(shared_kitti, tmp_path, FRAMES, single=True)
-    words = ["inspect", "--layout", "tracking", "--data", tmp_path, "--detections", shared_kitti / "detections"]
-    words += ["--masks", shared_kitti / "masks", "--prior", shared_kitti / "prior.npz", "--config", "fast"]
-    assert main([str(word) for word in (*words, "--tracks", "--frame", 1, "--out", tmp_path / "figures")]) == 2
+    assert main(command(shared_kitti, tmp_path, "--frame", "1")) == 2
     shown = capsys.readouterr()
     assert "--tracks: expected a car in several of these frames, got none; give more --frames" in shown.err
     assert "figures" not in shown.out
     assert not (tmp_path / "figures").exists()
-
-
-def test_frames_by_themselves_have_no_tracks(
-    shared_kitti: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["inspect", "--data", shared_kitti, "--detections", shared_kitti / "detections"]
-    words += ["--masks", shared_kitti / "masks", "--tracks", "--frames", 0, 1, "--out", tmp_path / "figures"]
-    assert main([str(word) for word in words]) == 2
-    assert "tracks: expected a layout of sequences" in capsys.readouterr().err

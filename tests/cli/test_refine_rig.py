@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from helpers.kitti_folder import write_data_set
 from test_refine_command import command
 
 from directshape_torch.cli.main import main
-from directshape_torch.rig.rig_file import load_rigs
+from directshape_torch.rig.rig_file import load_rigs, save_field
 
 
 @pytest.fixture
@@ -49,14 +50,22 @@ def test_is_estimated_kept_and_shown(source: Path, tmp_path: Path, capsys: pytes
     assert not (tmp_path / "none" / "rig.json").exists()
 
 
-def test_frames_of_two_rigs_are_refined_in_one_run(source: Path, tmp_path: Path) -> None:
+def test_frames_of_two_rigs_are_refined_in_one_run(
+    source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     another_rig(source, "000001")
     assert main(command(source, tmp_path / "out", "--batch-frames", "2")) == 0
     assert len(load_rigs(tmp_path / "out" / "rig.json")) == 2
     file = ("--rig", str(tmp_path / "out" / "rig.json"))
     assert main(command(source, tmp_path / "by_file", *file)) == 0
+    assert main(command(source, tmp_path / "none", "--rig", "none")) == 0
     for name in ("data/000000.txt", "data/000001.txt"):
-        assert (tmp_path / "out" / name).read_text() == (tmp_path / "by_file" / name).read_text()
+        by_rig, by_file, by_none = ((tmp_path / each / name).read_text() for each in ("out", "by_file", "none"))
+        assert by_rig == by_file != by_none
+    field = load_rigs(tmp_path / "out" / "rig.json")[0].field
+    save_field(replace(field, coefficients=field.coefficients + 0.5), tmp_path / "other.json")
+    assert main(command(source, tmp_path / "by_file", "--rig", str(tmp_path / "other.json"))) == 2
+    assert "sha256 of 'stereo_bias'" in capsys.readouterr().err
 
 
 def test_a_file_of_another_rig_fails_its_frames(

@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
-from helpers.finished_run import FinishedRun, finished_run
+from helpers.finished_run import FinishedRun
 
 from directshape_torch.cli.main import main
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    return finished_run(tmp_path_factory.mktemp("run"))
-
-
-def inputs(run: FinishedRun) -> list[str]:
-    root = run.root
+def inputs(finished: FinishedRun) -> list[str]:
+    root = finished.root
     options = {"data": root, "detections": root / "detections", "masks": root / "masks", "prior": root / "prior.npz"}
     return [word for name, path in options.items() for word in (f"--{name}", str(path))]
 
 
-def test_the_page_lies_in_the_folder_of_the_run(run: FinishedRun, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", str(run.out), *inputs(run)]) == 0
+def test_the_page_lies_in_the_folder_of_the_run(
+    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = shutil.copytree(finished.out, tmp_path / "out")
+    assert main(["report", str(folder), *inputs(finished)]) == 0
     out, err = capsys.readouterr()
-    page = run.out / "report.html"
+    page = folder / "report.html"
     assert page.read_text("utf-8").startswith("<!doctype html>")
     assert str(page) in out
     assert "4 of 2 frames, 2 of them with pictures" in out
     assert "note:" not in err
 
 
-def test_notes_say_what_is_missing(run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_notes_say_what_is_missing(finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "elsewhere" / "page.html"
-    assert main(["report", str(run.out), "--html", str(page), "--frames", "1"]) == 0
+    assert main(["report", str(finished.out), "--html", str(page), "--frames", "1"]) == 0
     err = capsys.readouterr().err
     assert page.is_file()
     # The run used a prior of its own, which no bundled one can decode.
@@ -54,11 +53,11 @@ def test_notes_say_what_is_missing(run: FinishedRun, tmp_path: Path, capsys: pyt
     ],
 )
 def test_wrong_usage(
-    run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     page = tmp_path / "page.html"
-    words = [word.format(root=run.root) for word in words]
-    assert main(["report", str(run.out), "--html", str(page), *words]) == 2
+    words = [word.format(root=finished.root) for word in words]
+    assert main(["report", str(finished.out), "--html", str(page), *words]) == 2
     assert message in capsys.readouterr().err
     assert not page.exists()
 

@@ -5,19 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
-from helpers.finished_run import FinishedRun, finished_run
+from helpers.finished_run import FinishedRun
 
 from directshape_torch.export.box_files import DETECTION_NAMES, KITTI_TYPES
 from directshape_torch.export.export_run import FORMATS
 from directshape_torch.export.painted_cars import NEUTRAL_RGB
 
 TEXT = (Path(__file__).parent.parent.parent / "docs" / "outputs.md").read_text(encoding="utf-8")
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    return finished_run(tmp_path_factory.mktemp("run"))
 
 
 def test_every_format_has_a_row() -> None:

@@ -119,16 +119,6 @@ class TestOrientation:
         assert scores.score("2d", 0.7, "easy").aos_r40 is None
 
 
-class TestWhatIsEvaluated:
-    def test_a_detector_without_3d_boxes_is_scored_in_the_image_alone(self) -> None:
-        result = "Car -1 -1 -10 0 100 100 150 -1 -1 -1 -1000 -1000 -1000 -10 0.9"
-        scores = evaluate([line()], [result])
-        assert {score.metric for score in scores.scores} == {"2d"}
-        assert scores.score("2d", 0.7, "easy").ap_area == 100
-        with pytest.raises(InputError, match=r"expected 2d; .*got 3d"):
-            scores.score("3d", 0.7, "easy")
-
-
 class TestFilesAndErrors:
     @pytest.fixture
     def folders(self, tmp_path: Path) -> tuple[Path, Path]:

@@ -11,7 +11,6 @@ import torch
 from helpers.finished_run import FRAMES, FinishedRun, by_place
 from numpy.typing import NDArray
 
-from directshape_torch.errors import InputError
 from directshape_torch.export.export_run import export_run
 from directshape_torch.geometry.box3d import box_corners
 
@@ -138,16 +137,6 @@ def test_nuscenes_heading_is_the_cars_own(finished: FinishedRun, exported: Path)
         np.testing.assert_allclose(np.arctan2(forward[1], forward[0]), np.angle(np.exp(1j * yaw)), atol=1e-5)
 
 
-def test_coco_needs_images(finished: FinishedRun, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--data: expected the data set of the run"):
-        export_run(finished.folder(), tmp_path, ["coco3d"], finished.inputs(with_images=False))
-
-
 def test_boxes_alone_need_no_images(finished: FinishedRun, exported: Path, tmp_path: Path) -> None:
     export_run(finished.folder(), tmp_path, ["nuscenes", "kitti"], finished.inputs(with_images=False))
     assert (tmp_path / "nuscenes.json").read_bytes() == (exported / "nuscenes.json").read_bytes()
-
-
-def test_an_unknown_format_is_named(finished: FinishedRun, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"formats: expected of glb, .*got 'obj'"):
-        export_run(finished.folder(), tmp_path, ["obj"], finished.inputs())  # type: ignore[list-item]

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from directshape_torch.config import RefinerConfig
 from directshape_torch.config_files import config_from_mapping
-from directshape_torch.errors import DataFormatError, InputError, MissingDependencyError
+from directshape_torch.errors import DataFormatError, MissingDependencyError
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
@@ -276,11 +276,6 @@ def test_an_end_that_fails_leaves_nothing_half_written(
         export_run(RunFolder(finished.out, [0]), tmp_path, formats, finished.inputs())
     left = {path.name for path in tmp_path.iterdir()}
     assert left == ({"coco3d.json", "recording.rrd"} if recording_first else {"coco3d.json"})
-
-
-def test_iterations_need_the_detections_of_the_run(finished: FinishedRun) -> None:
-    with pytest.raises(InputError, match="detections: expected those of the run"):
-        replace(finished.inputs(), refiner=refiner_of(finished))
 
 
 def test_without_rerun_the_error_says_what_to_install(

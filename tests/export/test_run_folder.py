@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.finished_run import FRAMES, FinishedRun
+from helpers.finished_run import FinishedRun
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError
 from directshape_torch.io.run_folder import COPIED, RunFolder
 from directshape_torch.status import Status
 
@@ -37,16 +37,6 @@ def test_the_centre_is_half_a_height_above_the_bottom(finished: FinishedRun) -> 
 @pytest.mark.parametrize("wanted", [["000001"], ["1"], [1], ["000001", 1, "1"]])
 def test_frames_are_named_in_any_way(finished: FinishedRun, wanted: list[str | int]) -> None:
     assert RunFolder(finished.out, wanted).frame_ids == ("000001",)
-
-
-def test_all_finished_frames_are_the_default(finished: FinishedRun) -> None:
-    assert finished.folder().frame_ids == FRAMES
-    assert finished.folder().classes == ("Car",)
-
-
-def test_unknown_frames_are_named(finished: FinishedRun) -> None:
-    with pytest.raises(InputError, match=r"frames: expected finished frames of .*, got 17, x"):
-        RunFolder(finished.out, ["17", "x", "0"])
 
 
 def test_files_that_do_not_fit_together_are_named(finished: FinishedRun, tmp_path: Path) -> None:

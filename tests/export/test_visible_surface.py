@@ -77,11 +77,6 @@ def test_a_mask_takes_away_what_it_does_not_cover() -> None:
     assert 0.3 < part.sum() / whole.sum() < 0.7
 
 
-def test_points_behind_the_camera_are_not_seen() -> None:
-    points = np.array([[0.0, 0.5, -8.0], [0.0, 0.5, 8.0]])
-    assert not view().is_seen(0, points, np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])).any()
-
-
 def test_colours_are_those_between_pixels() -> None:
     """An image that is linear in u and v gives back the pixel itself."""
     v, u = np.mgrid[:120, :160]
@@ -90,9 +85,3 @@ def test_colours_are_those_between_pixels() -> None:
     points = np.concatenate([(uv - K[:2, 2]) / 150, np.ones((5, 1))], axis=1) * 12.0
     wanted = [[10, 21, 7], [0, 0, 7], [159, 119, 7], [159, 118, 7], [159, 0, 7]]
     np.testing.assert_array_equal(view(image).colours(points), wanted)
-
-
-def test_no_points_have_no_colours() -> None:
-    nothing = np.zeros((0, 3))
-    assert view().colours(nothing).shape == (0, 3)
-    assert view().is_seen(0, nothing, nothing).shape == (0,)

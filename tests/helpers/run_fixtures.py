@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from helpers.finished_run import FinishedRun, finished_run
 from helpers.kitti_folder import write_data_set
 
 
@@ -30,3 +31,9 @@ def kitti(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def kitti_copy(shared_kitti: Path, tmp_path: Path) -> Path:
     """A copy of it that a test may damage."""
     return Path(shutil.copytree(shared_kitti, tmp_path / "kitti"))
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    """A finished run with meshes, which reports and exports read and no test writes to."""
+    return finished_run(tmp_path_factory.mktemp("finished"), meshes="glb")

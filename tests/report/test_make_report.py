@@ -10,19 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.finished_run import FinishedRun, finished_run, refined, unpacked
+from helpers.finished_run import FinishedRun, refined, unpacked
 
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError
 from directshape_torch.evaluation.comparison import compare_results
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.report.make_report import ReportOutcome, make_report
 from directshape_torch.shape.pca_prior import PCAShapePrior
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    return finished_run(tmp_path_factory.mktemp("run"), meshes="glb")
 
 
 def blocks(page: Path) -> dict[str, Any]:
@@ -32,8 +27,10 @@ def blocks(page: Path) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def outcome(run: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> ReportOutcome:
-    return make_report(run.folder(), tmp_path_factory.mktemp("page") / "page.html", run.dataset, run.prior)
+def outcome(finished: FinishedRun, tmp_path_factory: pytest.TempPathFactory) -> ReportOutcome:
+    return make_report(
+        finished.folder(), tmp_path_factory.mktemp("page") / "page.html", finished.dataset, finished.prior
+    )
 
 
 @pytest.fixture(scope="module")
@@ -60,15 +57,15 @@ def test_page_carries_every_part(outcome: ReportOutcome, data: dict[str, Any]) -
         assert scene["ground"][3] == pytest.approx(1.65, abs=1e-5)
 
 
-def test_table_says_what_the_files_say(run: FinishedRun, data: dict[str, Any]) -> None:
+def test_table_says_what_the_files_say(finished: FinishedRun, data: dict[str, Any]) -> None:
     rows = [dict(zip(data["cars"]["columns"], row, strict=True)) for row in data["cars"]["rows"]]
-    shapes = read_shapes(run.out / "shapes" / "000001.npz")
+    shapes = read_shapes(finished.out / "shapes" / "000001.npz")
     last = [row for row in rows if row["frame"] == 1]
     assert [row["line"] for row in last] == shapes.input_lines.tolist() == [1, 3]
     assert [row["status"] for row in last] == list(shapes.statuses)
     assert [row["distance_m"] for row in last] == pytest.approx(shapes.T_cam_obj[:, 2, 3], abs=0.006)
     # The same errors as `directshape compare`, and the means over the same cars.
-    compared = compare_results(run.root / "training" / "label_2", run.root / "detections", run.out)
+    compared = compare_results(finished.root / "training" / "label_2", finished.root / "detections", finished.out)
     by_car = {(car.frame_id, car.detection_line): car for car in compared.cars}
     assert by_car
     for row in rows:
@@ -100,9 +97,9 @@ def test_meshes_stand_on_the_page_where_their_boxes_are(data: dict[str, Any]) ->
         assert faces.max() == len(vertices) - 1
 
 
-def test_saved_meshes_stand_in_for_the_prior(run: FinishedRun, tmp_path: Path) -> None:
-    with_prior = blocks(make_report(run.folder(), tmp_path / "a.html", prior=run.prior).path)["scene-0"]
-    outcome = make_report(run.folder(), tmp_path / "b.html")
+def test_saved_meshes_stand_in_for_the_prior(finished: FinishedRun, tmp_path: Path) -> None:
+    with_prior = blocks(make_report(finished.folder(), tmp_path / "a.html", prior=finished.prior).path)["scene-0"]
+    outcome = make_report(finished.folder(), tmp_path / "b.html")
     saved = blocks(outcome.path)["scene-0"]
     assert any("no residual maps" in note for note in outcome.notes)
     for decoded_car, saved_car in zip(with_prior["cars"], saved["cars"], strict=True):
@@ -111,8 +108,8 @@ def test_saved_meshes_stand_in_for_the_prior(run: FinishedRun, tmp_path: Path) -
         assert np.abs(decoded.max(axis=1) - read.max(axis=1)).max() <= 2
 
 
-def test_without_inputs_the_page_says_so(run: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(run.folder(), tmp_path / "page.html", prior=run.prior)
+def test_without_inputs_the_page_says_so(finished: FinishedRun, tmp_path: Path) -> None:
+    outcome = make_report(finished.folder(), tmp_path / "page.html", prior=finished.prior)
     data = blocks(outcome.path)
     assert data["run"]["notes"] == list(outcome.notes)
     assert any("--data" in note for note in outcome.notes)
@@ -123,12 +120,14 @@ def test_without_inputs_the_page_says_so(run: FinishedRun, tmp_path: Path) -> No
     assert len(data["scene-0"]["cars"][0]["box_after"]) == 24
 
 
-def test_a_changed_image_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(run.root, tmp_path / "kitti"))
+def test_a_changed_image_is_not_used(finished: FinishedRun, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(finished.root, tmp_path / "kitti"))
     shutil.copy(root / "training/image_3/000000.png", root / "training/image_2/000000.png")
     (root / "training/image_2/000001.png").unlink()
     (root / "masks/000001.json").unlink()
-    outcome = make_report(run.folder(), tmp_path / "page.html", FinishedRun(root, run.out).dataset, run.prior)
+    outcome = make_report(
+        finished.folder(), tmp_path / "page.html", FinishedRun(root, finished.out).dataset, finished.prior
+    )
     data = blocks(outcome.path)
     assert data["scene-0"]["image"] is None
     assert "left image not used: the file has changed since the run (1 of 2 frames)" in outcome.notes
@@ -136,28 +135,28 @@ def test_a_changed_image_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
 
 
 def test_detections_are_looked_for_in_all_frames_and_images_where_there_are_pictures(
-    run: FinishedRun, tmp_path: Path
+    finished: FinishedRun, tmp_path: Path
 ) -> None:
-    root = Path(shutil.copytree(run.root, tmp_path / "kitti"))
+    root = Path(shutil.copytree(finished.root, tmp_path / "kitti"))
     for name in ("000000", "000001"):
         (root / "training" / "image_2" / f"{name}.png").unlink()
         path = root / "detections" / "data" / f"{name}.txt"
         path.write_text(path.read_text() + "\n")
-    dataset = FinishedRun(root, run.out).dataset
-    outcome = make_report(run.folder(), tmp_path / "page.html", dataset, run.prior, most_frames=1)
+    dataset = FinishedRun(root, finished.out).dataset
+    outcome = make_report(finished.folder(), tmp_path / "page.html", dataset, finished.prior, most_frames=1)
     assert "left image not found (1 of 1 frames)" in outcome.notes
     of_detections = [note for note in outcome.notes if note.startswith("detections")]
     assert of_detections == ["detections not used: the file has changed since the run (2 of 2 frames)"]
 
 
-def test_another_prior_is_not_used(run: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(run.folder(), tmp_path / "page.html", run.dataset, PCAShapePrior.load_bundled())
+def test_another_prior_is_not_used(finished: FinishedRun, tmp_path: Path) -> None:
+    outcome = make_report(finished.folder(), tmp_path / "page.html", finished.dataset, PCAShapePrior.load_bundled())
     assert any("the prior is not that of the run" in note for note in outcome.notes)
     assert "mean-mesh" not in blocks(outcome.path)
 
 
-def test_few_frames_have_details(run: FinishedRun, tmp_path: Path) -> None:
-    outcome = make_report(run.folder(), tmp_path / "page.html", run.dataset, run.prior, most_frames=1)
+def test_few_frames_have_details(finished: FinishedRun, tmp_path: Path) -> None:
+    outcome = make_report(finished.folder(), tmp_path / "page.html", finished.dataset, finished.prior, most_frames=1)
     data = blocks(outcome.path)
     assert len(data["frames"]["detailed"]) == 1
     assert len(data["cars"]["rows"]) == 4
@@ -165,18 +164,9 @@ def test_few_frames_have_details(run: FinishedRun, tmp_path: Path) -> None:
     assert "pictures and 3D views of 1 of 2 frames (--max-frames)" in outcome.notes
 
 
-def test_chosen_frames_alone(run: FinishedRun, tmp_path: Path) -> None:
-    page = make_report(run.folder("1", "000001"), tmp_path / "page.html", run.dataset, run.prior).path
-    data = blocks(page)
-    assert data["frames"]["ids"] == ["000001"]
-    assert data["run"]["frames_done"] == 1
-    with pytest.raises(InputError, match="000009"):
-        run.folder("000009")
-
-
-def test_failed_frames_and_frames_without_cars(run: FinishedRun, tmp_path: Path) -> None:
+def test_failed_frames_and_frames_without_cars(finished: FinishedRun, tmp_path: Path) -> None:
     folder = tmp_path / "again"
-    shutil.copytree(run.root, folder / "kitti")
+    shutil.copytree(finished.root, folder / "kitti")
     data_set = folder / "kitti"
     (data_set / "training/image_3/000000.png").write_bytes(b"no image")
     (data_set / "detections/data/000001.txt").write_text("")
@@ -189,47 +179,36 @@ def test_failed_frames_and_frames_without_cars(run: FinishedRun, tmp_path: Path)
     assert data["run"]["errors"] is None
 
 
-def test_a_run_that_was_cut_off(run: FinishedRun, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(run.out, tmp_path / "out"))
+def test_a_run_that_was_cut_off(finished: FinishedRun, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(finished.out, tmp_path / "out"))
     log = (out / "run.jsonl").read_text().splitlines(keepends=True)
     (out / "run.jsonl").write_text("".join(log[:-2]))
     text = (out / "data" / "000001.txt").read_bytes()
     (out / "data" / "000001.txt").unlink()
-    assert blocks(make_report(RunFolder(out), tmp_path / "a.html", run.dataset, run.prior).path)["frames"]["ids"] == [
-        "000000"
-    ]
+    assert blocks(make_report(RunFolder(out), tmp_path / "a.html", finished.dataset, finished.prior).path)["frames"][
+        "ids"
+    ] == ["000000"]
     (out / "data" / "000001.txt").write_bytes(text)
     summary = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
-    outcome = make_report(RunFolder(out), tmp_path / "b.html", run.dataset, run.prior)
+    outcome = make_report(RunFolder(out), tmp_path / "b.html", finished.dataset, finished.prior)
     assert blocks(outcome.path)["frames"]["ids"] == ["000000", "000001"]
     assert blocks(outcome.path)["run"]["ground_sources"] == {"file": 2}
     (note,) = outcome.notes
     assert re.search(r"not finished \(running, 1 frames left\)", note)
 
 
-def test_equal_runs_give_equal_pages(run: FinishedRun, outcome: ReportOutcome, tmp_path: Path) -> None:
-    again = make_report(run.folder(), tmp_path / "again.html", run.dataset, run.prior)
+def test_equal_runs_give_equal_pages(finished: FinishedRun, outcome: ReportOutcome, tmp_path: Path) -> None:
+    again = make_report(finished.folder(), tmp_path / "again.html", finished.dataset, finished.prior)
     assert again.path.read_bytes() == outcome.path.read_bytes()
 
 
-def test_no_run_no_page(tmp_path: Path) -> None:
-    with pytest.raises(DataFormatError, match=r"summary\.json.*directshape refine"):
-        make_report(RunFolder(tmp_path), tmp_path / "page.html")
-    assert not (tmp_path / "page.html").exists()
-
-
-def test_a_damaged_frame_leaves_the_old_page(run: FinishedRun, tmp_path: Path) -> None:
-    out = Path(shutil.copytree(run.out, tmp_path / "out"))
+def test_a_damaged_frame_leaves_the_old_page(finished: FinishedRun, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(finished.out, tmp_path / "out"))
     page = tmp_path / "page.html"
     page.write_text("old")
     (out / "shapes" / "000001.npz").write_bytes(b"PK")
     with pytest.raises(DataFormatError, match="000001"):
-        make_report(RunFolder(out), page, run.dataset, run.prior)
+        make_report(RunFolder(out), page, finished.dataset, finished.prior)
     assert page.read_text() == "old"
     assert [path.name for path in tmp_path.iterdir() if path.name.endswith(".tmp")] == []
-
-
-def test_a_negative_number_of_frames(run: FinishedRun, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="most_frames"):
-        make_report(run.folder(), tmp_path / "page.html", most_frames=-1)

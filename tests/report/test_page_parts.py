@@ -100,13 +100,6 @@ def test_numbers_come_back(numbers: list[int]) -> None:
     assert unpacked(packed(np.array(numbers, dtype=np.int64))).tolist() == numbers
 
 
-def test_a_triangle_by_hand() -> None:
-    data = mesh_data(np.array([[0.0, 0.1, -2.0], [1.2344, 0.0, 0.0], [1.2346, -0.5, 3.0]]), np.array([[2, 0, 1]]))
-    # x of all vertices, then y, then z, in millimetres.
-    assert unpacked(data["vertices"]).tolist() == [0, 1234, 1235, 100, 0, -500, -2000, 0, 3000]
-    assert unpacked(data["faces"]).tolist() == [2, 0, 1]
-
-
 def test_a_car_is_small() -> None:
     mesh = mean_car(PCAShapePrior.load_bundled())
     data = mesh_data(mesh.vertices, mesh.faces)

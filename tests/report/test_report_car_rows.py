@@ -26,18 +26,6 @@ def result(*cars: KittiObject, **changes: object) -> FrameResult:
     return FrameResult("000107", lines, shape_arrays(len(cars), **changes), FrameRecord("", {}, [], {}, len(cars), 0))
 
 
-def test_errors_before_and_after() -> None:
-    after, before, labels = car(1.0, 100), car(2.0, 100), [car(50.0, 900), car(1.2, 102)]
-    (row,) = car_rows(3, result(after), [before], labels)
-    assert (row.frame, row.line, row.status, row.refined) == (3, 1, "converged", True)
-    assert row.counts is True
-    assert row.centre_before_m == pytest.approx(0.8)
-    assert row.centre_after_m == pytest.approx(0.2)
-    # Footprints 4.0 m long, shifted along their length.
-    assert row.iou_before == pytest.approx(3.2 / 4.8, abs=1e-4)
-    assert row.iou_after == pytest.approx(3.8 / 4.2, abs=1e-4)
-
-
 def test_what_is_not_known_is_none() -> None:
     unknown = np.full(2, np.nan)
     rows = car_rows(0, result(car(1, 100), car(2, 300), mask_iou_left=unknown, probabilities_better=unknown))

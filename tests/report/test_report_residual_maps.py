@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from directshape_torch.config_files import load_config
-from directshape_torch.report.residual_maps import Floats, photometric_picture, residual_maps, silhouette_picture
+from directshape_torch.report.residual_maps import Floats, residual_maps
 from directshape_torch.visualize.drawing import View, pixel_grid
 
 SHARP = load_config(None, ["stages=[{contour_width_px: 0.25}]"])
@@ -90,21 +90,6 @@ def test_brightness_is_matched_where_the_run_matched_it() -> None:
         medians.append(abs(float(np.nanmedian(photometric))))
     assert medians[0] < 2
     assert medians[1] > 6
-
-
-def test_a_wide_window_is_thinned() -> None:
-    assert pixel_grid((10, 5, 250, 25), 240).shape == (20, 240, 2)
-    assert pixel_grid((0, 0, 960, 100), 240).shape == (25, 240, 2)
-    assert pixel_grid((3, 4, 6, 6), 3)[0].tolist() == [[3, 4], [4, 4], [5, 4]]
-
-
-def test_colours() -> None:
-    image = np.full((4, 4, 3), 100, np.uint8)
-    residual = np.array([[0.0, 80.0], [-80.0, np.nan]])
-    picture = photometric_picture(image, (0, 0, 2, 2), residual)
-    assert picture.tolist() == [[[245, 245, 245], [214, 47, 39]], [[49, 87, 200], [50, 50, 50]]]
-    silhouette = silhouette_picture(image, (0, 0, 2, 2), np.array([[0.0, 4.6], [-4.6, 0.0]]))
-    assert silhouette.tolist() == [[[50, 50, 50], [255, 140, 0]], [[186, 60, 220], [50, 50, 50]]]
 
 
 @pytest.mark.parametrize("points", [[[0.0, 0.0, -5.0]], [[-90.0, 0.0, 10.0], [-80.0, 1.0, 10.0]]])
