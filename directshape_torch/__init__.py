@@ -2,7 +2,6 @@
 
 from directshape_torch.batch.fit_shape import ShapeFit, fit_shape
 from directshape_torch.config import RefinerConfig
-from directshape_torch.config_files import load_config
 from directshape_torch.errors import (
     ConfigError,
     DataFormatError,
@@ -14,11 +13,12 @@ from directshape_torch.errors import (
 )
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.config_files import load_config
 from directshape_torch.refinement.disparity_profile import DisparityProfile
 from directshape_torch.refinement.observability import Observability
 from directshape_torch.refinement.quality import FitQuality
+from directshape_torch.refinement.result import KittiBoxes, RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import KittiBoxes, RefinementResult
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.scene import Detections, FrameBatch, GroundPlane, Occluders
 from directshape_torch.scene_check.check_scene import check_scene

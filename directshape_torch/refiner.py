@@ -22,9 +22,9 @@ from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import check_fit, check_no_tangents, refusals, without_empty_masks
 from directshape_torch.refinement.outcome import Outcome
 from directshape_torch.refinement.problem import CarProblem
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.refinement.tracks import refined
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.shape_prior import ShapePrior

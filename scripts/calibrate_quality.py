@@ -40,7 +40,7 @@ from quality_calibration.report import (
 
 from directshape_torch.cli.options import frame_id_of
 from directshape_torch.config import AcceptanceConfig
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.refinement.quality import TrustModel
 from directshape_torch.refiner import DirectShapeRefiner, KnownRig

@@ -37,7 +37,7 @@ from directshape_torch.errors import ConfigError
 from directshape_torch.files.atomic_files import write_text
 from directshape_torch.geometry.box3d import pose_from_kitti, rotation_y_from_pose
 from directshape_torch.laboratory.scenes import load_scene, select_detections
-from directshape_torch.result import RefinementResult
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.solver.differentiate import NotStationaryWarning
 
 MODES = ("unroll", "implicit", "implicit_gauss_newton")

@@ -33,14 +33,14 @@ from command_line import run_command
 from torch import Tensor
 
 from directshape_torch.cli.options import frame_id_of
-from directshape_torch.config_files import load_config
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
 from directshape_torch.evaluation.pose_error import boxes_of, pose_errors
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import load_rigs
 

@@ -17,7 +17,7 @@ from typing import Any
 import yaml
 
 from directshape_torch.config import RefinerConfig, Settings, limits_in_words, type_hints
-from directshape_torch.config_files import config_to_mapping
+from directshape_torch.io.config_files import config_to_mapping
 
 TARGET = Path(__file__).parent.parent / "directshape_torch" / "assets" / "configs" / "default.yaml"
 _UNITS = {

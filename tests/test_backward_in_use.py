@@ -18,8 +18,8 @@ from torch import Tensor
 from directshape_torch.config import StageConfig
 from directshape_torch.errors import InputError, NoGradientWarning
 from directshape_torch.refinement import tracks as tracks_module
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.differentiate import NotStationaryWarning
 

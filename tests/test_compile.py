@@ -27,11 +27,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from directshape_torch import compile as compile_module
 from directshape_torch.compile import CARS_WORTH_COMPILING, Compilable, cars_ahead, compiling, num_forms, will_compile
-from directshape_torch.config_files import load_config
-from directshape_torch.depth import marched_views
 from directshape_torch.errors import CompilationError
+from directshape_torch.io.config_files import load_config
 from directshape_torch.refinement.disparity_profile import shifted_costs
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.terms.depth import marched_views
 from directshape_torch.terms.term import parts_of
 
 pytestmark = pytest.mark.usefixtures("fresh_compiler_counts")

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from directshape_torch.compile import Compilable
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
 # Two iterations, so that the second one follows what the first has found.

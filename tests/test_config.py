@@ -17,8 +17,8 @@ from directshape_torch.config import (
     Settings,
     StageConfig,
 )
-from directshape_torch.config_files import config_from_mapping, config_to_mapping, load_config
 from directshape_torch.errors import ConfigError, DirectShapeError
+from directshape_torch.io.config_files import config_from_mapping, config_to_mapping, load_config
 
 
 @pytest.mark.parametrize(

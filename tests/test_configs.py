@@ -13,8 +13,8 @@ import yaml
 
 import directshape_torch
 from directshape_torch.config import RefinerConfig
-from directshape_torch.config_files import BUNDLED_CONFIGS, config_to_mapping, load_config
 from directshape_torch.errors import ConfigError
+from directshape_torch.io.config_files import BUNDLED_CONFIGS, config_to_mapping, load_config
 
 ROOT = Path(__file__).parent.parent
 CONFIGS = ROOT / "configs"

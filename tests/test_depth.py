@@ -6,9 +6,9 @@ import pytest
 import torch
 from helpers.ellipsoids import Ellipsoid
 
-from directshape_torch.depth import Hits, tracked_depth
 from directshape_torch.rows import Rays
 from directshape_torch.shape.field import PackedField
+from directshape_torch.terms.depth import Hits, tracked_depth
 
 RADIUS_M = 1.5
 FIELD = PackedField(Ellipsoid.sphere(RADIUS_M))

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
 from directshape_torch.errors import InputError
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.rows import Blocks
 from directshape_torch.scene import Detections
 from directshape_torch.status import Status

@@ -13,8 +13,8 @@ from helpers.synthetic_scene import disturbed, joined_detections, joined_frames,
 from torch import Tensor
 
 from directshape_torch.config import PointCloudConfig, RefinerConfig
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.status import Status
 

@@ -23,8 +23,8 @@ from directshape_torch.config import RefinerConfig, SearchConfig
 from directshape_torch.errors import InputError, NoGradientWarning
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import rotation_y_from_pose
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 
 SEARCH = replace(DEFAULT, search=SearchConfig(disparity_offsets_px=(-1.0, 1.0), yaw_offsets_deg=(-10.0, 10.0)))

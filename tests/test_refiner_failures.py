@@ -25,8 +25,8 @@ from torch import Tensor
 from directshape_torch.config import RefinerConfig
 from directshape_torch.errors import ConfigError, InputError
 from directshape_torch.geometry import se3
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch, Occluders
 from directshape_torch.status import Status
 

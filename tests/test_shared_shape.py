@@ -32,8 +32,8 @@ from directshape_torch.refinement import tracks
 from directshape_torch.refinement.outcome import Outcome
 from directshape_torch.refinement.problem import CarProblem
 from directshape_torch.refinement.quality import EVIDENCE_NAMES
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.sharing import Groups

@@ -17,8 +17,8 @@ from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.box_formats import BoxFormat, boxes_to_poses
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status

@@ -31,7 +31,7 @@ from directshape_torch.io.run_folder import (
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.io.track_files import track_name
-from directshape_torch.result import RefinementResult
+from directshape_torch.refinement.result import RefinementResult
 
 if TYPE_CHECKING:
     import trimesh

@@ -21,8 +21,8 @@ from directshape_torch.errors import CompilationError, DirectShapeError, Missing
 from directshape_torch.io.frame_collation import collate, split_by_rig
 from directshape_torch.io.run_manifest import FrameEntry, hash_files
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 
 # What is true of every frame: going on would only fail them one after another.
 _STOPS_THE_RUN = (CompilationError, MissingDependencyError, OutputLostError)

@@ -19,8 +19,8 @@ from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, r
 from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
 from directshape_torch.batch.workers import GroupDispatch, LocalWorkers, ThisProcess, Workers
-from directshape_torch.config_files import config_to_mapping
 from directshape_torch.errors import DirectShapeError, InputError
+from directshape_torch.io.config_files import config_to_mapping
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import FrameEntry, RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import StereoDataset

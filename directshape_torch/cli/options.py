@@ -12,9 +12,9 @@ from typing import get_args
 
 import torch
 
-from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.mask_files import CocoFileMasks
 from directshape_torch.io.run_folder import RunFolder

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import InputError
 from directshape_torch.files.read_files import read_lines
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.scene_check.image_boxes import box_iou
 
 _MINIMUM_IOU_2D = 0.3
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError, shown
 from directshape_torch.files.read_files import Line
+from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.io.folder_json import FolderFrame, FolderObject, FolderRig, read_frame, read_rig
 from directshape_torch.io.frame_detections import GivenMasks
 from directshape_torch.io.frame_layout import FrameLayout, existing_folder
@@ -32,7 +33,6 @@ from directshape_torch.io.instance_masks import (
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera, upright_plane
 from directshape_torch.io.kitti_labels import KittiObject, parse_object, poses_cam
 from directshape_torch.numerics.checks import is_no_rotation
-from directshape_torch.scene_check.image_boxes import project_boxes
 
 _CAR = "Car"
 # KITTI's numbers for what a line does not have.

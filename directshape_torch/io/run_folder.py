@@ -19,11 +19,11 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.config_files import config_from_mapping
 from directshape_torch.errors import ConfigError, DataFormatError, InputError
 from directshape_torch.files.read_files import is_frame_id, parse_json, read_bytes
 from directshape_torch.files.schema import record_of
 from directshape_torch.geometry.box3d import rotation_about_y
+from directshape_torch.io.config_files import config_from_mapping
 from directshape_torch.io.kitti_labels import KittiObject, read_objects
 from directshape_torch.io.result_files import ShapeArrays, read_shapes
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes, read_manifest

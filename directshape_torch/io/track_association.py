@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.frame_detections import match_one_to_one
 from directshape_torch.io.kitti_labels import KittiObject
-from directshape_torch.scene_check.image_boxes import box_iou
 
 # A car that is not found again within so many frames is a new one.
 _LONGEST_GAP = 2

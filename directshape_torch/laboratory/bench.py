@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.depth import closest_of_march, first_hits, march
 from directshape_torch.geometry import se3
 from directshape_torch.laboratory.regimes import Draw, Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
@@ -24,6 +23,7 @@ from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
+from directshape_torch.terms.depth import closest_of_march, first_hits, march
 from directshape_torch.terms.motion import MOTION_NAMES, timed
 from directshape_torch.terms.next_view import NEXT_VIEW_NAME
 from directshape_torch.terms.silhouette import contour_zeta

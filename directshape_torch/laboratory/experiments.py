@@ -14,12 +14,12 @@ import torch
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from directshape_torch.depth import surface_depth
 from directshape_torch.geometry import se3
 from directshape_torch.laboratory.bench import Bench
 from directshape_torch.laboratory.differences import Evaluate
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms import robust
+from directshape_torch.terms.depth import surface_depth
 from directshape_torch.terms.photometric import Photometric, Surface
 from directshape_torch.terms.photometric_rows import Comparison, compared
 from directshape_torch.terms.point_cloud import PointCloud

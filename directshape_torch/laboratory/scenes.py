@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from directshape_torch.depth import march
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import box_corners
@@ -19,6 +18,7 @@ from directshape_torch.rows import Rays, Rows
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
+from directshape_torch.terms.depth import march
 
 DEMO_FOLDER = Path(__file__).parents[1] / "assets" / "demo"
 

@@ -30,17 +30,13 @@ class OcclusionMap:
 
     There are two numbers, for instances of known and of unknown depth: the depth, metres, and less the lower edge of
     the left 2D box, pixels.
-
-    Attributes:
-        crop: (B, 6) integer, of each object: u0, v0, u1, v1 of what all masks cover, half open; the entry of `covering`
-            that pixel (0, 0) of its frame would have; entries from one row of pixels to the next.
-        in_front: (B, 2) what an instance must be below to be in front of each object.
-        covering: (A, 2) least numbers of the instances that cover each pixel, infinity where none does.
     """
 
+    # (B, 6) integer, of each object: u0, v0, u1, v1 of what all masks cover, half open; the entry of `covering` that
+    # pixel (0, 0) of its frame would have; entries from one row of pixels to the next
     crop: Tensor
-    in_front: Tensor
-    covering: Tensor
+    in_front: Tensor  # (B, 2) what an instance must be below to be in front of each object
+    covering: Tensor  # (A, 2) least numbers of the instances that cover each pixel, infinity where none does
 
     def at(
         self,

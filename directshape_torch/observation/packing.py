@@ -21,27 +21,16 @@ from directshape_torch.scene import Detections, FrameBatch
 
 @dataclass(frozen=True)
 class PixelSamples:
-    """P pixels of one image side, sorted by object.
+    """P pixels of one image side, sorted by object."""
 
-    Attributes:
-        object_index: (P,) ascending.
-        uv: (P, 2) pixels.
-        origin_cam: (P, 3) camera centre of the pixel's own camera, in the left camera frame, metres.
-        ray_cam: (P, 3) direction of unit depth in the pixel's own camera, in the left camera frame.
-        foreground: (P,) probability in [0, 1] of the mask at the pixel.
-        gradient_magnitude: (P,) grey levels per pixel.
-        bias_px: (P,) residual disparity at the (corresponding) left pixel, zero without a field.
-        vertical_px: (P,) residual row offset there, zero without a field.
-    """
-
-    object_index: Tensor
-    uv: Tensor
-    origin_cam: Tensor
-    ray_cam: Tensor
-    foreground: Tensor
-    gradient_magnitude: Tensor
-    bias_px: Tensor
-    vertical_px: Tensor
+    object_index: Tensor  # (P,) ascending
+    uv: Tensor  # (P, 2) pixels
+    origin_cam: Tensor  # (P, 3) camera centre of the pixel's own camera, in the left camera frame, metres
+    ray_cam: Tensor  # (P, 3) direction of unit depth in the pixel's own camera, in the left camera frame
+    foreground: Tensor  # (P,) probability in [0, 1] of the mask at the pixel
+    gradient_magnitude: Tensor  # (P,) grey levels per pixel
+    bias_px: Tensor  # (P,) residual disparity at the (corresponding) left pixel, zero without a field
+    vertical_px: Tensor  # (P,) residual row offset there, zero without a field
 
     def __len__(self) -> int:
         return len(self.object_index)
@@ -59,21 +48,15 @@ class PixelSamples:
 
 @dataclass(frozen=True)
 class Observation:
-    """Everything that B cars see of the images.
+    """Everything that B cars see of the images."""
 
-    Attributes:
-        left, right: packed pixels of the two images.
-        region_left, region_right: (B, 4) integer regions (u0, v0, u1, v1), half open, pixels.
-        hidden_right: what hides cars in the right image, by row of the detections; None: not asked for.
-        mask_areas: (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent.
-    """
-
-    left: PixelSamples
-    right: PixelSamples
-    region_left: Tensor
-    region_right: Tensor
+    left: PixelSamples  # packed pixels of the two images
+    right: PixelSamples  # likewise
+    region_left: Tensor  # (B, 4) integer regions (u0, v0, u1, v1), half open, pixels
+    region_right: Tensor  # likewise
+    # what hides cars in the right image, by row of the detections; None: not asked for
     hidden_right: OcclusionMap | None
-    mask_areas: Tensor
+    mask_areas: Tensor  # (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent
 
     def of_objects(self, keep: Tensor) -> Observation:
         """What the objects where `keep` (B,) holds see; occlusion and areas stay those of all detections."""

@@ -13,7 +13,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from directshape_torch.depth import Hits
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.refinement.disparity_profile import (
@@ -28,6 +27,7 @@ from directshape_torch.rows import CarSums, ObjectRays, Rays
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status
 from directshape_torch.terms.cars import CarBatch, CarState, move_by_disparity
+from directshape_torch.terms.depth import Hits
 from directshape_torch.terms.photometric import Photometric, Surface
 
 # Range and step of each search: near cars may begin further away than the first one reaches.

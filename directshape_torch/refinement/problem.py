@@ -15,7 +15,6 @@ from torch import Tensor
 
 from directshape_torch.compile import will_compile
 from directshape_torch.config import RefinerConfig, StageConfig
-from directshape_torch.depth import marched_views
 from directshape_torch.numerics.gradient_mode import map_tensors
 from directshape_torch.numerics.tensors import constant_like
 from directshape_torch.rows import CarSums, Rays
@@ -23,6 +22,7 @@ from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.sharing import INDEPENDENT, Sharing
 from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.terms.depth import marched_views
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.priors import PriorTerm, joined
 from directshape_torch.terms.silhouette import MaskRows

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.depth import closest_of_march, first_hits, march
 from directshape_torch.rows import Rays
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.depth import closest_of_march, first_hits, march
 
 
 class RayCast(NamedTuple):

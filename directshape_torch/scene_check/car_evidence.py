@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from directshape_torch.geometry.box3d import rotation_y_from_pose
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.scene import Detections, FrameBatch, boxes_around
-from directshape_torch.scene_check.image_boxes import box_iou
 
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_masks import check_placement
 from directshape_torch.scene_check.conventions import (
@@ -14,7 +15,6 @@ from directshape_torch.scene_check.conventions import (
     score_conventions,
 )
 from directshape_torch.scene_check.finding import Finding, found, of_cars
-from directshape_torch.scene_check.image_boxes import box_iou
 
 # Mean overlap that another convention must gain for boxes to be taken as written in it: with the observation angles,
 # and without them for many and for few cars. Intact sets gain nothing, single frames of two to six cars up to 0.05.

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, found, of_cars
-from directshape_torch.scene_check.image_boxes import box_iou
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 

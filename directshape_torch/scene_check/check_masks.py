@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.scene_check.car_evidence import SIDES, Floats, FrameEvidence, Side
 from directshape_torch.scene_check.conventions import projected_boxes
 from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
-from directshape_torch.scene_check.image_boxes import box_iou
 
 # Mean overlap of masks and 2D boxes, over as many pairs as there could be.
 OVERLAP_ERROR, OVERLAP_WARNING = 0.3, 0.37

@@ -18,17 +18,11 @@ _MASK_THRESHOLD = 0.5
 
 @dataclass(frozen=True)
 class PointSamples:
-    """P points of B cars, sorted by object.
+    """P points of B cars, sorted by object."""
 
-    Attributes:
-        object_index: (P,) ascending.
-        points_cam: (P, 3) metres.
-        counts: (B,) points that passed the filters, before the reduction to `max_points`.
-    """
-
-    object_index: Tensor
-    points_cam: Tensor
-    counts: Tensor
+    object_index: Tensor  # (P,) ascending
+    points_cam: Tensor  # (P, 3) metres
+    counts: Tensor  # (B,) points that passed the filters, before the reduction to `max_points`
 
     def __len__(self) -> int:
         return len(self.object_index)

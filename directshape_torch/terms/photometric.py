@@ -19,13 +19,13 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import PhotometricConfig, StageConfig
-from directshape_torch.depth import NEAR_SURFACE_M, Hits, surface_depth, tracked_depth
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import length
 from directshape_torch.rows import BLOCK, Blocks, CarSums, ObjectRays, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust
 from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.depth import NEAR_SURFACE_M, Hits, surface_depth, tracked_depth
 from directshape_torch.terms.photometric_rows import (
     LeftPixels,
     PhotometricRows,

@@ -27,23 +27,14 @@ from directshape_torch.terms.term import Linear, Term, Where
 
 @dataclass(frozen=True)
 class PointCloud(Term):
-    """See module. Build with `of_points`; the points are those of the whole refinement.
+    """See module. Build with `of_points`; the points are those of the whole refinement."""
 
-    Attributes:
-        name: of the term.
-        huber_m: corner of the norm, metres.
-        all_blocks: M blocks.
-        points_cam: points as rays from the camera that are there at the depth 1, (M, 64) places.
-        filled: (M, 64) 1 in filled places, else 0.
-        weight: (M,) float64, lambda over the number of points of the car.
-    """
-
-    name: str
-    huber_m: float
-    all_blocks: Blocks
-    points_cam: Rays
-    filled: Tensor
-    weight: Tensor
+    name: str  # of the term
+    huber_m: float  # corner of the norm, metres
+    all_blocks: Blocks  # M blocks
+    points_cam: Rays  # points as rays from the camera that are there at the depth 1, (M, 64) places
+    filled: Tensor  # (M, 64) 1 in filled places, else 0
+    weight: Tensor  # (M,) float64, lambda over the number of points of the car
 
     @classmethod
     def of_points(cls, config: PointCloudConfig, points: PointSamples, name: str = "point_cloud") -> PointCloud:

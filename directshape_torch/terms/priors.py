@@ -38,23 +38,15 @@ class PriorResidual(NamedTuple):
 
 @dataclass(frozen=True)
 class PriorTerm(Term):
-    """`weight * sum_i r_i^2 / 2` of a residual of the state alone: one block of R rows for each car.
+    """`weight * sum_i r_i^2 / 2` of a residual of the state alone: one block of R rows for each car."""
 
-    Attributes:
-        name: of the term.
-        weight: lambda.
-        cars: constants of the cars.
-        residual_of: the residual with its Jacobian, from the constants and a state.
-        num_rows: R.
-        is_prior: False for what belongs to the measurements.
-    """
-
-    name: str
-    weight: float
-    cars: CarBatch
+    name: str  # of the term
+    weight: float  # lambda
+    cars: CarBatch  # constants of the cars
+    # the residual with its Jacobian, from the constants and a state
     residual_of: Callable[[CarBatch, CarState], PriorResidual]
-    num_rows: int
-    is_prior: bool = True
+    num_rows: int  # R
+    is_prior: bool = True  # False for what belongs to the measurements
 
     @property
     def names(self) -> tuple[str, ...]:

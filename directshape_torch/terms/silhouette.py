@@ -20,7 +20,13 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from directshape_torch.config import SilhouetteConfig, StageConfig
-from directshape_torch.depth import (
+from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
+from directshape_torch.rows import Blocks, CarSums, Rays, Rows
+from directshape_torch.shape.field import Field
+from directshape_torch.shape.sdf_grid import Lookup
+from directshape_torch.terms import robust
+from directshape_torch.terms.cars import CarBatch, CarState
+from directshape_torch.terms.depth import (
     Closest,
     along_face,
     attached_closest_depth,
@@ -28,12 +34,6 @@ from directshape_torch.depth import (
     sample_depths,
     tracked_closest,
 )
-from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
-from directshape_torch.rows import Blocks, CarSums, Rays, Rows
-from directshape_torch.shape.field import Field
-from directshape_torch.shape.sdf_grid import Lookup
-from directshape_torch.terms import robust
-from directshape_torch.terms.cars import CarBatch, CarState
 from directshape_torch.terms.term import Linear, Sight, Term, Where
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from directshape_torch.compile import compilable, will_compile, with_varying
 from directshape_torch.config import StageConfig
-from directshape_torch.depth import Closest, Hits
 from directshape_torch.rows import Blocks, CarSums
 from directshape_torch.shape.field import Field, field_of
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.terms.depth import Closest, Hits
 from directshape_torch.terms.robust import RobustValue
 
 Where: TypeAlias = Any

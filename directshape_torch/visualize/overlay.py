@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.result import RefinementResult
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.visualize.drawing import (
     BLUE,
     GREEN,

@@ -15,8 +15,8 @@ from directshape_torch.numerics.full_precision import full_precision
 from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.refinement.problem import CarStage
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.gauss_newton import Minimum, minimise, search_start
 from directshape_torch.solver.problem import put_rows, where_rows

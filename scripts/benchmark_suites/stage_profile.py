@@ -20,7 +20,6 @@ from benchmark_suites.measures import OperationCount
 from benchmark_suites.times import make_refiner
 from benchmark_suites.timing import Row, Spread
 from benchmark_suites.workloads import demo_scene
-from directshape_torch import depth
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refinement.outcome import outcome_of
 from directshape_torch.refinement.problem import CarIterations, CarProblem, CarStage
@@ -29,7 +28,7 @@ from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.iteration import iterate
-from directshape_torch.terms import cars, term
+from directshape_torch.terms import cars, depth, term
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.priors import PriorTerm
 from directshape_torch.terms.silhouette import Silhouettes

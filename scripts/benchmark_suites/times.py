@@ -12,7 +12,7 @@ from benchmark_suites.measures import count_operations, count_synchronisations, 
 from benchmark_suites.timing import Row, Spread, time_interleaved
 from benchmark_suites.workloads import Scene
 from directshape_torch.compile import compiler_problem
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections, FrameBatch

@@ -93,7 +93,7 @@ TARGETS: dict[str, Target] = {
         ("tests/terms/test_robust.py",),
     ),
     "depth": Target(
-        "directshape_torch/depth.py",
+        "directshape_torch/terms/depth.py",
         ("along_face", "attached_closest_depth", "surface_depth"),
         _GRADIENTS,
     ),
@@ -189,7 +189,7 @@ TARGETS: dict[str, Target] = {
         ("tests/geometry/test_short_axes.py",),
     ),
     "bracket": Target(
-        "directshape_torch/depth.py",
+        "directshape_torch/terms/depth.py",
         ("Bracket.between", "Bracket.probed", "_line_zero"),
         ("tests/shape/test_bracket.py",),
     ),

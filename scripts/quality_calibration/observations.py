@@ -17,8 +17,8 @@ from directshape_torch.files.read_files import read_npz
 from directshape_torch.geometry.box3d import rotation_y_from_pose, wrap_angle
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.scene import Detections
 from quality_calibration.bend import Bend

@@ -20,7 +20,7 @@ from directshape_torch.batch.resumption import EarlierResults
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.result_files import read_shapes
 from directshape_torch.io.run_manifest import hash_prior
-from directshape_torch.result import RefinementResult
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.scene import FrameBatch
 
 

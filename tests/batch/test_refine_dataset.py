@@ -17,12 +17,12 @@ from helpers.quick_runs import dataset, refine
 from directshape_torch import compile as compile_module
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import expected_cars, refine_dataset
-from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.shape.pca_prior import PCAShapePrior
 
 

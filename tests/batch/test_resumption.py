@@ -12,8 +12,8 @@ from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.config_files import load_config
 from directshape_torch.errors import ResumeError
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.pca_prior import PCAShapePrior

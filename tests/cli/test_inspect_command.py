@@ -12,7 +12,7 @@ from PIL import Image
 from directshape_torch.cli.demo import DEMO_FOLDER, demo_dataset
 from directshape_torch.cli.inspect_cars import silhouette_trace
 from directshape_torch.cli.main import main
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
 _PICTURES = ("sampling", "residuals", "drift")

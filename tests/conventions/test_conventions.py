@@ -21,7 +21,6 @@ from helpers.synthetic_scene import cached_street, disturbed
 from kornia.geometry.liegroup import So3
 from torch import Tensor
 
-from directshape_torch.depth import march
 from directshape_torch.geometry import box3d, se3
 from directshape_torch.geometry.camera import rays_from_pixels, right_rays
 from directshape_torch.geometry.projection import project, warp_to_right
@@ -29,12 +28,13 @@ from directshape_torch.image.grey_levels import grey_levels, halve
 from directshape_torch.io.kitti_calibration import KittiCalibration, plane_ref_to_cam, read_plane, to_stereo_camera
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import write_result_text
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.shape.shape_prior import DimensionsDerivative
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.terms.cars import CarState, retract
+from directshape_torch.terms.depth import march
 from directshape_torch.terms.photometric_rows import DSO_PATTERN
 from directshape_torch.terms.priors import dimensions_prior, height_prior, shape_prior
 from directshape_torch.terms.silhouette import product_residual, sdf_state_jacobian

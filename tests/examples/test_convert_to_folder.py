@@ -20,9 +20,9 @@ from helpers.layouts import put
 import directshape_torch
 from directshape_torch.cli.main import main
 from directshape_torch.data_check.check_dataset import check_dataset
+from directshape_torch.geometry.image_boxes import box_iou
 from directshape_torch.io.kitti_labels import poses_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
-from directshape_torch.scene_check.image_boxes import box_iou
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "convert_to_folder.py"

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.config_files import config_from_mapping
 from directshape_torch.errors import DataFormatError, MissingDependencyError
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import SEEN, PaintedFrame
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.io.config_files import config_from_mapping
 from directshape_torch.io.kitti_labels import read_objects
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder

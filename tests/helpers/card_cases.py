@@ -22,9 +22,9 @@ from torch import Tensor
 
 from directshape_torch.cli.main import main as command
 from directshape_torch.config import RefinerConfig
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from helpers.exact_disparity import measured_street

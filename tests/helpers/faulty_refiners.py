@@ -12,9 +12,9 @@ from typing import Any
 import torch
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import FrameBatch
 from directshape_torch.shape.pca_prior import PCAShapePrior
 

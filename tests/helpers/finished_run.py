@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
-from directshape_torch.config_files import load_config
 from directshape_torch.export.frame_source import ExportInputs
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
 from directshape_torch.refiner import DirectShapeRefiner

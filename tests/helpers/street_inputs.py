@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from directshape_torch.config import BackwardConfig, RefinerConfig, StageConfig
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT

@@ -16,10 +16,10 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.image_boxes import project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import StereoDataset, open_dataset
-from directshape_torch.scene_check.image_boxes import project_boxes
 
 P2 = torch.tensor([[500.0, 0, 60, 30], [0, 500, 30, 0], [0, 0, 1, 0.003]], dtype=torch.float64)
 P3 = torch.tensor([[500.0, 0, 60, -220], [0, 500, 30, 2], [0, 0, 1, 0.003]], dtype=torch.float64)

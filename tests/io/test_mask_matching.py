@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.geometry.image_boxes import box_iou, project_boxes
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.frame_detections import match_masks, match_one_to_one, without_duplicates
 from directshape_torch.io.instance_masks import InstanceMask
-from directshape_torch.scene_check.image_boxes import box_iou, project_boxes
 
 SIZE_HW = (200, 600)
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from directshape_torch.depth import Closest
 from directshape_torch.geometry import se3
 from directshape_torch.laboratory.bench import TERM_NAMES, TRACK_NAMES, Bench
 from directshape_torch.laboratory.comparison import compare
@@ -24,6 +23,7 @@ from directshape_torch.laboratory.experiments import (
 from directshape_torch.laboratory.regimes import REGIMES
 from directshape_torch.shape.field import field_of
 from directshape_torch.terms import photometric
+from directshape_torch.terms.depth import Closest
 
 BenchOf = Callable[..., Bench]
 _MORE = {"disparity_offset": ("rig",), "track": TRACK_NAMES}

@@ -1,4 +1,4 @@
-"""What rays meet of a shape, by fine samples narrowed down; nothing is shared with `directshape_torch.depth`."""
+"""What rays meet of a shape, by fine samples narrowed down; nothing is shared with `directshape_torch.terms.depth`."""
 
 from __future__ import annotations
 

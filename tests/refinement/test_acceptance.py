@@ -12,8 +12,8 @@ from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import AcceptanceConfig, BackwardConfig, RefinerConfig, RigConfig
 from directshape_torch.refinement.quality import EVIDENCE_NAMES
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections
 from directshape_torch.status import Status
 

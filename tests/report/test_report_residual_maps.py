@@ -11,7 +11,7 @@ from helpers.synthetic_scene import cached_street
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
 from directshape_torch.report.residual_maps import Floats, residual_maps
 from directshape_torch.visualize.drawing import View, pixel_grid
 

@@ -9,7 +9,7 @@ import reproduce_tables as script
 from helpers.kitti_folder import write_data_set
 
 from directshape_torch.cli.main import make_parser
-from directshape_torch.config_files import load_config
+from directshape_torch.io.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.depth import Bracket
+from directshape_torch.terms.depth import Bracket
 
 # Falling from above zero to below it between 0 and 1: straight, curved either way, with a kink beside the root, steep.
 FUNCTIONS = {

@@ -6,9 +6,9 @@ import torch
 from helpers.ellipsoids import ellipsoid_prior
 from torch import Tensor
 
-from directshape_torch.depth import Closest, along_face, closest_of_march, march
 from directshape_torch.rows import ObjectRays
 from directshape_torch.shape.field import field_of
+from directshape_torch.terms.depth import Closest, along_face, closest_of_march, march
 
 PRIOR = ellipsoid_prior()
 FIELD = field_of(PRIOR.bind(torch.tensor([[0.7, -0.4, 0.5]], dtype=torch.float64)))

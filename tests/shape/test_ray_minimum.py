@@ -10,12 +10,19 @@ from reference.rays import RaysObj, first_entry, least
 from reference.residuals import MARGIN_M
 from torch import Tensor
 
-from directshape_torch.depth import along_face, closest_of_march, first_hits, march, surface_depth, tracked_closest
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays, Rays
 from directshape_torch.shape.field import Field, PackedField, field_of
 from directshape_torch.shape.sdf_grid import RayMinimum
 from directshape_torch.shape.shape_prior import BoundShape
+from directshape_torch.terms.depth import (
+    along_face,
+    closest_of_march,
+    first_hits,
+    march,
+    surface_depth,
+    tracked_closest,
+)
 
 PRIOR = ellipsoid_prior()
 SMOOTH = Ellipsoid(torch.tensor([2.0, 0.75, 0.85]).double(), torch.tensor([0.0, -0.75, 0.0]).double(), 0.75)

@@ -12,8 +12,8 @@ from helpers.quadratics import Energy, ResidualProblem, Vector, VectorProblem, l
 from torch import Tensor
 
 from directshape_torch.config import SolverConfig, StageConfig
-from directshape_torch.config_files import load_config
 from directshape_torch.errors import ConfigError
+from directshape_torch.io.config_files import load_config
 from directshape_torch.refinement.problem import method_stages
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import minimise

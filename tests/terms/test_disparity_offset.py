@@ -14,8 +14,8 @@ from helpers.synthetic_scene import TWO_CARS, Street, disturbed, select, street
 from directshape_torch.config import RefinerConfig, RigConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.terms.priors import rig_prior
 

@@ -17,8 +17,8 @@ from torch import Tensor
 from directshape_torch.config import TracksConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.problem import take_rows
 from directshape_torch.solver.sharing import Groups

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from directshape_torch.config import RefinerConfig, StageConfig
 from directshape_torch.errors import InputError
+from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
-from directshape_torch.result import RefinementResult
 from directshape_torch.scene import Detections
 from directshape_torch.terms.cars import CarBatch
 from directshape_torch.terms.priors import detector_pose_sigma

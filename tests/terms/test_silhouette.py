@@ -15,12 +15,12 @@ from helpers.problems import DEFAULT, begun_stage, figures_at
 from helpers.synthetic_scene import cached_street, disturbed
 from torch import Tensor
 
-from directshape_torch.depth import closest_of_march, march
 from directshape_torch.geometry import se3
 from directshape_torch.rows import ObjectRays
 from directshape_torch.shape.field import PackedField
 from directshape_torch.terms import silhouette
 from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.depth import closest_of_march, march
 from directshape_torch.terms.silhouette import (
     SATURATION,
     SilhouetteProducts,

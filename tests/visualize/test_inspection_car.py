@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.config_files import load_config
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.box3d import pose_from_kitti
+from directshape_torch.io.config_files import load_config
 from directshape_torch.observation.packing import pack_pixels
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.visualize.drawing import Surface, View, silhouette_mask

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.config_files import load_config
 from directshape_torch.geometry import se3
+from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections

@@ -20,7 +20,7 @@ BUNDLED_CONFIGS = ("default", "paper", "fast")
 
 # The parser takes a second for ten thousand lines.
 _MOST_BYTES = 2**20
-_CONFIG_FOLDER = Path(__file__).parent / "assets" / "configs"
+_CONFIG_FOLDER = Path(__file__).parents[1] / "assets" / "configs"
 _KINDS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 _GroupT = TypeVar("_GroupT", bound=Settings)
 
