@@ -24,7 +24,7 @@ from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.scene_check.car_evidence import CarBoxes
 from directshape_torch.scene_check.check_calibration import check_calibration
-from directshape_torch.scene_check.check_pair import PairMatches, check_pair, fit_rows, match_pair
+from directshape_torch.scene_check.check_pair import PairMatches, check_pair, match_pair
 from directshape_torch.scene_check.check_stereo import StereoCars, check_distances
 from directshape_torch.scene_check.conventions import AS_DOCUMENTED, BoxConvention, all_conventions
 from directshape_torch.scene_check.finding import CheckReport, Finding
@@ -85,15 +85,6 @@ def test_rows_may_differ_as_the_calibration_says() -> None:
     shifted = PairMatches(pair.uv_left, pair.uv_right + np.array([0, 10]), len(pair))
     assert check_pair(shifted, None, SIZE_HW, "")[0].check == "not_rectified"
     assert check_pair(shifted, camera(calibration(right=other_centre)), SIZE_HW, "") == []
-
-
-def test_row_fit_ignores_a_tenth_of_wrong_matches() -> None:
-    uv = np.random.default_rng(1).uniform((0, 0), (1200, 400), (200, 2))
-    rows = 0.3 + 2.0 * (uv[:, 1] / 400 - 0.5)
-    rows[:20] += 50
-    offset, across, down, scatter = fit_rows(uv, rows, SIZE_HW)
-    assert (across, down, scatter) == pytest.approx((0.0, 2.0, 0.0), abs=1e-6)
-    assert offset == pytest.approx(0.3, abs=0.3)
 
 
 def test_features_of_a_shifted_texture_match_where_they_should() -> None:

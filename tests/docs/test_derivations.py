@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs" / "derivations").glob("*.md"))
 RESIDUAL_PAGES = [page for page in PAGES if page.name != "README.md"]
+OVERVIEW = (ROOT / "docs" / "derivations" / "README.md").read_text(encoding="utf-8")
 NAMED_TEST = re.compile(r"tests/[\w/]+\.py(?:::\w+)?")
 
 
@@ -20,9 +21,11 @@ def functions_of(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", RESIDUAL_PAGES, ids=lambda page: page.stem)
-def test_every_named_test_exists(page: Path) -> None:
-    names = NAMED_TEST.findall(page.read_text(encoding="utf-8"))
-
+def test_a_page_has_its_symbols_and_names_tests_that_exist(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert "| ours | the paper's | meaning |" in text
+    assert f"({page.name})" in OVERVIEW
+    names = NAMED_TEST.findall(text)
     assert names
     for name in names:
         path, separator, function = name.partition("::")
@@ -30,21 +33,11 @@ def test_every_named_test_exists(page: Path) -> None:
         assert (ROOT / path).is_file(), name
         assert function.startswith("test_"), name
         assert function in functions_of(ROOT / path), name
-
-
-@pytest.mark.parametrize("page", RESIDUAL_PAGES, ids=lambda page: page.stem)
-def test_every_inexact_point_names_its_test(page: Path) -> None:
-    _, _, rest = page.read_text(encoding="utf-8").partition("## Where the paper's text is inexact")
-    rows = [line for line in rest.splitlines() if line.startswith("| ")][1:]
-
-    assert rows
-    for row in rows:
+    # Where the paper is inexact a test says so.
+    rows = [line for line in text.partition("## Where the paper's text is inexact")[2].splitlines() if line[:2] == "| "]
+    assert rows[1:]
+    for row in rows[1:]:
         assert NAMED_TEST.search(row.split("|")[-2]), row
-
-
-@pytest.mark.parametrize("page", RESIDUAL_PAGES, ids=lambda page: page.stem)
-def test_every_page_sets_our_symbols_beside_the_papers(page: Path) -> None:
-    assert "| ours | the paper's | meaning |" in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -53,15 +46,6 @@ def test_every_relative_link_leads_to_a_file(page: Path) -> None:
         assert (page.parent / link).exists(), link
 
 
-def test_the_overview_lists_every_page() -> None:
-    overview = (ROOT / "docs" / "derivations" / "README.md").read_text(encoding="utf-8")
-
-    for page in RESIDUAL_PAGES:
-        assert f"({page.name})" in overview
-
-
 def test_every_named_file_of_the_overview_exists() -> None:
-    overview = (ROOT / "docs" / "derivations" / "README.md").read_text(encoding="utf-8")
-
-    for name in re.findall(r"`((?:(?:geometry|terms|shape|image)/)?\w+\.py)`", overview):
+    for name in re.findall(r"`((?:(?:geometry|terms|shape|image)/)?\w+\.py)`", OVERVIEW):
         assert (ROOT / "directshape_torch" / name).is_file(), name

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
-from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.rig.known_depth import known_depth_from_lidar
 from directshape_torch.rig.rig import Rig
@@ -37,12 +34,3 @@ def test_a_point_right_behind_a_nearer_one_and_those_outside_are_left_out(tmp_pa
     # (20, 5, 1): 300 * -5 / 20 + 200 = 125 and 300 * -1 / 20 + 80 = 65; the second point is 1.5 px beside the first.
     expected = torch.tensor([[200.0, 80.0, 10.0], [125.0, 65.0, 20.0]], dtype=torch.float64)
     torch.testing.assert_close(known, expected)
-
-
-def test_a_cut_scan_and_a_calibration_without_lidar_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "scan.bin"
-    path.write_bytes(b"\0" * 17)
-    with pytest.raises(DataFormatError, match="16 bytes a point"):
-        known_depth_from_lidar(path, calibration(), rig())
-    with pytest.raises(DataFormatError, match="Tr_velo_to_cam"):
-        known_depth_from_lidar(path, replace(calibration(), Tr_velo_to_cam=None), rig())

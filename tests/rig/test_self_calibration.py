@@ -1,8 +1,7 @@
-"""Motion and road give back a field that was put into them; a road alone, or a car that stands, is refused."""
+"""Motion and road give back a field that was put into them; a road alone is refused."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -51,15 +50,11 @@ def motion(
     way_m: float = 2.0,
     moving_share: float = 0.0,
     noise_px: float = 0.1,
-    depth_at: Callable[[Tensor], Tensor] | None = None,
 ) -> MotionConstraint:
     """Points 5 to 60 m away, the camera driving ahead and turning a little; some points move by themselves."""
     generator, rig = torch.Generator().manual_seed(seed), camera()
     uv = random_pixels(500, generator)
     depth = 5 + 55 * torch.rand(500, generator=generator, dtype=torch.float64)
-    if depth_at is not None:
-        uv = uv[uv[:, 1] > 230]
-        depth = depth_at(uv)
     seen = measured(uv, depth, generator, noise_px)
     T_later_cam = exp(torch.tensor([0.02, 0.01, -way_m, 0.002, 0.01 * (seed % 3 - 1), 0.001], dtype=torch.float64))
     own_motion = (torch.rand(len(uv), generator=generator) < moving_share)[:, None] * torch.tensor([0.0, 0.0, 1.5])
@@ -125,35 +120,8 @@ def test_standard_deviation_is_that_of_halves_that_disagree() -> None:
     assert len(steps) > 30
 
 
-def test_standard_deviation_is_not_known_where_half_determines_no_field() -> None:
-    result = self_calibrate([*(road(k) for k in range(3)), *(motion(k) for k in range(3))], 1)
-    assert result.sigma_px is None
-
-
 def shifted(constraint: MotionConstraint, by_px: float) -> MotionConstraint:
     return replace(constraint, seen=constraint.seen + torch.tensor([0.0, 0.0, by_px, 0.0]))
-
-
-def test_motion_over_a_plane_does_not_see_a_bias_proportional_to_disparity() -> None:
-    """There that bias is affine in the pixel; points of many depths see it as well as any other."""
-    plane = torch.tensor([0.0, 1 / HEIGHT_M, 0.002], dtype=torch.float64)
-
-    def on_plane(uv: Tensor) -> Tensor:
-        return 1 / (rays_from_pixels(uv, camera().K_left[0]) @ plane)
-
-    def anywhere(uv: Tensor) -> Tensor:
-        return torch.linspace(5, 60, len(uv), dtype=torch.float64)
-
-    information = []
-    for depth_at in (on_plane, anywhere):
-        seen = motion(0, noise_px=0.0, depth_at=depth_at)
-        basis = polynomial_basis(seen.uv, SIZE)
-        disparity = 720 * 0.53 / on_plane(seen.uv)
-        proportional = torch.linalg.lstsq(basis, disparity[:, None]).solution[:, 0]
-        torch.testing.assert_close(basis @ proportional, disparity)
-        H, _ = seen.linearise(TRUE, 2.0).of_field()
-        information.append(float(proportional @ H @ proportional))
-    assert information[0] < 1e-3 * information[1]
 
 
 def test_a_wrong_height_hardly_matters_where_motion_sees_many_depths() -> None:
@@ -167,25 +135,6 @@ def test_a_wrong_height_hardly_matters_where_motion_sees_many_depths() -> None:
 def test_a_road_alone_does_not_determine_a_field() -> None:
     with pytest.raises(InputError, match="no constant, no slope"):
         self_calibrate([road(k) for k in range(10)], 1)
-
-
-def test_a_road_does_not_see_pitch_but_height_and_bends() -> None:
-    """The information about the constant is nothing, about v and u^2 it is much, once the plane is eliminated."""
-    seen = replace(road(1), inverse_plane=road(1).inverse_plane - torch.tensor([0.0, 0.012, 0.004]))
-    H, _ = seen.linearise(TRUE, 2.0).of_field()
-    constant, slope_u, slope_v, bend_u = (float(H[k, k]) for k in range(4))
-    assert constant < 1e-3 * slope_v
-    assert slope_u < 1e-3 * bend_u
-    # 2 cm of 1.65 m are 1.2 % of the 60 px of disparity between the horizon and the lower edge.
-    assert 0.3 / 0.73**2 < slope_v < 1.2 / 0.73**2
-    assert bend_u > 1
-
-
-def test_a_car_that_stands_is_refused() -> None:
-    with pytest.raises(InputError, match="drives past still things"):
-        self_calibrate([motion(k, way_m=0.0) for k in range(4)], 1)
-    with pytest.raises(InputError, match="followed from frame to frame"):
-        self_calibrate([], 1)
 
 
 @pytest.mark.parametrize("constraint", [motion(1), road(1, pitch=0.01)], ids=["motion", "road"])
@@ -230,3 +179,8 @@ def height_gradient(constraint: RoadConstraint) -> Tensor:
     (0.5 * ((1 / plane.norm() - HEIGHT_M) / 0.02) ** 2).backward()
     assert plane.grad is not None
     return torch.cat([plane.grad, torch.zeros(len(TRUE), dtype=torch.float64)])
+
+
+def test_standard_deviation_is_not_known_where_half_determines_no_field() -> None:
+    result = self_calibrate([*(road(k) for k in range(3)), *(motion(k) for k in range(3))], 1)
+    assert result.sigma_px is None

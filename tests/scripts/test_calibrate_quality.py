@@ -13,15 +13,12 @@ from helpers.synthetic_scene import cached_street
 from quality_calibration import fit, noise, observations, report
 from quality_calibration.bend import Bend
 
-import directshape_torch
 from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.geometry.box3d import rotation_y_from_pose
 from directshape_torch.geometry.disparity_field import polynomial_basis
 from directshape_torch.refinement.quality import EVIDENCE_NAMES, load_trust_model
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.rig.estimate import RigEstimate
-
-DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
 
 
 def simulated(count: int = 6000, frames: int = 24):
@@ -82,13 +79,6 @@ def test_no_prediction_has_seen_its_frame() -> None:
 def judged(cars: observations.Observations, probabilities: np.ndarray) -> report.Judged:
     errors, raw = fit.in_view(cars)
     return report.Judged("cars", cars, probabilities, errors, raw)
-
-
-def test_the_area_under_the_roc_curve_by_hand() -> None:
-    outcome = np.array([True, True, False, False])
-    # Of four pairs three are in order, one is tied.
-    assert report.area_under_roc(np.array([0.9, 0.5, 0.5, 0.1]), outcome) == 0.875
-    assert np.isnan(report.area_under_roc(np.ones(2), np.ones(2, dtype=bool)))
 
 
 def test_the_policy_by_hand() -> None:

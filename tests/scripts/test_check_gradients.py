@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import check_gradients as script
 import pytest
-import torch
 from helpers.priors import first_components
 
-from directshape_torch.laboratory.regimes import regimes_named
-from directshape_torch.laboratory.scenes import LaboratoryScene, load_scene
-from directshape_torch.laboratory.study import StudyPlan, run_study
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.terms.priors import PriorTerm
 from directshape_torch.terms.term import Linear
@@ -83,23 +78,3 @@ def test_a_term_of_ones_own(
 def test_wrong_use(capsys: pytest.CaptureFixture[str], option: list[str], message: str) -> None:
     assert script.main(option) == 2
     assert re.search(f"error: .*{message}", capsys.readouterr().err)
-
-
-def _without_masks(scene: LaboratoryScene) -> LaboratoryScene:
-    none = torch.zeros_like(scene.detections.has_mask_left)
-    return replace(scene, detections=replace(scene.detections, has_mask_left=none, has_mask_right=none))
-
-
-def test_states_without_pixels_are_counted_and_do_not_crash() -> None:
-    said: list[str] = []
-    plan = StudyPlan(
-        ("photometric", "shape"), regimes=tuple(regimes_named(["typical"])), num_states=2, pixels_per_car=4
-    )
-    prior = PCAShapePrior.load_bundled().double()
-    study = run_study(_without_masks(load_scene()), prior, plan, said.append)
-    assert study.states_without_pixels == {"typical": 2}
-    assert "2 of 2 states see no valid pixel" in said[0]
-    by_name = {c.name: c for c in study.comparisons}
-    assert by_name["photometric"].entries == 0
-    assert by_name["shape"].compared == 2 * 2 * 8
-    assert study.broken_bounds() == []

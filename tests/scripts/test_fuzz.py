@@ -14,7 +14,7 @@ from directshape_torch.errors import InputError
 
 
 def test_a_few_of_each_find_nothing_and_are_counted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert fuzz.main(["--calls", "10", "--files", "12", "--faults", "80", "--out", str(tmp_path)]) == 0
+    assert fuzz.main(["--calls", "10", "--files", "12", "--faults", "40", "--out", str(tmp_path)]) == 0
     figures = json.loads((tmp_path / "fuzz.json").read_text())
     for kind, count in (("calls", 10), ("files", 12)):
         assert figures[kind]["accepted"] + figures[kind]["refused"] == count

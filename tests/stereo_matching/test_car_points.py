@@ -120,15 +120,6 @@ def test_a_car_without_a_pose_has_no_points_and_touches_no_other() -> None:
     assert torch.equal(points.points_cam, healthy.points_cam[healthy.object_index == 1])
 
 
-def test_the_points_of_some_objects() -> None:
-    points = points_of()
-    second = points.of_objects(torch.tensor([False, True]))
-    assert torch.equal(second.points_cam, points.points_cam[points.object_index == 1])
-    assert (second.object_index == 0).all()
-    nothing = points.of_objects(torch.tensor([False, False]))
-    assert len(nothing) == len(nothing.counts) == 0
-
-
 def test_frames_without_disparity_are_an_error() -> None:
     with pytest.raises(InputError, match=r"frames\.disparity: expected a disparity map of each frame, got None"):
         points_of(disparity=None)

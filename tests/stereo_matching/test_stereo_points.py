@@ -6,12 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.projection import depth_from_disparity, disparity_of_depth, points_from_disparity
-from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.stereo_matching.plane_from_points import estimate_ground_plane, fit_ground_plane
+from directshape_torch.stereo_matching.plane_from_points import fit_ground_plane
 
 K_LEFT = torch.tensor([[721.5, 0.0, 609.6], [0.0, 721.5, 172.9], [0.0, 0.0, 1.0]], dtype=torch.float64)
 K_RIGHT = torch.tensor([[718.0, 0.0, 613.0], [0.0, 719.0, 171.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -43,14 +41,6 @@ def test_a_field_takes_the_bias_off_the_measured_disparity() -> None:
     measured = torch.tensor(721.5 * 0.5 / 20 - 0.4, dtype=torch.float64)
     depth = depth_from_disparity(uv, measured, K_LEFT, K_LEFT, T_right_cam, field)
     assert float(depth) == pytest.approx(20.0)
-
-
-def test_disparities_of_no_point_in_front_are_nan() -> None:
-    T_right_cam = torch.eye(4, dtype=torch.float64)
-    T_right_cam[0, 3] = -0.5
-    uv = torch.tensor([[500.0, 200.0]] * 3, dtype=torch.float64)
-    disparity = torch.tensor([0.0, -3.0, torch.nan], dtype=torch.float64)
-    assert depth_from_disparity(uv, disparity, K_LEFT, K_LEFT, T_right_cam).isnan().all()
 
 
 def road_with_clutter(seed: int) -> tuple[Tensor, Tensor]:
@@ -92,12 +82,9 @@ def test_points_without_a_road_give_none() -> None:
     assert fit_ground_plane(steep) is None
 
 
-def test_ground_plane_wants_one_frame() -> None:
-    import numpy as np
-
-    P = torch.cat([K_LEFT, torch.zeros(3, 1)], dim=1)[None].repeat(2, 1, 1)
-    P_right = P.clone()
-    P_right[:, 0, 3] = -380.0
-    image = np.zeros((20, 40, 3), np.uint8)
-    with pytest.raises(InputError, match="one frame"):
-        estimate_ground_plane(image, image, StereoCamera.from_projections(P, P_right))
+def test_disparities_of_no_point_in_front_are_nan() -> None:
+    T_right_cam = torch.eye(4, dtype=torch.float64)
+    T_right_cam[0, 3] = -0.5
+    uv = torch.tensor([[500.0, 200.0]] * 3, dtype=torch.float64)
+    disparity = torch.tensor([0.0, -3.0, torch.nan], dtype=torch.float64)
+    assert depth_from_disparity(uv, disparity, K_LEFT, K_LEFT, T_right_cam).isnan().all()

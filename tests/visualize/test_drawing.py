@@ -35,12 +35,6 @@ def test_silhouette_of_a_square() -> None:
     assert mask[30:51, 40:61].all()
 
 
-def test_overlapping_triangles_leave_no_hole() -> None:
-    twice = Surface(np.concatenate([SQUARE, SQUARE + np.array([0, 0, 1])]), np.concatenate([FACES, FACES + 4]))
-    mask = silhouette_mask(black(), twice)
-    assert mask[30:51, 40:61].all()
-
-
 def test_triangles_behind_the_camera_are_left_out() -> None:
     behind = Surface(SQUARE - np.array([0, 0, 20]), FACES)
     assert not silhouette_mask(black(), behind).any()
@@ -75,13 +69,6 @@ def test_enlarged_window_projects_to_the_same_things() -> None:
     bright_rows, bright_columns = np.nonzero(view.picture[..., 0] > 100)
     assert bright_columns.mean() == pytest.approx(u, abs=0.1)
     assert bright_rows.mean() == pytest.approx(v, abs=0.1)
-
-
-def test_window_beyond_the_image_is_black() -> None:
-    view = View(np.full((10, 10, 3), 200, np.uint8), K).part((-5, -5, 15, 15), 1.0)
-    assert view.picture.shape == (20, 20, 3)
-    assert (view.picture[5:15, 5:15] == 200).all()
-    assert view.picture.sum() == 200 * 100 * 3
 
 
 def test_segments_are_cut_at_the_near_plane() -> None:
@@ -121,8 +108,3 @@ def test_negative_is_blue_and_positive_red(value_px: float, strong: int, weak: i
     assert field_pixel[strong] > field_pixel[weak] + 80
     assert before[strong] > before[weak] + 80
     assert after.min() > 240
-
-
-def test_no_data_is_drawn_as_such() -> None:
-    field = DisparityField.constant(0.1, FIELD_SIZE, torch.eye(3), torch.eye(3), torch.eye(4))
-    assert draw_disparity_field(field, torch.zeros(0, 2), torch.zeros(0)).dtype == "uint8"

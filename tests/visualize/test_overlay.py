@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from directshape_torch.export.painted_cars import ground_grid
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Array, Picture, Surface, View
 from directshape_torch.visualize.drawn_car import DrawnCar
@@ -60,19 +59,6 @@ def test_cars_in_odd_places_do_not_break_the_picture(z: float) -> None:
     assert has_colour(picture[30:300, :1000], ORANGE)
 
 
-def test_no_cars_and_small_images() -> None:
-    picture = overlay_picture(image(60, 80), [], [])
-    # The image is enlarged so that text can be read beside it.
-    assert picture.shape == (2 * 750, 1000 + 560, 3)
-
-
-def test_many_cars_wrap_into_rows_of_the_width_of_the_image() -> None:
-    cars = [car(0.5 * k - 4, 15 + k, k) for k in range(14)]
-    picture = overlay_picture(image(), cars, cars)
-    assert picture.shape[1] == 1560
-    assert picture.shape[0] > 600 + 2 * 300
-
-
 def test_birds_eye_is_true_to_scale() -> None:
     square = np.array([[x, 0, z] for x, z in ((-2, 10), (2, 10), (2, 14), (-2, 14))], dtype=float)
     picture = birds_eye_picture([Footprint(square, BLUE)], (800, 800))
@@ -87,12 +73,3 @@ def test_birds_eye_leaves_far_truth_out_of_the_scale() -> None:
     near, far = corners(0, 15), corners(0, 150)
     with_far = birds_eye_picture([Footprint(near, BLUE), Footprint(far, GREEN, is_framed=False)], (400, 400))
     np.testing.assert_array_equal(with_far, birds_eye_picture([Footprint(near, BLUE)], (400, 400)))
-
-
-def test_ground_grid_lies_on_the_plane_and_is_seen_from_both_sides() -> None:
-    normal = torch.tensor([0.02, -0.999, 0.03], dtype=torch.float64)
-    normal = normal / normal.norm()
-    grid = ground_grid(normal, 1.7)
-    np.testing.assert_allclose(grid.vertices @ normal.numpy() + 1.7, 0, atol=1e-12)
-    up = grid.face_normals[:, 1] < 0
-    assert up.sum() == (~up).sum() > 0

@@ -74,21 +74,6 @@ def test_cars_move_where_a_step_was_accepted_and_nowhere_else(trace: RefinementT
         assert trace.steps_of(car)[-1] == len(trace) - 1
 
 
-def test_states_are_those_of_the_iterations_that_cars_took(trace: RefinementTrace) -> None:
-    iterations, took_part = [s for s in trace.stage if s >= 0], trace.result.cost_history.isfinite()
-    assert len(iterations) == took_part.shape[1]
-    assert iterations == sorted(iterations)
-    assert len(trace.accepted) == len(trace.costs) == len(trace)
-    assert torch.equal(took_part.sum(dim=1), trace.result.iterations)
-    assert not (trace.accepted[len(trace) - took_part.shape[1] :].T & ~took_part).any()
-
-
-def test_search_adds_the_start_that_it_chose(demo_frame: LoadedFrame) -> None:
-    config = load_config("fast", ["compile=off", _SEARCH, "stages=[{max_iterations: 1}]"])
-    trace = trace_refinement(DirectShapeRefiner(config=config), demo_frame.frame, demo_frame.detections)
-    assert trace.stage == (-1, -1, 0)
-
-
 def test_no_cars_at_all(demo_frame: LoadedFrame) -> None:
     T_cam_obj = torch.full_like(demo_frame.detections.T_cam_obj, torch.nan)
     T_cam_obj[:, :3, :3] = torch.eye(3)
@@ -96,3 +81,9 @@ def test_no_cars_at_all(demo_frame: LoadedFrame) -> None:
     trace = trace_refinement(refiner, demo_frame.frame, replace(demo_frame.detections, T_cam_obj=T_cam_obj))
     assert len(trace) == len(trace.costs) == 1
     assert len(trace.rows) == 0
+
+
+def test_search_adds_the_start_that_it_chose(demo_frame: LoadedFrame) -> None:
+    config = load_config("fast", ["compile=off", _SEARCH, "stages=[{max_iterations: 1}]"])
+    trace = trace_refinement(DirectShapeRefiner(config=config), demo_frame.frame, demo_frame.detections)
+    assert trace.stage == (-1, -1, 0)
