@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.numerics.tensors import take
+from directshape_torch.numerics.tensors import not_negative, take
 
 
 class BilinearPatch(NamedTuple):
@@ -72,6 +72,6 @@ def _cell(
     last = last.int() if isinstance(last, Tensor) else coordinate.new_full((), last, dtype=torch.int32)
     # Not a choice by `inside`, which takes four times as long; not `minimum`, which halves derivatives on the last row;
     # NaN must not become an index.
-    clamped = coordinate.nan_to_num(0.0).clamp_min(0).clamp_max(last)
+    clamped = not_negative(coordinate).clamp_max(last)
     index = clamped.detach().int().minimum((last - 1).clamp_min(0))
     return clamped - index, clamped == coordinate, index, last.clamp(max=1)

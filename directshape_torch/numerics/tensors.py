@@ -102,6 +102,19 @@ def all_along(flags: Tensor, dim: int) -> Tensor:
     return functools.reduce(torch.logical_and, flags.unbind(dim))
 
 
+def not_negative(values: Tensor) -> Tensor:
+    """The values, and 0 in place of negative ones and of NaN.
+
+    Examples:
+        >>> not_negative(torch.tensor([2.0, -2.0, torch.nan]))
+        tensor([2., 0., 0.])
+    """
+    if torch.compiler.is_compiling():
+        # Of `nan_to_num` the compiler makes a loop over single numbers.
+        return torch.where(values >= 0, values, 0.0)
+    return values.nan_to_num(0.0).clamp_min(0)
+
+
 def cross(left: Tensor, right: Tensor) -> Tensor:
     """Cross products (*, 3) of vectors (*, 3)."""
     if not torch.compiler.is_compiling():

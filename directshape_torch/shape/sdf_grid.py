@@ -15,7 +15,6 @@ least distance that of the point (the envelope theorem) with the gradient that `
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import torch
@@ -60,7 +59,8 @@ class GridShape:
     @property
     def field(self) -> GridField:
         """What terms look up in."""
-        return GridField(self.values.reshape(-1), self.basis, self.origin, self.spacing_m)
+        last = constant_like(tuple(count - 1.0 for count in self.basis.shape[:3]), self.origin)
+        return GridField(self.values.reshape(-1), self.basis, self.origin, last, self.spacing_m)
 
     def value(self, points_obj: Tensor, object_index: Tensor) -> Tensor:
         """Signed distance (P,) in metres at points (P, 3) of objects (P,)."""
@@ -82,6 +82,8 @@ class GridField(NamedTuple):
     values: Tensor  # (B * nx * ny * nz,) metres
     basis: Tensor  # (nx, ny, nz, K) metres per standard deviation
     origin: Tensor  # (3,) position of node (0, 0, 0), metres
+    # (3,) number of the last node along each axis: of constants the compiler makes choices, which cost as much as sums
+    last: Tensor
     spacing_m: float  # between nodes
 
     @property
@@ -94,17 +96,13 @@ class GridField(NamedTuple):
         ny, nz = self.basis.shape[1:3]
         return ny * nz, nz, 1
 
-    def along_axes(self, values: Sequence[float], like: Tensor) -> Tensor:
-        """One number for each axis, as it goes with points (3, ...)."""
-        return constant_like(tuple(values), like).view(3, *[1] * (like.ndim - 1))
-
     def positions(self, points_obj: Tensor) -> Tensor:
         """Points (3, ...) in cells from node (0, 0, 0)."""
         return (points_obj - self.origin.view(3, *[1] * (points_obj.ndim - 1))) * (1 / self.spacing_m)
 
     def last_nodes(self, like: Tensor) -> Tensor:
         """Number of the last node along each axis, as it goes with points (3, ...)."""
-        return self.along_axes([count - 1 for count in self.basis.shape[:3]], like)
+        return self.last.view(3, *[1] * (like.ndim - 1))
 
     def steps(self, cells: Tensor) -> Tensor:
         """What moves (3, ...) by whole cells, in floating point, add to the flat index (...) of a node."""
