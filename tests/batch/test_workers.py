@@ -58,15 +58,6 @@ def dispatch(workers: Imagined, size: int = 1, retries: int = 1, frames: str = "
     return GroupDispatch(frame_groups(frames, size, ()), workers, retries, nothing)
 
 
-@pytest.mark.parametrize("capacity", [1, 3, 20])
-def test_every_frame_is_refined_once(capacity: int) -> None:
-    workers = Imagined(capacity, lambda *_: False)
-    run = dispatch(workers, size=3)
-    assert len(list(run.reports())) == 3
-    assert sorted(workers.written) == list("abcdefgh")
-    assert (run.num_deaths, run.lost) == (0, {})
-
-
 @pytest.mark.parametrize("retries", [0, 1, 2])
 def test_the_frame_that_kills_is_found_among_its_companions(retries: int) -> None:
     workers = Imagined(2, lambda group, _: "c" in group.frame_ids)

@@ -5,7 +5,6 @@ import pytest
 
 from directshape_torch.cli import build_prior
 from directshape_torch.cli.main import make_parser
-from directshape_torch.errors import InputError
 from directshape_torch.shape.parametric_cars import car_mesh
 from directshape_torch.shape.parametric_cars_types import sample_car
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -53,16 +52,3 @@ def test_skips_a_mesh_that_is_no_solid_and_says_so(meshes, tmp_path, capsys):
     (folder / "broken.obj").write_text("v 0 0 0\n")
     assert run("--meshes", str(folder), "--out", str(tmp_path / "car.npz"), *OPTIONS) == 3
     assert "skipped broken.obj" in capsys.readouterr().out
-
-
-def test_wrong_input(meshes, tmp_path):
-    out = str(tmp_path / "car.npz")
-    with pytest.raises(InputError, match="--meshes: expected a folder"):
-        run("--meshes", str(tmp_path / "none"), "--out", out)
-    with pytest.raises(InputError, match=r"none in"):
-        run("--meshes", str(meshes), "--out", out, "--pattern", "*.glb")
-    with pytest.raises(InputError, match="more than --num-codes = 9 usable meshes"):
-        run("--meshes", str(meshes), "--out", out, "--num-codes", "9", "--up-axis=-y", "--spacing", "0.2")
-    with pytest.raises(InputError, match="--spacing"):
-        run("--meshes", str(meshes), "--out", out, "--spacing", "3")
-    assert list(tmp_path.iterdir()) == []

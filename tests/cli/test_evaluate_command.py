@@ -71,14 +71,6 @@ def test_json(folders: tuple[str, str], tmp_path: Path) -> None:
         assert f'"{name}":' in documented
 
 
-def test_wrong_input_is_one_line(folders: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--labels", folders[0], "--results", folders[0]]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert "a result without score" in captured.err
-    assert captured.err.count("\n") == 1
-
-
 def test_detectors_of_image_boxes_alone(
     folders: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

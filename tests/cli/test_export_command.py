@@ -57,32 +57,6 @@ def test_masks_and_grey_change_the_colours(finished: FinishedRun, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--format", "coco3d"), "--data: expected the data set of the run, for the sizes"),
-        (("--format", "ply", "--masks", "x"), "--data: expected the data set of the run, because of --masks"),
-        (("--format", "ply", "--masks-left", "x"), "because of --masks-left"),
-        (
-            ("--format", "ply", "--iterations"),
-            "--iterations: expected --format rerun, which alone records them, got ply",
-        ),
-        (("--format", "ply", "--frames", "7"), "frames: expected finished frames of"),
-        (("--format", "points", "--points", "0"), "points_per_car: expected at least 1, got 0"),
-        (("--format", "ply", "--prior", "pca"), "--prior: expected the prior of the run"),
-    ],
-)
-def test_wrong_use_is_named(
-    finished: FinishedRun,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    words: tuple[str, ...],
-    message: str,
-) -> None:
-    assert main(command(finished, tmp_path, *words)) == 2
-    assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
     ("words", "purpose"), [(("points",), "stereo points"), (("rerun", "--iterations"), "--iterations")]
 )
 def test_what_depends_on_the_runs_field_asks_for_it(
@@ -97,11 +71,6 @@ def test_what_depends_on_the_runs_field_asks_for_it(
     assert main(command(run, tmp_path / "export", "--format", *words, *inputs)) == 2
     said = capsys.readouterr().err
     assert f"--rig: expected the file that the run was made with, for {purpose}, got nothing" in said
-
-
-def test_a_folder_without_a_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(tmp_path), "--format", "kitti", "--out", str(tmp_path / "out")]) == 2
-    assert "summary.json: is missing" in capsys.readouterr().err
 
 
 def test_another_rigs_field_is_refused(

@@ -9,7 +9,7 @@ import cv2
 import pytest
 from PIL import Image
 
-from directshape_torch.cli.demo import DEMO_FOLDER, demo_dataset
+from directshape_torch.cli.demo import demo_dataset
 from directshape_torch.cli.inspect_cars import silhouette_trace
 from directshape_torch.cli.main import main
 from directshape_torch.io.config_files import load_config
@@ -49,28 +49,6 @@ def test_without_both_of_the_papers_terms_there_is_no_drift(setting: str) -> Non
     data = demo_dataset()
     refiner = DirectShapeRefiner(config=load_config("fast", ["compile=off", setting]))
     assert silhouette_trace(refiner, data.load("000000")) is None
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--demo", "--frame", "7"], "000007"),
-        (["--demo", "--car", "9"], "car of frame 000000: 1, 2, 3, 4, 5, 6, got 9"),
-        (["--demo", "--data", "x"], "bundled frame alone"),
-        (["--data", str(DEMO_FOLDER)], "give --frame ID"),
-        ([], "something to inspect"),
-        (["--demo", "--tracks"], "expected frames of a sequence, got --demo, one frame; give --data with --frames"),
-        (["--data", "x", "--tracks", "--car", "1"], "all cars of several frames, got --car 1 too"),
-        (["--demo", "--prior", "nowhere.npz"], "nowhere.npz"),
-        (["--demo", "--car", "2", "--set", "sampling.min_usable_pixels=100000"], "too_few_pixels"),
-    ],
-)
-def test_refusals_name_what_is_wrong(
-    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["inspect", *words, "--out", str(tmp_path / "out")]) == 2
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 def test_cars_that_cannot_be_refined_are_named_and_passed_by(

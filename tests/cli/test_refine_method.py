@@ -58,13 +58,6 @@ def test_without_maps_the_images_are_matched(source: Path, tmp_path: Path) -> No
     assert "disparity" not in RunFolder(tmp_path).read("000000").record.inputs
 
 
-def test_maps_that_nobody_reads_are_an_error(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert refine(source, tmp_path, "--disparity", str(source / "disparity")) == 2
-    assert "--disparity: expected a method that uses it, got direct; add --method" in capsys.readouterr().err
-    assert refine(source, tmp_path, "--method", "geometric", "--disparity", str(tmp_path / "none")) == 2
-    assert "is no folder of disparity maps" in capsys.readouterr().err
-
-
 def test_a_bad_map_fails_its_frame_alone(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = Path(shutil.copytree(source / "disparity", tmp_path / "disparity"))
     write_disparity(folder / "000000.png", np.ones((9, 9)))

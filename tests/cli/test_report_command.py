@@ -38,30 +38,3 @@ def test_notes_say_what_is_missing(finished: FinishedRun, tmp_path: Path, capsys
     # The run used a prior of its own, which no bundled one can decode.
     for option in ("--data", "--detections", "--prior"):
         assert f"({option})" in err
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--frames", "1", "9"], "got 9"),
-        (["--max-frames", "-1"], "most_frames"),
-        (["--detections", "."], "--data"),
-        (["--rig", "field.json"], "--data"),
-        (["--prior", "neural"], "the prior of the run"),
-        (["--data", "nowhere"], "training"),
-        (["--masks", "a", "--masks-left", "b", "--data", "{root}"], "either a folder (--masks DIR) or COCO files"),
-    ],
-)
-def test_wrong_usage(
-    finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
-    page = tmp_path / "page.html"
-    words = [word.format(root=finished.root) for word in words]
-    assert main(["report", str(finished.out), "--html", str(page), *words]) == 2
-    assert message in capsys.readouterr().err
-    assert not page.exists()
-
-
-def test_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", str(tmp_path)]) == 2
-    assert "summary.json" in capsys.readouterr().err

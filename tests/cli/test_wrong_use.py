@@ -1,0 +1,80 @@
+"""Wrong use of the commands: exit code 2, one line that says what was expected, and nothing written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from helpers.finished_run import FinishedRun
+
+from directshape_torch.cli.demo import DEMO_FOLDER
+from directshape_torch.cli.main import main
+
+EXPORT = "export {run} --prior {root}/prior.npz --out {out}"
+REPORT = "report {run} --html {out}/page.html"
+INSPECT = "inspect --out {out}"
+PRIOR = "build-prior --meshes {meshes} --out {out}/car.npz"
+REFINE = "refine --data {root} --detections {root}/detections --out {out} --prior {root}/prior.npz --device cpu"
+MASKED = f"{REFINE} --masks {{root}}/masks"
+
+CASES = [
+    (f"{EXPORT} --format coco3d", "--data: expected the data set of the run, for the sizes"),
+    (f"{EXPORT} --format ply --masks x", "--data: expected the data set of the run, because of --masks"),
+    (f"{EXPORT} --format ply --masks-left x", "because of --masks-left"),
+    (f"{EXPORT} --format ply --iterations", "--iterations: expected --format rerun, which alone records them, got ply"),
+    (f"{EXPORT} --format ply --frames 7", "frames: expected finished frames of"),
+    (f"{EXPORT} --format points --points 0", "points_per_car: expected at least 1, got 0"),
+    (f"{EXPORT} --format ply --prior pca", "--prior: expected the prior of the run"),
+    ("export {root} --format kitti --out {out}", "summary.json: is missing"),
+    (f"{REPORT} --frames 1 9", "got 9"),
+    (f"{REPORT} --max-frames -1", "most_frames"),
+    (f"{REPORT} --detections .", "--data"),
+    (f"{REPORT} --rig field.json", "--data"),
+    (f"{REPORT} --prior neural", "the prior of the run"),
+    (f"{REPORT} --data nowhere", "training"),
+    (f"{REPORT} --masks a --masks-left b --data {{root}}", "either a folder (--masks DIR) or COCO files"),
+    ("report {root} --html {out}/page.html", "summary.json"),
+    ("status {root}", "no run of 'directshape refine' is or was here"),
+    (INSPECT, "something to inspect"),
+    (f"{INSPECT} --demo --frame 7", "000007"),
+    (f"{INSPECT} --demo --car 9", "car of frame 000000: 1, 2, 3, 4, 5, 6, got 9"),
+    (f"{INSPECT} --demo --data x", "bundled frame alone"),
+    (f"{INSPECT} --data {DEMO_FOLDER}", "give --frame ID"),
+    (f"{INSPECT} --demo --tracks", "expected frames of a sequence, got --demo, one frame; give --data with --frames"),
+    (f"{INSPECT} --data x --tracks --car 1", "all cars of several frames, got --car 1 too"),
+    (f"{INSPECT} --demo --prior nowhere.npz", "nowhere.npz"),
+    (f"{INSPECT} --demo --car 2 --set sampling.min_usable_pixels=100000", "too_few_pixels"),
+    ("build-prior --meshes nowhere --out {out}/car.npz", "--meshes: expected a folder"),
+    (f"{PRIOR} --pattern *.glb", "none in"),
+    (f"{PRIOR} --num-codes 9 --up-axis=-y --spacing 0.2", "more than --num-codes = 9 usable meshes"),
+    (f"{PRIOR} --spacing 3", "--spacing"),
+    (REFINE, "--masks: expected either a folder"),
+    (f"{MASKED} --masks-left x.json", "got both"),
+    (f"{MASKED} --threads 0", "threads: expected at least 1, got 0"),
+    (f"{MASKED} --lidar nowhere", "nowhere: is no folder of LiDAR scans"),
+    (f"{MASKED} --disparity x", "--disparity: expected a method that uses it, got direct; add --method"),
+    (f"{MASKED} --method geometric --disparity nowhere", "is no folder of disparity maps"),
+    ("check-data --data {root} --detections {root}/detections --masks {root}/masks --frames 77", "000077"),
+    ("evaluate --labels {root}/training/label_2 --results {root}/training/label_2", "a result without score"),
+]
+
+
+@pytest.fixture(scope="session")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("meshes")
+    (folder / "broken.obj").write_text("v 0 0 0\n")
+    return folder
+
+
+@pytest.mark.parametrize(("words", "said"), CASES)
+def test_one_line_says_it(
+    finished: FinishedRun, meshes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, said: str
+) -> None:
+    places = {"run": finished.out, "root": finished.root, "meshes": meshes, "out": tmp_path / "out"}
+    assert main([word.format(**places) for word in words.split()]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    line = shown.err.splitlines()[-1]
+    assert line.startswith("directshape: error: ")
+    assert said in line
+    assert not list(tmp_path.iterdir())
