@@ -82,13 +82,6 @@ def test_paper_anneals_the_contour_by_a_factor_of_07() -> None:
         assert sharper == pytest.approx(0.7 * softer, abs=1e-3)
 
 
-def test_fast_has_less_to_do() -> None:
-    fast, default = load_config(CONFIGS / "fast.yaml"), RefinerConfig()
-    steps = [sum(stage.max_iterations for stage in config.stages) for config in (fast, default)]
-    assert steps[0] < steps[1]
-    assert fast.sampling.max_pixels < default.sampling.max_pixels
-
-
 def test_paper_names_an_option_that_exists_for_each_deviation() -> None:
     text = (CONFIGS / "paper.yaml").read_text(encoding="utf-8")
     header = text[: text.index("\nmethod:")]

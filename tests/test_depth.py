@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from helpers.ellipsoids import Ellipsoid
 
@@ -34,21 +33,6 @@ def _depth_of(rays: Rays, T_obj_cam: torch.Tensor) -> torch.Tensor:
     x = rays.in_objects(T_obj_cam)
     a, b = (x.direction_obj**2).sum(0), (x.centre_obj * x.direction_obj).sum(0)
     return (-b - (b**2 - a * ((x.centre_obj**2).sum(0) - RADIUS_M**2)).sqrt()) / a
-
-
-@pytest.mark.parametrize(
-    ("shift", "bound_m"), [((0.0, 0.0, 0.5), 1e-4), ((0.05, 0.0, 0.05), 1e-4), ((0.15, -0.1, 0.2), 5e-3)]
-)
-def test_a_surface_is_found_again(shift: tuple[float, float, float], bound_m: float) -> None:
-    """Within a Newton step of it, as the photometric term takes one more."""
-    rays, before = _rays(), _pose((0.0, 0.0, 0.0))
-    points = rays.in_objects(before).at(_depth_of(rays, before))
-    hits = Hits(points, FIELD.gradient(points, OWNER), torch.ones(1, 64, dtype=torch.bool), _depth_of(rays, before))
-    there = _pose(shift)
-    if shift[2] == 0.5:
-        hits = hits._replace(depth=hits.depth + 3)  # where a hit lies is told by its point alone
-    found = tracked_depth(FIELD, rays, rays.in_objects(there), hits)
-    assert (found - _depth_of(rays, there)).abs().max() < bound_m
 
 
 def test_a_surface_that_is_gone_is_not_found() -> None:

@@ -55,13 +55,6 @@ def test_masks_that_are_no_tensors_are_refused_with_the_cure() -> None:
         from_boxes(mask_left=STREET.detections.mask_left.numpy())
 
 
-def test_a_result_moves_and_counts_from_the_end_like_a_tensor() -> None:
-    result = refined()
-    assert result.to(torch.float64).T_cam_obj.dtype == result.to(dtype=torch.float64).code.dtype == torch.float64
-    assert result.to("cpu").T_cam_obj.dtype == result.T_cam_obj.dtype
-    assert (result.mesh(-1).vertices == result.mesh(len(result) - 1).vertices).all()
-
-
 def test_intrinsics_of_one_and_of_many_frames() -> None:
     K = STREET.frames.camera.K_left[0]
     assert StereoCamera.from_intrinsics(K, 0.5).baseline.tolist() == [0.5]
@@ -177,6 +170,7 @@ def test_results_move_and_give_arrays() -> None:
     assert single.prior.origin.dtype == torch.float32
     assert result.prior.origin.dtype == torch.float64  # the refiner's own shapes stay
     assert result.cpu().prior is result.prior
+    assert result.to(torch.float32).code.dtype == result.to("cpu", torch.float32).code.dtype == torch.float32
     attached = replace(result, T_cam_obj=result.T_cam_obj.clone().requires_grad_())
     assert not attached.detach().T_cam_obj.requires_grad
     arrays = attached.numpy()

@@ -52,21 +52,6 @@ def test_what_follows_the_setting_of_all_backends_goes_on_following_it() -> None
     assert seen() == ("ieee", "ieee")
 
 
-def test_the_older_names_can_be_read_inside() -> None:
-    torch.set_float32_matmul_precision("high")
-    with full_precision("cpu"):
-        assert torch.get_float32_matmul_precision() == "highest"
-        assert not CUDA.allow_tf32
-    assert CUDA.allow_tf32
-
-
-def test_after_an_error_too() -> None:
-    torch.set_float32_matmul_precision("high")
-    with pytest.raises(ZeroDivisionError), full_precision("cpu"):
-        _ = 1 / 0
-    assert torch.get_float32_matmul_precision() == "high"
-
-
 def test_the_last_thread_to_leave_puts_the_setting_back() -> None:
     torch.set_float32_matmul_precision("high")
     entered, may_leave = threading.Event(), threading.Event()

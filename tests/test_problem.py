@@ -6,15 +6,15 @@ import math
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import pytest
 import torch
-from helpers.derivatives import moved, relative_error
+from helpers.derivatives import moved
 from helpers.five_cars import begun_stage, five_cars, step_of
 from helpers.problems import DEFAULT, MARCHED, PAPER, figures_at, photometric_of
 from helpers.problems import begun_stage as begun_at
-from helpers.synthetic_scene import cached_street, disturbed, joined_frames, select
+from helpers.synthetic_scene import cached_street, disturbed, select
 from helpers.term_cases import CLOUD, COMBINED, case
 from torch import Tensor
 
@@ -104,45 +104,7 @@ def test_so_it_is_on_the_synthetic_street_for_all_terms(regime: str) -> None:
     assert _gradient_error(stage, state, stage.problem.term_names).max() < 1e-4
 
 
-def test_single_precision_says_nearly_the_same_in_double() -> None:
-    prior, scene = cached_street()
-    detections = disturbed(scene.detections)
-    stage, state = begun_at(prior, scene.frames, detections)
-    low, low_state = begun_at(
-        prior.__class__.to(cached_street(torch.float32)[0], torch.float32),
-        scene.frames.to(dtype=torch.float32),
-        detections.to(dtype=torch.float32),
-    )
-    exact, found = figures_at(stage, state), figures_at(low, low_state)
-    assert found.cost.dtype == found.gradient.dtype == found.hessian.dtype == torch.float64
-    torch.testing.assert_close(found.cost, exact.cost, rtol=5e-3, atol=1e-3)
-    assert relative_error(found.gradient.sum(1), exact.gradient.sum(1)) < 0.02
-
-
 # Iterations against figures
-
-
-@pytest.mark.parametrize("config", [DEFAULT, MARCHED, COMBINED], ids=["tracked", "marched", "combined"])
-@pytest.mark.parametrize("number", [0, 1])
-def test_the_iterations_begin_at_the_figures(config: RefinerConfig, number: int) -> None:
-    """Rays that are certain are left out, so the gradient lacks what they would add: less than a thousandth."""
-    stage, state = begun_stage(config, number)
-    sight = stage.problem.look(state)
-    (_, at), figures = stage.start(sight), stage.figures(sight)
-    torch.testing.assert_close(at.cost, figures.cost, rtol=1e-10, atol=0)
-    assert relative_error(at.gradient, figures.gradient.sum(1)) < 1e-3
-    assert relative_error(at.hessian, figures.hessian.sum(1)) < 1e-3
-
-
-def test_by_autograd_the_iterations_are_the_same() -> None:
-    """After a step the depth of a tracked surface is one Newton step ahead of where its slope was taken."""
-    evaluations = []
-    for jacobian in ("analytic", "autograd"):
-        stage, state = begun_stage(replace(DEFAULT, solver=replace(DEFAULT.solver, jacobian=jacobian)))
-        iterations, at = stage.start(stage.problem.look(state))
-        evaluations += [(at[:3], iterations.evaluate(moved(state, step_of(5, 0.005, 0.05)), at)[:3])]
-    for by_hand, by_autograd, tolerance in zip(*evaluations, (1e-9, 2e-3), strict=True):
-        _assert_same(by_autograd, by_hand, tolerance)
 
 
 @pytest.mark.parametrize("config", [DEFAULT, MARCHED], ids=["tracked", "marched"])
@@ -162,19 +124,6 @@ def test_cars_that_leave_change_nothing_of_the_others(config: RefinerConfig, kee
         if len(keep) == 2:
             fewer, at_fewer = fewer.of_problems(torch.tensor([False, True]), [1], at_fewer)
             kept, keep = torch.arange(5) == keep[1], keep[1:]
-
-
-def test_a_refused_step_leaves_no_trace() -> None:
-    stage, state = begun_stage()
-    iterations, at = stage.start(stage.problem.look(state))
-    far = iterations.evaluate(moved(state, step_of(5, 0.3, 1.0)), at)
-    accepted = torch.tensor([True, False, True, False, False])
-    chosen = iterations.choose(accepted, far, at)
-    there = moved(state, step_of(5, 0.01, 0.1, seed=8))
-    found, as_if_none, as_if_all = (iterations.evaluate(there, near)[:3] for near in (chosen, at, far))
-    for x, none, every in zip(found, as_if_none, as_if_all, strict=True):
-        assert torch.equal(x[~accepted], none[~accepted])
-        assert torch.equal(x[accepted], every[accepted])
 
 
 def test_the_state_moves_within_the_trust_region(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,96 +175,6 @@ def _figures(frames: FrameBatch, detections: Detections, step: Tensor | None, co
 
 def _compared(figures: Figures) -> tuple[Tensor, ...]:
     return figures.term_costs, figures.gradient, figures.hessian, figures.information
-
-
-@pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=["default", "paper"])
-def test_permuted_cars_are_permuted_and_a_batch_is_a_loop(config: RefinerConfig) -> None:
-    _, frames, detections = five_cars()
-    # Who is left out of the detections hides nobody.
-    config = replace(config, sampling=replace(config.sampling, occlusion=False))
-    step = step_of(5, 0.01, 0.1)
-    together = _compared(_figures(frames, detections, step, config))
-    order = torch.tensor([3, 0, 4, 2, 1])
-    permuted = _compared(_figures(frames, select(detections, order), step[order], config))
-    _assert_same(permuted, tuple(x[order] for x in together), 1e-12)
-    for car in range(5):
-        alone = _compared(_figures(frames, select(detections, torch.tensor([car])), step[car : car + 1], config))
-        _assert_same(alone, tuple(x[car : car + 1] for x in together))
-
-
-def test_padding_changes_nothing() -> None:
-    _, scene = cached_street()
-    alone = _compared(_figures(scene.frames, scene.detections, None, DEFAULT))
-    height, width = scene.frames.images_left.shape[2:]
-    larger = replace(
-        scene.frames,
-        images_left=torch.nn.functional.pad(scene.frames.images_left, (0, 31, 0, 17), value=0.9),
-        images_right=torch.nn.functional.pad(scene.frames.images_right, (0, 31, 0, 17), value=0.1),
-    )
-    masks: dict[str, Any] = {
-        name: torch.nn.functional.pad(getattr(scene.detections, name), (0, 31, 0, 17))
-        for name in ("mask_left", "mask_right")
-    }
-    padded = _compared(_figures(joined_frames([larger]), replace(scene.detections, **masks), None, DEFAULT))
-    assert (height, width) == tuple(scene.frames.sizes[0].tolist())
-    _assert_same(padded, alone, 1e-12)
-
-
-@pytest.mark.parametrize("what", ["pose", "code"])
-@pytest.mark.parametrize("config", [DEFAULT, MARCHED], ids=["tracked", "marched"])
-def test_a_broken_car_touches_no_other(what: str, config: RefinerConfig) -> None:
-    stage, state = begun_stage(config)
-    broken = CarState.of(state.T_obj_cam.clone(), state.code.clone())
-    (broken.T_obj_cam if what == "pose" else broken.code)[1] = torch.nan
-    others = torch.arange(5) != 1
-    found, expected = (_compared(figures_at(stage, s)) for s in (broken, state))
-    _assert_same(tuple(x[others] for x in found), tuple(x[others] for x in expected), 0)
-    assert not found[0][1].isfinite().all()
-    iterations, at = stage.start(stage.problem.look(state))
-    tracked = [iterations.evaluate(s, at)[:3] for s in (broken, state)]
-    _assert_same(tuple(x[others] for x in tracked[0]), tuple(x[others] for x in tracked[1]), 0)
-
-
-def test_no_cars_and_cars_without_pixels() -> None:
-    stage, state = begun_stage(cars=[])
-    figures = figures_at(stage, state)
-    assert figures.gradient.shape == (0, 7, 9)
-    assert stage.start(stage.problem.look(state))[1].cost.shape == (0,)
-    _, frames, detections = five_cars()
-    # Its masks are empty, and no part of its box is in the image.
-    unseen = replace(
-        select(detections, torch.tensor([0])),
-        mask_left=torch.zeros_like(detections.mask_left[:1]),
-        mask_right=torch.zeros_like(detections.mask_right[:1]),
-        box_2d=torch.tensor([[-50.0, -50.0, -40.0, -40.0]], dtype=torch.float64),
-        T_cam_obj=detections.T_cam_obj[:1].clone(),
-    )
-    unseen.T_cam_obj[:, 0, 3] += 60
-    alone = _figures(frames, unseen, None, DEFAULT)
-    assert (alone.term_costs[0, :3] == 0).all()
-    assert alone.term_costs.isfinite().all()
-
-
-def test_moving_the_whole_scene_changes_no_residual() -> None:
-    """Camera, ground and cars turned about the y axis and shifted together: the state's frame is the car's own."""
-    stage, state = case()
-    motion = se3.exp(torch.tensor([1.0, -0.4, 3.0, 0.0, 0.7, 0.0], dtype=torch.float64))
-    masks = stage.problem.masks
-    rotated = (motion[:3, :3] @ masks.rays.ray_cam.flatten(1)).view_as(masks.rays.ray_cam)
-    rays = masks.rays._replace(centre_cam=se3.transform(motion, masks.rays.centre_cam), ray_cam=rotated)
-    there = CarState.of(state.T_obj_cam @ se3.inverse(motion), state.code)
-    silhouettes = stage.terms[0]
-    masks = replace(masks, rays=rays)
-    problem = replace(stage.problem, masks=masks, rays=masks.of_sides())
-    before, after = stage.problem.look(state), problem.look(there)
-    torch.testing.assert_close(after.closest.depth, before.closest.depth, rtol=0, atol=1e-9)
-    moved_term = replace(silhouettes, rows=problem.masks)  # type: ignore[type-var]
-    for term, sight, which in ((silhouettes, before, state), (moved_term, after, there)):
-        at = term.linear(sight.field, which, term.where(sight))
-        if term is silhouettes:
-            expected = at
-    torch.testing.assert_close(at.residual, expected.residual, rtol=0, atol=1e-9)
-    torch.testing.assert_close(at.J_inner_state, expected.J_inner_state, rtol=0, atol=1e-7)
 
 
 # Stages, terms, weights
@@ -377,28 +236,6 @@ def test_stages_of_the_geometric_method_alternate() -> None:
     assert [stage.unknowns for stage in method_stages(joint)] == ["both"]
     with pytest.raises(ConfigError, match=r"point_cloud\.order: backward\.mode implicit needs joint, got alternating"):
         replace(geometric, backward=replace(DEFAULT.backward, mode="implicit"))
-
-
-def test_factors_of_single_cars_count_in_everything() -> None:
-    factor = torch.tensor([0.0, 0.5, 1.0, 2.0, 3.0], dtype=torch.float64)
-    plain, state = begun_stage()
-    weighted, _ = begun_stage(term_weights={"photometric": factor, "shape": factor})
-    at = moved(state, step_of(5, 0.01, 0.1))
-    expected = torch.ones(5, 7, dtype=torch.float64)
-    expected[:, [2, 3]] = factor[:, None]
-    found, without = (_compared(figures_at(stage, at)) for stage in (weighted, plain))
-    _assert_same(found, tuple(x * expected.view(5, 7, *[1] * (x.ndim - 2)) for x in without), 1e-12)
-    sight = plain.problem.look(state)
-    for stage in (plain, weighted):
-        _, start = stage.start(sight)
-        torch.testing.assert_close(start.cost, stage.figures(sight).cost, rtol=1e-10, atol=0)
-
-
-def test_the_photometric_term_needs_a_stage() -> None:
-    problem = begun_stage()[0].problem
-    term = next(t for t in problem.terms if t.names == ("photometric",))
-    with pytest.raises(RuntimeError, match="no pixel set before a stage begins: call `begin` first"):
-        _ = term.blocks
 
 
 # The rig's residual disparity

@@ -12,7 +12,6 @@ import torch
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.problems import DEFAULT, PAPER
 from helpers.synthetic_scene import (
-    Street,
     cached_street,
     disturbed,
     joined_detections,
@@ -329,15 +328,6 @@ def test_only_bad_cars() -> None:
     assert result.status == [Status.no_mask] * 2
     assert result.covariance.isnan().all()
     assert not result.refined.any()
-
-
-def test_a_failed_car_has_its_costs_or_none_but_never_a_refined_state() -> None:
-    scene: Street = cached_street()[1]
-    frames = replace(scene.frames, images_right=scene.frames.images_right * torch.nan)
-    result = refine(frames, scene.detections)
-    assert result.status == [Status.non_finite] * 2
-    assert torch.equal(result.T_cam_obj, scene.detections.T_cam_obj)
-    assert (result.code == 0).all()
 
 
 def test_a_car_that_is_not_refined_keeps_the_detectors_box_and_has_no_figures() -> None:

@@ -154,40 +154,6 @@ def test_a_track_of_two_cars_is_split_where_they_were_swapped(monkeypatch: pytes
     assert torch.equal(swapped.code[4:], alone.code[4:])
 
 
-@pytest.mark.parametrize("cut", [1, 3, 6])
-def test_the_cut_is_where_the_shape_changes(cut: int) -> None:
-    generator = torch.Generator().manual_seed(2)
-    A = 3 * torch.randn(7, 20, 3, generator=generator, dtype=torch.float64)
-    A, known = A.mT @ A / 20, 0.15 * torch.eye(3, dtype=torch.float64).expand(7, 3, 3)
-    code = 0.1 * torch.randn(7, 3, generator=generator, dtype=torch.float64)
-    views = [6, 0, 3, 1, 5, 2, 4]
-
-    def parts(code: Tensor) -> list[list[int]]:
-        return tracks._of_one_car(views, tracks._Quadratics(A, A @ code[:, :, None], known))
-
-    assert parts(code) == [views]
-    code[views[cut:]] += torch.tensor([1.5, -1.0, 0.8])
-    assert parts(code) == [views[:cut], views[cut:]]
-
-
-def test_what_two_shapes_save_is_what_the_least_costs_say() -> None:
-    generator = torch.Generator().manual_seed(3)
-    roots = torch.randn(5, 4, 2, generator=generator, dtype=torch.float64)
-    A, code = roots.mT @ roots, torch.randn(5, 2, 1, generator=generator, dtype=torch.float64)
-    known = 0.15 * torch.eye(2, dtype=torch.float64)
-
-    def least(views: list[int]) -> float:
-        both = known + A[views].sum(dim=0)
-        c = torch.linalg.solve(both, (A[views] @ code[views]).sum(dim=0))
-        off = c - code[views]
-        return float((off.mT @ A[views] @ off).sum() + c.mT @ known @ c)
-
-    says = tracks._Quadratics(A, A @ code, known.expand(5, 2, 2))
-    for cut, saved in enumerate(says.saved([3, 0, 4, 1]), start=1):
-        views = [3, 0, 4, 1]
-        assert saved == pytest.approx(least(views) - least(views[:cut]) - least(views[cut:]))
-
-
 def test_a_view_without_a_mask_touches_nothing_else() -> None:
     _, detections, _ = drive()
     unmasked = replace(

@@ -7,11 +7,9 @@ import math
 import torch
 
 from directshape_torch.geometry.box3d import (
-    BOX_EDGES,
     alpha_from_kitti,
     box_corners,
     pose_from_kitti,
-    rotation_about_y,
     rotation_y_from_pose,
     wrap_angle,
 )
@@ -24,17 +22,6 @@ def test_round_trip_of_the_heading() -> None:
     T = pose_from_kitti(location, rotation_y)
     torch.testing.assert_close(rotation_y_from_pose(T), rotation_y)
     assert (T[:, :3, 3] == location).all()
-
-
-def test_rotation_y_is_the_exponential_about_y() -> None:
-    twist = torch.tensor([0, 0, 0, 0, 0.7, 0], dtype=torch.float64)
-    torch.testing.assert_close(rotation_about_y(torch.tensor(0.7, dtype=torch.float64)), exp(twist)[:3, :3])
-
-
-def test_a_positive_heading_turns_the_nose_to_the_camera() -> None:
-    # rotation_y = pi/2: the car's x axis points along -z, towards the camera.
-    nose = pose_from_kitti(torch.zeros(3), torch.tensor(math.pi / 2))[:3, 0]
-    torch.testing.assert_close(nose, torch.tensor([0.0, 0.0, -1.0]), atol=1e-6, rtol=0)
 
 
 def test_a_tilted_car_keeps_its_heading() -> None:
@@ -52,13 +39,6 @@ def test_corners_by_hand() -> None:
     torch.testing.assert_close(corners, torch.tensor(expected), atol=1e-5, rtol=0)
 
 
-def test_edges_join_corners_that_differ_in_one_dimension() -> None:
-    corners = box_corners(torch.eye(4), torch.tensor([1.5, 2.0, 4.0]))
-    assert len(set(BOX_EDGES)) == 12
-    for i, j in BOX_EDGES:
-        assert ((corners[i] - corners[j]).abs() > 1e-6).sum() == 1
-
-
 def test_alpha_and_wrapping() -> None:
     # Straight to the right at 45 degrees, heading 0: alpha = -pi/4.
     location = torch.tensor([[10.0, 1.6, 10.0], [-10.0, 1.6, 10.0]], dtype=torch.float64)
@@ -67,8 +47,3 @@ def test_alpha_and_wrapping() -> None:
     torch.testing.assert_close(alpha, expected)
     wrapped = wrap_angle(torch.tensor([math.pi, -math.pi, 7.0], dtype=torch.float64))
     torch.testing.assert_close(wrapped, torch.tensor([-math.pi, -math.pi, 7 - 2 * math.pi], dtype=torch.float64))
-
-
-def test_no_boxes() -> None:
-    assert box_corners(torch.zeros(0, 4, 4), torch.zeros(0, 3)).shape == (0, 8, 3)
-    assert pose_from_kitti(torch.zeros(0, 3), torch.zeros(0)).shape == (0, 4, 4)

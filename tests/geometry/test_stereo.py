@@ -24,16 +24,6 @@ def test_warp_equals_the_long_way_for_a_general_right_camera() -> None:
     assert warped.in_front.all()
 
 
-def test_disparity_is_focal_times_baseline_over_depth() -> None:
-    pure = torch.eye(4, dtype=torch.float64)
-    pure[0, 3] = -0.54
-    warped = warp_to_right(rays_from_pixels(UV, K_LEFT), DEPTH, K_LEFT, pure)
-    # Disparity u_left - u_right = f b / z, positive: 700 * 0.54 / 20 = 18.9 px at 20 m.
-    torch.testing.assert_close(UV[:, 0] - warped.uv_right[:, 0], 700 * 0.54 / DEPTH)
-    assert abs(float(UV[1, 0] - warped.uv_right[1, 0]) - 18.9) < 1e-9
-    torch.testing.assert_close(warped.uv_right[:, 1], UV[:, 1])
-
-
 @pytest.mark.parametrize("bias", [None, torch.tensor([0.3, -1.2, 0.7], dtype=torch.float64)])
 def test_depth_derivative_against_differences_and_autograd(bias: torch.Tensor | None) -> None:
     ray = rays_from_pixels(UV, K_LEFT)
@@ -100,16 +90,3 @@ def test_in_front_is_told_by_the_depth_and_not_by_the_row() -> None:
     warped = warp_to_right(rays_from_pixels(above, K_LEFT), DEPTH[:1], K_LEFT, torch.eye(4, dtype=torch.float64))
     assert warped.in_front.all()
     torch.testing.assert_close(warped.uv_right, above)
-
-
-def test_neighbourhoods_share_one_depth() -> None:
-    rays = rays_from_pixels(UV[:, None] + torch.tensor([[0.0, 0.0], [2.0, 0.0]]), K_LEFT)
-    both = warp_to_right(rays, DEPTH[:, None], K_RIGHT, GENERAL)
-    alone = warp_to_right(rays[:, 1], DEPTH, K_RIGHT, GENERAL)
-    torch.testing.assert_close(both.uv_right[:, 1], alone.uv_right)
-
-
-def test_no_pixels() -> None:
-    empty = torch.zeros(0, 3, dtype=torch.float64)
-    assert warp_to_right(empty, empty[:, 0], K_RIGHT, GENERAL).uv_right.shape == (0, 2)
-    assert right_rays(empty[:, :2], K_RIGHT, GENERAL).direction_cam.shape == (0, 3)

@@ -41,23 +41,6 @@ def central_differences(function: Callable[[Tensor], Tensor], at: Tensor, step: 
     return torch.stack(columns, dim=-1).reshape(*value.shape, *at.shape)
 
 
-def jacobian_by_state(function: Callable[[CarState], Tensor], state: CarState) -> Tensor:
-    """Autograd `d function / d delta` at zero, (R, B, 6 + K), for a function of the state with values (R,)."""
-    jacobian = torch.autograd.functional.jacobian(lambda delta: function(moved(state, delta)), tangent_of(state))
-    assert isinstance(jacobian, Tensor)
-    return jacobian
-
-
-def differences_by_state(function: Callable[[CarState], Tensor], state: CarState, step: float = 1e-6) -> Tensor:
-    """Central differences `d function / d delta` at zero, (R, B, 6 + K)."""
-    return central_differences(lambda delta: function(moved(state, delta)), tangent_of(state), step)
-
-
-def of_own_object(jacobian: Tensor, object_index: Tensor) -> Tensor:
-    """Rows (R, D) of each residual by its own object, from (R, B, D)."""
-    return jacobian[torch.arange(len(object_index)), object_index]
-
-
 def relative_error(a: Tensor, b: Tensor) -> float:
     """Largest difference, relative to the largest magnitude."""
     return float((a - b).abs().max() / b.abs().max().clamp_min(1e-300))

@@ -1,4 +1,4 @@
-"""Lookups in stacks of images, coordinates together, and in grids at points of any shape."""
+"""Lookups in stacks of images, coordinates together."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from directshape_torch.image.interpolate import bilinear_patch
-from directshape_torch.shape.sdf_grid import GridField, Lookup
 
 
 def bilinear_with_gradient(
@@ -21,14 +20,3 @@ def bilinear_with_gradient(
     first = frame_index * (height * width)
     at = bilinear_patch(images.reshape(-1), first, width, uv[..., 0], uv[..., 1], last_column, last_row)
     return at.value, torch.stack([at.d_u, at.d_v], dim=-1), at.inside
-
-
-def value_at(field: GridField, points: Tensor, index: Tensor) -> Tensor:
-    """Signed distance (...) at points (3, ...) of the objects (...)."""
-    return field.value(points[..., None], index)[..., 0]
-
-
-def derivatives_at(field: GridField, points: Tensor, index: Tensor, constant: bool = False) -> Lookup:
-    """Value (...), gradient (3, ...) and code derivative (..., K) there."""
-    at = field.derivatives(points[..., None], index, constant)
-    return Lookup(at.value[..., 0], at.gradient[..., 0], at.J_value_code[..., 0, :])

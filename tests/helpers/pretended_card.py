@@ -26,7 +26,6 @@ from torch.utils._python_dispatch import return_and_correct_aliasing
 from torch.utils._pytree import tree_flatten, tree_map
 
 from directshape_torch.numerics import gradient_mode
-from helpers.host_traffic import INDEXED, WAITS
 
 
 class _Module(backend_registration._DummyBackendModule):
@@ -42,6 +41,26 @@ CARD = torch.device("card:0")
 # On a card tensors of a single number from the processor go with operations element by element, and with no others.
 _NO_SINGLE_NUMBERS = {"aten.cat", "aten.stack"}
 _PACKAGE = str(Path(gradient_mode.__file__).parents[1])
+# Their results, or the shapes of their results, are read by the host.
+WAITS = {
+    "aten._local_scalar_dense",
+    "aten.is_nonzero",
+    "aten.equal",
+    "aten.nonzero",
+    "aten.masked_select",
+    "aten.bincount",
+    "aten._unique",
+    "aten._unique2",
+    "aten.unique_dim",
+    "aten.unique_consecutive",
+    "aten.unique_dim_consecutive",
+    # Whether a decomposition has failed; `cholesky_ex` and its like leave the question to the caller.
+    "aten._linalg_check_errors",
+    "aten._linalg_eigh",
+    "aten.linalg_lstsq",
+}
+# By a mask they ask how many places it has.
+INDEXED = {"aten.index", "aten.index_put", "aten.index_put_", "aten._index_put_impl_"}
 
 
 class Wait(NamedTuple):

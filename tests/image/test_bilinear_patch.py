@@ -42,14 +42,6 @@ def test_images_of_different_sizes_in_a_row() -> None:
     assert (~found.inside).any(dim=1).all()
 
 
-def test_a_cell_by_hand_with_numbers_for_sizes() -> None:
-    # 1 (1-u)(1-v) + 5 u (1-v) + 11 (1-u) v + 31 u v at u = 0.25, v = 0.5: 9; by u 4/2 + 20/2; by v 10 3/4 + 26/4.
-    pixels = torch.tensor([7.0, 1.0, 5.0, 11.0, 31.0], dtype=torch.float64)
-    u, v = (torch.tensor([x], dtype=torch.float64) for x in (0.25, 0.5))
-    at = bilinear_patch(pixels, torch.tensor([1]), 2, u, v, 1, 1)
-    assert [x.tolist() for x in at] == [[9.0], [12.0], [14.0], [True]]
-
-
 def test_coordinates_that_are_not_finite_are_outside() -> None:
     images = _images()
     u = torch.full((len(images), 3), 0.0, dtype=torch.float64)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from directshape_torch.laboratory.comparison import Comparison, PairError, compare, quantile
+from directshape_torch.laboratory.comparison import Comparison, PairError, compare
 from directshape_torch.laboratory.differences import STEPS
 from directshape_torch.laboratory.experiments import Experiment, Subject, factor_experiment
 
@@ -88,8 +88,3 @@ def test_exclusions_are_limited_in_the_typical_regime() -> None:
     found = [Comparison("f", regime, 100, 97, {"kink": 3}, 0, 0, errors) for regime in ("typical", "grazing")]
     assert "3.0 percent" in found[0].broken_bounds()[0]
     assert found[1].broken_bounds() == []
-
-
-def test_quantile_of_nothing_is_nan() -> None:
-    assert math.isnan(quantile(torch.zeros(0), 0.5))
-    assert quantile(torch.tensor([3.0, 1.0, 2.0]), 0.5) == 2.0

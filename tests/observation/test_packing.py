@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -211,41 +211,3 @@ def test_work_follows_the_cars_and_not_the_frame() -> None:
     frames, detections = random_scene(6, count=5, num_frames=1, others=0)
     small, large = (touched_by_packing(*enlarged(frames, detections, factor)) for factor in (4, 8))
     assert large < 1.02 * small
-
-
-class HostWaits(TorchDispatchMode):
-    """Names the operations that wait for a number on the host."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.names: list[str] = []
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        name, kwargs = str(func), kwargs or {}
-        waits = ("_local_scalar_dense", "nonzero", "bincount", "masked_select", "aten.equal", "unique")
-        by_mask = "aten.index" in name and any(
-            isinstance(part, Tensor) and part.dtype == torch.bool
-            for arg in args[1:] if isinstance(arg, (list, tuple)) for part in arg
-        )  # fmt: skip
-        unsized = "repeat_interleave.Tensor" in name and kwargs.get("output_size") is None
-        if by_mask or unsized or any(word in name for word in waits):
-            self.names.append(name)
-        return func(*args, **kwargs)
-
-
-@pytest.mark.parametrize("count", [2, 40])
-def test_few_host_synchronisations_however_many_cars(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames, detections = random_scene(8, count=count)
-    to_list = Tensor.tolist
-    with HostWaits() as waits:
-        monkeypatch.setattr(Tensor, "tolist", lambda self: (waits.names.append("tolist"), to_list(self))[1])
-        pack_pixels(frames, detections, SamplingConfig())
-    assert 0 < len(waits.names) <= 20, waits.names
-
-
-def test_work_is_linear_in_the_cars() -> None:
-    frames, detections = random_scene(7, count=6, num_frames=1, others=0)
-    many = {f.name: getattr(detections, f.name) for f in fields(detections)}
-    rows = {name: torch.cat([value] * 8) for name, value in many.items() if isinstance(value, Tensor)}
-    once, eight = (touched_by_packing(frames, d) for d in (detections, replace(detections, **rows)))
-    assert eight < 8.1 * once

@@ -8,7 +8,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from reference.pixel_sampling import gradient_magnitude, select_pixels
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig, SamplingMode
@@ -21,24 +20,6 @@ MODES: tuple[SamplingMode, ...] = get_args(SamplingMode)
 def noise(seed: int) -> Tensor:
     """Two padded frames."""
     return torch.rand(2, 3, 70, 150, generator=torch.Generator().manual_seed(seed))
-
-
-def random_regions(seed: int, count: int) -> tuple[Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(seed)
-    frame = torch.randint(2, (count,), generator=generator)
-    height, width = SIZES[frame].unbind(1)
-    u, v = ((torch.rand(count, 2, generator=generator) * n[:, None]).long().sort().values for n in (width, height))
-    return frame, torch.stack([u[:, 0], v[:, 0], u[:, 1], v[:, 1]], dim=1)
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("seed", range(4))
-def test_random_regions_equal_the_plain_form(mode: SamplingMode, seed: int) -> None:
-    images, (frame, regions) = noise(seed), random_regions(seed, 9)
-    settings = SamplingConfig(density=0.1, min_pixels=20 + 50 * seed, max_pixels=400)
-    expected = select_pixels(gradient_magnitude(images, SIZES), frame, regions, mode, settings)
-    for got, wanted in zip(sampled_pixels(images, SIZES, frame, regions, mode, settings), expected, strict=True):
-        assert torch.equal(got, wanted)
 
 
 @given(width=st.integers(0, 300), height=st.integers(0, 200), wanted=st.integers(1, 900))
@@ -80,11 +61,3 @@ def test_a_nan_image_still_gives_pixels_and_touches_no_other_frame() -> None:
     (of, uv), (clean_of, clean_uv) = sampled_pixels(spoiled, *arguments), sampled_pixels(images, *arguments)
     assert (of == 0).any()
     assert torch.equal(uv[of == 1], clean_uv[clean_of == 1])
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_no_cars(mode: SamplingMode) -> None:
-    none = torch.zeros(0, dtype=torch.long)
-    of, uv = sampled_pixels(noise(0), SIZES, none, none.reshape(0, 4), mode, SamplingConfig())
-    assert of.shape == (0,)
-    assert uv.shape == (0, 2)

@@ -9,58 +9,10 @@ from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.photometric_rows import DSO_PATTERN
-from directshape_torch.terms.point_cloud import PointCloud
-from directshape_torch.terms.silhouette import SATURATION, MaskRows, SilhouetteProducts, Silhouettes
-from reference.rays import RaysObj, first_entry, least
+from reference.rays import RaysObj, first_entry
 
 # From the prior's bounds: so far away the closest approach stays of them, where the field has a kink.
 MARGIN_M = 1e-4
-
-
-def _rays(rows: MaskRows, state: CarState) -> RaysObj:
-    size = rows.filled.shape[1]
-    owner = rows.rays.owner.repeat_interleave(size)
-    return RaysObj.of(
-        state.T_obj_cam, owner, rows.rays.centre_cam.repeat_interleave(size, dim=0), rows.rays.ray_cam.flatten(1).mT
-    )
-
-
-def least_distance(prior: ShapePrior, rays: RaysObj, state: CarState) -> tuple[Tensor, Tensor]:
-    """Least signed distance (P,) along rays, and whether they cross the prior's bounds."""
-    lower, upper = prior.bounds_obj
-    near, far, crosses = rays.interval(torch.stack([lower + MARGIN_M, upper - MARGIN_M]))
-    near, far = torch.where(crosses, near, 1.0), torch.where(crosses, far, 2.0)
-    distance = rays.along(prior.bind(state.code))
-    return distance(least(distance, near, far)[:, None])[:, 0], crosses
-
-
-def silhouette(prior: ShapePrior, term: Silhouettes, state: CarState) -> Tensor:
-    """`-log(pi p_fg + (1 - pi) p_bg)` (M, R) with `pi = sigmoid(-zeta min sdf)`."""
-    sdf, crosses = least_distance(prior, _rays(term.rows, state), state)
-    foreground = term.rows.foreground
-    exponent = (term.zeta * sdf.view_as(foreground)).clamp(-SATURATION, SATURATION)
-    hit = torch.where(crosses.view_as(foreground), 1 / (1 + exponent.exp()), 0.0)
-    return -(hit * foreground + (1 - hit) * (1 - foreground)).log()
-
-
-def product(prior: ShapePrior, term: SilhouetteProducts, state: CarState, depths: Tensor, crosses: Tensor) -> Tensor:
-    """The same (M, R) with `pi = 1 - prod_s 1 / (1 + exp(-zeta sdf_s))` over samples at constant depths (S, M, R)."""
-    miss = torch.ones_like(term.rows.foreground)
-    for depth in depths:
-        sdf = _rays(term.rows, state).along(prior.bind(state.code))(depth.reshape(-1, 1)).view_as(miss)
-        miss = miss / (1 + torch.exp(-term.zeta * sdf))
-    hit = torch.where(crosses, 1 - miss, 0.0)
-    foreground = term.rows.foreground
-    return -(hit * foreground + (1 - hit) * (1 - foreground)).log()
-
-
-def point_cloud(prior: ShapePrior, term: PointCloud, state: CarState) -> Tensor:
-    """Signed distances (M, R) of the points."""
-    points_cam, size = term.points_cam.ray_cam, term.filled.shape[1]
-    owner = term.points_cam.owner.repeat_interleave(size)
-    T = state.T_obj_cam[owner]
-    points = (T[:, :3, :3] @ points_cam.flatten(1).mT[..., None])[..., 0] + T[:, :3, 3]
-    return prior.bind(state.code).value(points, owner).view_as(term.filled)
 
 
 def surface_depth(prior: ShapePrior, term: Photometric, state: CarState) -> tuple[Tensor, Tensor]:

@@ -140,15 +140,6 @@ def _figures(cost: Tensor, pixels: float = 100.0) -> dict[str, float]:
     return {name: float(value[0]) for name, value in found._asdict().items()}
 
 
-def test_both_curves_in_one_go_have_the_figures_of_each() -> None:
-    before, after = 2 + (OFFSETS - 0.6)[None] ** 2, torch.stack([1 + OFFSETS.abs(), 3 + (OFFSETS + 1) ** 2])
-    pixels = torch.tensor([100.0, 50.0]).double()
-    profile = DisparityProfile(OFFSETS, before.expand(2, -1), after, pixels)
-    for found, expected in zip(profile.figures, (profile.before, profile.after), strict=True):
-        for x, y in zip(found, expected, strict=True):
-            assert torch.equal(x, y)
-
-
 def test_a_parabola_by_hand() -> None:
     """2 + 3 (x - 0.6)^2: curvature 6, sigma^2 = 2 * 2 / (6 * 100)."""
     found = _figures(2 + 3 * (OFFSETS - 0.6) ** 2)
@@ -237,16 +228,6 @@ def test_offsets_that_make_no_curve_are_refused(range_px: float, step_px: float)
         profile_offsets(range_px, step_px)
 
 
-def test_placing_and_blanking() -> None:
-    values = torch.tensor([[3.0, 1.0, 2.0]]).double()
-    some = DisparityProfile(torch.tensor([-1.0, 0.0, 1.0]).double(), values, 2 * values, torch.tensor([9.0]).double())
-    placed = some.spread(torch.tensor([1]), 2)
-    assert placed.cost_after[1].tolist() == [6, 2, 4]
-    assert placed.cost_before[0].isnan().all()
-    assert placed.num_pixels[0].isnan()
-    assert placed.where(torch.tensor([True, False])).cost_after.isnan().all()
-
-
 @pytest.mark.parametrize("config", CONFIGS)
 def test_all_pixels_cost_what_the_term_says_on_the_surface_and_beside_it(config: str) -> None:
     scene = cached_street()[1]
@@ -301,10 +282,3 @@ def test_without_a_pixel_there_is_no_curve_and_a_car_without_them_touches_no_oth
                 assert found.num_pixels[car] == 0
             else:
                 torch.testing.assert_close(found.cost_after[car], expected.cost_after[car], rtol=1e-9, atol=1e-9)
-
-
-def test_before_a_stage_there_is_no_curve() -> None:
-    stage, state = begun(far_street().frames, far_street())
-    surface, term = surface_at(stage, state), replace(photometric_of(stage), fixed=None)
-    with pytest.raises(RuntimeError, match="before a stage begins"):
-        disparity_profile(term, surface, surface, 2, state.code)

@@ -159,11 +159,3 @@ def test_the_profile_by_hand() -> None:
     for name, value in expected.items():
         assert float(found[name][0]) == pytest.approx(value), name
         assert math.isnan(found[name][1])
-
-
-def test_a_flat_profile_is_as_wide_as_its_range() -> None:
-    course = course_at_truth()
-    flat = torch.full((2, 25), 4.0, dtype=torch.float64)
-    found = columns(replace(course, profile=replace(course.profile, cost_before=flat, cost_after=flat)))
-    assert float(found["log_profile_sigma"][0]) == pytest.approx(math.log(3))
-    assert found["log_profile_contrast"].tolist() == [0, 0]

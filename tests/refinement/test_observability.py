@@ -27,7 +27,7 @@ from directshape_torch.refinement.observability import (
 )
 from directshape_torch.terms.cars import CarState
 
-LENGTH, DEPTH, WIDTH = (CAR_QUANTITIES.index(name) for name in ("length", "depth", "width"))
+LENGTH, DEPTH = (CAR_QUANTITIES.index(name) for name in ("length", "depth"))
 
 
 @cache

@@ -42,14 +42,6 @@ def test_beyond_three_deviations_nothing_changes_and_unknown_counts_as_the_mean(
     torch.testing.assert_close(HEAD(evidence(torch.nan, 0.1)), torch.tensor([1 / (1 + math.exp(-0.25))]).double())
 
 
-def test_a_batch_equals_its_cars() -> None:
-    model = bundled_trust_model()
-    rows = torch.randn(50, len(EVIDENCE_NAMES), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    one_by_one = torch.cat([model.better(row[None]) for row in rows])
-    assert torch.equal(model.better(rows), one_by_one)
-    assert model.not_worse(rows[:0]).shape == (0,)
-
-
 def test_sigmas_are_scaled_along_and_across_the_viewing_ray() -> None:
     """Straight ahead the ray is z and x lies across it."""
     covariance = torch.diag(torch.tensor([0.01, 0.04, 0.09, 0.0004])).double()[None]
@@ -69,11 +61,6 @@ def test_sigmas_turn_with_the_scene(angle: float) -> None:
     covariance, location = (A @ A.T)[None], torch.tensor([[3.0, 1.5, 14.0]]).double()
     turned = MODEL.calibrated_covariance(R @ covariance @ R.T, location @ R[:3, :3].T)
     torch.testing.assert_close(turned, R @ MODEL.calibrated_covariance(covariance, location) @ R.T)
-
-
-def test_a_model_survives_its_file(tmp_path: Path) -> None:
-    MODEL.save(tmp_path / "model.json")
-    assert load_trust_model(tmp_path / "model.json") == MODEL
 
 
 def test_damaged_files_are_refused(tmp_path: Path) -> None:

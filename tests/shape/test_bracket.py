@@ -50,25 +50,3 @@ def test_the_best_depth_is_the_one_of_least_distance() -> None:
     near = bracket.depth
     bracket = bracket.probed(torch.tensor([-0.01])).probed(torch.tensor([0.3]))
     assert torch.equal(bracket.best, near)
-
-
-def test_a_zero_that_is_met_is_kept() -> None:
-    bracket = _begun(torch.tensor([0.5]), torch.tensor([-0.5]))
-    for _ in range(5):
-        bracket = bracket.probed(0.5 - bracket.depth)
-        assert bracket.best.tolist() == [0.5]
-        assert bracket.depth.isfinite().all()
-
-
-def test_nan_touches_no_other() -> None:
-    values, ends = torch.tensor([0.6, 0.6, 0.6]), torch.tensor([-0.4, -0.4, -0.4])
-    bracket, alone = _begun(values, ends), _begun(values[:1], ends[:1])
-    for _ in range(4):
-        sdf = (0.6 - bracket.depth) ** 3 - 0.001
-        sdf[1] = torch.nan
-        bracket = bracket.probed(sdf)
-        alone = alone.probed((0.6 - alone.depth) ** 3 - 0.001)
-    for mine, its in zip(bracket, alone, strict=True):
-        assert torch.equal(mine[[0, 2]], its.expand(2))
-    # Of one that is never known the best depth is what it was.
-    assert float(bracket.best[1]) == 1.0

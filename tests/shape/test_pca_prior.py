@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import torch
-from helpers.host_traffic import host_traffic
 from helpers.priors import first_components
 
 from directshape_torch.errors import DataFormatError, InputError
@@ -41,11 +40,6 @@ def prior(samples) -> PCAShapePrior:
     return fit_pca(samples, ORIGIN, SPACING_M, 4, MADE)
 
 
-def test_bounds_are_computed_without_the_host_once_their_sizes_are_known(prior):
-    torch.testing.assert_close(prior.bounds_obj[1], torch.tensor([2.0, 0.4, 1.0], dtype=torch.float64))
-    assert host_traffic(lambda: prior.bounds_obj).found == []
-
-
 def test_unweighted_components_equal_those_of_a_singular_value_decomposition(samples):
     prior = fit_pca(samples, ORIGIN, SPACING_M, 3, MADE, surface_band_m=None)
     centred = (samples - samples.mean(0)).flatten(1)
@@ -79,15 +73,6 @@ def test_linear_dimensions_follow_the_zero_level(prior):
     extents = zero_level_extents(prior.values(code), prior.origin, prior.spacing_m)
     measured = (extents[:, 1] - extents[:, 0])[:, [1, 2, 0]]
     torch.testing.assert_close(prior.dimensions_hwl(code), measured, atol=0.06, rtol=0)
-
-
-def test_bind_agrees_with_the_sum_over_components(prior):
-    code = torch.tensor([[0.5, -1.0, 0.2, 0.1]], dtype=torch.float64)
-    node = torch.tensor([4, 6, 3])
-    point = prior.origin + prior.spacing_m * node
-    expected = prior.mean[4, 6, 3] + (prior.basis[4, 6, 3] * code[0]).sum()
-    torch.testing.assert_close(prior.bind(code).value(point[None], torch.tensor([0]))[0], expected)
-    assert prior.values(prior.initial_code(0)).shape == (0, *SHAPE)
 
 
 def test_state_dict_and_dtype(prior, samples):

@@ -10,7 +10,7 @@ from helpers.derivatives import central_differences
 from helpers.priors import KINDS, prior_of
 from torch import Tensor
 
-from directshape_torch.shape.shape_prior import BoundShape, ShapePrior
+from directshape_torch.shape.shape_prior import ShapePrior
 
 pytestmark = pytest.mark.parametrize("kind", KINDS)
 REGIMES = ("mean", "typical", "three_sigma")
@@ -48,18 +48,6 @@ def by_autograd(prior: ShapePrior, code: Tensor, points: Tensor, index: Tensor) 
     J_points, J_code = torch.autograd.functional.jacobian(value, (points, code))
     rows = torch.arange(len(points))
     return J_points[rows, rows], J_code[rows, index]
-
-
-def test_it_offers_what_the_protocol_says(kind: str) -> None:
-    prior = prior_of(kind)
-    assert isinstance(prior, ShapePrior)
-    assert isinstance(prior.bind(prior.initial_code(1)), BoundShape)
-    assert torch.equal(prior.initial_code(3), torch.zeros(3, prior.num_codes, dtype=torch.float64))
-    lower, upper = prior.bounds_obj
-    assert (lower < upper).all()
-    assert prior.bounds_obj.dtype == prior.origin.dtype == torch.float64
-    hwl = prior.dimensions_and_derivative(prior.initial_code(1)).hwl
-    assert ((hwl > 1.2) & (hwl < 5)).all()
 
 
 @pytest.mark.parametrize("regime", REGIMES)
@@ -107,15 +95,6 @@ def test_second_derivatives_exist_and_are_right(kind: str) -> None:
     torch.testing.assert_close(by_code, expected, atol=1e-6, rtol=1e-6)
     assert by_points.abs().max() > 1e-3
     assert by_code.abs().max() > 1e-3
-
-
-def test_forward_mode_gives_the_same(kind: str) -> None:
-    prior = prior_of(kind)
-    code, points, index = codes(prior, "typical"), points_in(prior, 6), owners(6)
-    direction = codes(prior, "three_sigma")
-    _, moved = torch.func.jvp(lambda c: prior.bind(c).value(points, index), (code,), (direction,))
-    at = prior.bind(code).value_and_derivatives(points, index)
-    torch.testing.assert_close(moved, (at.J_value_code * direction[index]).sum(1), atol=1e-12, rtol=1e-9)
 
 
 def test_outside_the_bounds_the_distance_to_them_is_added(kind: str) -> None:

@@ -1,39 +1,44 @@
-"""Trilinear lookup: value, gradient and code derivative against a slow loop, autograd and grid_sample."""
+"""Trilinear lookups in every form against a slow loop over the corners, autograd and one another."""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import pytest
 import torch
 import torch.autograd.forward_ad as fwAD
 from torch import Tensor
 
-from directshape_torch.shape.sdf_grid import GridShape
+from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
 SPACING = 0.4
 COUNTS = (6, 5, 4)
 LAST = ORIGIN + SPACING * (torch.tensor(COUNTS, dtype=torch.float64) - 1)
+LookUp = Callable[[GridField, Tensor, Tensor], Lookup]
 
 
-def random_shape(num_objects: int = 2, num_codes: int = 3) -> GridShape:
+@pytest.fixture(params=["to be differentiated", "constant", "as a compiler traces it"])
+def look_up(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> LookUp:
+    """The last one as Python, without a compiler: only the question whether one is at work is answered otherwise."""
+    if request.param == "as a compiler traces it":
+        monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    constant = request.param == "constant"
+    return lambda field, points_obj, owner: field.derivatives(points_obj, owner, constant)
+
+
+def random_shape(num_objects: int = 2, num_codes: int = 3, dtype: torch.dtype = torch.float64) -> GridShape:
     generator = torch.Generator().manual_seed(5)
     values = torch.randn(num_objects, *COUNTS, generator=generator, dtype=torch.float64)
     basis = torch.randn(*COUNTS, num_codes, generator=generator, dtype=torch.float64)
-    return GridShape(values, basis, ORIGIN, SPACING)
+    return GridShape(values.to(dtype), basis.to(dtype), ORIGIN.to(dtype), SPACING)
 
 
-def points_inside(count: int) -> Tensor:
-    generator = torch.Generator().manual_seed(6)
-    return ORIGIN + (LAST - ORIGIN) * torch.rand(count, 3, generator=generator, dtype=torch.float64)
-
-
-def points_outside(count: int) -> Tensor:
-    generator = torch.Generator().manual_seed(7)
-    far = ORIGIN + (LAST - ORIGIN) * (4 * torch.rand(count * 4, 3, generator=generator, dtype=torch.float64) - 1.5)
-    outside = ((far < ORIGIN) | (far > LAST)).any(1)
-    return far[outside][:count]
+def points(count: int = 75, stretch: float = 1.6) -> Tensor:
+    """(P, 3), by default two thirds of them outside of the grid."""
+    share = torch.rand(count, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    return 0.5 * (ORIGIN + LAST) + stretch * (LAST - ORIGIN) * (share - 0.5)
 
 
 def slow_lookup(grid: Tensor, point: Tensor) -> Tensor:
@@ -51,54 +56,58 @@ def slow_lookup(grid: Tensor, point: Tensor) -> Tensor:
     return total if grid.ndim == 4 else total + (point - clamped).norm()
 
 
-@pytest.mark.parametrize("where", ["inside", "outside"])
-def test_value_and_code_derivative_against_a_slow_loop(where: str) -> None:
-    shape = random_shape(3)
-    points = points_inside(25) if where == "inside" else points_outside(25)
-    index = torch.arange(25) % 3
-    at = shape.value_and_derivatives(points, index)
-    for i in range(25):
-        torch.testing.assert_close(at.value[i], slow_lookup(shape.values[index[i]], points[i]))
-        torch.testing.assert_close(at.J_value_code[i], slow_lookup(shape.basis, points[i]))
-    torch.testing.assert_close(shape.value(points, index), at.value, rtol=1e-14, atol=1e-14)
+@pytest.mark.parametrize("num_codes", [0, 1, 3])
+def test_value_and_derivatives_against_a_slow_loop(look_up: LookUp, num_codes: int) -> None:
+    """Points in blocks, of which each has its object; some on nodes."""
+    shape, at = random_shape(3, num_codes), points()
+    at[:2] = torch.stack([ORIGIN, ORIGIN + SPACING * torch.tensor([2.0, 1.0, 3.0])])
+    owner = torch.tensor([0, 2, 1])
+    blocks = at.view(3, 25, 3).movedim(-1, 0)
+    found, values = look_up(shape.field, blocks, owner), shape.field.value(blocks, owner)
+    for i, point in enumerate(at):
+        value = slow_lookup(shape.values[owner[i // 25]], point)
+        torch.testing.assert_close(found.value[i // 25, i % 25], value)
+        torch.testing.assert_close(values[i // 25, i % 25], value)
+        torch.testing.assert_close(found.J_value_code[i // 25, i % 25], slow_lookup(shape.basis, point))
 
 
-@pytest.mark.parametrize("where", ["inside", "outside"])
-def test_gradient_is_the_derivative_of_the_value(where: str) -> None:
-    shape = random_shape()
-    points = (points_inside(40) if where == "inside" else points_outside(40)).requires_grad_()
-    index = torch.arange(40) % 2
-    (by_autograd,) = torch.autograd.grad(shape.value(points, index).sum(), points)
-    at = shape.value_and_derivatives(points, index)
-    torch.testing.assert_close(at.gradient, by_autograd, rtol=1e-12, atol=1e-12)
-    (other,) = torch.autograd.grad(at.value.sum(), points)
+@pytest.mark.parametrize("stretch", [1.0, 3.0])
+def test_gradient_is_the_derivative_of_the_value(look_up: LookUp, stretch: float) -> None:
+    field, owner = random_shape().field, torch.arange(2)
+    at = points(40, stretch).mT.reshape(3, 2, 20).requires_grad_()
+    (by_autograd,) = torch.autograd.grad(field.value(at, owner).sum(), at)
+    found = look_up(field, at, owner)
+    torch.testing.assert_close(found.gradient, by_autograd, rtol=1e-12, atol=1e-12)
+    (other,) = torch.autograd.grad(found.value.sum(), at)
     torch.testing.assert_close(other, by_autograd, rtol=1e-12, atol=1e-12)
+    if stretch == 1:  # no point is outside, which may be said
+        within = field.derivatives(at, owner, inside=True)
+        for mine, theirs in zip((*within, field.value(at, owner, inside=True)), (*found, found.value), strict=True):
+            torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
+    else:
+        torch.testing.assert_close(field.gradient(at, owner), found.gradient, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_shape_looks_up_packed_points(dtype: torch.dtype) -> None:
+    shape, at, index = random_shape(dtype=dtype), points().to(dtype), torch.arange(75) % 2
+    expected, found = shape.field.derivatives(at.mT[..., None], index), shape.value_and_derivatives(at, index)
+    torch.testing.assert_close(found.value, expected.value[:, 0], rtol=0, atol=0)
+    torch.testing.assert_close(found.gradient.mT, expected.gradient[..., 0], rtol=0, atol=0)
+    torch.testing.assert_close(found.J_value_code, expected.J_value_code[:, 0], rtol=0, atol=0)
+    rounding = 30 * torch.finfo(dtype).eps
+    torch.testing.assert_close(shape.value(at, index), found.value, rtol=0, atol=rounding)
+    with torch.no_grad():  # the basis vectors are added in another order
+        torch.testing.assert_close(shape.value_and_derivatives(at, index)[2], found[2], rtol=0, atol=rounding)
+    assert shape.value(at[:0], index[:0]).shape == (0,)
 
 
 def test_the_last_faces_belong_to_their_cells() -> None:
     shape, index = random_shape(1), torch.zeros(3, dtype=torch.long)
     shape = GridShape(shape.values, shape.basis, torch.zeros(3, dtype=torch.float64), 0.5)
-    points = torch.tensor([[2.5, 0.7, 0.3], [0.2, 2.0, 0.3], [0.2, 0.3, 1.5]], dtype=torch.float64, requires_grad=True)
-    (from_autograd,) = torch.autograd.grad(shape.value(points, index).sum(), points)
-    torch.testing.assert_close(shape.value_and_derivatives(points, index).gradient, from_autograd)
-
-
-def test_code_derivative_is_the_derivative_by_the_nodes_values() -> None:
-    basis = random_shape().basis
-    mean = random_shape(1).values[0]
-    points = torch.cat([points_inside(10), points_outside(10)])
-    index = torch.zeros(20, dtype=torch.long)
-    code = torch.tensor([[0.3, -1.0, 2.0]], dtype=torch.float64)
-
-    def value(c: Tensor) -> Tensor:
-        return GridShape(mean[None] + torch.einsum("xyzk,bk->bxyz", basis, c), basis, ORIGIN, SPACING).value(
-            points, index
-        )
-
-    J = torch.autograd.functional.jacobian(value, code)
-    assert isinstance(J, Tensor)
-    bound = GridShape(mean[None] + torch.einsum("xyzk,bk->bxyz", basis, code), basis, ORIGIN, SPACING)
-    torch.testing.assert_close(bound.value_and_derivatives(points, index).J_value_code, J[:, 0])
+    at = torch.tensor([[2.5, 0.7, 0.3], [0.2, 2.0, 0.3], [0.2, 0.3, 1.5]], dtype=torch.float64, requires_grad=True)
+    (by_autograd,) = torch.autograd.grad(shape.value(at, index).sum(), at)
+    torch.testing.assert_close(shape.value_and_derivatives(at, index).gradient, by_autograd)
 
 
 def test_continuation_beyond_a_corner_points_away_from_it() -> None:
@@ -109,39 +118,54 @@ def test_continuation_beyond_a_corner_points_away_from_it() -> None:
     torch.testing.assert_close(at.gradient, away / 1.3)
 
 
-@pytest.mark.parametrize("where", ["inside", "outside"])
-def test_lookups_that_nobody_differentiates_are_the_same(where: str) -> None:
-    shape, points = random_shape(), points_inside(40) if where == "inside" else points_outside(40)
-    index = torch.arange(40) % 2
-    expected = shape.value_and_derivatives(points, index)
-    with torch.no_grad():
-        found = shape.value_and_derivatives(points, index)
-        torch.testing.assert_close(shape.value(points, index), expected.value, rtol=1e-14, atol=1e-14)
-    for mine, theirs in zip(found, expected, strict=True):
-        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
-    owned = shape.field.gradient(points.mT.contiguous()[..., None], index)[..., 0]
-    assert torch.equal(owned.mT, found.gradient)
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, -torch.inf])
+def test_points_that_are_not_finite_disturb_no_others(look_up: LookUp, bad: float) -> None:
+    field, at, owner = random_shape().field, points(20).mT.reshape(3, 20, 1).contiguous(), torch.arange(20) % 2
+    clean = look_up(field, at, owner)
+    at[1, 7] = bad
+    broken = look_up(field, at, owner)
+    others = (torch.arange(20) != 7).nonzero()[:, 0]
+    assert not broken.value[7].isfinite()
+    for mine, theirs, axis in zip(broken, clean, (0, 1, 0), strict=True):
+        assert torch.equal(mine.index_select(axis, others), theirs.index_select(axis, others))
+
+
+def test_traced_lookups_have_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the points, the values and the basis, through value, gradient and code derivative."""
+
+    def gradients() -> tuple[Tensor, ...]:
+        field, owner = random_shape().field, torch.arange(3) % 2
+        inputs = [x.clone().requires_grad_() for x in (points().mT.reshape(3, 3, 25), field.values, field.basis)]
+        at = field._replace(values=inputs[1], basis=inputs[2]).derivatives(inputs[0], owner)
+        total = sum((x * torch.linspace(-1, 1, x.numel(), dtype=x.dtype).view_as(x)).sum() for x in at)
+        return torch.autograd.grad(total, inputs)
+
+    expected = gradients()
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    for mine, theirs in zip(gradients(), expected, strict=True):
+        assert theirs.abs().max() > 0.1
+        torch.testing.assert_close(mine, theirs, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("by", ["forward transform", "reverse transform", "dual numbers"])
 def test_differentiation_needs_no_gradient_mode(by: str) -> None:
     """Where there is no distance from the grid, a derivative that takes it for a constant is NaN."""
-    shape, points = random_shape(), points_inside(20)
+    shape, at = random_shape(), points(20, 1.0)
     index, along = torch.arange(20) % 2, torch.ones(20, 3, dtype=torch.float64)
-    expected = (shape.value_and_derivatives(points, index).gradient * along).sum(1)
+    expected = (shape.value_and_derivatives(at, index).gradient * along).sum(1)
     with torch.no_grad():
         if by == "dual numbers":
             with fwAD.dual_level():
-                tangent = fwAD.unpack_dual(shape.value(fwAD.make_dual(points, along), index)).tangent
+                tangent = fwAD.unpack_dual(shape.value(fwAD.make_dual(at, along), index)).tangent
         elif by == "reverse transform":
-            (gradient,) = torch.func.vjp(lambda x: shape.value(x, index), points)[1](torch.ones(20).double())
+            (gradient,) = torch.func.vjp(lambda x: shape.value(x, index), at)[1](torch.ones(20).double())
             tangent = (gradient * along).sum(1)
         else:
-            _, tangent = torch.func.jvp(lambda x: shape.value(x, index), (points,), (along,))
+            _, tangent = torch.func.jvp(lambda x: shape.value(x, index), (at,), (along,))
     torch.testing.assert_close(tangent, expected, rtol=1e-12, atol=1e-12)
 
 
 def test_the_gradient_can_be_traced() -> None:
-    field, points, owner = random_shape().field, points_inside(20).mT.contiguous()[..., None], torch.arange(20) % 2
+    field, at, owner = random_shape().field, points(20).mT.reshape(3, 2, 10), torch.arange(2)
     traced = torch.compile(field.gradient, backend="eager", fullgraph=True)
-    torch.testing.assert_close(traced(points, owner), field.gradient(points, owner), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(traced(at, owner), field.gradient(at, owner), rtol=1e-12, atol=1e-12)

@@ -142,21 +142,6 @@ def test_implicit_equals_unrolling_to_convergence() -> None:
     assert (cut_short - implicit).abs().max() > 1e-3
 
 
-def test_the_gauss_newton_matrix_is_an_approximation() -> None:
-    theta = _theta().requires_grad_()
-    exact, approximate = (torch.autograd.grad(_implicit(theta, e).sum(), theta)[0] for e in (True, False))
-    error = (approximate - exact).norm() / exact.norm()
-    assert 1e-3 < error < 1
-
-
-def test_values_are_those_of_the_minimum_to_the_bit() -> None:
-    theta = _theta().requires_grad_()
-    problem = Curved(theta)
-    minimum = _minimum(problem, START)
-    assert torch.equal(_implicit(theta), _polished(problem, minimum).state.x)
-    assert torch.equal(_unrolled(theta, START, 3), minimum.state.x)
-
-
 def test_only_the_wanted_problems_and_each_by_itself() -> None:
     theta = _theta().requires_grad_()
     minimum = _minimum(Curved(theta), START)

@@ -46,12 +46,6 @@ def test_pure_gauss_newton_solves_linear_problems_in_one_step(count: int) -> Non
     assert (result.iterations <= 2).all()
 
 
-def test_damped_gauss_newton_finds_the_same_minimum() -> None:
-    problem, solution = linear_problem(4, 3, ONE_STAGE)
-    result = minimise(problem, start(4), replace(DAMPED, cost_tolerance=1e-14, step_tolerance=1e-14))
-    torch.testing.assert_close(result.state.x, solution, rtol=1e-6, atol=1e-7)
-
-
 def test_the_cost_never_rises_unless_every_step_is_accepted() -> None:
     problem = rosenbrock(6)
     result = minimise(problem, start(6, 2, -1.3), replace(DAMPED, cost_tolerance=1e-15))
@@ -75,14 +69,6 @@ def test_accepting_every_step_goes_uphill_but_returns_the_best_state() -> None:
     assert (one.state.x == -1.0).all()
 
 
-def test_the_best_state_on_the_way_is_returned() -> None:
-    """Gauss-Newton on atan(x) from 3 with steps of at most 4.5: -1.5 by hand, then 1.69, then -2.32: it diverges."""
-    problem = ResidualProblem(lambda x, _: torch.atan(x), torch.arange(1), 1, [StageConfig(1.0, 0, 3)], limit=4.5)
-    result = minimise(problem, start(1, 1, 3.0), replace(PURE, step_tolerance=0.0))
-    assert result.cost_history[0, 1] > result.cost_history[0, 0]
-    assert float(result.state.x) == -1.5
-
-
 def test_each_problem_is_solved_as_if_alone() -> None:
     together = minimise(rosenbrock(5), start(5, 2, -1.3), DAMPED)
     for i in range(5):
@@ -104,31 +90,6 @@ def test_compaction_changes_nothing(block: int) -> None:
     assert (result.status == reference.status).all()
     if block == 1:
         assert len(problem.compactions) > 1
-
-
-def test_finished_problems_are_evaluated_no_more() -> None:
-    problem, _ = linear_problem(3, 2, ONE_STAGE)
-    minimise(problem, start(3, 2), replace(PURE, block_iterations=1))
-    assert len(problem.evaluated) <= 4
-
-
-@pytest.mark.parametrize("block", [1, 3, 100])
-@pytest.mark.parametrize("config", [DAMPED, PURE], ids=["damped", "pure"])
-def test_costs_are_logged_while_a_problem_takes_part_and_no_longer(config: SolverConfig, block: int) -> None:
-    """Blocks of one iteration have nothing to leave out: the costs are the same for blocks of any length."""
-    problem = rosenbrock(6, [StageConfig(2.0, 1, 20), StageConfig(1.0, 0, 20)])
-    uneven = Vector(torch.linspace(-1.3, 1.0, 6, dtype=torch.float64)[:, None].repeat(1, 2))
-    result = minimise(problem, uneven, replace(config, block_iterations=block), record=True)
-    took_part = result.cost_history.isfinite()
-    assert len(result.iterations.unique()) > 1
-    assert torch.equal(took_part.sum(dim=1), result.iterations)
-    stage = torch.tensor([it.stage for it in result.trajectory])
-    for number in range(2):
-        # From the first iteration of a stage on, without gaps.
-        assert (took_part[:, stage == number].long().diff(dim=1) <= 0).all()
-    single = minimise(rosenbrock(6, problem.stages()), uneven, replace(config, block_iterations=1))
-    for history, expected in zip(result.cost_history, single.cost_history, strict=True):
-        torch.testing.assert_close(history[history.isfinite()], expected[expected.isfinite()], rtol=1e-12, atol=1e-13)
 
 
 def _poisoned(kind: str) -> ResidualProblem:
@@ -199,17 +160,6 @@ def test_what_failed_takes_no_part_in_the_iterations_of_the_next_stage(kind: str
     assert (result.state.x[1] == -1.3).all()
 
 
-def test_stages_of_problems_that_have_all_failed_evaluate_nothing() -> None:
-    problem = _poisoned("nan at the input")
-    problem.identity, problem.stage_configs = torch.tensor([1, 1]), TWO_STAGES
-    result = minimise(problem, start(2, 2, -1.3), PURE)
-    assert status_of(result.status) == [Status.non_finite] * 2
-    assert len(problem.begun) == 2
-    # At the input, and the one block's first iterations.
-    assert len(problem.evaluated) == 1 + PURE.block_iterations
-    assert (result.state.x == -1.3).all()
-
-
 def test_what_failed_unseen_by_the_host_is_told_from_what_it_saw() -> None:
     """A stage without iterations is not read: its failures are only known at the end of the next block."""
     problem = _poisoned("nan at the input")
@@ -278,25 +228,6 @@ def test_steps_stay_in_the_trust_region() -> None:
     assert moved.max() <= 0.1 + 1e-12  # a refused candidate is followed by one from the old state
 
 
-def test_each_state_is_evaluated_near_the_last_one_that_was_taken() -> None:
-    problem = rosenbrock(3)
-    result = minimise(problem, start(3, 2, -1.3), replace(DAMPED, block_iterations=1000), record=True)
-    assert not all(it.accepted.all() for it in result.trajectory)
-    assert len(problem.near) == len(result.trajectory) == len(problem.evaluated) - 1
-    for near, it in zip(problem.near, result.trajectory, strict=True):
-        assert torch.equal(near, it.state.x)
-
-
-def test_what_was_seen_and_said_at_both_ends_is_returned() -> None:
-    problem = rosenbrock(3)
-    result = minimise(problem, start(3, 2, -1.3), DAMPED)
-    assert torch.equal(result.seen_initial.x, start(3, 2, -1.3).x)
-    assert torch.equal(result.seen_end.x, result.end.x)
-    assert result.stage is problem
-    assert torch.equal(result.before.cost, problem.energy(start(3, 2, -1.3).x).cost)
-    assert torch.equal(result.after.cost, problem.energy(result.end.x).cost)
-
-
 def test_the_end_is_known_whatever_the_status() -> None:
     problem, solution = linear_problem(2, 3, [StageConfig(1.0, 0, 0)])
     result = minimise(problem, Vector(solution), DAMPED, start(2))
@@ -320,9 +251,3 @@ def test_no_problems() -> None:
     result = minimise(problem, start(0), DAMPED)
     assert result.state.x.shape == (0, 3)
     assert result.status.shape == result.iterations.shape == (0,)
-
-
-def test_the_solver_takes_no_gradient_graph() -> None:
-    problem, _ = linear_problem(1, 3, ONE_STAGE)
-    x = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
-    assert not minimise(problem, Vector(x), PURE).state.x.requires_grad

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.derivatives import moved, tangent_of
 from helpers.ellipsoids import ellipsoid_prior
 from helpers.ground import cars_on
 from helpers.problems import DEFAULT
@@ -23,8 +22,7 @@ from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.solver.problem import take_rows
 from directshape_torch.solver.sharing import Groups
 from directshape_torch.terms.cars import CarBatch, CarState
-from directshape_torch.terms.motion import deviation_sigma, hold_of_path, motion_terms, timed, with_path
-from directshape_torch.terms.priors import PriorTerm
+from directshape_torch.terms.motion import hold_of_path, motion_terms, timed, with_path
 
 CONFIG = TracksConfig()
 TIMES = torch.tensor([0.0, 0.1, 0.3, 0.4, 1.0], dtype=torch.float64)
@@ -41,27 +39,6 @@ def views(with_camera: bool, num_offsets: int = 0) -> tuple[CarBatch, CarState]:
     state = CarState.of(T_obj_cam, random(5, 3, seed=2))
     state = state._replace(offset_px=random(5, num_offsets, seed=3), path=random(5, 9, seed=4))
     return replace(cars, time_s=TIMES, T_world_cam=T_world_cam), state
-
-
-@pytest.mark.parametrize("number", [0, 1])
-@pytest.mark.parametrize("num_offsets", [0, 1])
-@pytest.mark.parametrize("with_camera", [False, True])
-def test_derivatives_are_those_of_autograd_and_of_differences(with_camera: bool, num_offsets: int, number: int) -> None:
-    cars, state = views(with_camera, num_offsets)
-    term: PriorTerm = motion_terms(CONFIG, cars)[number]
-    J = term.residual_of(cars, state).J_residual_state
-
-    def residual(delta: Tensor) -> Tensor:
-        return term.residual_of(cars, moved(state, delta)).residual.sum(dim=0)
-
-    zero = tangent_of(state)
-    by_autograd = torch.autograd.functional.jacobian(residual, zero).movedim(1, 0)
-    torch.testing.assert_close(J, by_autograd, rtol=1e-9, atol=1e-9)
-    for column in range(state.num_unknowns):
-        step = torch.zeros_like(zero)
-        step[:, column] = 1e-6
-        both = [term.residual_of(cars, moved(state, sign * step)).residual for sign in (1, -1)]
-        torch.testing.assert_close(J[:, :, column], (both[0] - both[1]) / 2e-6, rtol=1e-6, atol=1e-6)
 
 
 def on_a_path(path: Tensor, T_world_cam: Tensor | None) -> CarState:
@@ -129,13 +106,6 @@ def test_the_fitted_path_is_the_cheapest_for_views_where_they_are() -> None:
     (slope,) = torch.autograd.grad(cost(path), path)
     summed = sharing.total(slope[:, :6].sum(dim=1), torch.ones(5, dtype=torch.bool))
     assert summed.abs().max() < 1e-6 * float(cost(path).detach() + 1)
-
-
-def test_deviations_grow_with_the_time_from_the_middle() -> None:
-    sigma = deviation_sigma(CONFIG, torch.tensor([0.0, -0.5, 0.5, 2.0], dtype=torch.float64))
-    assert sigma[0].tolist() == pytest.approx([0.05, 0.05, math.radians(1.0)])
-    assert torch.equal(sigma[1], sigma[2])
-    assert (sigma[3] > 40 * sigma[0]).all()
 
 
 def drive(time_s: Tensor | None, T_world_cam: Tensor | None = None) -> tuple[FrameBatch, Detections]:

@@ -21,7 +21,7 @@ from directshape_torch.shape.field import field_of
 from directshape_torch.terms.cars import CarState, retract
 from directshape_torch.terms.next_view import NextView, NextViews
 from directshape_torch.terms.photometric import Brightness, Photometric
-from directshape_torch.terms.term import Sight, by_autograd
+from directshape_torch.terms.term import Sight
 
 # Three views of two cars.
 NEXT = torch.tensor([2, 3, 4, 5, 4, 5])
@@ -71,32 +71,6 @@ def disturbed(state: CarState) -> CarState:
     generator = torch.Generator().manual_seed(3)
     delta = torch.randn(6, state.num_unknowns, generator=generator, dtype=torch.float64)
     return retract(state, 0.01 * delta)
-
-
-@pytest.mark.parametrize("stage", [0, 1])
-@pytest.mark.parametrize("num_offsets", [0, 1])
-def test_derivatives_are_those_of_autograd_and_of_differences(num_offsets: int, stage: int) -> None:
-    problem, state = at_truth(*drive(), num_offsets)
-    term, sight = begun(problem, state, stage)
-    state = disturbed(state)
-    at = term.linear(field_of(problem.prior.bind(state.code)), state, term.where(sight))
-    J = at.J_residual_inner[..., None] * at.J_inner_state[:, :, None]
-    assert (at.J_residual_inner > 0).double().mean() > 0.5
-    ((residual, expected),) = by_autograd([term], problem.prior, state, [at.where])
-    torch.testing.assert_close(at.residual, residual, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(J, expected, rtol=1e-9, atol=1e-9)
-
-    def moved(column: int, by: float) -> Tensor:
-        delta = torch.zeros(6, state.num_unknowns, dtype=torch.float64)
-        delta[:, column] = by
-        there = retract(state, delta)
-        return term.residual(field_of(problem.prior.bind(there.code)), there, at.where)
-
-    for column in range(state.num_unknowns):
-        difference = (moved(column, 1e-6) - moved(column, -1e-6)) / 2e-6
-        off = (difference - J[..., column]).abs() > 1e-3 * (1 + J[..., column].abs())
-        # On the edges of pixels and of cells the two sides differ.
-        assert off.double().mean() < 0.01
 
 
 def test_true_poses_and_shapes_explain_the_next_view() -> None:
@@ -188,18 +162,6 @@ def test_the_next_frame_may_have_another_camera_and_size(stage: int) -> None:
     ]
     torch.testing.assert_close(residuals[1], residuals[0])
     assert torch.equal(term.row_weight[of_first[1]], whole.row_weight[of_first[0]])
-
-
-@pytest.mark.parametrize("stage", [0, 1])
-def test_points_are_looked_up_where_the_next_camera_sees_them(stage: int) -> None:
-    problem, state = at_truth(*drive())
-    term, _ = begun(problem, state, stage)
-    owner, scale = term.blocks.owner, 0.5 ** problem.stages()[stage].image_level
-    points = torch.rand(3, len(owner), 64, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    at = term._looked_up(state, points)
-    seen = se3.transform(se3.inverse(state.T_obj_next[:, 0])[owner][:, None], points.movedim(0, -1))
-    uv = (seen @ term.next_views.K_left[owner].mT)[..., :2] / seen[..., 2:]
-    torch.testing.assert_close(torch.stack([at.u, at.v], dim=-1), (uv + 0.5) * scale - 0.5)
 
 
 def test_the_exposure_of_the_next_frame_does_not_matter() -> None:

@@ -36,12 +36,6 @@ def _translated(state: CarState, metres: list[float]) -> CarState:
     return CarState.of(T, state.code)
 
 
-def test_dso_pattern_has_eight_pixels_and_its_centre() -> None:
-    assert len(set(DSO_PATTERN)) == 8
-    assert (0, 0) in DSO_PATTERN
-    assert all(abs(u) + abs(v) <= 2 for u, v in DSO_PATTERN)
-
-
 @pytest.mark.parametrize("number", [0, 1])
 @pytest.mark.parametrize("regime", ["typical", "near", "rotated_right_camera"])
 def test_residuals_at_any_depth_are_the_references_and_have_its_slope(regime: str, number: int) -> None:
@@ -146,13 +140,6 @@ def test_pixel_sets_and_their_weights() -> None:
         c2 = GRADIENT_CONSTANT**2
         expected = c2 / (c2 + term.left.pixels.gradient_magnitude[own] ** 2)
         torch.testing.assert_close(term.pixel_set.rows.pixel_weight[counted], expected)
-
-
-def test_the_set_stays_as_it_is_while_a_stage_lasts() -> None:
-    stage, state = _stage()
-    before = photometric_of(stage).pixel_set
-    figures_at(stage, _translated(state, [2.0, 0.0, 0.0]))
-    assert photometric_of(stage).pixel_set is before
 
 
 def test_gain_brings_the_left_image_to_the_brightness_of_the_right_one() -> None:

@@ -87,15 +87,6 @@ def test_nothing_that_counts_is_no_residual_of_nan() -> None:
         assert patch_residual(right[:0], left[:0], weight[:0], form, FLOOR).shape == (0, 8)
 
 
-def test_many_offsets_at_once_are_each_by_itself() -> None:
-    left, right, weight = _patches()
-    several = torch.stack([right - left, 0.5 * right - left])
-    for form in FORMS:
-        together = patch_residual(several, left, weight, form, FLOOR)
-        for at_once, alone in zip(together, several, strict=True):
-            torch.testing.assert_close(at_once, patch_residual(alone, left, weight, form, FLOOR))
-
-
 @pytest.mark.parametrize("floor", [0.5, FLOOR, 60.0])
 @pytest.mark.parametrize("form", FORMS)
 def test_derivative_by_the_depth_three_ways(form: PatchForm, floor: float) -> None:

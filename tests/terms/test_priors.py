@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from helpers.derivatives import differences_by_state, jacobian_by_state
 from helpers.ground import cars_on
 from helpers.twists import twists
 from torch import Tensor
@@ -21,7 +20,6 @@ from directshape_torch.terms.priors import (
     dimensions_prior,
     height_prior,
     pose_prior,
-    shape_prior,
     tilt_prior_cosine,
     tilt_prior_normal,
 )
@@ -34,10 +32,6 @@ BASIS_HWL = torch.tensor([[0.1, 0.0, 0.02], [0.03, 0.1, 0.0], [0.3, -0.1, 0.2]],
 SIGMA_HWL = torch.tensor([0.1, 0.1, 0.4], dtype=torch.float64)
 
 
-def _shape(state: CarState) -> PriorResidual:
-    return shape_prior(state.code)
-
-
 def _on_ground(form: Callable[[CarBatch, CarState], PriorResidual]) -> Callable[[CarState], PriorResidual]:
     return lambda state: form(cars_on(NORMAL, OFFSET, len(state.code)), state)
 
@@ -46,62 +40,12 @@ def _linear_dimensions(code: Tensor) -> DimensionsDerivative:
     return DimensionsDerivative(MEAN_HWL + code @ BASIS_HWL.T, BASIS_HWL.expand(len(code), -1, -1))
 
 
-def _dimensions(state: CarState) -> PriorResidual:
-    detector = torch.tensor([1.4, 1.7, 4.3], dtype=torch.float64).expand(len(state.code), 3)
-    return dimensions_prior(_linear_dimensions(state.code), detector, SIGMA_HWL)
-
-
-POSE_SIGMA = torch.tensor([0.8, 0.5, 0.4, 0.07], dtype=torch.float64)
-
-
-def _pose(state: CarState) -> PriorResidual:
-    detector = pose_from_kitti(torch.tensor([2.3, 1.7, 14.0]).double(), torch.tensor(-2.8).double())
-    count = len(state.code)
-    return pose_prior(state.T_obj_cam, detector.expand(count, 4, 4), POSE_SIGMA.expand(count, 4), NUM_CODES)
-
-
-PRIORS: dict[str, Callable[[CarState], PriorResidual]] = {
-    "shape": _shape,
-    "height": _on_ground(height_prior),
-    "tilt": _on_ground(tilt_prior_normal),
-    "cosine": _on_ground(tilt_prior_cosine),
-    "dimensions": _dimensions,
-    "pose": _pose,
-}
-
-
 def states(regime: str) -> CarState:
     T_cam_obj = se3.exp(0.5 * twists("normal", 4))
     depth = {"typical": 15.0, "near": 3.0, "far": 80.0, "three_sigma": 15.0}[regime]
     T_cam_obj[:, :3, 3] = torch.tensor([2.0, 1.6, depth], dtype=torch.float64)
     code = 3.0 * torch.ones(4, NUM_CODES, dtype=torch.float64) if regime == "three_sigma" else torch.zeros(4, NUM_CODES)
     return CarState.of(se3.inverse(T_cam_obj), code.double())
-
-
-@pytest.mark.parametrize("regime", ["typical", "near", "far", "three_sigma"])
-@pytest.mark.parametrize("name", PRIORS)
-def test_jacobian_three_ways(name: str, regime: str) -> None:
-    prior, state = PRIORS[name], states(regime)
-    analytic = prior(state).J_residual_state
-    rows = analytic.shape[1]
-
-    def residual(at: CarState) -> Tensor:
-        return prior(at).residual.reshape(-1)
-
-    own = torch.arange(4)
-    by_autograd = jacobian_by_state(residual, state).view(4, rows, 4, -1)[own, :, own]
-    by_differences = differences_by_state(residual, state).view(4, rows, 4, -1)[own, :, own]
-    torch.testing.assert_close(analytic, by_autograd, rtol=1e-10, atol=1e-12)
-    torch.testing.assert_close(analytic, by_differences, rtol=1e-6, atol=1e-8)
-
-
-@pytest.mark.parametrize("name", PRIORS)
-@pytest.mark.parametrize("count", [0, 1, 3])
-def test_shapes(name: str, count: int) -> None:
-    state = CarState.of(torch.eye(4).double().repeat(count, 1, 1), torch.zeros(count, NUM_CODES).double())
-    result = PRIORS[name](state)
-    assert len(result.residual) == count
-    assert result.J_residual_state.shape == (*result.residual.shape, 6 + NUM_CODES)
 
 
 def _standing(height_m: float, roll_rad: float = 0.0) -> CarState:
