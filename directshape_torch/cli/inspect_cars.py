@@ -20,11 +20,15 @@ from directshape_torch.io.kitti_labels import box_corners_cam
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.io.track_files import track_name
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.visualize.car_figures import (
+    write_drift_figure,
+    write_iteration_animation,
+    write_residual_figure,
+    write_sampling_figure,
+)
+from directshape_torch.visualize.car_view import CarView
 from directshape_torch.visualize.drawing import Picture, View, draw_box, draw_contour, draw_text
 from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars
-from directshape_torch.visualize.inspection.car_view import CarView
-from directshape_torch.visualize.inspection.course_figures import write_drift_figure, write_iteration_animation
-from directshape_torch.visualize.inspection.still_figures import write_residual_figure, write_sampling_figure
 from directshape_torch.visualize.overlay import overlay_of_frame
 from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
 

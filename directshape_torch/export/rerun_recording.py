@@ -25,10 +25,15 @@ from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.status import Status
+from directshape_torch.visualize.car_figures import WORST_SILHOUETTE
 from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour, blue_white_red, picture_of
-from directshape_torch.visualize.inspection.pixel_residuals import CarResiduals, PixelResiduals, car_residuals
-from directshape_torch.visualize.inspection.still_figures import WORST_SILHOUETTE
-from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
+from directshape_torch.visualize.refinement_trace import (
+    CarResiduals,
+    PixelResiduals,
+    RefinementTrace,
+    car_residuals,
+    trace_refinement,
+)
 
 if TYPE_CHECKING:
     import trimesh

@@ -33,12 +33,7 @@ _FARTHEST_PX = 1e5
 
 
 def picture_of(image: Tensor) -> Picture:
-    """An image (3, h, w) in [0, 1] as a picture (h, w, 3); what is not a number is black.
-
-    Examples:
-        >>> picture_of(torch.tensor([0.0, 0.5, torch.nan]).view(3, 1, 1)).tolist()
-        [[[0, 128, 0]]]
-    """
+    """An image (3, h, w) in [0, 1] as a picture (h, w, 3); what is not a number is black."""
     levels = (255 * image.detach().nan_to_num().clamp(0, 1)).round().to(torch.uint8)
     return np.ascontiguousarray(levels.permute(1, 2, 0).cpu().numpy())
 
@@ -56,13 +51,7 @@ class View:
         return cls(picture_of(frame.images_left[0]), frame.camera.K_left[0].double().cpu().numpy())
 
     def part(self, window: Window, scale: float) -> View:
-        """A window, enlarged; beyond the picture it is black.
-
-        Examples:
-            >>> view = View(np.zeros((4, 6, 3), np.uint8), np.eye(3)).part((1, 1, 5, 3), 2.0)
-            >>> view.picture.shape, view.K[0].tolist()
-            ((4, 8, 3), [2.0, 0.0, -1.5])
-        """
+        """A window, enlarged; beyond the picture it is black."""
         u0, v0, u1, v1 = window
         part = np.zeros((v1 - v0, u1 - u0, 3), np.uint8)
         height, width = self.picture.shape[:2]
@@ -112,12 +101,7 @@ def window_around(bounds: tuple[float, float, float, float], wide: float, tall: 
 
 
 def pixel_grid(window: Window, columns: int) -> Tensor:
-    """Pixels (h, w, 2) at equal steps over a window, so many in a row.
-
-    Examples:
-        >>> pixel_grid((10, 20, 30, 30), 10).shape
-        torch.Size([5, 10, 2])
-    """
+    """Pixels (h, w, 2) at equal steps over a window, so many in a row."""
     u0, v0, u1, v1 = window
     step = (u1 - u0) / columns
     # Counted in whole numbers: a range of float steps may end on the window's border, outside of the image.
@@ -146,10 +130,9 @@ def draw_contour(view: View, surface: Surface, colour: Colour, thickness: int = 
 
 
 def silhouette_mask(view: View, surface: Surface, padding: int = 0) -> Picture:
-    """Where a triangle of the shape is seen, 255, else 0; triangles that reach behind the camera are left out.
+    """Where a triangle of the shape is seen, 255, else 0, (h + 2 padding, w + 2 padding): the picture and a rim.
 
-    Returns:
-        (h + 2 padding, w + 2 padding): the picture with that many pixels around it.
+    Triangles that reach behind the camera are left out.
     """
     height, width = view.picture.shape[:2]
     mask = np.zeros((height + 2 * padding, width + 2 * padding), np.uint8)

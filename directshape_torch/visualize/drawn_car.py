@@ -96,16 +96,10 @@ def cars_after(
     prior: ShapePrior | None,
     mesh_files: Sequence[Path | None] | None = None,
 ) -> list[DrawnCar]:
-    """The refined shapes with the boxes of the result; cars that were not refined stay as they were.
+    """The refined shapes, of the prior or else of saved meshes, with the boxes of the result.
 
-    Args:
-        lines, statuses, T_cam_obj, codes, corners: what the refinement left of B cars.
-        before: the cars as they were, or None where nobody knows.
-        prior: gives the shapes; None takes those of the files.
-        mesh_files: of each car, in its place in the left camera frame, where one was saved.
-
-    Raises:
-        DataFormatError: a file is no readable mesh.
+    Cars that were not refined stay as they were `before`, where that is known. Raises `DataFormatError` for a file
+    that is no readable mesh.
     """
     cars = []
     for car, status in enumerate(statuses):

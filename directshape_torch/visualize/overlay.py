@@ -46,15 +46,7 @@ _LEAST_DEPTH_M = 15.0
 
 
 def overlay_of_frame(loaded: LoadedFrame, result: RefinementResult) -> Picture:
-    """The picture of a refined frame.
-
-    Args:
-        loaded: the frame.
-        result: of its detections.
-
-    Returns:
-        (h, w, 3) RGB uint8.
-    """
+    """The picture (h, w, 3), RGB, of a refined frame."""
     before, after = drawn_cars(loaded, result)
     classes = [one.type for one in loaded.detected_objects]
     truth = true_corners(loaded.labels, classes, loaded.frame.camera.t_cam_ref[0])
@@ -68,14 +60,7 @@ def overlay_picture(
     truth_corners_cam: Sequence[Array] = (),
     title: str = "",
 ) -> Picture:
-    """Two rows with the image, before and after; below them each car enlarged; beside them the view from above.
-
-    Args:
-        view: the left image.
-        before, after: the same cars in both states, with their shapes.
-        truth_corners_cam: (8, 3) corners of each true box.
-        title: of the picture.
-    """
+    """Two rows with the image, before and after; below them each car enlarged; beside them the view from above."""
     inks = [car.colour for car in after]
     rows = [
         _image_row(view, before, [ORANGE] * len(before), f"{title}  before: the detection's box, mean shape"),
@@ -113,10 +98,7 @@ def _image_row(image: View, cars: Sequence[DrawnCar], inks: Sequence[Colour], ti
 
 
 def _tile_strip(image: View, before: Sequence[DrawnCar], after: Sequence[DrawnCar], width_px: int) -> Picture:
-    """All cars that are seen in the image, side by side; (h, width_px, 3).
-
-    Tiles are made a little smaller where that saves a second row, else they wrap into as many rows as needed.
-    """
+    """All cars that are seen in the image, side by side, a little smaller where that saves a second row."""
     for height_px in (*_TILE_HEIGHTS_PX, _TILE_HEIGHTS_PX[0]):
         tiles = [_tile(image, *pair, height_px) for pair in zip(before, after, strict=True)]
         rows = _wrapped([tile for tile in tiles if tile is not None], width_px)
@@ -175,9 +157,9 @@ class Footprint:
     """One box of the view from above."""
 
     corners_cam: Array  # (8, 3) in the order of `box_corners`: the first two are at the front
-    colour: Colour  # of its outline
+    colour: Colour
     thickness: int = 1  # of its outline, pixels
-    label: str = ""  # text beside it, or ""
+    label: str = ""
     is_framed: bool = True  # whether the picture is made large enough to show it
 
 

@@ -27,17 +27,8 @@ _FEW, _DOT_RADIUS_PX, _DOT_RADIUS_OF_FEW_PX = 500, 2, 6
 def draw_rigs(
     rigs: Sequence[RigEstimate],  # at least one
 ) -> Picture:  # (H, W, 3) RGB
-    """One below the other: what was found in words, the field, the detections' offsets before it and after.
-
-    The offsets are less the detector's own bias.
-
-    Examples:
-        >>> from directshape_torch.rig.estimate import RigEstimate
-        >>> K, T_right_cam = torch.eye(3), torch.eye(4)
-        >>> T_right_cam[0, 3] = -0.5
-        >>> draw_rigs([RigEstimate((320, 96), K, K, T_right_cam)]).shape
-        (424, 320, 3)
-    """
+    """One below the other: what was found in words, the field, the detections' offsets, less their own bias, before
+    the field and after."""
     pictures = []
     for rig in rigs:
         offset = rig.rows[:, 3] - rig.detector.bias * rig.rows[:, 2]
@@ -52,10 +43,7 @@ def draw_disparity_field(
     uv_left: Tensor,  # (P, 2) pixels of the data
     bias_px: Tensor,  # (P,) measured minus true disparity there
 ) -> Picture:  # (3 * (H + title), W, 3) RGB
-    """Three panels, blue negative, white zero, red positive: the field, the data before, the data after.
-
-    The field is shown as it is used, continued beyond the hull of the data (grey polygon) by its nearest value.
-    """
+    """Three panels, blue negative, white zero, red positive: the field, the data before, the data after."""
     values, after = _field_values(field), bias_px - field.bias(uv_left)
     most = max(float(np.abs(values).max()), float(bias_px.abs().quantile(0.9)) if len(bias_px) else 0.0)
     limit = max(0.5, math.ceil(2 * most) / 2)

@@ -13,8 +13,7 @@ from directshape_torch.io.config_files import load_config
 from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
-from directshape_torch.visualize.inspection.pixel_residuals import car_residuals
-from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement
+from directshape_torch.visualize.refinement_trace import RefinementTrace, car_residuals, trace_refinement
 
 _SEARCH = "search.disparity_offsets_px=[-2,2]"
 
