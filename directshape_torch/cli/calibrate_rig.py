@@ -18,11 +18,18 @@ from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
 from directshape_torch.rig.estimate import RigEstimate, rig_among
-from directshape_torch.rig.known_depth import TruthSource, add_truth, chosen_frames, observe_frame, truth_files
-from directshape_torch.rig.of_dataset import estimate_rigs
+from directshape_torch.rig.from_files import (
+    TruthSource,
+    add_truth,
+    chosen_frames,
+    estimate_rigs,
+    observe_frame,
+    observe_motion,
+    open_sequence,
+    truth_files,
+)
 from directshape_torch.rig.rig_file import load_rigs, save_rigs
 from directshape_torch.rig.self_calibration import self_calibrate
-from directshape_torch.rig.stereo_sequence import observe_motion, open_sequence
 from directshape_torch.visualize.rig_picture import draw_rigs
 
 

@@ -30,7 +30,7 @@ from directshape_torch.files.atomic_files import write_png
 from directshape_torch.io.frame_collation import collate
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, RigEstimates
-from directshape_torch.rig.of_dataset import estimate_rigs
+from directshape_torch.rig.from_files import estimate_rigs
 from directshape_torch.rig.rig_file import RIG_FILE, RIG_PICTURE, holds_rigs, load_rigs, save_rigs
 from directshape_torch.scene_check.check_scene import check_scene
 from directshape_torch.terms.lidar import LidarPoints

@@ -116,17 +116,17 @@ class RigEstimate(nn.Module):
     @property
     def mean(self) -> Tensor:
         """(12,) coefficients of the field (pixels), relative depth bias of the detector, its setback (metres)."""
-        return self._posterior().mean
+        return self._solve()[0].mean
 
     @property
     def covariance(self) -> Tensor:
         """(12, 12), of `mean`."""
-        return self._posterior().covariance
+        return self._solve()[0].covariance
 
     @property
     def detector(self) -> Detector:
         """Bias and noise of the detector's depths; without detections those of the prior."""
-        found = self._posterior()
+        found = self._solve()[0]
         sigma = float(found.covariance[BIAS, BIAS].sqrt())
         return Detector(float(found.mean[BIAS]), sigma, found.depth_noise, len(self.rows))
 
@@ -139,10 +139,7 @@ class RigEstimate(nn.Module):
         self,
         uv_left: Tensor,  # (*, 2) pixels of the left image
     ) -> tuple[Tensor, Tensor]:  # (*,), (*,)
-        """Measured less true disparity and its standard deviation, pixels, in the dtype of `uv_left`.
-
-        Beyond the data the field's value is that of the nearest data and the standard deviation that of the place.
-        """
+        """Measured less true disparity, beyond the data that of the nearest ones, and its deviation (pixels)."""
         return self.field.bias(uv_left), self.field.sigma(uv_left)
 
     def in_the_middle(self) -> tuple[float, float]:
@@ -257,9 +254,6 @@ class RigEstimate(nn.Module):
     @property
     def _focal_baseline(self) -> float:
         return float(self._blank.K_left[0, 0] * -self._blank.T_right_cam[0, 3])
-
-    def _posterior(self) -> Posterior:
-        return self._solve()[0]
 
     def _solve(self) -> tuple[Posterior, DisparityField]:
         if self._solved is None:

@@ -5,7 +5,7 @@ Stereo gives the same depths with the rig's bias on them. So `measured disparity
 bias(u, v)`, the factor s free: points of different depth in the same part of the image separate the two, and the
 constant of the field comes from the far ones, whose disparity is hardly more than the bias. What trades with the factor
 is a bias proportional to disparity: a wrong baseline, which no image shows, and on a road, where disparity is affine in
-v, the field's slope along v. The known height of the camera decides that one (`rig/road.py`).
+v, the field's slope along v. The known height of the camera decides that one (`RoadConstraint`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pixels of known depth as evidence on a rig's field: LiDAR, disparity maps, and points of a moving rig."""
+"""Pixels of known depth as evidence on a rig's field: measured disparity against true, and the fit to it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,13 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
+from directshape_torch.rig.rig import Rig
+from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 
-_BALANCE_GRID = (16, 8)
+_GRID = (16, 8)
+# A match farther from the truth is a wrong match or a hidden point, not a bias.
+_LARGEST_DIFFERENCE_PX = 4.0
+_POINTS_PER_FRAME = 30_000
 # Points of one cell share their scene and its errors: they count as this many independent ones at most, and those of
 # one frame, which share its scene and the errors of the model, as that many.
 _INDEPENDENT_PER_CELL = 10
@@ -117,19 +122,53 @@ def _information(
     return share * basis.T @ (weight[:, None] * basis), share * basis.T @ (weight * offset_px)
 
 
-def cell_index(
-    uv: Tensor,  # (P, 2)
-    size_wh: tuple[int, int],
-    grid: tuple[int, int],
-) -> Tensor:  # (P,)
-    """Number of the image cell of each pixel, row by row, in a grid of columns x rows."""
-    column = (uv[:, 0] * grid[0] / size_wh[0]).long().clamp(0, grid[0] - 1)
-    row = (uv[:, 1] * grid[1] / size_wh[1]).long().clamp(0, grid[1] - 1)
-    return row * grid[0] + column
+def _cell_index(uv: Tensor, size_wh: tuple[int, int]) -> Tensor:
+    """Number (P,) of the image cell of each pixel (P, 2), row by row."""
+    column = (uv[:, 0] * _GRID[0] / size_wh[0]).long().clamp(0, _GRID[0] - 1)
+    row = (uv[:, 1] * _GRID[1] / size_wh[1]).long().clamp(0, _GRID[1] - 1)
+    return row * _GRID[0] + column
 
 
 def _balance(uv: Tensor, size_wh: tuple[int, int]) -> Tensor:
     """Weights that let no part of the image outvote another, as the road would, which has most of the points."""
-    cell = cell_index(uv, size_wh, _BALANCE_GRID)
-    count = torch.bincount(cell, minlength=_BALANCE_GRID[0] * _BALANCE_GRID[1]).double()
+    cell = _cell_index(uv, size_wh)
+    count = torch.bincount(cell, minlength=_GRID[0] * _GRID[1]).double()
     return (_INDEPENDENT_PER_CELL / count[cell]).clamp_max(1.0)
+
+
+def observe_disparity(
+    pair: MatchedPair,
+    rig: Rig,
+    known: Tensor,  # (P, 3) u, v, depth
+) -> Tensor:
+    """Measure the disparity at pixels of known depth: semi-global matching, then alignment of small patches.
+
+    Returns:
+        (Q, 4) u, v, measured minus true disparity, measured minus true row in the right image, where both methods
+        found the point, of at most 30 000 of the pixels, evenly over the image.
+    """
+    uv, displacement = known[:, :2], rig.displacement(known[:, :2], known[:, 2])
+    last = torch.tensor(rig.size_wh) - 1
+    column, row = torch.minimum(uv.round().long().clamp_min(0), last).unbind(dim=1)
+    measured = pair.matched[row, column]
+    # Comparisons with NaN are false, so unmatched pixels drop out here.
+    usable = torch.nonzero((measured - displacement[:, 0]).abs() < _LARGEST_DIFFERENCE_PX)[:, 0]
+    chosen = usable[_evenly(uv[usable], rig.size_wh, _POINTS_PER_FRAME)]
+    uv, true = uv[chosen], displacement[chosen]
+    # The semi-global disparity leans towards whole pixels.
+    found = pair.aligned(uv, measured[chosen], true[:, 1])
+    offset = torch.stack([found.disparity - true[:, 0], true[:, 1] - found.row_shift], dim=1)
+    keep = found.reliable & (offset[:, 0].abs() < _LARGEST_DIFFERENCE_PX)
+    return torch.cat([uv, offset], dim=1)[keep]
+
+
+def _evenly(uv: Tensor, size_wh: tuple[int, int], count: int) -> Tensor:
+    """At most `count` of the pixels, thinning full cells first; in their order."""
+    if len(uv) <= count:
+        return torch.arange(len(uv))
+    shuffled = torch.randperm(len(uv), generator=torch.Generator().manual_seed(0))
+    cell = _cell_index(uv[shuffled], size_wh)
+    by_cell = torch.argsort(cell, stable=True)
+    rank_in_cell = torch.arange(len(uv)) - torch.searchsorted(cell[by_cell], cell[by_cell])
+    first = torch.argsort(rank_in_cell, stable=True)[:count]
+    return shuffled[by_cell[first]].sort().values

@@ -16,17 +16,20 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from directshape_torch.errors import InputError
+from directshape_torch.geometry.camera import rays_from_pixels
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
 from directshape_torch.geometry.projection import warp_to_right
 from directshape_torch.rig.pixels import COEFFICIENT_SIGMA_PX, PixelEvidence, pixel_evidence
 from directshape_torch.rig.rig import Rig
+from directshape_torch.stereo_matching.patch_alignment import MatchedPair
+from directshape_torch.stereo_matching.plane_from_points import fit_ground_plane
 
 # Standard deviation of a patch's disparity, pixels.
 PATCH_SIGMA_PX = 0.12
@@ -40,6 +43,18 @@ _CONVERGED_PX = 1e-4
 # A field less certain than this at its own data is that of the prior, not of the images.
 _LARGEST_SIGMA_PX = 0.5
 _LEAST_SIGMA_PX, _UNKNOWN_SIGMA_PX = 0.05, 0.2
+# Of the road.
+_SPACING_PX = 8
+_BORDER_PX = 6
+_DEPTH_RANGE_M = (4.0, 30.0)
+_LARGEST_LATERAL_M = 8.0
+# From the plane through the raw points, which is off itself by the rig's bias.
+_LARGEST_DIFFERENCE_PX = 1.5
+_FEWEST_PIXELS = 100
+# Roads are even to about this share of the camera's height, and so is the disparity on them.
+_UNEVENNESS = 0.01
+# A car bounces on its springs, and its road is no plane: this much, metres, in every frame.
+_HEIGHT_SIGMA_M = 0.02
 
 
 class Linearisation(NamedTuple):
@@ -49,23 +64,14 @@ class Linearisation(NamedTuple):
     g: Tensor  # (M + 10,)
     spread: float  # how many times larger than expected the residuals are, by their median
 
-    def of_field(self) -> tuple[Tensor, Tensor]:
-        """H (10, 10) and g (10,) of the coefficients with the other unknowns eliminated."""
-        M = len(self.g) - NUM_COEFFICIENTS
-        solved = self._solved()
-        return self.H[M:, M:] - self.H[M:, :M] @ solved[:, 1:], self.g[M:] - self.H[M:, :M] @ solved[:, 0]
-
-    def own_step(self, step: Tensor) -> Tensor:
-        """Step (M,) of the constraint's own unknowns that belongs to a step (10,) of the coefficients."""
-        solved = self._solved()
-        return 0.0 - (solved[:, 0] + solved[:, 1:] @ step)
-
-    def _solved(self) -> Tensor:
-        M = len(self.g) - NUM_COEFFICIENTS
-        own = self.H[:M, :M]
+    def of_field(self) -> tuple[Tensor, Tensor, Tensor]:
+        """H (10, 10) and g (10,) of the coefficients with the other unknowns eliminated, and these: minus their step is
+        affine in that of the coefficients, a column of constants and a matrix (M, 1 + 10)."""
+        H, g, M = self.H, self.g, len(self.g) - NUM_COEFFICIENTS
         # A direction of its own unknowns that nothing sees (a bend of the road) stays where it is.
-        own = own + torch.diag(1e-9 * own.diagonal() + 1e-12)
-        return torch.as_tensor(torch.linalg.solve(own, torch.cat([self.g[:M, None], self.H[:M, M:]], dim=1)))
+        seen = H[:M, :M] + torch.diag(1e-9 * H[:M, :M].diagonal() + 1e-12)
+        own = torch.linalg.solve(seen, torch.cat([g[:M, None], H[:M, M:]], dim=1))
+        return H[M:, M:] - H[M:, :M] @ own[:, 1:], g[M:] - H[M:, :M] @ own[:, 0], own
 
 
 @dataclass(frozen=True)
@@ -194,7 +200,7 @@ def _solve(constraints: Sequence[FieldConstraint], on_step: Callable[[], object]
         H = H_prior + sum(part[0] for part in parts)
         step = -torch.linalg.solve(H, H_prior @ coefficients + sum(part[1] for part in parts))
         coefficients = coefficients + step
-        current = [c.moved(one.own_step(step)) for c, one in zip(current, linear, strict=True)]
+        current = [c.moved(-(own[:, 0] + own[:, 1:] @ step)) for c, (_, _, own) in zip(current, parts, strict=True)]
         shrink = math.inf if iteration < _FIRST_ITERATIONS else _SHRINK
         scales = [max(1.0, min(shrink * old, new.spread)) for old, new in zip(scales, linear, strict=True)]
         on_step()
@@ -219,3 +225,62 @@ def _sigma_from_halves(
         return None
     difference = polynomial_basis(observations[:, :2], size_wh) @ (first.coefficients - second.coefficients)
     return 0.5 * float(difference.square().mean().sqrt())
+
+
+@dataclass(frozen=True)
+class RoadConstraint(FieldConstraint):
+    """The road of one frame, a plane at a known height; own unknowns: `inverse_plane`.
+
+    Inverse depth is `inverse_plane . ray_cam`, hence disparity an affine function of the pixel.
+    """
+
+    inverse_plane: Tensor  # (3,) `a` with `a . x_cam = 1` on the road, 1/m: minus the upward normal over the height
+    height_m: float  # of the camera above it
+
+    def residuals(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Disparity, predicted less measured."""
+        rays_cam = rays_from_pixels(self.uv, self.rig.K_left)
+        predicted, slope = self.disparity(rays_cam, self.inverse_depth(coefficients))
+        basis = polynomial_basis(self.uv, self.rig.size_wh)
+        sigma = (PATCH_SIGMA_PX**2 + (_UNEVENNESS * self.seen[:, 2:3]) ** 2).sqrt()
+        residual = (predicted + basis @ coefficients - self.seen[:, 2])[:, None] / sigma
+        return residual, (torch.cat([slope[:, None] * rays_cam, basis], dim=1) / sigma)[:, None]
+
+    def inverse_depth(self, coefficients: Tensor) -> Tensor:
+        """That of the plane."""
+        return (rays_from_pixels(self.uv, self.rig.K_left) @ self.inverse_plane).clamp_min(1e-4)
+
+    def moved(self, own_step: Tensor) -> Self:
+        """Another plane."""
+        return replace(self, inverse_plane=self.inverse_plane + own_step)
+
+    def known(self) -> tuple[Tensor, Tensor]:
+        """The height."""
+        height = 1 / self.inverse_plane.norm()
+        return (height - self.height_m) / _HEIGHT_SIGMA_M, -self.inverse_plane * height**3 / _HEIGHT_SIGMA_M
+
+
+def find_road(pair: MatchedPair, rig: Rig, height_m: float) -> RoadConstraint | None:
+    """Pixels 4 to 30 m ahead that lie near the dominant plane; None where no road is seen."""
+    seen = pair.seen_at(_grid(pair.matched))
+    rays_cam = rays_from_pixels(seen[:, :2], rig.K_left)
+    plane = fit_ground_plane(rig.depth(seen[:, :2], seen[:, 2])[:, None] * rays_cam)
+    if plane is None:
+        return None
+    inverse_plane = -plane[0] / plane[1]
+    depth = 1 / (rays_cam @ inverse_plane).clamp_min(1e-3)
+    near = (seen[:, 2] - rig.displacement(seen[:, :2], depth)[:, 0]).abs() < _LARGEST_DIFFERENCE_PX
+    ahead = (depth > _DEPTH_RANGE_M[0]) & (depth < _DEPTH_RANGE_M[1])
+    on_road = near & ahead & ((depth * rays_cam[:, 0]).abs() < _LARGEST_LATERAL_M)
+    if int(on_road.sum()) < _FEWEST_PIXELS:
+        return None
+    return RoadConstraint(rig, seen[on_road], inverse_plane, height_m)
+
+
+def _grid(matched: Tensor) -> Tensor:
+    """(P, 2) every eighth pixel of the lower half that has a disparity."""
+    height, width = matched.shape
+    v = torch.arange(height // 2, height - _BORDER_PX, _SPACING_PX)
+    u = torch.arange(_BORDER_PX, width - _BORDER_PX, _SPACING_PX)
+    uv = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1).reshape(-1, 2)
+    return uv[matched[uv[:, 1], uv[:, 0]].isfinite()].double()

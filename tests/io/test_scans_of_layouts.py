@@ -14,7 +14,7 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.io.frame_layout import FrameLayout
 from directshape_torch.io.kitti_calibration import read_velo_to_cam, to_stereo_camera
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
-from directshape_torch.rig.known_depth import known_depth_from_lidar
+from directshape_torch.rig.from_files import known_depth_from_lidar
 from directshape_torch.rig.rig import Rig
 
 FRAME = "000000"

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
-from directshape_torch.rig.known_depth import known_depth_from_lidar
+from directshape_torch.rig.from_files import known_depth_from_lidar
 from directshape_torch.rig.rig import Rig
 
 SIZE = (400, 160)

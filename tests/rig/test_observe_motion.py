@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from directshape_torch.cli.main import make_parser
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.atomic_files import write_png
+from directshape_torch.rig.from_files import observe_motion, open_sequence
 from directshape_torch.rig.motion import MotionConstraint
 from directshape_torch.rig.rig_file import load_fields
-from directshape_torch.rig.stereo_sequence import observe_motion, open_sequence
 
 SIZE = (320, 160)
 FOCAL_PX, BASELINE_M, BIAS_PX = 300.0, 0.5, -0.4

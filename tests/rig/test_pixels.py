@@ -143,7 +143,7 @@ def test_each_of_two_rigs_has_its_estimate_and_unknown_frames_are_refused(tmp_pa
     "DIRECTSHAPE_DATA" not in os.environ, reason="DIRECTSHAPE_DATA, the folder of KITTI frames, is not set"
 )
 def test_real_frame_has_the_known_field() -> None:
-    from directshape_torch.rig.known_depth import add_truth, observe_frame, truth_files
+    from directshape_torch.rig.from_files import add_truth, observe_frame, truth_files
 
     root = Path(os.environ["DIRECTSHAPE_DATA"]) / "kitti"
     rigs: list[RigEstimate] = []

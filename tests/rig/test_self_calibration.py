@@ -17,8 +17,7 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.rig.estimate import RigEstimate
 from directshape_torch.rig.motion import MotionConstraint
 from directshape_torch.rig.rig import Rig
-from directshape_torch.rig.road import RoadConstraint
-from directshape_torch.rig.self_calibration import FieldConstraint, SelfCalibration, self_calibrate
+from directshape_torch.rig.self_calibration import FieldConstraint, RoadConstraint, SelfCalibration, self_calibrate
 
 SIZE = (1242, 375)
 HEIGHT_M = 1.65

@@ -1,0 +1,307 @@
+"""Evidence on rigs from files: detections of a data set, disparity maps or LiDAR, consecutive frames."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
+from directshape_torch.geometry.projection import project
+from directshape_torch.geometry.stereo_camera import StereoCamera
+from directshape_torch.io.frame_layout import image_stems
+from directshape_torch.io.image_files import find_image, read_disparity, read_pair, read_rgb
+from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, to_stereo_camera
+from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.io.velodyne import read_scan
+from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.motion import STEPS, StereoFeatures, find_features, track_features
+from directshape_torch.rig.pixels import observe_disparity, pixel_evidence
+from directshape_torch.rig.rig import Rig
+from directshape_torch.rig.self_calibration import FieldConstraint, find_road
+from directshape_torch.stereo_matching.patch_alignment import MatchedPair
+
+TruthSource = Literal["disparity", "lidar"]
+Frame = tuple[Rig, Tensor]  # and observations (P, 4), see `observe_disparity`
+
+# Half a second each, and an estimate from detections hardly gets better than that.
+_MOST_FRAMES = 60
+_SIGMA_PX = 0.06
+_DEPTH_RANGE_M = (3.0, 80.0)
+# The scanner stands higher than the camera and looks over things. A point is hidden where a neighbour within this many
+# pixels is nearer by this much disparity; on a level road five rows are 1.6 px.
+_WINDOW_PX = 5
+_HIDDEN_BY_PX = 2.5
+
+
+def estimate_rigs(
+    dataset: StereoDataset,
+    tell: Callable[[str], object] = lambda _: None,
+    rigs: list[RigEstimate] | None = None,
+) -> list[RigEstimate]:
+    """One estimate for each calibration among the frames of a data set, whichever of them are chosen.
+
+    Frames with cars are taken evenly from all of them, at most 60 a rig, until the field is known to 0.06 px in the
+    middle of the cars. What cannot be read is passed over: it is reported when its turn comes.
+
+    Args:
+        dataset: a disparity field of its own is not used.
+        tell: called with the name of each frame that was looked at.
+        rigs: what is known already; the evidence is added to these, and new rigs join the list.
+    """
+    plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), [] if rigs is None else rigs
+    for frame_ids in _frames_by_rig(plain):
+        _take_in(plain, frame_ids, tell, rigs)
+    return rigs
+
+
+def _frames_by_rig(dataset: StereoDataset) -> list[list[str]]:
+    """All frames, chosen or not, those of one calibration together; those whose calibration cannot be read drop out."""
+    groups: dict[bytes, list[str]] = {}
+    for frame_id in dict.fromkeys([*dataset.layout.frame_ids(), *dataset.frame_ids]):
+        with suppress(DirectShapeError, OSError):
+            calibration = dataset.layout.calibration(frame_id)
+            groups.setdefault(calibration.P2.tobytes() + calibration.P3.tobytes(), []).append(frame_id)
+    return list(groups.values())
+
+
+def _take_in(
+    dataset: StereoDataset, frame_ids: Sequence[str], tell: Callable[[str], object], rigs: list[RigEstimate]
+) -> None:
+    rig, num_seen = _rig_of_first(dataset, frame_ids, rigs), 0
+    if rig is None:
+        return
+    for frame_id in _evenly(frame_ids):
+        with suppress(DirectShapeError, OSError):
+            if not any(found.type in dataset.classes for found in dataset.objects(frame_id)):
+                continue
+            loaded = dataset.load(frame_id)
+            rig.update(loaded.frame, loaded.detections)
+            num_seen += 1
+            tell(frame_id)
+            if num_seen == _MOST_FRAMES or rig.in_the_middle()[1] < _SIGMA_PX:
+                break
+
+
+def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[RigEstimate]) -> RigEstimate | None:
+    """That of the first frame whose left image can be read; a rig whose frames have no cars is one too."""
+    for frame_id in frame_ids:
+        with suppress(DirectShapeError, OSError):
+            height, width = read_rgb(dataset.layout.images(frame_id)[0]).shape[:2]
+            camera = to_stereo_camera([dataset.layout.calibration(frame_id)], dtype=torch.float64)
+            return rig_among(rigs, Rig.of(camera, (width, height)))
+    return None
+
+
+def _evenly(frame_ids: Sequence[str]) -> list[str]:
+    """All of them, so that the first N are spread over the whole: in the order of their bit-reversed numbers.
+
+    Examples:
+        >>> "".join(_evenly("abcdefgh"))
+        'aecgbfdh'
+    """
+    num_bits = max(1, (len(frame_ids) - 1).bit_length())
+    return [frame_ids[k] for k in sorted(range(len(frame_ids)), key=lambda k: f"{k:0{num_bits}b}"[::-1])]
+
+
+def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
+    """The files of a source by frame id; of a stereo pair 2015 the first image (`NNNNNN_10`) keeps its full name.
+
+    Raises:
+        DataFormatError: there is no `root/training` or no file of that kind in it.
+    """
+    training = root / "training"
+    if not training.is_dir():
+        raise DataFormatError(root, "holds no folder 'training'", cure="give the folder above it, in KITTI's layout")
+    patterns = ("disp_noc_0/*.png", "disp_occ_0/*.png") if source == "disparity" else ("velodyne/*.bin",)
+    files = {path.stem: path for pattern in patterns for path in sorted(training.glob(pattern))}
+    if not files:
+        wanted = " or ".join(f"training/{pattern}" for pattern in patterns)
+        cure = f"choose one of --from {', '.join(get_args(TruthSource))}"
+        raise DataFormatError(root, f"holds no {wanted}", cure=cure)
+    return dict(sorted(files.items()))
+
+
+def chosen_frames(known: Sequence[str], frames: Sequence[int | str] | None) -> list[str]:
+    """The wanted frames among those that are known, a number for a name with leading zeros; all if `frames` is None.
+
+    Raises:
+        InputError: one of them is not known.
+
+    Examples:
+        >>> chosen_frames(["000107", "007322"], [107])
+        ['000107']
+    """
+    if frames is None:
+        return list(known)
+    by_word = {word: name for name in known for word in (name, int(name) if name.isdecimal() else name)}
+    missing = [str(frame) for frame in frames if frame not in by_word]
+    if missing:
+        raise InputError("frames", f"ids among {', '.join(known[:5])} ...", ", ".join(missing[:5]), "check --frames")
+    return list(dict.fromkeys(by_word[frame] for frame in frames))
+
+
+def observe_frame(root: Path, frame_id: str, truth: Path, source: TruthSource) -> Frame:
+    """Read one frame and measure its disparities where the truth is known.
+
+    Raises:
+        DataFormatError: a file is missing or damaged.
+    """
+    training = root / "training"
+    calibration = read_calibration(training / "calib" / f"{frame_id}.txt")
+    left, right = read_pair(*(find_image(training / name, frame_id) for name in ("image_2", "image_3")))
+    rig = Rig.of(to_stereo_camera([calibration], dtype=torch.float64), (left.shape[1], left.shape[0]))
+    known = _of_map(truth, rig) if source == "disparity" else known_depth_from_lidar(truth, calibration, rig)
+    return rig, observe_disparity(MatchedPair.of(left, right), rig, known)
+
+
+def add_truth(rigs: list[RigEstimate], source: TruthSource, frames: Sequence[Frame]) -> None:
+    """The evidence of observed frames to the estimates of their rigs; new rigs join the list.
+
+    Raises:
+        InputError: fewer than 50 pixels of known and measured disparity for one of the rigs.
+    """
+    of_rig: dict[RigEstimate, list[Frame]] = {}
+    for frame in frames:
+        of_rig.setdefault(rig_among(rigs, frame[0]), []).append(frame)
+    for estimate, seen in of_rig.items():
+        observations = torch.cat([observed for _, observed in seen])
+        estimate.add_pixels(source, pixel_evidence(observations, seen[0][0].size_wh, len(seen)))
+
+
+def known_depth_from_lidar(path: Path, calibration: KittiCalibration, rig: Rig) -> Tensor:
+    """Scan points (P, 3) u, v, depth that fall into the left image and are not hidden from the camera.
+
+    Raises:
+        DataFormatError: see `read_scan`.
+    """
+    points_cam = read_scan(path, calibration, to_stereo_camera([calibration], dtype=torch.float64))
+    points_cam = points_cam[(points_cam[:, 2] > _DEPTH_RANGE_M[0]) & (points_cam[:, 2] < _DEPTH_RANGE_M[1])]
+    known = torch.cat([project(points_cam, rig.K_left), points_cam[:, 2:]], dim=1)
+    limit = torch.tensor(rig.size_wh, dtype=torch.float64) - 1
+    known = known[((known[:, :2] >= 0) & (known[:, :2] <= limit)).all(dim=-1)]
+    return known[~_hidden(known[:, :2], rig.displacement(known[:, :2], known[:, 2])[:, 0], rig.size_wh)]
+
+
+def _of_map(path: Path, rig: Rig) -> Tensor:
+    """Pixels (P, 3) u, v, depth whose true disparity is known."""
+    disparity = torch.from_numpy(read_disparity(path, (rig.size_wh[1], rig.size_wh[0]))).double()
+    v, u = torch.nonzero(disparity.isfinite(), as_tuple=True)
+    uv = torch.stack([u, v], dim=-1).double()
+    known = torch.cat([uv, rig.depth(uv, disparity[v, u])[:, None]], dim=1)
+    return known[known[:, 2].isfinite()]
+
+
+def _hidden(uv: Tensor, disparity: Tensor, size_wh: tuple[int, int]) -> Tensor:
+    """Whether (P,) a much nearer point lies close by in the image."""
+    import cv2
+
+    column, row = uv[:, 0].round().long().numpy(), uv[:, 1].round().long().numpy()
+    nearest: NDArray[np.float32] = np.zeros((size_wh[1], size_wh[0]), np.float32)
+    np.maximum.at(nearest, (row, column), disparity.numpy().astype(np.float32))
+    kernel = np.ones((2 * _WINDOW_PX + 1, 2 * _WINDOW_PX + 1), np.uint8)
+    around = np.asarray(cv2.dilate(nearest, kernel))[row, column]
+    return torch.from_numpy(around).double() > disparity + _HIDDEN_BY_PX
+
+
+@dataclass(frozen=True)
+class StereoSequence:
+    """Where the frames of a sequence are."""
+
+    root: Path  # folder that holds `image_02`, `image_03` and `calib.txt`
+    frame_ids: tuple[str, ...]  # in their order in time
+    camera: StereoCamera  # the rig's calibration (one frame, float64)
+
+    def gaps(self) -> tuple[tuple[str, str], ...]:
+        """Neighbours whose numbers are farther apart than those of the closest pair; none where ids are no numbers."""
+        if not all(frame_id.isdecimal() for frame_id in self.frame_ids):
+            return ()
+        pairs = {(before, after): int(after) - int(before) for before, after in pairwise(self.frame_ids)}
+        return tuple(pair for pair, step in pairs.items() if step > min(pairs.values()))
+
+
+def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> StereoSequence:
+    """The sequence in a folder with `image_02`, `image_03` and `calib.txt` (lines P2 and P3).
+
+    Args:
+        root: the folder.
+        frames: ids of the frames to use, or None for all; they must be consecutive frames of a moving car.
+
+    Raises:
+        DataFormatError: there is no calibration, or no left or right image of a frame.
+        InputError: one of `frames` has no image, or fewer than two frames are left.
+    """
+    left, right = (_images(root, name) for name in ("image_02", "image_03"))
+    chosen = tuple(sorted(chosen_frames(left, frames), key=_in_time))
+    if len(chosen) < 2:
+        raise InputError("frames", "at least two consecutive frames", str(len(chosen)), "give more frames")
+    # Now rather than after minutes of work on the frames before it.
+    if lonely := [frame_id for frame_id in chosen if frame_id not in right]:
+        problem = f"has no image of {', '.join(lonely[:5])}"
+        cure = "add the right image of every frame, or leave frames out with --frames"
+        raise DataFormatError(root / "image_03", problem, cure=cure)
+    camera = to_stereo_camera([read_calibration(root / "calib.txt")], dtype=torch.float64)
+    return StereoSequence(root, chosen, camera)
+
+
+def _images(root: Path, name: str) -> list[str]:
+    """Ids of the images in a subfolder, in time."""
+    found = image_stems(root / name)
+    if not found:
+        cure = "--from motion needs consecutive frames: a folder with image_02, image_03 and calib.txt"
+        raise DataFormatError(root, f"holds no {name}/*.png", cure=cure)
+    return sorted(found, key=_in_time)
+
+
+def _in_time(frame_id: str) -> tuple[int, str]:
+    """Numbers in their order, with and without leading zeros."""
+    return len(frame_id), frame_id
+
+
+def observe_motion(
+    sequence: StereoSequence, height_m: float | None, frame_ids: Iterable[str] | None = None
+) -> list[FieldConstraint]:
+    """Read the frames one after the other and collect what they show.
+
+    Args:
+        sequence: of one rig.
+        height_m: of the camera above the road; None leaves the road out.
+        frame_ids: the sequence's own, as an iterator that shows progress, say.
+
+    Raises:
+        DataFormatError: an image is missing or damaged, or not as large as those before it.
+    """
+    constraints: list[FieldConstraint] = []
+    waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)
+    for frame_id in sequence.frame_ids if frame_ids is None else frame_ids:
+        left, right = read_pair(*(find_image(sequence.root / name, frame_id) for name in ("image_02", "image_03")))
+        rig = Rig.of(sequence.camera, (left.shape[1], left.shape[0]))
+        if waiting and waiting[0].rig.size_wh != rig.size_wh:
+            (width, height), before = rig.size_wh, waiting[0].rig.size_wh
+            problem = f"is {width} x {height}, the frames before it {before[0]} x {before[1]}"
+            raise DataFormatError(sequence.root / "image_02" / frame_id, problem, cure="give frames of one rig")
+        pair = MatchedPair.of(left, right)
+        road = None if height_m is None else find_road(pair, rig, height_m)
+        constraints += [] if road is None else [road]
+        waiting.append(find_features(left, pair, rig))
+        if len(waiting) == waiting.maxlen:
+            constraints += _of_first(waiting)
+    # The last frames have fewer that follow them.
+    while waiting:
+        constraints += _of_first(waiting)
+    return constraints
+
+
+def _of_first(waiting: deque[StereoFeatures]) -> Sequence[FieldConstraint]:
+    """The first frame is taken away and found again in those that follow it."""
+    first = waiting.popleft()
+    return track_features(first, [features.grey_left for features in waiting])
