@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.data_check.check_rig import check_rig
 from directshape_torch.data_check.frame_parts import gather_evidence, numbers_of, read_parts
-from directshape_torch.errors import DataFormatError, InputError
+from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
+from directshape_torch.rig.estimate import RigEstimate, rig_among
+from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.car_evidence import FrameEvidence
-from directshape_torch.scene_check.check_calibration import SPOILS_CAMERA, check_calibration
-from directshape_torch.scene_check.check_pair import SPOILS_PAIR, check_images
+from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.check_scene import Pair, check_cars
-from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
+from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, found, names
 
 DEFAULT_MAX_FRAMES = 20
 REPORT_SCHEMA_VERSION = 1
 _NAMED = 3
+FEWEST_CARS = 8
+# 0.15 px are 0.35 m at 30 m on KITTI's rig.
+LARGEST_OFFSET_PX, LARGEST_BIAS = 0.15, 0.03
+_SURE = 2.0  # standard deviations
 
 
 def check_dataset(
@@ -45,7 +50,8 @@ def check_dataset(
     for frame_id in chosen:
         findings += _check_frame(dataset, frame_id, seen)
         tell(frame_id)
-    of_cars = check_cars(seen.evidence, seen.pairs) if seen.num_cars else [_no_cars()]
+    nothing = found("no_cars", "all frames", "no detection of the chosen classes with a 3D box")
+    of_cars = check_cars(seen.evidence, seen.pairs) if seen.num_cars else [nothing]
     # Of boxes or images that are wrong an estimate would only say the same again.
     if not any(finding.severity == "error" for finding in (*findings, *of_cars)):
         of_cars += check_rig(dataset, chosen)
@@ -91,17 +97,6 @@ def _check_frame(dataset: StereoDataset, frame_id: str, seen: _Seen) -> list[Fin
     return findings
 
 
-def _no_cars() -> Finding:
-    return Finding(
-        "no_cars",
-        "error",
-        "all frames",
-        "no detection of the chosen classes with a 3D box",
-        "lines of class Car (or --classes) with positive h w l and a location",
-        "check names of classes and the folder of detections",
-    )
-
-
 def check_files(dataset: StereoDataset) -> list[Finding]:
     """One finding for each kind of file that is missing; looks at names only, so all frames can be asked."""
     missing: dict[str, list[str]] = {}
@@ -109,7 +104,7 @@ def check_files(dataset: StereoDataset) -> list[Finding]:
         for role, path in _files(dataset, frame_id):
             if not path.is_file():
                 missing.setdefault(role, []).append(str(path))
-    return [_finding(role, paths, len(dataset)) for role, paths in missing.items()]
+    return [_missing(role, paths, len(dataset)) for role, paths in missing.items()]
 
 
 def _files(dataset: StereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
@@ -121,16 +116,10 @@ def _files(dataset: StereoDataset, frame_id: str) -> Iterable[tuple[str, Path]]:
         return [("image_left", left), ("image_right", right), ("list of masks", error.path)]
 
 
-def _finding(role: str, paths: list[str], num_frames: int) -> Finding:
+def _missing(role: str, paths: list[str], num_frames: int) -> Finding:
     more = f" and {len(paths) - _NAMED} more" if len(paths) > _NAMED else ""
-    return Finding(
-        "missing_files",
-        "error",
-        f"{len(paths)} of {num_frames} frames",
-        f"no {role.replace('_', ' ')}: {', '.join(paths[:_NAMED])}{more}",
-        "every frame to have all of its files",
-        "add them, or leave the frames out with --split or --frames",
-    )
+    measured = f"no {role.replace('_', ' ')}: {', '.join(paths[:_NAMED])}{more}"
+    return found("missing_files", f"{len(paths)} of {num_frames} frames", measured)
 
 
 def report_content(report: CheckReport) -> dict[str, Any]:
@@ -142,3 +131,39 @@ def report_content(report: CheckReport) -> dict[str, Any]:
         "cars": report.num_cars,
         "findings": [asdict(finding) for finding in report.findings],
     }
+
+
+def check_rig(dataset: StereoDataset, frame_ids: Sequence[str]) -> list[Finding]:
+    """What the detections of some frames say of their rigs beyond the disparity fields that the data set has."""
+    plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), list[RigEstimate]()
+    for frame_id in frame_ids:
+        # What cannot be read was found before.
+        with suppress(DirectShapeError, OSError):
+            loaded = plain.load(frame_id)
+            rig_among(rigs, Rig.of_frame(loaded.frame)).update(loaded.frame, loaded.detections)
+    enough = [rig for rig in rigs if len(rig.rows) >= FEWEST_CARS]
+    return [finding for rig in enough for finding in (*_offset(rig, dataset), *_bias(rig))]
+
+
+def _offset(rig: RigEstimate, dataset: StereoDataset) -> list[Finding]:
+    place = rig.rows[:, :2].median(dim=0).values
+    offset, sigma = (float(x) for x in rig.offset_at(place))
+    known = sum(float(field.bias(place)) for field in dataset.disparity_fields if rig.is_of(*field.rig))
+    rest = offset - known
+    if abs(rest) < max(LARGEST_OFFSET_PX, _SURE * sigma):
+        return []
+    measured = (
+        f"disparities differ from those of the boxes by {rest:+.2f} +- {sigma:.2f} px in the middle of the cars, "
+        f"{abs(rest) * rig.metres_per_pixel(30.0):.1f} m at 30 m"
+    )
+    return [found("rig_offset", f"{len(rig.rows)} cars", measured, limit=LARGEST_OFFSET_PX)]
+
+
+def _bias(rig: RigEstimate) -> list[Finding]:
+    detector = rig.detector
+    if abs(detector.bias) < max(LARGEST_BIAS, _SURE * detector.bias_sigma):
+        return []
+    side = "near" if detector.bias < 0 else "far"
+    measured = f"boxes stand {abs(detector.bias):.1%} +- {detector.bias_sigma:.1%} too {side}".replace("%", " %")
+    limit = f"{LARGEST_BIAS:.0%}".replace("%", " %")
+    return [found("detector_bias", f"{detector.num_cars} cars", measured, limit=limit)]

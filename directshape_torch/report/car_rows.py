@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 from directshape_torch.evaluation.matching import CountedLabels, match_to_labels
-from directshape_torch.evaluation.pose_error import CarErrors, errors_of
+from directshape_torch.evaluation.pose_error import errors_of
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.run_folder import FrameResult
 from directshape_torch.report.page_parts import known
 from directshape_torch.visualize.drawn_car import is_refined
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CarRow:
     """One car of the table; None for what is not known."""
 
@@ -38,13 +39,13 @@ class CarRow:
     length_m: float | None  # of the result
     width_m: float | None
     height_m: float | None
-    counts: bool | None  # whether `directshape compare` would count its label; None without a label
-    centre_before_m: float | None  # errors against the label
-    centre_after_m: float | None
-    yaw_before_deg: float | None
-    yaw_after_deg: float | None
-    iou_before: float | None
-    iou_after: float | None
+    counts: bool | None = None  # whether `directshape compare` would count its label; None without a label
+    centre_before_m: float | None = None  # errors against the label
+    centre_after_m: float | None = None
+    yaw_before_deg: float | None = None
+    yaw_after_deg: float | None = None
+    iou_before: float | None = None
+    iou_after: float | None = None
     unseen: str  # the direction that the view shows least, in words
 
 
@@ -57,26 +58,12 @@ def car_rows(
     detections: Sequence[KittiObject] | None = None,
     labels: Sequence[KittiObject] | None = None,
 ) -> list[CarRow]:
-    """The rows of a frame.
-
-    Args:
-        frame: its number in the page.
-        result: what the run left of it.
-        detections: the lines of its cars in the detection file, or None.
-        labels: its labels, or None.
-    """
+    """The rows of the frame of that number in the page; without detections or labels what follows from them is None."""
     judged = {} if labels is None else _judged(detections, result.cars, labels)
-    return [_row(frame, result, car, *judged.get(car, (None, None, None))) for car in range(len(result.cars))]
+    return [_row(frame, result, car, judged.get(car, {})) for car in range(len(result.cars))]
 
 
-def _row(
-    frame: int,
-    result: FrameResult,
-    car: int,
-    counts: bool | None,
-    before: CarErrors | None,
-    after: CarErrors | None,
-) -> CarRow:
+def _row(frame: int, result: FrameResult, car: int, judged: dict[str, Any]) -> CarRow:
     shapes, kitti = result.shapes, result.cars[car]
     ious = [known(array[car]) for array in (shapes.mask_iou_left, shapes.mask_iou_right)]
     height, width, length = (known(size, 3) for size in shapes.boxes_hwl[car])
@@ -103,20 +90,14 @@ def _row(
         length_m=length,
         width_m=width,
         height_m=height,
-        counts=counts,
-        centre_before_m=None if before is None else known(before.centre_m),
-        centre_after_m=None if after is None else known(after.centre_m),
-        yaw_before_deg=None if before is None else known(before.yaw_deg, 2),
-        yaw_after_deg=None if after is None else known(after.yaw_deg, 2),
-        iou_before=None if before is None else known(before.bev_iou),
-        iou_after=None if after is None else known(after.bev_iou),
         unseen=shapes.unseen[car],
+        **judged,
     )
 
 
 def _judged(
     before: Sequence[KittiObject] | None, after: Sequence[KittiObject], labels: Sequence[KittiObject]
-) -> dict[int, tuple[bool, CarErrors | None, CarErrors]]:
+) -> dict[int, dict[str, Any]]:
     """For each place in `after` whose car has a label: whether that counts, and the errors before and after.
 
     Cars are matched by their 2D boxes, which a refinement leaves alone.
@@ -124,10 +105,15 @@ def _judged(
     partners = {car: partner for car, partner in enumerate(match_to_labels(after, labels)) if partner >= 0}
     cars, true = list(partners), [labels[partner] for partner in partners.values()]
     counted = CountedLabels(tuple({o.type for o in after}))
-    errors_after = errors_of([after[car] for car in cars], true)
-    errors_before = [None] * len(cars) if before is None else errors_of([before[car] for car in cars], true)
-    rows = zip(map(counted.counts, true), errors_before, errors_after, strict=True)
-    return dict(zip(cars, rows, strict=True))
+    judged: dict[int, dict[str, Any]] = {
+        car: {"counts": counted.counts(label)} for car, label in zip(cars, true, strict=True)
+    }
+    for side, objects in (("before", before), ("after", after)):
+        errors = [] if objects is None else errors_of([objects[car] for car in cars], true)
+        for car, error in zip(cars, errors, strict=False):
+            judged[car][f"centre_{side}_m"], judged[car][f"iou_{side}"] = known(error.centre_m), known(error.bev_iou)
+            judged[car][f"yaw_{side}_deg"] = known(error.yaw_deg, 2)
+    return judged
 
 
 def car_gains(rows: Sequence[CarRow]) -> list[tuple[float, int]]:

@@ -57,11 +57,8 @@ class DetailSettings:
 
 
 def frame_details(material: FrameMaterial, settings: DetailSettings) -> dict[str, Any]:
-    """Three parts by name, each parsed by the page when it is first needed.
-
-    `thumbnails`: for each car its pictures "before" and "after". `maps`: for each car its residual maps, costs by term
-    and disparity profile. `scene`: image, camera, ground, boxes and meshes.
-    """
+    """Parts by name, each parsed by the page when it is first needed: pictures of each car; its residual maps, costs
+    and disparity profile; and the 3D scene."""
     shapes, t_cam_ref = material.result.shapes, _t_cam_ref(material.result.shapes)
     before = None
     if material.detections is not None:

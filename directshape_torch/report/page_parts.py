@@ -12,7 +12,7 @@ import json
 import math
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -37,9 +37,6 @@ def page_frame(title: str) -> tuple[str, str]:
 
     The content security policy names the page's own inline scripts by their hash and lets nothing be loaded: a script
     or handler that came in with the data would not run even if it were not escaped.
-
-    Args:
-        title: text of the page's title; escaped here.
     """
     import_map = json.dumps({"imports": _modules()}, separators=(",", ":"))
     start = 'import "report/main";'
@@ -48,20 +45,12 @@ def page_frame(title: str) -> tuple[str, str]:
         "default-src 'none'; img-src data:; connect-src 'none'; form-action 'none'; base-uri 'none'; "
         f"style-src {_hash(style)}; script-src data: {_hash(import_map)} {_hash(start)}"
     )
-    values = {
-        "title": html.escape(title),
-        "policy": html.escape(policy, quote=True),
-        "style": style,
-        "import_map": import_map,
-        "start": start,
-    }
-    head, foot = (_filled(part, values) for part in _asset("page.html").split("{{data}}"))
+    values = {"title": html.escape(title), "policy": html.escape(policy, quote=True), "style": style}
+    values |= {"import_map": import_map, "start": start}
+    parts = _asset("page.html").split("{{data}}")
+    # All places in one pass: a value that looks like a place stays as it is.
+    head, foot = (re.sub(r"\{\{(\w+)\}\}", lambda place: values[place[1]], part) for part in parts)
     return head, foot
-
-
-def _filled(template: str, values: Mapping[str, str]) -> str:
-    """All places filled in one pass: a value that looks like a place stays as it is."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda place: values[place[1]], template)
 
 
 def data_block(name: str, value: object) -> str:
@@ -118,51 +107,28 @@ def known(value: float | np.floating[Any] | None, decimals: int = 4) -> float | 
 
 
 def numbers(values: Sequence[float] | npt.NDArray[np.floating[Any]], decimals: int = 5) -> list[float | None]:
-    """Several of them.
-
-    Examples:
-        >>> numbers(np.array([0.123456, np.inf]), 2)
-        [0.12, None]
-    """
+    """Several of them."""
     return [known(value, decimals) for value in values]
 
 
 def mesh_data(vertices_obj: npt.NDArray[Any], faces: npt.NDArray[Any]) -> dict[str, str]:
     """A mesh in the object frame, about 7 bytes a vertex; the page's `mesh.js` is its reader.
 
-    Args:
-        vertices_obj: (V, 3) metres.
-        faces: (F, 3) triangles.
-
-    Returns:
-        `vertices`: x of all vertices, then y, then z; `faces`: corners, triangle by triangle. Both are int32,
-        little-endian, each number less the one before it, zlib, base64.
+    `vertices`: x of all vertices in millimetres, then y, then z; `faces`: corners, triangle by triangle. Both int32,
+    little-endian, each number less the one before it, zlib, base64.
     """
     millimetres = np.round(vertices_obj * _PER_METRE).astype(np.int64)
     return {"vertices": packed(millimetres.T.reshape(-1)), "faces": packed(faces.reshape(-1))}
 
 
 def packed(numbers: npt.NDArray[np.integer[Any]]) -> str:
-    """Whole numbers as text: neighbours of a mesh differ by little, and small differences deflate well.
-
-    Examples:
-        >>> len(packed(np.arange(1000)))
-        40
-    """
+    """Whole numbers as text: neighbours of a mesh differ by little, and small differences deflate well."""
     differences = np.diff(numbers.astype(np.int64), prepend=0).astype("<i4")
     return base64.b64encode(zlib.compress(differences.tobytes(), 9)).decode("ascii")
 
 
 def data_url(picture: Picture, quality: int = _SMALL_QUALITY) -> str:
-    """A picture (h, w, 3) as WebP in a data URL.
-
-    Raises:
-        OSError: OpenCV cannot encode it.
-
-    Examples:
-        >>> data_url(np.zeros((4, 6, 3), np.uint8)).split(",")[0]
-        'data:image/webp;base64'
-    """
+    """A picture (h, w, 3) as WebP in a data URL; raises `OSError` where OpenCV cannot encode it."""
     encoded, content = cv2.imencode(".webp", picture[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])
     if not encoded:
         raise OSError(f"cannot encode a picture of shape {picture.shape} as WebP")

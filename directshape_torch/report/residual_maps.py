@@ -52,10 +52,8 @@ def residual_maps(
 ) -> tuple[Floats, Floats | None]:
     """Both maps of a car in one state, over a grid of (h, w) pixels of its window.
 
-    Returns:
-        The photometric one, right minus left, grey levels, NaN where the car is not seen in both images; and that of
-        the silhouette, positive where the shape spills out of its mask, negative where it does not fill it, None
-        without a mask.
+    The photometric one is right minus left, grey levels, NaN where the car is not seen in both images; that of the
+    silhouette is positive where the shape spills out of its mask, negative where it does not fill it, None without one.
     """
     grid = _grid(window)
     uv = grid.reshape(-1, 2)
@@ -102,13 +100,7 @@ def _silhouette(closest_sdf: Tensor, p_fg: Tensor, zeta: float, floor: float) ->
 
 
 def photometric_picture(image: Picture, window: Window, residual: Floats) -> Picture:
-    """White where left and right agree, red where the right image is brighter, blue where it is darker.
-
-    Args:
-        image: (H, W, 3) left.
-        window: of the car.
-        residual: (h, w) grey levels, NaN where there is none.
-    """
+    """White where left and right agree, red where the right image is brighter, blue where it is darker."""
     colour = blue_white_red(residual, _FULL_COLOUR_GREY_LEVELS)
     return _uint8(np.where(np.isfinite(residual)[..., None], colour, _dimmed(image, window)))
 

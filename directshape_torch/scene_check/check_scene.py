@@ -11,11 +11,9 @@ from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
 from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
-from directshape_torch.scene_check.check_calibration import SPOILS_CAMERA, check_calibration
-from directshape_torch.scene_check.check_heading import check_heading
+from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.check_masks import check_masks
-from directshape_torch.scene_check.check_pair import SPOILS_PAIR, check_images
-from directshape_torch.scene_check.check_stereo import check_distances, check_swapped, measure_cars
+from directshape_torch.scene_check.check_places import check_distances, check_heading, check_swapped, measure_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 from directshape_torch.scene_check.finding import found as found_mistake
 from directshape_torch.stereo_matching.disparity import rgb8
@@ -86,13 +84,9 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
 
 
 def check_cars(frames: Sequence[FrameEvidence], pairs: Sequence[Pair | None]) -> list[Finding]:
-    """Boxes, masks and distances; each is asked only where what it rests on was found right.
-
-    Args:
-        frames: what is known of the cars.
-        pairs: the images of each frame, None where they cannot be used.
-    """
-    cars = [measure_cars(frame, *pair) for frame, pair in zip(frames, pairs, strict=True) if pair is not None]
+    """Boxes, masks and distances, each only where what it rests on was found right; a pair is None if not usable."""
+    measured = [measure_cars(frame, *pair) for frame, pair in zip(frames, pairs, strict=True) if pair is not None]
+    cars = np.concatenate([np.empty((0, 3)), *measured])
     frames = [frame for frame in frames if len(frame.boxes)]
     swapped = check_swapped(cars)
     if swapped:

@@ -46,12 +46,7 @@ class Finding:
 
 
 def unreadable(check: str, where: str, expected: str, error: Exception, cure: str) -> Finding:
-    """A file that cannot be used, in the words of its error, which ends with a cure of its own or is given one.
-
-    Examples:
-        >>> unreadable("mask_file", "frame 1", "a list", ValueError("a.json: is empty; write it"), "?").cure
-        'write it'
-    """
+    """A file that cannot be used, in the words of its error, which ends with a cure of its own or is given one."""
     measured, _, own_cure = " ".join(str(error).split()).partition("; ")
     return Finding(check, "error", where, measured, expected, own_cure or cure)
 
@@ -95,13 +90,7 @@ class CheckReport:
 
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Errors, then warnings, then notes; else in their order.
-
-    Examples:
-        >>> note, error = (Finding("a", severity, "", "", "", "") for severity in ("note", "error"))
-        >>> [finding.severity for finding in by_severity([note, error])]
-        ['error', 'note']
-    """
+    """Errors, then warnings, then notes; else in their order."""
     return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
@@ -210,6 +199,24 @@ MISTAKES: dict[str, Mistake] = {
         "at least {limit}",
         "check that detections, masks, images and calibration are of the same frames; then frame, origin and units",
     ),
+    "missing_files": Mistake(
+        "error", "every frame to have all of its files", "add them, or leave the frames out with --split or --frames"
+    ),
+    "no_cars": Mistake(
+        "error",
+        "lines of class Car (or --classes) with positive h w l and a location",
+        "check names of classes and the folder of detections",
+    ),
+    "rig_offset": Mistake(
+        "warning",
+        "within {limit} px",
+        "nothing for 'directshape refine', which estimates it (--rig auto); for more evidence: 'calibrate-rig'",
+    ),
+    "detector_bias": Mistake(
+        "warning",
+        "within {limit}",
+        "check focal length and baseline, or the detector's training; 'directshape refine' goes by the images",
+    ),
     "distance_scale": Mistake("error", "within {limit:.0%}", "check focal length, baseline and the units of the boxes"),
 }
 
@@ -227,14 +234,9 @@ def found(
     severity: Severity | None = None,
     expected: str = "",
     cure: str = "",
-    **numbers: float,
+    **numbers: float | str,
 ) -> Finding:
-    """A finding with what the table says of its kind, unless something else is said here.
-
-    Examples:
-        >>> str(found("few_matches", "frame 1", "7 feature matches between the images", limit=30))[:73]
-        'note: few_matches (frame 1): 7 feature matches between the images; expect'
-    """
+    """A finding with what the table says of its kind, unless something else is said here."""
     kind = MISTAKES[check]
     return Finding(
         check,

@@ -13,7 +13,7 @@ from helpers.broken_data import BREAKS, copy_data
 import directshape_torch
 from directshape_torch.data_check import check_dataset as checks
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.scene_check import check_pair
+from directshape_torch.scene_check import check_images
 from directshape_torch.scene_check.finding import CheckReport
 
 DEMO = Path(directshape_torch.__file__).parent / "assets" / "demo"
@@ -35,7 +35,7 @@ def once(function: Callable[..., Any]) -> Callable[..., Any]:
 @pytest.fixture(scope="module", autouse=True)
 def match_once() -> Any:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(check_pair, "match_pair", once(check_pair.match_pair))
+        patch.setattr(check_images, "match_pair", once(check_images.match_pair))
         yield
 
 

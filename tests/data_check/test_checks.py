@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import torch
 from helpers.layouts import write_folder
+from numpy.typing import NDArray
 
 import directshape_torch
 from directshape_torch.cli.main import main
-from directshape_torch.data_check import check_rig as module
+from directshape_torch.data_check import check_dataset as module
 from directshape_torch.data_check.check_dataset import check_dataset
 from directshape_torch.data_check.frame_parts import numbers_of
 from directshape_torch.errors import InputError
@@ -23,9 +24,8 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
 from directshape_torch.scene_check.car_evidence import CarBoxes
-from directshape_torch.scene_check.check_calibration import check_calibration
-from directshape_torch.scene_check.check_pair import PairMatches, check_pair, match_pair
-from directshape_torch.scene_check.check_stereo import StereoCars, check_distances
+from directshape_torch.scene_check.check_images import PairMatches, check_calibration, check_pair, match_pair
+from directshape_torch.scene_check.check_places import check_distances
 from directshape_torch.scene_check.conventions import AS_DOCUMENTED, BoxConvention, all_conventions
 from directshape_torch.scene_check.finding import CheckReport, Finding
 
@@ -141,10 +141,10 @@ def test_every_convention_can_be_undone() -> None:
 
 
 def test_distances_tell_the_baseline_from_the_boxes() -> None:
-    def ratios(stereo: float, size: float) -> list[StereoCars]:
-        return [StereoCars(np.full(10, 20.0), np.full(10, stereo), np.full(10, size))]
+    def ratios(stereo: float, size: float) -> NDArray[np.float64]:
+        return np.tile([20.0, stereo, size], (10, 1))
 
-    assert check_distances([]) == check_distances(ratios(1.1, 1.0)) == []
+    assert check_distances(np.empty((0, 3))) == check_distances(ratios(1.1, 1.0)) == []
     assert check_distances(ratios(1.2, 1.0))[0].severity == "warning"
     (of_baseline,) = check_distances(ratios(1.5, 1.0))
     assert of_baseline.severity == "error"

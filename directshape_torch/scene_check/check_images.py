@@ -1,20 +1,31 @@
-"""The two images against each other, by feature matches: swapped, the same, of different scenes, not rectified."""
+"""Calibration and images by themselves: signs and magnitudes; swapped, mirrored, of other scenes, not rectified."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from directshape_torch.geometry.stereo_camera import StereoCamera
-from directshape_torch.scene_check.check_stereo import swapped
+from directshape_torch.scene_check.check_places import swapped
 from directshape_torch.scene_check.finding import Finding, Severity, found
 
 # With these wrong, what disparities and projections show says nothing more.
+SPOILS_CAMERA = frozenset({"baseline_sign", "baseline_length", "focal_length", "principal_point"})
 SPOILS_PAIR = frozenset(
     {"images_swapped", "image_mirrored", "same_image", "different_scenes", "not_rectified", "few_matches"}
 )
+# Lenses from 15 to 150 degrees of view across the image.
+FOCAL_SHARES = (0.13, 3.8)
+# Crops move the centre; a half of the image is no crop any more.
+CENTRE_SHARE_WARNING = 0.15
+BASELINES_M = (0.03, 3.0)
+# The squares of pixels: rectified images have them unless resized in one direction.
+ASPECT_TOLERANCE = 0.05
+# Images that were resized move both coordinates of the centre by the same factor, which is none near 1.
+_SAME_FACTOR, _LEAST_FACTOR = 0.1, 1.3
 MIN_MATCHES = 30
 # Images with so many features that still do not match are not of one scene.
 MANY_FEATURES = 500
@@ -34,6 +45,55 @@ EPIPOLAR_TOLERANCE_PX = 1.0
 CONFIDENCE = 0.999
 
 
+def check_calibration(
+    cameras: Mapping[str, NDArray[np.float64]],
+    baseline_m: float,
+    size_hw: tuple[int, int] | None,
+    where: str,
+) -> list[Finding]:
+    """Everything that the numbers alone show: intrinsics (3, 3) by camera, baseline (NaN: a focal length is nothing)
+    and size of the images, where it is known."""
+    findings = []
+    if size_hw is not None:
+        findings = [f for name, K in cameras.items() for f in _check_intrinsics(K, size_hw, f"{where}, {name}")]
+    if baseline_m <= 0:
+        measured = f"baseline {baseline_m:.4f} m: the right camera is not to the right of the left one"
+        return [*findings, found("baseline_sign", where, measured)]
+    low, high = BASELINES_M
+    if baseline_m < low or baseline_m > high:  # neither of NaN
+        findings.append(found("baseline_length", where, f"baseline {baseline_m:.4g} m", low=low, high=high))
+    return findings
+
+
+def _check_intrinsics(K: NDArray[np.float64], size_hw: tuple[int, int], where: str) -> list[Finding]:
+    height, width = size_hw
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    low, high = (share * width for share in FOCAL_SHARES)
+    if not low < fx < high:
+        in_mm = "divide a focal length in millimetres by the size of a pixel (mm); or were the intrinsics normalised?"
+        cure = in_mm if 0 < fx < low else "check the order of the numbers and whether images were resized"
+        measured = f"fx = {fx:.4g} px for images {width} px wide"
+        expected = f"between {low:.0f} and {high:.0f} px (15 to 150 degrees of view)"
+        return [found("focal_length", where, measured, expected=expected, cure=cure)]
+    findings = []
+    if abs(fx / fy - 1) > ASPECT_TOLERANCE:
+        findings.append(found("focal_length", where, f"fx = {fx:.1f}, fy = {fy:.1f} px"))
+    return findings + _check_centre((cx, cy), (width, height), where)
+
+
+def _check_centre(centre: tuple[float, float], size_wh: tuple[int, int], where: str) -> list[Finding]:
+    offset = max(abs(c / n - 0.5) for c, n in zip(centre, size_wh, strict=True))
+    if offset <= CENTRE_SHARE_WARNING:
+        return []
+    across, down = (c / (0.5 * n) for c, n in zip(centre, size_wh, strict=True))
+    resized = across > 0 and abs(across / down - 1) < _SAME_FACTOR and max(across, 1 / across) > _LEAST_FACTOR
+    inside = all(0 <= c < n for c, n in zip(centre, size_wh, strict=True))
+    severity: Severity = "error" if resized or not inside else "warning"
+    cure = f"K is of images {across:.2f} times as large: multiply fx, fy, cx and cy by {1 / across:.2f}"
+    measured = f"({centre[0]:.1f}, {centre[1]:.1f}) in images of {size_wh[0]} x {size_wh[1]} pixels"
+    return [found("principal_point", where, measured, severity=severity, cure=cure if resized else "")]
+
+
 def check_images(
     left: NDArray[np.uint8], right: NDArray[np.uint8], camera: StereoCamera | None, where: str
 ) -> list[Finding]:
@@ -50,14 +110,7 @@ def check_images(
 def check_pair(
     matches: PairMatches, camera: StereoCamera | None, size_hw: tuple[int, int], where: str
 ) -> list[Finding]:
-    """What the feature matches of a pair show.
-
-    Args:
-        matches: of its two images.
-        camera: predicts where points of a rectified pair lie; without it equal rows are expected.
-        size_hw: of the images.
-        where: named in the findings.
-    """
+    """What the feature matches of a pair show; without a camera equal rows are expected."""
     if matches.num_candidates < MIN_MATCHES and matches.num_features < MANY_FEATURES:
         measured = f"{matches.num_candidates} feature matches between the images"
         return [found("few_matches", where, measured, limit=MIN_MATCHES)]
@@ -70,7 +123,7 @@ def check_pair(
     if float(np.median(np.hypot(disparity, matches.vertical))) < SAME_IMAGE_PX:
         return [found("same_image", where, "matched points have the same place in both images")]
     negative, rows = float(np.mean(disparity < -1.0)), _row_residual(matches, disparity, camera)
-    sides = [swapped(where, negative, float(np.median(disparity)))] if negative > MAX_NEGATIVE_SHARE else []
+    sides = [swapped(where, disparity)] if negative > MAX_NEGATIVE_SHARE else []
     return sides + _check_rows(matches, rows, size_hw, where)
 
 
@@ -112,12 +165,6 @@ def fit_rows(
     """Median of the row residual, its change over the width and over the height of the image, and what is left.
 
     The slopes are fitted by least squares with points beyond three deviations left out, five times.
-
-    Examples:
-        >>> uv = np.random.default_rng(0).uniform(0, 100, (50, 2))
-        >>> _, across, down, _ = fit_rows(uv, 0.02 * (uv[:, 0] - 50), (100, 100))
-        >>> f"{across:.3f} px more at the right edge, {abs(down):.3f} px at the bottom"
-        '2.000 px more at the right edge, 0.000 px at the bottom'
     """
     height, width = size_hw
     basis = np.column_stack([np.ones(len(residual)), uv_left[:, 0] / width - 0.5, uv_left[:, 1] / height - 0.5])
@@ -149,11 +196,7 @@ class PairMatches:
 
 
 def match_pair(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> PairMatches:
-    """SIFT features matched both ways with the ratio test, then a fundamental matrix by RANSAC (of fixed seed).
-
-    Args:
-        left, right: (H, W, 3) RGB.
-    """
+    """SIFT features of two images (H, W, 3) matched both ways, then a fundamental matrix by RANSAC (of fixed seed)."""
     import cv2
 
     sift = cv2.SIFT_create(NUM_FEATURES)  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Whether cars head where they are said to: the mean car's outline against the masks, also with other headings."""
+"""Whether cars stand and head where their boxes say: distances by disparity, headings by the mean car's outline."""
 
 from __future__ import annotations
 
@@ -11,15 +11,27 @@ from numpy.typing import NDArray
 
 from directshape_torch.geometry.box3d import pose_from_kitti
 from directshape_torch.geometry.image_boxes import box_iou
+from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.scene_check.car_evidence import Floats, FrameEvidence
 from directshape_torch.scene_check.conventions import projected_boxes
-from directshape_torch.scene_check.finding import Finding, found, of_cars
+from directshape_torch.scene_check.finding import Finding, Severity, found, of_cars
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 
+# The visible surface lies before the centre by about a third of the box's depth.
+_SURFACE_SHARE = 0.33
+_MIN_HEIGHT_PX = 25
+# Cars are matched at this height: fine enough for the distance, and quick.
+_PATCH_HEIGHT_PX = 48
+# Share of the image's width that disparities may have; nearer cars are not seen by both cameras.
+_LARGEST_DISPARITY = 0.3
+_MIN_CORRELATION = 0.6
+_FEWEST_SWAPPED = 3
+WARNING_RATIO, ERROR_RATIO = 1.15, 1.3
+# The mean of a few boxes of a monocular detector may be off by more.
+FEW_CARS, WARNING_RATIO_OF_FEW = 8, 1.25
 # Outlines are compared at this size, box on box, so that where the car stands does not count.
 _SIZE_PX = 64
-_MIN_HEIGHT_PX = 25
 _NEAREST_M = 3.0
 # Of the mask's box and that of the 3D box: less is cut off, hidden, or wrong in other ways.
 _MIN_OVERLAP = 0.4
@@ -35,6 +47,120 @@ _WAYS: dict[str, tuple[Callable[[float], float], str]] = {
     "turned by 180 degrees": (lambda yaw: yaw + np.pi, "add pi to the headings"),
     "with the opposite sign": (lambda yaw: -yaw, "negate the headings"),
 }
+
+
+def measure_cars(frame: FrameEvidence, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> Floats:
+    """What both images (H, W, 3) say of the cars that have a tall enough left mask and are in front of the camera.
+
+    Returns:
+        (N, 3) disparity in pixels, and over the distance of the box that by disparity and that by the height of the
+        mask, which needs no baseline.
+    """
+    around = frame.mask_boxes["left"]
+    with np.errstate(invalid="ignore"):
+        tall = (around[:, 3] - around[:, 1] >= _MIN_HEIGHT_PX) & (frame.boxes.location[:, 2] > 0)
+    rows = []
+    for car in np.flatnonzero(tall).tolist():
+        disparity = patch_disparity(left, right, around[car])
+        if np.isfinite(disparity):
+            rows.append((disparity, *_ratios(frame, car, disparity)))
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def patch_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], box: Floats) -> float:
+    """By how many pixels what a box shows in the left image lies farther left in the right one; NaN if nowhere.
+
+    The best normalised correlation along the rows, in both directions: swapped images have negative disparities.
+    """
+    import cv2
+
+    u0, v0, u1, v1 = (int(x) for x in box)
+    scale = min(1.0, _PATCH_HEIGHT_PX / (v1 - v0))
+    reach = int(_LARGEST_DISPARITY * left.shape[1])
+    first, end = max(0, u0 - reach), min(left.shape[1], u1 + 1 + reach)
+    rows = slice(v0 + (v1 - v0) // 8, v1 + 1 - (v1 - v0) // 8)
+    patch, strip = (
+        cv2.resize(cv2.cvtColor(part, cv2.COLOR_RGB2GRAY), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        for part in (left[rows, u0 : u1 + 1], right[rows, first:end])
+    )
+    if patch.shape[1] < 8 or strip.shape[1] <= patch.shape[1] or patch.std() < 2:
+        return np.nan
+    score = cv2.matchTemplate(strip, patch[:, : strip.shape[1]], cv2.TM_CCOEFF_NORMED)[0]
+    best = int(np.argmax(score))
+    if not score[best] > _MIN_CORRELATION:
+        return np.nan
+    offset = 0.0
+    if 0 < best < len(score) - 1:
+        bend = score[best - 1] - 2 * score[best] + score[best + 1]
+        offset = 0.5 * (score[best - 1] - score[best + 1]) / bend if bend < 0 else 0.0
+    return float((u0 - first) - (best + offset) / scale)
+
+
+def _ratios(frame: FrameEvidence, car: int, disparity: float) -> tuple[float, float]:
+    camera, box = frame.camera, frame.mask_boxes["left"][car]
+    at = torch.tensor([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2], dtype=torch.float64)
+    measured = depth_from_disparity(
+        at, torch.tensor(disparity, dtype=torch.float64), camera.K_left[0], camera.K_right[0], camera.T_right_cam[0]
+    )
+    by_size = float(camera.K_left[0, 1, 1]) * float(frame.boxes.hwl[car, 0]) / float(box[3] - box[1] + 1)
+    z = _surface_depth(frame, car)
+    return float(measured) / z, by_size / z
+
+
+def _surface_depth(frame: FrameEvidence, car: int) -> float:
+    """Depth of the middle of the visible surface, metres."""
+    _, width, length = frame.boxes.hwl[car]
+    yaw = frame.boxes.rotation_y[car]
+    extent = abs(length * np.sin(yaw)) + abs(width * np.cos(yaw))
+    z = float(frame.boxes.location[car, 2] + frame.camera.t_cam_ref[0, 2])
+    return max(0.3 * z, z - _SURFACE_SHARE * float(extent))
+
+
+def check_swapped(cars: Floats) -> list[Finding]:
+    """Whether cars, as `measure_cars` has them, lie farther right in the right image."""
+    disparity = cars[:, 0]
+    if len(disparity) < _FEWEST_SWAPPED or np.mean(disparity < -1.0) < 0.7:
+        return []
+    return [swapped(of_cars(len(disparity)), disparity)]
+
+
+def swapped(where: str, disparity: Floats) -> Finding:
+    """That many of some disparities (N,) are negative, by more than a pixel."""
+    negative, median = np.mean(disparity < -1.0), np.median(disparity)
+    measured = (
+        f"{negative:.0%} of what matches lies farther right in the right image (median disparity {median:.1f} px)"
+    )
+    return found("images_swapped", where, measured)
+
+
+def check_distances(cars: Floats) -> list[Finding]:
+    """Whether boxes stand where the disparity says, over the cars of all frames, as `measure_cars` has them."""
+    ratios = cars[np.isfinite(cars[:, 1:]).all(axis=1), 1:]
+    if not len(ratios):
+        return []
+    scale, by_size = (float(x) for x in np.median(ratios, axis=0))
+    off = max(scale, 1 / scale)
+    limit = WARNING_RATIO if len(ratios) >= FEW_CARS else WARNING_RATIO_OF_FEW
+    if off < limit:
+        return []
+    severity: Severity = "error" if off > ERROR_RATIO else "warning"
+    measured = (
+        f"cars are {scale:.2f} times as far by their disparity as their boxes say "
+        f"(by the height of the masks {by_size:.2f} times)"
+    )
+    where, cure = f"all frames, {len(ratios)} cars with masks", _cure(scale, by_size)
+    return [found("distance_scale", where, measured, severity=severity, cure=cure, limit=limit - 1)]
+
+
+def _cure(scale: float, by_size: float) -> str:
+    if max(by_size, 1 / by_size) < WARNING_RATIO:
+        return (
+            f"the boxes fit the image, so the baseline is wrong: divide it by {scale:.2f}, or check that the "
+            "principal points are those of the rectified images"
+        )
+    if abs(np.log(scale / by_size)) < np.log(WARNING_RATIO):
+        return "both agree against the boxes: check the units and the frame of the boxes' locations"
+    return ""
 
 
 def check_heading(frames: Sequence[FrameEvidence]) -> list[Finding]:
