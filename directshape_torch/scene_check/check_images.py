@@ -142,7 +142,7 @@ def _row_residual(
 def _check_rows(
     matches: PairMatches, residual: NDArray[np.float64], size_hw: tuple[int, int], where: str
 ) -> list[Finding]:
-    offset, across, down, scatter = fit_rows(matches.uv_left, residual, size_hw)
+    offset, across, down, scatter = _fit_rows(matches.uv_left, residual, size_hw)
     worst = max(abs(offset), abs(across), abs(down))
     if worst > VERTICAL_WARNING_PX:
         severity: Severity = "error" if worst > VERTICAL_ERROR_PX else "warning"
@@ -157,7 +157,7 @@ def _check_rows(
     return [found("not_synchronous", where, measured, limit=SCATTER_WARNING_PX)]
 
 
-def fit_rows(
+def _fit_rows(
     uv_left: NDArray[np.float64],  # (N, 2)
     residual: NDArray[np.float64],  # (N,)
     size_hw: tuple[int, int],
