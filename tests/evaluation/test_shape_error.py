@@ -6,17 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from helpers.ellipsoids import CENTRE_OBJ, HALF_AXES, ellipsoid_prior
 from helpers.synthetic_scene import stereo_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from directshape_torch.errors import DataFormatError, InputError
-from directshape_torch.evaluation.shape_error import TAUS_M, EstimatedCar, read_depth, segment_truth, shape_error
+from directshape_torch.evaluation.shape_error import TAUS_M, read_depth, segment_truth, shape_error
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.geometry.box3d import pose_from_kitti
 
 
 def test_completeness_and_accuracy_are_told_apart() -> None:
@@ -73,39 +70,6 @@ def test_wrong_input(
 ) -> None:
     with pytest.raises(InputError, match=text):
         shape_error(true, estimated, taus)
-
-
-T_CAM_OBJ = pose_from_kitti(torch.tensor([[0.5, 1.65, 10.0]], dtype=torch.float64), torch.tensor([0.6]))[0]
-
-
-def test_points_at_pixels_are_the_first_hits_of_their_rays() -> None:
-    car = EstimatedCar(ellipsoid_prior(), torch.zeros(3, dtype=torch.float64), T_CAM_OBJ)
-    K = torch.tensor([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]], dtype=torch.float64)
-    u, v = np.meshgrid(np.arange(400.0, 900, 7), np.arange(100.0, 300, 7))
-    uv = np.stack([u.ravel(), v.ravel()], axis=-1)
-    points = car.points_at_pixels(uv, K)
-    hit = np.isfinite(points).all(axis=1)
-    seen = points[hit] @ K.numpy().T
-    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], uv[hit], atol=1e-3)
-    least, first = first_hit(uv, K.numpy())
-    # The grid of 0.2 m knows the outline to some percent of the half axes.
-    assert hit[least < 0.85].all()
-    assert not hit[least > 1.1].any()
-    clear = least < 0.85
-    assert clear.sum() > 100
-    assert np.abs(points[:, 2] - first)[clear].max() < 0.12
-
-
-def first_hit(uv: np.ndarray, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each ray its least level of the ellipsoid (below 1 inside), and the depth where it enters (NaN: it misses)."""
-    T = T_CAM_OBJ.double().numpy()
-    rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(K).T
-    origin = (-T[:3, 3] @ T[:3, :3] - CENTRE_OBJ) / np.array(HALF_AXES)
-    direction = (rays @ T[:3, :3]) / np.array(HALF_AXES)
-    a, b, c = (direction**2).sum(1), direction @ origin, origin @ origin - 1
-    least = np.sqrt(np.maximum(c + 1 - b**2 / a, 0))
-    with np.errstate(invalid="ignore"):
-        return least, (-b - np.sqrt(b**2 - a * c)) / a
 
 
 def test_points_of_a_segment_are_those_of_its_known_depths() -> None:

@@ -1,4 +1,4 @@
-"""A run resumes only into results of the same settings and files, and says what differs."""
+"""A run resumes only into results of the same settings and contents, and says what differs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,20 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
+from helpers.ellipsoids import ellipsoid_prior
 
 from directshape_torch.errors import DataFormatError, ResumeError
+from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.run_manifest import (
     RunManifest,
     check_resume,
+    hash_fields,
+    hash_prior,
     read_manifest,
     write_manifest,
 )
+from directshape_torch.shape.pca_prior import PCAShapePrior
 
 A, B = "a" * 64, "b" * 64
 
@@ -81,3 +87,35 @@ def test_what_all_frames_share_is_needed(tmp_path: Path, hashes: dict[str, str |
     path.write_text(json.dumps(json.loads(path.read_text()) | {"sha256": hashes}))
     with pytest.raises(DataFormatError, match=r"summary\.json: sha256.*expected (an object with 'prior'|str)"):
         read_manifest(path)
+
+
+def test_a_prior_has_the_same_hash_however_it_is_stored(tmp_path: Path) -> None:
+    prior = ellipsoid_prior(torch.float32)
+    prior.save(tmp_path / "first.npz")
+    prior.save(tmp_path / "second_name.npz", grid_dtype="float64")
+    hashes = {hash_prior(PCAShapePrior.load(path)) for path in tmp_path.iterdir()}
+    assert hashes == {hash_prior(prior)}
+    prior.basis[0, 0, 0, 0] += 1e-3
+    assert hash_prior(prior) not in hashes
+
+
+def test_every_tensor_of_a_field_counts() -> None:
+    assert hash_fields(()) is None
+    field = DisparityField(
+        coefficients=torch.zeros(10),
+        hull_uv=torch.tensor([[0.0, 0.0], [9.0, 0.0], [0.0, 9.0]]),
+        size_wh=(64, 48),
+        K_left=torch.eye(3),
+        K_right=torch.eye(3),
+        T_right_cam=torch.eye(4),
+    )
+    names = [name for name, value in vars(field).items() if isinstance(value, torch.Tensor)]
+    assert {"coefficients", "hull_uv", "K_left", "K_right", "T_right_cam"} <= set(names)
+    changed = [hash_fields([dataclasses.replace(field, **{name: getattr(field, name) + 1})]) for name in names]
+    changed += [
+        hash_fields([field]),
+        hash_fields([dataclasses.replace(field, size_wh=(48, 64))]),
+        hash_fields([field, field]),
+    ]
+    assert len(set(changed)) == len(names) + 3
+    assert hash_fields([dataclasses.replace(field, provenance={"made": "later"})]) == hash_fields([field])
