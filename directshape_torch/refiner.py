@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import PurePath
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -31,9 +32,6 @@ from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.solver.gauss_newton import search_start
 from directshape_torch.status import Status, is_refined
 from directshape_torch.terms.cars import CarBatch, CarState
-
-if TYPE_CHECKING:
-    from directshape_torch.terms.car_points import PointSamples
 
 
 class KnownRig(Protocol):
@@ -169,8 +167,7 @@ class DirectShapeRefiner(nn.Module):
         self, frames: FrameBatch, detections: Detections, term_weights: Mapping[str, Tensor] | None
     ) -> RefinementResult:
         seen = self._observe(frames, detections)
-        num_points = None if seen.points is None else seen.points.counts
-        failure = refusals(frames, detections, seen.pixels, num_points, self.config)
+        failure = refusals(frames, detections, seen, self.config)
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
         cars = self._cars(frames, detections).of_cars(usable)
@@ -211,30 +208,30 @@ class DirectShapeRefiner(nn.Module):
         code = self.prior.initial_code(len(T_cam_obj)).to(T_cam_obj)
         return CarState.of(se3.inverse(T_cam_obj), code, cars.num_offsets)
 
-    def _observe(self, frames: FrameBatch, detections: Detections) -> _Seen:
+    def _observe(self, frames: FrameBatch, detections: Detections) -> Observation:
         """What the images show of all cars; stereo points for the methods that use them."""
         extents = scene_extents(detections)
         detections = without_empty_masks(detections, extents)
-        pixels = pack_pixels(frames, detections, self.config.sampling, extents)
+        seen = pack_pixels(frames, detections, self.config.sampling, extents)
         if self.config.method in ("direct", "box_alignment"):
-            return _Seen(pixels, None)
+            return seen
         from directshape_torch.stereo_matching.disparity import with_disparity
         from directshape_torch.terms.car_points import car_points
 
         matched = with_disparity(frames, needed=detections.frame_index)
-        return _Seen(pixels, car_points(matched, detections, self.config.point_cloud))
+        return replace(seen, points=car_points(matched, detections, self.config.point_cloud))
 
     def _problem(
         self,
         frames: FrameBatch,
         detections: Detections,
         cars: CarBatch,
-        seen: _Seen,
+        seen: Observation,
         term_weights: Mapping[str, Tensor] | None,
     ) -> CarProblem:
         """The problem of some of the detections, of which `cars` and `seen` are."""
         extra = self.extra_terms
-        return problem_of_scene(self.config, self.prior, frames, detections, cars, *seen, extra, term_weights)
+        return problem_of_scene(self.config, self.prior, frames, detections, cars, seen, extra, term_weights)
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
         if self.config.method == "box_alignment":
@@ -251,16 +248,6 @@ def _config_cure(config: object) -> str:
     if isinstance(config, (str, PurePath)):
         return f'pass config=load_config("{config}")'
     return 'pass config=load_config("fast"), or config_from_mapping(RefinerConfig, ...) of nested keys'
-
-
-class _Seen(NamedTuple):
-    """What the images show of some cars."""
-
-    pixels: Observation
-    points: PointSamples | None
-
-    def of_objects(self, keep: Tensor) -> _Seen:
-        return _Seen(self.pixels.of_objects(keep), None if self.points is None else self.points.of_objects(keep))
 
 
 def _assembled(

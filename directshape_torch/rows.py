@@ -1,4 +1,4 @@
-"""Rows of residuals in blocks that belong to one car each: the one layout of everything that is summed per car.
+"""Packed pixels and points, and rows of residuals in blocks of one car: the one layout of all that is summed per car.
 
 Pixels are packed once, 64 of one car to a block. What a car has once (its pose, its camera's centre) is looked up per
 block and not per row, the products of a block's rows have a fixed shape, and a car that leaves the batch takes its
@@ -8,6 +8,7 @@ blocks along without a row being moved. Tensors have the blocks at their last ax
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,48 @@ BLOCK = 64
 """Rows of a block."""
 # Stands for a component of a direction that is zero.
 _LEAST_DIRECTION = 1e-12
+
+
+@dataclass(frozen=True)
+class PixelSamples:
+    """P pixels of one image side, sorted by object."""
+
+    object_index: Tensor  # (P,) ascending
+    uv: Tensor  # (P, 2) pixels
+    origin_cam: Tensor  # (P, 3) camera centre of the pixel's own camera, in the left camera frame, metres
+    ray_cam: Tensor  # (P, 3) direction of unit depth in the pixel's own camera, in the left camera frame
+    foreground: Tensor  # (P,) probability in [0, 1] of the mask at the pixel
+    gradient_magnitude: Tensor  # (P,) grey levels per pixel
+    bias_px: Tensor  # (P,) residual disparity at the (corresponding) left pixel, zero without a field
+    vertical_px: Tensor  # (P,) residual row offset there, zero without a field
+
+    def __len__(self) -> int:
+        return len(self.object_index)
+
+    def select(self, index: Tensor) -> PixelSamples:
+        """The pixels of the numbers (Q,), in that order."""
+        return replace(self, **{f.name: getattr(self, f.name).index_select(0, index) for f in fields(self)})
+
+    def of_objects(self, keep: Tensor) -> PixelSamples:
+        """The pixels of the objects where `keep` (B,) holds, renumbered."""
+        new_number = torch.cumsum(keep.long(), 0) - 1
+        chosen = self.select(keep[self.object_index].nonzero()[:, 0])
+        return replace(chosen, object_index=new_number[chosen.object_index])
+
+
+@dataclass(frozen=True)
+class PointSamples:
+    """P points of B cars, sorted by object."""
+
+    object_index: Tensor  # (P,) ascending
+    points_cam: Tensor  # (P, 3) metres
+    counts: Tensor  # (B,) points that passed the filters, before the reduction to `max_points`
+
+    def of_objects(self, keep: Tensor) -> PointSamples:
+        """The points of the objects where `keep` (B,) holds, renumbered."""
+        new_number = torch.cumsum(keep.long(), 0) - 1
+        rows = keep[self.object_index].nonzero()[:, 0]
+        return PointSamples(new_number[self.object_index[rows]], self.points_cam[rows], self.counts[keep])
 
 
 class Blocks(NamedTuple):

@@ -19,10 +19,10 @@ from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.numerics.checks import check_shape
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
 from directshape_torch.status import Status
-from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch
 from directshape_torch.terms.point_cloud import PointCloud
 

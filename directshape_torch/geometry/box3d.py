@@ -36,12 +36,7 @@ def pose_from_kitti(
 
 
 def rotation_y_from_pose(T: Tensor) -> Tensor:
-    """KITTI's heading (*,) of poses (*, 4, 4): `atan2(-R[2, 0], R[0, 0])`, the direction of the car's x axis.
-
-    Examples:
-        >>> rotation_y_from_pose(pose_from_kitti(torch.zeros(3), torch.tensor(0.3)))
-        tensor(0.3000)
-    """
+    """KITTI's heading (*,) of poses (*, 4, 4): `atan2(-R[2, 0], R[0, 0])`, the direction of the car's x axis."""
     return torch.atan2(-T[..., 2, 0], T[..., 0, 0])
 
 
@@ -54,12 +49,7 @@ def alpha_from_kitti(
     location_ref: Tensor,  # (*, 3)
     rotation_y: Tensor,  # (*,)
 ) -> Tensor:
-    """KITTI's observation angle (*,): `wrap(rotation_y - atan2(x, z))`.
-
-    Examples:
-        >>> alpha_from_kitti(torch.tensor([10.0, 1.6, 10.0]), torch.tensor(0.0))
-        tensor(-0.7854)
-    """
+    """KITTI's observation angle (*,): `wrap(rotation_y - atan2(x, z))`."""
     return wrap_angle(rotation_y - torch.atan2(location_ref[..., 0], location_ref[..., 2]))
 
 

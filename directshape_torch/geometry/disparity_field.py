@@ -35,12 +35,7 @@ def polynomial_basis(
     uv: Tensor,  # (*, 2) pixels of the left image
     size_wh: tuple[int, int],
 ) -> Tensor:  # (*, 10)
-    """Values of the basis functions at left pixels; the image is mapped to [-1, 1] in both directions.
-
-    Examples:
-        >>> polynomial_basis(torch.tensor([100.0, 50.0]), (101, 101))
-        tensor([1., 1., 0., 1., 0., 0., 1., 0., 0., 1.])
-    """
+    """Values of the basis functions at left pixels; the image is mapped to [-1, 1] in both directions."""
     u, v = (2 * uv[..., k] / max(size_wh[k] - 1, 1) - 1 for k in range(2))
     one = torch.ones_like(u)
     u_powers, v_powers = [one, u, u * u, u * u * u, u * u * u * u], [one, v, v * v]

@@ -26,15 +26,7 @@ _EXP_SERIES = tuple((1 / math.factorial(2 * n + 2), 1 / math.factorial(2 * n + 3
 
 
 def generators(dtype: torch.dtype = torch.float64, device: torch.device | str | None = None) -> Tensor:
-    """The six infinitesimal generators of SE(3), translations first (paper, supplement, `G_0 .. G_5`).
-
-    Returns:
-        :math:`(6, 4, 4)`.
-
-    Examples:
-        >>> generators()[0, 0, 3]
-        tensor(1., dtype=torch.float64)
-    """
+    """The six infinitesimal generators (6, 4, 4) of SE(3), translations first (paper, supplement, `G_0 .. G_5`)."""
     return Se3.hat(torch.eye(6, dtype=dtype, device=device))
 
 

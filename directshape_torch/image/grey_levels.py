@@ -18,20 +18,10 @@ _WEIGHTS = (255 * 0.299, 255 * 0.587, 255 * 0.114)
 def grey_levels(
     images: Tensor,  # (*, 3, H, W)
 ) -> Tensor:
-    """Grey levels 0..255 of RGB images in [0, 1].
-
-    Args:
-        images: (*, 3, H, W), RGB in [0, 1].
-
-    Returns:
-        (*, H, W), `255 (0.299 R + 0.587 G + 0.114 B)`.
+    """Grey levels (*, H, W) of RGB images in [0, 1]: `255 (0.299 R + 0.587 G + 0.114 B)`.
 
     Raises:
         InputError: not (*, 3, H, W) or not floating point.
-
-    Examples:
-        >>> grey_levels(torch.ones(1, 3, 1, 2, dtype=torch.float64))
-        tensor([[[255., 255.]]], dtype=torch.float64)
     """
     if images.ndim < 3 or images.shape[-3] != 3:
         raise InputError("images", "shape (*, 3, H, W)", f"{tuple(images.shape)}", "put the colour axis there")
@@ -50,12 +40,6 @@ def length_2d(
 
     A length that is not finite has no derivative either: 0 and not NaN, which a product with the 0 of whoever does not
     use it would spread over the image.
-
-    Examples:
-        >>> flat = torch.zeros(1, requires_grad=True)
-        >>> length_2d(flat, flat).backward()
-        >>> flat.grad
-        tensor([0.])
     """
     square = (d_u * d_u).add_(d_v * d_v)
     if not square.requires_grad:
@@ -72,20 +56,10 @@ def gradient_magnitude_of_part(
     size_hw: Sequence[int],
     part: Sequence[int],
 ) -> Tensor:
-    """Length of the image gradient in one part of a frame, by central differences; differentiable by the image.
+    """Length of the image gradient in a part (u0, v0, u1, v1) of a frame, half open, not empty, by central differences.
 
-    Args:
-        image: (3, H, W), RGB in [0, 1], padded at the right and bottom.
-        size_hw: (height, width) of the frame without padding; at its own edge the edge is replicated.
-        part: (u0, v0, u1, v1) within the frame, half open, not empty.
-
-    Returns:
-        (v1 - v0, u1 - u0), grey levels per pixel.
-
-    Examples:
-        >>> ramp = torch.arange(40.0).expand(3, 40, 40) / 255
-        >>> gradient_magnitude_of_part(ramp, (40, 40), (0, 8, 3, 9))
-        tensor([[0.5000, 1.0000, 1.0000]])
+    `size_hw` is the frame without padding, at whose own edge the edge is replicated. In grey levels per pixel
+    (v1 - v0, u1 - u0); differentiable by the image.
     """
     (u0, v0, u1, v1), (height, width) = part, size_hw
     # One pixel more on each side, as far as there is one.
@@ -104,22 +78,7 @@ def gradient_magnitude_at(
     frame_index: Tensor,  # (P,)
     uv: Tensor,  # (P, 2)
 ) -> Tensor:
-    """`gradient_magnitude_of_part` at single pixels, the same numbers; differentiable by the images.
-
-    Args:
-        images: (F, 3, H, W), RGB in [0, 1], padded at the right and bottom.
-        sizes: (F, 2) integer (height, width) of each frame without padding; at its own edge the edge is replicated.
-        frame_index: (P,) frame of each pixel.
-        uv: (P, 2) integer, within their frames.
-
-    Returns:
-        (P,), grey levels per pixel.
-
-    Examples:
-        >>> ramp = torch.arange(40.0).expand(1, 3, 40, 40) / 255
-        >>> gradient_magnitude_at(ramp, torch.tensor([[40, 40]]), torch.tensor([0, 0]), torch.tensor([[0, 8], [1, 8]]))
-        tensor([0.5000, 1.0000])
-    """
+    """`gradient_magnitude_of_part` at single pixels (P,), the same numbers; differentiable by the images."""
     last_v, last_u = (sizes - 1).index_select(0, frame_index).unbind(1)
     u, v = uv.unbind(1)
     # To the right, to the left, below, above.
@@ -139,23 +98,13 @@ def gradient_magnitude_at(
 def halve(
     images: Tensor,  # (F, C, H, W)
 ) -> Tensor:
-    """The next coarser pyramid level: each pixel is the mean of a 2x2 block.
+    """The next coarser pyramid level (F, C, H // 2, W // 2): each pixel is the mean of a 2x2 block.
 
     An odd last row or column has no partner and is dropped, so that every coarse pixel is a true 2x2 mean, with its
     centre at pixel `2 u + 0.5` of the finer level.
 
-    Args:
-        images: (F, C, H, W), H and W at least 2.
-
-    Returns:
-        (F, C, H // 2, W // 2).
-
     Raises:
         InputError: not four axes, or a side below 2 pixels.
-
-    Examples:
-        >>> halve(torch.arange(8.0).reshape(1, 1, 2, 4))
-        tensor([[[[2.5000, 4.5000]]]])
     """
     if images.ndim != 4 or min(images.shape[2:]) < 2:
         raise InputError("images", "shape (F, C, H, W) with H, W >= 2", f"{tuple(images.shape)}", "use fewer levels")
@@ -168,14 +117,7 @@ def halve(
 def halve_sizes(
     sizes: Tensor,  # (F, 2)
 ) -> Tensor:
-    """(height, width) of each frame one level up; integer division, as `halve` drops an odd last row or column.
-
-    A side of one pixel stays one: a lookup must find a pixel in every frame of a batch.
-
-    Examples:
-        >>> halve_sizes(torch.tensor([[375, 1242]]))
-        tensor([[187, 621]])
-    """
+    """(height, width) of each frame one level up; a side of one pixel stays one, for a lookup must find a pixel."""
     return torch.div(sizes, 2, rounding_mode="floor").clamp_min(1)
 
 

@@ -23,13 +23,7 @@ def bilinear_at(
     image: Tensor,  # (H, W)
     uv: Tensor,  # (..., 2) pixels (column, row)
 ) -> BilinearPatch:
-    """`bilinear_patch` in one image.
-
-    Examples:
-        >>> at = bilinear_at(torch.tensor([[0.0, 2.0], [10.0, 12.0]]), torch.tensor([[0.5, 0.25]]))
-        >>> at.value, at.d_u, at.d_v, at.inside
-        (tensor([3.5000]), tensor([2.]), tensor([10.]), tensor([True]))
-    """
+    """`bilinear_patch` in one image."""
     height, width = image.shape
     first = torch.zeros((), dtype=torch.long, device=image.device)
     return bilinear_patch(image.reshape(-1), first, width, uv[..., 0], uv[..., 1], width - 1, height - 1)

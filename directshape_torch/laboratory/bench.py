@@ -13,15 +13,14 @@ from directshape_torch.geometry import se3
 from directshape_torch.laboratory.regimes import Draw, Regime, seeded
 from directshape_torch.laboratory.scenes import LaboratoryScene
 from directshape_torch.numerics.tensors import length, occurrences
-from directshape_torch.observation.packing import Observation, PixelSamples, pack_pixels
+from directshape_torch.observation.packing import Observation, pack_pixels
 from directshape_torch.refinement.problem import CarProblem, CarStage
 from directshape_torch.refinement.scene_problem import TermFactory, problem_of_scene
 from directshape_torch.refinement.tracks import in_tracks, own_and_shared
-from directshape_torch.rows import Rays, Rows
+from directshape_torch.rows import PixelSamples, PointSamples, Rays, Rows
 from directshape_torch.shape.field import field_of
 from directshape_torch.shape.pca_prior import PCAShapePrior
 from directshape_torch.solver.sharing import Groups
-from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarBatch, CarState, retract
 from directshape_torch.terms.depth import closest_of_march, first_hits, march
 from directshape_torch.terms.motion import MOTION_NAMES, timed
@@ -93,7 +92,7 @@ class Bench:
         observation = pack_pixels(frame, detections, config.sampling)
         if regime.pixels != "sampled":
             observation = _chosen(observation, regime, prior, drawn.state, cars, config, pixels_per_car, generator)
-        points = _points(observation.left, drawn.state, generator)
+        seen = replace(observation, points=_points(observation.left, drawn.state, generator))
         other_forms = replace(
             config,
             silhouette=replace(config.silhouette, form="product"),
@@ -105,7 +104,7 @@ class Bench:
         start = drawn.state._replace(T_obj_cam=se3.inverse(detections.T_cam_obj), offset_px=no_offset)
         stages = []
         for c in (config, other_forms):
-            problem = problem_of_scene(c, prior, frame, detections, cars, observation, points, own_terms)
+            problem = problem_of_scene(c, prior, frame, detections, cars, seen, own_terms)
             if drawn.state.path.shape[1]:
                 problem = _of_a_track(problem, cars, drawn.state)
             stages.append(problem.begin(c.stages[regime.stage], problem.look(start)))

@@ -43,10 +43,6 @@ def check_shape(
     """Raise `InputError` unless `tensor` is a dense tensor of the expected shape and kind, with numbers.
 
     Letters stand for any size.
-
-    Examples:
-        >>> import torch
-        >>> check_shape("points", torch.zeros(7, 3), ("P", 3))
     """
     wanted = "(" + ", ".join(str(n) for n in expected) + ("," if len(expected) == 1 else "") + ")"
     if not isinstance(tensor, Tensor):

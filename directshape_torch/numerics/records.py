@@ -61,16 +61,7 @@ class Record:
         return self._with(Tensor.detach)
 
     def rows(self, index: Tensor) -> Self:
-        """The rows `index` (M,) int64, in that order.
-
-        Examples:
-            >>> from dataclasses import dataclass
-            >>> @dataclass(frozen=True)
-            ... class Depths(Record):
-            ...     depth_m: Tensor
-            >>> Depths(torch.tensor([10.0, 20.0])).rows(torch.tensor([1]))
-            Depths(depth_m=tensor([20.]))
-        """
+        """The rows `index` (M,) int64, in that order."""
         return self._with(lambda value: value.index_select(0, index.to(value.device)), by_row=True)
 
     def _with(self, change: Callable[..., Tensor], *others: Self, by_row: bool = False) -> Self:

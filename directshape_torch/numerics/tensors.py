@@ -44,15 +44,7 @@ def constant_like(values: tuple[float, ...], like: Tensor) -> Tensor:
 
 
 def made_once(make: Callable[[torch.dtype, torch.device], _T]) -> Callable[[Tensor], _T]:
-    """For a function that makes constants of a dtype on a device: one that gives those like a tensor.
-
-    Examples:
-        >>> @made_once
-        ... def ramp(dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-        ...     return torch.arange(3, dtype=dtype, device=device)
-        >>> ramp(torch.zeros(1)), ramp(torch.zeros(1)) is ramp(torch.ones(1))
-        (tensor([0., 1., 2.]), True)
-    """
+    """For a function that makes constants of a dtype on a device: one that gives those like a tensor."""
     constants: dict[_Key, Any] = {}
 
     @wraps(make)

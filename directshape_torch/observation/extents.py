@@ -35,10 +35,7 @@ class SceneExtents(NamedTuple):
 
 
 def scene_extents(detections: Detections) -> SceneExtents:
-    """Extents of every mask of a call, of detections and of occluders.
-
-    Args:
-        detections: B cars, with M further occluders or without. Absent masks are not read.
+    """Extents of every mask of a call, of detections and of occluders; absent masks are not read.
 
     Raises:
         InputError: occluders of another size, or masks with values above 1.5.
@@ -60,22 +57,10 @@ def scene_extents(detections: Detections) -> SceneExtents:
 def mask_extents(
     masks: Sequence[Tensor], present: Sequence[Tensor], names: Sequence[str] = ("masks",)
 ) -> list[MaskExtents]:
-    """Extents of several stacks of masks. A NaN counts as foreground, so that it does not go unnoticed.
-
-    Args:
-        masks: stacks (I, H, W) of foreground probabilities, or 0 and 1 in bool; I may differ.
-        present: (I,) bool of each stack; absent masks have no extent.
-        names: of the stacks, for errors.
+    """Extents of stacks of masks (I, H, W), none where `present` (I,) is false; a NaN counts as foreground.
 
     Raises:
-        InputError: stacks of different sizes, or values above 1.5.
-
-    Examples:
-        >>> mask = torch.zeros(1, 6, 8)
-        >>> mask[0, 2:4, 3:8] = 0.9
-        >>> (extents,) = mask_extents([mask], [torch.tensor([True])])
-        >>> extents.boxes.tolist(), extents.areas.tolist()
-        ([[3, 2, 8, 4]], [10])
+        InputError: stacks of different sizes, or values above 1.5; `names` are those of the stacks.
     """
     _check_sizes(masks, names)
     # The same memory, in a type of which maxima are fast.
@@ -135,19 +120,11 @@ def region_boxes(
     mask_boxes: Tensor,  # (B, 4)
     sizes: Tensor,  # (B, 2)
 ) -> Tensor:
-    """The region whose pixels can speak about each car, on one side.
+    """The region (B, 4) on one side whose pixels can speak about each car: integer, half open, 0 where nothing is left.
 
-    The mask's box joined with the given one, grown on every side by the larger of 4 px and a tenth of its width (or
-    height) and clipped to the image, so that a shape that spills out of its mask pays for it. An empty mask counts as
-    none.
-
-    Args:
-        boxes: (B, 4) u_min, v_min, u_max, v_max, pixels. NaN, or outside of the image: no box.
-        mask_boxes: (B, 4) integer, half open, as `mask_extents` finds them; all 0 where there is no mask.
-        sizes: (B, 2) integer (height, width) of each object's frame without padding.
-
-    Returns:
-        (B, 4) integer (u0, v0, u1, v1), half open: `image[v0:v1, u0:u1]`; all 0 where nothing is left.
+    The mask's box (all 0: none) joined with the given one (NaN, or outside of the image: none), grown on every side by
+    the larger of 4 px and a tenth of its width (or height) and clipped to the image, so that a shape that spills out of
+    its mask pays for it.
     """
     last_uv = (sizes.flip(-1) - 1).to(boxes.dtype)
     in_mask = mask_boxes[:, 2] > mask_boxes[:, 0]

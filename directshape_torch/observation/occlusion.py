@@ -43,15 +43,7 @@ class OcclusionMap:
         object_index: Tensor,  # (...)
         uv: Tensor,  # (..., 2)
     ) -> Tensor:
-        """Whether an instance in front of the object covers the nearest pixel of each point.
-
-        Args:
-            object_index: integer, broadcastable to (...).
-            uv: (..., 2) pixels, integer or floating point (rounded half to even); NaN is not hidden.
-
-        Returns:
-            (...) bool.
-        """
+        """Whether (...) an instance in front of the object covers the pixel next to each point; NaN is not hidden."""
         if uv.is_floating_point():
             # Far beyond any image, but within the integers.
             uv = uv.round().nan_to_num(nan=-1.0, posinf=-1.0, neginf=-1.0).clamp(-1.0, 2.0**30)

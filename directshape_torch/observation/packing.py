@@ -5,7 +5,7 @@ Pixels are packed over cars and frames, sorted by object, because a near car has
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -16,34 +16,8 @@ from directshape_torch.image.grey_levels import gradient_magnitude_at
 from directshape_torch.observation.extents import SceneExtents, region_boxes, scene_extents
 from directshape_torch.observation.occlusion import OcclusionMap, Side, occlusion_map
 from directshape_torch.observation.sampling import sampled_pixels
+from directshape_torch.rows import PixelSamples, PointSamples
 from directshape_torch.scene import Detections, FrameBatch
-
-
-@dataclass(frozen=True)
-class PixelSamples:
-    """P pixels of one image side, sorted by object."""
-
-    object_index: Tensor  # (P,) ascending
-    uv: Tensor  # (P, 2) pixels
-    origin_cam: Tensor  # (P, 3) camera centre of the pixel's own camera, in the left camera frame, metres
-    ray_cam: Tensor  # (P, 3) direction of unit depth in the pixel's own camera, in the left camera frame
-    foreground: Tensor  # (P,) probability in [0, 1] of the mask at the pixel
-    gradient_magnitude: Tensor  # (P,) grey levels per pixel
-    bias_px: Tensor  # (P,) residual disparity at the (corresponding) left pixel, zero without a field
-    vertical_px: Tensor  # (P,) residual row offset there, zero without a field
-
-    def __len__(self) -> int:
-        return len(self.object_index)
-
-    def select(self, index: Tensor) -> PixelSamples:
-        """The pixels of the numbers (Q,), in that order."""
-        return replace(self, **{f.name: getattr(self, f.name).index_select(0, index) for f in fields(self)})
-
-    def of_objects(self, keep: Tensor) -> PixelSamples:
-        """The pixels of the objects where `keep` (B,) holds, renumbered."""
-        new_number = torch.cumsum(keep.long(), 0) - 1
-        chosen = self.select(keep[self.object_index].nonzero()[:, 0])
-        return replace(chosen, object_index=new_number[chosen.object_index])
 
 
 @dataclass(frozen=True)
@@ -52,22 +26,15 @@ class Observation:
 
     left: PixelSamples  # packed pixels of the two images
     right: PixelSamples  # likewise
-    region_left: Tensor  # (B, 4) integer regions (u0, v0, u1, v1), half open, pixels
-    region_right: Tensor  # likewise
     # what hides cars in the right image, by row of the detections; None: not asked for
     hidden_right: OcclusionMap | None
     mask_areas: Tensor  # (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent
+    points: PointSamples | None = None  # of dense stereo, for the methods that use them
 
     def of_objects(self, keep: Tensor) -> Observation:
         """What the objects where `keep` (B,) holds see; occlusion and areas stay those of all detections."""
-        index = keep.nonzero()[:, 0]
-        return replace(
-            self,
-            left=self.left.of_objects(keep),
-            right=self.right.of_objects(keep),
-            region_left=self.region_left.index_select(0, index),
-            region_right=self.region_right.index_select(0, index),
-        )
+        points = None if self.points is None else self.points.of_objects(keep)
+        return replace(self, left=self.left.of_objects(keep), right=self.right.of_objects(keep), points=points)
 
 
 def pack_pixels(
@@ -75,11 +42,7 @@ def pack_pixels(
 ) -> Observation:
     """Choose the pixels of every car in both images and gather what the residuals need of them.
 
-    Args:
-        frames: F frames.
-        detections: B cars, whose initial poses fix regions and correspondence for the disparity field.
-        config: density, regions, occlusion.
-        extents: of the masks of these detections, where they are known already.
+    The initial poses fix regions and the correspondence for the disparity field.
     """
     extents = scene_extents(detections) if extents is None else extents
     regions = car_regions(frames, detections, extents)
@@ -90,7 +53,6 @@ def pack_pixels(
     return Observation(
         _pack_side(frames, detections, "left", regions[0], hidden_left, config),
         _pack_side(frames, detections, "right", regions[1], hidden_right, config),
-        *regions,
         hidden_right,
         extents.areas,
     )

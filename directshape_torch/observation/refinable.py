@@ -27,12 +27,9 @@ _DTYPES = (torch.float32, torch.float64)
 
 
 def check_no_tangents(*records: object) -> None:
-    """Raise `InputError` where a tensor of a record is a dual number of forward-mode differentiation.
+    """Raise `InputError` where a tensor of mappings and dataclasses is a dual number of forward-mode differentiation.
 
     What the iterations hold constant, they hold back from gradients; tangents would pass through it and come out wrong.
-
-    Args:
-        records: mappings of tensors, and dataclasses of tensors and of further such dataclasses.
     """
     # Of the whole process, other threads' regions too: what counts is whether these tensors take part.
     if is_forward_mode() and any(map(_has_tangent, _tensors(records))):
@@ -117,12 +114,7 @@ def _check_times(detections: Detections, frames: FrameBatch) -> None:
 
 
 def without_empty_masks(detections: Detections, extents: SceneExtents | None = None) -> Detections:
-    """A mask without any foreground counts as none: it would only say that there is no car.
-
-    Args:
-        detections: B cars.
-        extents: of their masks, where they are known already; they hold for the result too.
-    """
+    """A mask without any foreground counts as none: it would only say that there is no car."""
     areas = (scene_extents(detections) if extents is None else extents).areas
     left, right = (areas > 0).unbind(dim=1)
     # A copy and not `replace`, which would check all over again what is not touched.
@@ -132,26 +124,16 @@ def without_empty_masks(detections: Detections, extents: SceneExtents | None = N
     return same
 
 
-def refusals(
-    frames: FrameBatch, detections: Detections, pixels: Observation, num_points: Tensor | None, config: RefinerConfig
-) -> Tensor:
-    """For each car the code (B,) of the status that forbids its refinement, or -1.
-
-    Args:
-        frames: F frames.
-        detections: B cars.
-        pixels: packed pixels of all cars.
-        num_points: (B,) of their stereo points; None for methods without.
-        config: method and least numbers.
-    """
+def refusals(frames: FrameBatch, detections: Detections, seen: Observation, config: RefinerConfig) -> Tensor:
+    """For each car the code (B,) of the status that forbids its refinement, or -1, from what all cars see."""
     T = detections.T_cam_obj
     finite = T.isfinite().all(-1).all(-1)
     upright = (T[:, :3, 1] * frames.ground.normal[detections.frame_index]).sum(-1) < 0
     in_front = finite & (T[:, 2, 3] > _MIN_DEPTH_M) & upright
-    if config.method == "geometric" and num_points is not None:
-        lacking = [(num_points < config.point_cloud.min_points, Status.too_few_points)]
+    if config.method == "geometric" and seen.points is not None:
+        lacking = [(seen.points.counts < config.point_cloud.min_points, Status.too_few_points)]
     else:
-        lacking = _lacking_pixels(pixels, config.sampling.min_usable_pixels)
+        lacking = _lacking_pixels(seen, config.sampling.min_usable_pixels)
     code = torch.full((len(detections),), -1, device=T.device)
     # Later ones say more.
     for condition, status in (*lacking, (~in_front, Status.behind_camera), (~finite, Status.non_finite)):

@@ -21,18 +21,7 @@ def sampled_pixels(
     mode: SamplingMode,
     settings: SamplingConfig,
 ) -> tuple[Tensor, Tensor]:
-    """Pixels of B regions in one image side, hidden ones among them.
-
-    Args:
-        images: RGB in [0, 1].
-        sizes: integer (height, width) of each frame without padding.
-        frame_index: frame of each region.
-        regions: integer (u0, v0, u1, v1), half open, within their frames.
-        mode: which pixels.
-        settings: how many.
-
-    Returns:
-        Object (P,) ascending and uv (P, 2) of the pixels, integer; cell by cell.
+    """Pixels of B regions in one image side, hidden ones among them: object (P,) ascending and integer uv (P, 2).
 
     Examples:
         >>> ramp = (torch.arange(40.0) / 40).square().expand(1, 3, 40, 40)
@@ -57,10 +46,6 @@ def cell_sides(
 
     They are laid from the region's upper left corner and are never below one pixel, so a tiny region gives every pixel
     it has. (The paper counts the detection's box; the region is used so that the density in it is the wanted one.)
-
-    Examples:
-        >>> cell_sides(torch.tensor([[0, 0, 100, 50]]), SamplingConfig(min_pixels=200, max_pixels=200))
-        tensor([[5.]], dtype=torch.float64)
     """
     areas = (regions[:, 2:] - regions[:, :2]).double().prod(dim=1, keepdim=True)
     wanted = (settings.density * areas).clamp(settings.min_pixels, settings.max_pixels)

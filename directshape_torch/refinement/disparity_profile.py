@@ -123,10 +123,6 @@ def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:
 
     Raises:
         InputError: no positive range and step, or a range below two steps.
-
-    Examples:
-        >>> profile_offsets(1.0, 0.5)
-        tensor([-1.0000, -0.5000,  0.0000,  0.5000,  1.0000], dtype=torch.float64)
     """
     if not (step_px > 0 and range_px >= 2 * step_px):
         raise InputError("range_px, step_px", "a positive step and at least two of them", f"{range_px}, {step_px}")
@@ -145,12 +141,7 @@ def default_offsets(like: Tensor) -> Tensor:
 
 
 def profile_figures(offsets_px: Tensor, cost: Tensor, num_pixels: Tensor) -> ProfileFigures:
-    """Figures of curves.
-
-    Args:
-        offsets_px: (n,) evenly spaced, 0 among them.
-        cost: (B, n).
-        num_pixels: (B,) whose mean the cost is.
+    """Figures of curves (B, n) at evenly spaced offsets (n,), 0 among them, each a mean over so many pixels (B,).
 
     Examples:
         >>> offsets = profile_offsets()
@@ -222,15 +213,9 @@ def disparity_profile(
     offsets_px: Tensor | None = None,
     max_pixels: int = MAX_PIXELS,
 ) -> DisparityProfile:
-    """The curves of B cars at two states.
+    """The curves of B cars, from the photometric term of a stage and the surface under its pixels at input and end.
 
-    Args:
-        term: of a stage that has begun; None without photometry.
-        before, after: the surface under its pixels at the input and at the end.
-        num_cars: B.
-        like: says the device.
-        offsets_px: (n,) evenly spaced, 0 among them; default -3 to 3 px in steps of 0.25.
-        max_pixels: of each car; of more, every second, third, ...
+    Offsets (n,) are evenly spaced, 0 among them; of each car's pixels every second, third, ... if it has too many.
     """
     offsets = default_offsets(like) if offsets_px is None else offsets_px
     nan = torch.full((num_cars, len(offsets)), torch.nan, dtype=torch.float64, device=like.device)

@@ -174,10 +174,8 @@ def _footprint_sigmas(course: Course, dimensions: DimensionsDerivative) -> Tenso
 def _expected(motion: Tensor, sigma: Tensor, hwl: Tensor) -> tuple[Tensor, Tensor]:
     """Expected misfit (B,) of footprints whose errors are normal, and how much larger it is at the input.
 
-    Args:
-        motion: (B, 5) of the output against the input, along and across the car, of heading, length and width.
-        sigma: (B, 5) of the output.
-        hwl: (B, 3) metres.
+    Motions of the output against the input and sigmas of the output (B, 5) are along and across the car, of heading,
+    length and width.
     """
     _, width, length = hwl.clamp_min(0.1).unbind(1)
     # IoU falls by twice the shift over the side, by the change of a side over itself, and by the corners cut in a turn.

@@ -129,10 +129,6 @@ def without_offset(information: Tensor, num_kept: int) -> Tensor:
     """The information (B, 6 + K, 6 + K) on pose and shape, whatever the offset is, from that on all unknowns (B, D, D).
 
     Schur's complement; an offset of which nothing is known has nothing to share.
-
-    Examples:
-        >>> without_offset(torch.tensor([[[2.0, 1.0], [1.0, 1.0]]]), 1)
-        tensor([[[1.]]])
     """
     of_offset = information.diagonal(dim1=1, dim2=2)[:, None, num_kept:]
     across = information[:, :num_kept, num_kept:] / torch.where(of_offset > 0, of_offset, 1.0)
@@ -158,13 +154,7 @@ def covariance_xyz_yaw(
 
 
 def observability_of(prior: ShapePrior, state: CarState, seen: Tensor | None) -> Observability:
-    """Principal directions of the car's quantities under the Fisher information of the terms that are no priors.
-
-    Args:
-        prior: the shapes, for the dimensions.
-        state: B cars.
-        seen: (B, D, D) that information at that state; None without such a term.
-    """
+    """Principal directions of the car's quantities under the information (B, D, D) of the terms that are no priors."""
     T_cam_obj = se3.inverse(state.T_obj_cam)
     alpha = alpha_from_kitti(T_cam_obj[:, :3, 3], rotation_y_from_pose(T_cam_obj)).to(torch.float64)
     if seen is None:

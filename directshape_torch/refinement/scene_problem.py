@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import torch
 from torch import Tensor
@@ -28,9 +28,6 @@ from directshape_torch.terms.priors import prior_terms
 from directshape_torch.terms.silhouette import MaskRows, SilhouetteProducts, Silhouettes
 from directshape_torch.terms.term import Term
 
-if TYPE_CHECKING:
-    from directshape_torch.terms.car_points import PointSamples
-
 # Those of "point_cloud" hold for the methods with points, the first two for the others.
 _WEIGHTS = "silhouette.weight, photometric.weight, point_cloud.weight or combined_weight, priors.*_weight"
 
@@ -45,22 +42,12 @@ def problem_of_scene(
     detections: Detections,
     cars: CarBatch,
     observation: Observation,
-    points: PointSamples | None = None,
     extra_terms: Sequence[TermFactory] = (),
     term_weights: Mapping[str, Tensor] | None = None,
 ) -> CarProblem:
     """The problem of `config.method`; terms of weight zero are left out, so ablations cost nothing.
 
-    Args:
-        config: weights and forms.
-        prior: the shapes.
-        frames: F frames.
-        detections: all detections of the call, which `cars.detection_row` points into.
-        cars: the B cars to refine.
-        observation: packed pixels of these cars.
-        points: stereo points of these cars; None for the methods without.
-        extra_terms: make further terms.
-        term_weights: (detections,) factors of named terms.
+    The B cars are the rows `cars.detection_row` of the detections, as of `term_weights`; `observation` what they see.
 
     Raises:
         ConfigError: every term has weight zero, so there is nothing to minimise.
@@ -71,12 +58,12 @@ def problem_of_scene(
     sides = [Rows.of_sorted(p.object_index, len(cars)) for p in pixels]
     masks = MaskRows.of_pixels(pixels, sides, config.silhouette, len(cars))
     terms: list[Term] = []
-    if points is not None:
+    if observation.points is not None:
         from directshape_torch.terms.point_cloud import PointCloud
 
         cloud, weight = config.point_cloud, config.point_cloud.combined_weight
         cloud = cloud if config.method == "geometric" else replace(cloud, weight=weight)
-        terms += [PointCloud.of_points(cloud, points)] if cloud.weight > 0 else []
+        terms += [PointCloud.of_points(cloud, observation.points)] if cloud.weight > 0 else []
     if config.method in ("direct", "combined") and config.silhouette.weight > 0:
         form = SilhouetteProducts if config.silhouette.form == "product" else Silhouettes
         terms.append(form(config.silhouette, cars, masks, prior.bounds_obj, torch.ones_like(masks.filled[:, :1])))

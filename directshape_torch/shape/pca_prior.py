@@ -120,13 +120,7 @@ class PCAShapePrior(nn.Module):
         return GridShape(self.values(code), self.basis, self.origin, self.spacing_m)
 
     def dimensions_hwl(self, code: Tensor) -> Tensor:
-        """Height, width and length (B, 3), metres, that codes (B, K) have by the linear map of the training cars.
-
-        Examples:
-            >>> prior = PCAShapePrior.load_bundled()
-            >>> bool((prior.dimensions_hwl(prior.initial_code(1)) == prior.dimensions_mean_hwl).all())
-            True
-        """
+        """Height, width and length (B, 3), metres, that codes (B, K) have by the linear map of the training cars."""
         check_shape("code", code, ("B", self.num_codes))
         return self.dimensions_mean_hwl + code @ self.dimensions_basis_hwl.T
 

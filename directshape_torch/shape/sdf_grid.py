@@ -366,22 +366,11 @@ def zero_level_extents(
     origin: Tensor,  # (3,)
     spacing_m: float,
 ) -> Tensor:  # (B, 2, 3)
-    """Lower and upper corner of the box around the zero level, along the object axes.
+    """Lower and upper corner (B, 2, 3) of the box around the zero level, metres; NaN along an axis without a crossing.
 
     The field is trilinear between nodes, so along an axis the outermost point of its zero level lies on a grid edge
     parallel to that axis (up to cells that the level only touches in their middle): the extent is the outermost linear
     crossing of all edges of the axis. Differentiable by `values`: the gradient flows through the outermost edge.
-
-    Args:
-        values: signed distance at the nodes, negative inside, metres.
-        origin: position of node (0, 0, 0), metres.
-        spacing_m: distance between nodes, metres.
-
-    Returns:
-        (B, 2, 3) lower and upper corner, metres; NaN for an object that has no zero crossing along an axis.
-
-    Raises:
-        InputError: `values` is not (B, nx, ny, nz).
 
     Examples:
         >>> x = torch.arange(-3.0, 4.0)

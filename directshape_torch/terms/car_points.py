@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
@@ -11,33 +9,10 @@ from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import points_from_disparity
 from directshape_torch.numerics.tensors import occurrences
+from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 
 _MASK_THRESHOLD = 0.5
-
-
-@dataclass(frozen=True)
-class PointSamples:
-    """P points of B cars, sorted by object."""
-
-    object_index: Tensor  # (P,) ascending
-    points_cam: Tensor  # (P, 3) metres
-    counts: Tensor  # (B,) points that passed the filters, before the reduction to `max_points`
-
-    def __len__(self) -> int:
-        return len(self.object_index)
-
-    def of_objects(self, keep: Tensor) -> PointSamples:
-        """The points of the objects where `keep` (B,) holds, renumbered.
-
-        Examples:
-            >>> points = PointSamples(torch.tensor([0, 1, 1]), torch.zeros(3, 3), torch.tensor([1, 2]))
-            >>> points.of_objects(torch.tensor([False, True])).object_index
-            tensor([0, 0])
-        """
-        new_number = torch.cumsum(keep.long(), 0) - 1
-        rows = keep[self.object_index].nonzero()[:, 0]
-        return PointSamples(new_number[self.object_index[rows]], self.points_cam[rows], self.counts[keep])
 
 
 def car_points(frames: FrameBatch, detections: Detections, config: PointCloudConfig) -> PointSamples:

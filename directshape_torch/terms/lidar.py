@@ -11,9 +11,10 @@ from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.projection import project
 from directshape_torch.numerics.tensors import occurrences
+from directshape_torch.rows import PointSamples
 from directshape_torch.scene import Detections, FrameBatch
 from directshape_torch.shape.shape_prior import ShapePrior
-from directshape_torch.terms.car_points import PointSamples, every_nth
+from directshape_torch.terms.car_points import every_nth
 from directshape_torch.terms.cars import CarBatch
 from directshape_torch.terms.point_cloud import PointCloud
 

@@ -18,12 +18,11 @@ from directshape_torch.config import PhotometricConfig
 from directshape_torch.image.grey_levels import GreyPair
 from directshape_torch.image.interpolate import BilinearPatch, bilinear_patch
 from directshape_torch.numerics.tensors import all_along, made_once
-from directshape_torch.rows import Rays, Rows
+from directshape_torch.rows import PixelSamples, Rays, Rows
 from directshape_torch.terms.cars import CarBatch
 
 if TYPE_CHECKING:
     from directshape_torch.observation.occlusion import OcclusionMap
-    from directshape_torch.observation.packing import PixelSamples
 
 PatchForm = Literal["plain", "zero_mean", "normalised"]
 

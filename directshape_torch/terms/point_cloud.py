@@ -16,10 +16,9 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
 from directshape_torch.numerics.tensors import occurrences
-from directshape_torch.rows import Blocks, Rays, Rows
+from directshape_torch.rows import Blocks, PointSamples, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.terms import robust
-from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.silhouette import sdf_state_jacobian
 from directshape_torch.terms.term import Linear, Term, Where

@@ -134,12 +134,7 @@ def detector_pose_sigma(config: PriorConfig, cars: CarBatch) -> Tensor:
 
 
 def shape_prior(code: Tensor) -> PriorResidual:
-    """Pulls the whitened code (B, K) to the mean shape (paper, E_shape; sigma is folded into the basis).
-
-    Examples:
-        >>> shape_prior(torch.ones(1, 2)).J_residual_state[0, 0]
-        tensor([0., 0., 0., 0., 0., 0., 1., 0.])
-    """
+    """Pulls the whitened code (B, K) to the mean shape (paper, E_shape; sigma is folded into the basis)."""
     num_cars, num_codes = code.shape
     identity = torch.eye(num_codes, dtype=code.dtype, device=code.device)
     return PriorResidual(code, torch.nn.functional.pad(identity, (6, 0)).expand(num_cars, -1, -1))
@@ -192,11 +187,6 @@ def dimensions_prior(
     """Shape dimensions against the detector's, in the detector's standard deviations.
 
     A car seen from behind does not show its length: the detector's dimensions are information (not in the paper).
-
-    Examples:
-        >>> shape = DimensionsDerivative(torch.zeros(1, 3), torch.zeros(1, 3, 2))
-        >>> dimensions_prior(shape, torch.ones(1, 3), torch.ones(3)).residual
-        tensor([[-1., -1., -1.]])
     """
     J_residual_code = shape.J_hwl_code / sigma_hwl[:, None]
     return PriorResidual((shape.hwl - detector_hwl) / sigma_hwl, torch.nn.functional.pad(J_residual_code, (6, 0)))
@@ -212,14 +202,6 @@ def pose_prior(
 
     The axes are those of the detector's viewing ray, so they stay while the car moves; the heading is the angle about
     the camera's y axis from the detector's x axis to the car's, in (-pi, pi].
-
-    Examples:
-        >>> T_cam_obj = torch.eye(4)[None].clone()
-        >>> T_cam_obj[:, 2, 3] = 10.0
-        >>> nearer = T_cam_obj.clone()
-        >>> nearer[:, 2, 3] = 9.0
-        >>> pose_prior(se3.inverse(nearer), T_cam_obj, torch.tensor([[0.5, 1.0, 1.0, 0.1]]), 0).residual
-        tensor([[-2.,  0.,  0.,  0.]])
     """
     T_cam_obj = se3.inverse(T_obj_cam)
     R_cam_obj, axes = T_cam_obj[:, :3, :3], viewing_axes(detector_T_cam_obj[:, :3, 3])

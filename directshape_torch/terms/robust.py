@@ -18,12 +18,7 @@ class RobustValue(NamedTuple):
 
 
 def quadratic(residual: Tensor) -> RobustValue:
-    """`rho = r^2 / 2`.
-
-    Examples:
-        >>> quadratic(torch.tensor(2.0)).rho
-        tensor(2.)
-    """
+    """`rho = r^2 / 2`."""
     one = torch.ones_like(residual)
     return RobustValue(0.5 * residual * residual, residual, one, one)
 
@@ -43,12 +38,7 @@ def huber(residual: Tensor, corner: float) -> RobustValue:
 
 
 def truncated_huber(residual: Tensor, corner: float, limit: float) -> RobustValue:
-    """Huber's norm that stays constant beyond `limit`: a reflection is no worse than a pixel that is lost.
-
-    Examples:
-        >>> truncated_huber(torch.tensor(99.0), 2.0, 3.0).rho
-        tensor(4.)
-    """
+    """Huber's norm that stays constant beyond `limit`: a reflection is no worse than a pixel that is lost."""
     norm = huber(residual.clamp(-limit, limit), corner)
     beyond = residual.abs() >= limit
     zero = torch.zeros_like(residual)
@@ -60,10 +50,6 @@ def identity(residual: Tensor, floor: float) -> RobustValue:
     """`rho = r` for non-negative residuals, as reweighted least squares: weight 1/r, r floored (paper, E_silh as IRLS).
 
     The information of such a row, a negative log-likelihood, is its squared slope: weight 1.
-
-    Examples:
-        >>> identity(torch.tensor(0.5), 0.01).hessian_weight
-        tensor(2.)
     """
     one = torch.ones_like(residual)
     return RobustValue(residual, one, 1 / residual.clamp_min(floor), one)

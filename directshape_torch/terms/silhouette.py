@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from torch.nn.functional import logsigmoid
 
 from directshape_torch.config import SilhouetteConfig, StageConfig
 from directshape_torch.numerics.gradient_mode import nothing_is_differentiated
-from directshape_torch.rows import Blocks, CarSums, Rays, Rows
+from directshape_torch.rows import Blocks, CarSums, PixelSamples, Rays, Rows
 from directshape_torch.shape.field import Field
 from directshape_torch.shape.sdf_grid import Lookup
 from directshape_torch.terms import robust
@@ -35,9 +35,6 @@ from directshape_torch.terms.depth import (
     tracked_closest,
 )
 from directshape_torch.terms.term import Linear, Sight, Term, Where
-
-if TYPE_CHECKING:
-    from directshape_torch.observation.packing import PixelSamples
 
 # Of zeta, per metre.
 ZETA_BOUNDS = (4.0, 400.0)

@@ -13,7 +13,8 @@ from directshape_torch.config import PointCloudConfig
 from directshape_torch.errors import InputError
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.disparity_field import DisparityField
-from directshape_torch.terms.car_points import PointSamples, car_points
+from directshape_torch.rows import PointSamples
+from directshape_torch.terms.car_points import car_points
 
 ALL = PointCloudConfig(min_points=1, max_points=100_000, min_height_m=-1.0, max_distance_m=5.0)
 

@@ -16,8 +16,8 @@ from torch import Tensor
 from directshape_torch.config import PointCloudConfig
 from directshape_torch.geometry import se3
 from directshape_torch.refinement.problem import CarStage
+from directshape_torch.rows import PointSamples
 from directshape_torch.shape.field import field_of
-from directshape_torch.terms.car_points import PointSamples
 from directshape_torch.terms.cars import CarState
 from directshape_torch.terms.point_cloud import PointCloud
 from directshape_torch.terms.term import Linear
