@@ -171,7 +171,9 @@ class DirectShapeRefiner(nn.Module):
         usable = failure < 0
         rows = usable.nonzero()[:, 0]
         cars = self._cars(frames, detections).of_cars(usable)
-        problem = self._problem(frames, detections, cars, seen.of_objects(usable), term_weights)
+        problem = problem_of_scene(
+            self.config, self.prior, frames, detections, cars, seen.of_objects(usable), self.extra_terms, term_weights
+        )
         # Detached: of cars that are not refined it is a value alone, and a NaN pose would have a NaN gradient here.
         state, status = self._input_state(detections.T_cam_obj.detach(), cars), failure
         outcome = Outcome.nothing(problem, CarState(*(part[:0] for part in state)))
@@ -188,7 +190,10 @@ class DirectShapeRefiner(nn.Module):
         """The minimisation problem and the input state of these cars, for experiments; statuses are not checked."""
         frames, detections = self._with_rig(frames, detections)
         cars = self._cars(frames, detections)
-        problem = self._problem(frames, detections, cars, self._observe(frames, detections), term_weights)
+        seen = self._observe(frames, detections)
+        problem = problem_of_scene(
+            self.config, self.prior, frames, detections, cars, seen, self.extra_terms, term_weights
+        )
         return problem, self._input_state(detections.T_cam_obj, cars)
 
     def _with_rig(self, frames: FrameBatch, detections: Detections) -> tuple[FrameBatch, Detections]:
@@ -220,18 +225,6 @@ class DirectShapeRefiner(nn.Module):
 
         matched = with_disparity(frames, needed=detections.frame_index)
         return replace(seen, points=car_points(matched, detections, self.config.point_cloud))
-
-    def _problem(
-        self,
-        frames: FrameBatch,
-        detections: Detections,
-        cars: CarBatch,
-        seen: Observation,
-        term_weights: Mapping[str, Tensor] | None,
-    ) -> CarProblem:
-        """The problem of some of the detections, of which `cars` and `seen` are."""
-        extra = self.extra_terms
-        return problem_of_scene(self.config, self.prior, frames, detections, cars, seen, extra, term_weights)
 
     def _minimise(self, problem: CarProblem, initial: CarState, cars: CarBatch) -> Outcome:
         if self.config.method == "box_alignment":

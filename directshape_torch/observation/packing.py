@@ -24,8 +24,8 @@ from directshape_torch.scene import Detections, FrameBatch
 class Observation:
     """Everything that B cars see of the images."""
 
-    left: PixelSamples  # packed pixels of the two images
-    right: PixelSamples  # likewise
+    left: PixelSamples  # packed pixels of the left image
+    right: PixelSamples  # and of the right one
     # what hides cars in the right image, by row of the detections; None: not asked for
     hidden_right: OcclusionMap | None
     mask_areas: Tensor  # (detections of the call, 2) foreground pixels of the left and right masks, 0 where absent

@@ -49,33 +49,20 @@ _MAX_STEP_M, _MAX_STEP_RAD, _MAX_STEP_CODE, _MAX_STEP_OFFSET_PX = 0.5, 0.15, 1.0
 
 @dataclass(frozen=True)
 class CarProblem:
-    """Minimise the sum of terms over pose and shape of B cars: a `solver.Problem`.
+    """Minimise the sum of terms over pose and shape of B cars: a `solver.Problem`."""
 
-    Attributes:
-        prior: the family of shapes.
-        terms: summands of the energy.
-        masks: the rays of both images, left ones first, which everything that looks at a state shares.
-        rays: of the blocks of the left and of the right image by themselves.
-        config: stages, trust region, samples per ray.
-        factors: (B, T) of the columns of the terms of each car, beside their own weights; None for 1.
-        num_extra: how many of the terms, the last ones, are a user's own.
-        num_offsets: S, 1 where the disparity of a car is off by an unknown offset.
-        num_path: N, 9 where views of a track have a path in common.
-        num_next: M, 1 where views of a track look at the next.
-        sharing: whose shapes are one (`tracks.py`).
-    """
-
-    prior: ShapePrior
-    terms: tuple[Term, ...]
-    masks: MaskRows
-    rays: tuple[Rays, Rays]
-    config: RefinerConfig
+    prior: ShapePrior  # the family of shapes
+    terms: tuple[Term, ...]  # summands of the energy
+    masks: MaskRows  # the rays of both images, left ones first, which everything that looks at a state shares
+    rays: tuple[Rays, Rays]  # of the blocks of the left and of the right image by themselves
+    config: RefinerConfig  # stages, trust region, samples per ray
+    # (B, T) of the columns of the terms of each car, beside their own weights; None for 1
     factors: Tensor | None = None
-    num_extra: int = 0
-    num_offsets: int = 0
-    num_path: int = 0
-    num_next: int = 0
-    sharing: Sharing = INDEPENDENT
+    num_extra: int = 0  # how many of the terms, the last ones, are a user's own
+    num_offsets: int = 0  # S, 1 where the disparity of a car is off by an unknown offset
+    num_path: int = 0  # N, 9 where views of a track have a path in common
+    num_next: int = 0  # M, 1 where views of a track look at the next
+    sharing: Sharing = INDEPENDENT  # whose shapes are one (`tracks.py`)
 
     @property
     def term_names(self) -> tuple[str, ...]:

@@ -96,26 +96,16 @@ def _attached(problem: CarProblem, cars: CarBatch, start: CarState, minimum: Min
 
 @dataclass(frozen=True)
 class Together:
-    """Views that share a shape with others.
+    """Views that share a shape with others."""
 
-    Attributes:
-        keep: (B,) bool, which of the cars of the call they are.
-        problem: of these R views, its last stage alone.
-        agreement: whose codes are one.
-        cars: the views, with times and cameras of their track.
-        gradient, hessian: (R, D) and (R, D, D) of what each adds to the cost of its track, where it ended by itself.
-        part: (R,) of its track, 0 unless it was split.
-        next_view: (R,) number of the next view of its part in time, of the last one its own.
-    """
-
-    keep: Tensor
-    problem: CarProblem
-    agreement: Groups
-    cars: CarBatch
-    gradient: Tensor
-    hessian: Tensor
-    part: Tensor
-    next_view: Tensor
+    keep: Tensor  # (B,) bool, which of the cars of the call they are
+    problem: CarProblem  # of these R views, its last stage alone
+    agreement: Groups  # whose codes are one
+    cars: CarBatch  # the views, with times and cameras of their track
+    gradient: Tensor  # (R, D) of what each adds to the cost of its track, where it ended by itself
+    hessian: Tensor  # (R, D, D) of the same
+    part: Tensor  # (R,) of its track, 0 unless it was split
+    next_view: Tensor  # (R,) number of the next view of its part in time, of the last one its own
 
     def agreed(self, alone: CarState) -> CarState:
         """States (R) with the one shape on which the views agree best, and poses as they go with it.
@@ -198,16 +188,11 @@ def _tracks(cars: CarBatch, usable: Tensor) -> list[list[int]]:
 
 @dataclass(frozen=True)
 class _Quadratics:
-    """What each of B views says of its code about where it ended by itself, its pose following: `c^T A c / 2 - b^T c`.
+    """What each of B views says of its code about where it ended, its pose following: `c^T A c / 2 - b^T c`."""
 
-    Attributes:
-        A, b: (B, K, K) and (B, K, 1), without what is known beforehand of shapes.
-        known: (B, K, K) which is this, about the mean shape.
-    """
-
-    A: Tensor
-    b: Tensor
-    known: Tensor
+    A: Tensor  # (B, K, K), without what is known beforehand of shapes
+    b: Tensor  # (B, K, 1), likewise
+    known: Tensor  # (B, K, K) which is this, about the mean shape
 
     @classmethod
     def of(cls, problem: CarProblem, minimum: Minimum[CarState]) -> tuple[_Quadratics, Tensor]:

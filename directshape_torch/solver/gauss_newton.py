@@ -23,55 +23,34 @@ from directshape_torch.status import Status, is_refined
 
 @dataclass(frozen=True)
 class Iteration(Generic[StateT]):
-    """What must be known to repeat one iteration of all B problems.
+    """What must be known to repeat one iteration of all B problems."""
 
-    Attributes:
-        stage: number of its stage.
-        state: states before it.
-        damping: (B,) Marquardt's mu.
-        lengths: (B,) what the steps were multiplied by, before their limits.
-        accepted: (B,) bool: the step was taken; false for problems that took no part.
-        improved: (B,) bool: it led to the best state of the stage so far.
-    """
-
-    stage: int
-    state: StateT
-    damping: Tensor
-    lengths: Tensor
-    accepted: Tensor
-    improved: Tensor
+    stage: int  # number of its stage
+    state: StateT  # states before it
+    damping: Tensor  # (B,) Marquardt's mu
+    lengths: Tensor  # (B,) what the steps were multiplied by, before their limits
+    accepted: Tensor  # (B,) bool: the step was taken; false for problems that took no part
+    improved: Tensor  # (B,) bool: it led to the best state of the stage so far
 
 
 @dataclass(frozen=True)
 class Minimum(Generic[StateT]):
-    """Result of a minimisation.
+    """Result of a minimisation."""
 
-    Attributes:
-        state: final states; the input's where the status says so.
-        end: states where the iterations ended, whatever the status says.
-        status: (B,) integer codes of `Status`.
-        iterations: (B,) iterations done.
-        cost_history: cost of the current state after each iteration, (B, iterations done in all), NaN where a problem
-            took no part. Costs of different stages are not comparable.
-        stage_starts: states at which each stage began and fixed its sets.
-        stage: the last stage that has begun, of all problems.
-        seen_initial, seen_end: what the problem's `look` gave at the input states and where the iterations ended.
-        before, after: the last stage's figures there.
-        trajectory: all iterations in order, if they were asked for.
-    """
-
-    state: StateT
-    end: StateT
-    status: Tensor
-    iterations: Tensor
+    state: StateT  # final states; the input's where the status says so
+    end: StateT  # states where the iterations ended, whatever the status says
+    status: Tensor  # (B,) integer codes of `Status`
+    iterations: Tensor  # (B,) iterations done
+    # cost of the current state after each iteration, (B, iterations done in all), NaN where a problem took no part.
+    # Costs of different stages are not comparable
     cost_history: Tensor
-    stage_starts: tuple[StateT, ...]
-    stage: Any
-    seen_initial: Any
-    seen_end: Any
-    before: Any
-    after: Any
-    trajectory: tuple[Iteration[StateT], ...] = ()
+    stage_starts: tuple[StateT, ...]  # states at which each stage began and fixed its sets
+    stage: Any  # the last stage that has begun, of all problems
+    seen_initial: Any  # what the problem's `look` gave at the input states
+    seen_end: Any  # and where the iterations ended
+    before: Any  # the last stage's figures at the input states
+    after: Any  # and where the iterations ended
+    trajectory: tuple[Iteration[StateT], ...] = ()  # all iterations in order, if they were asked for
 
 
 class _Log(Generic[StateT]):

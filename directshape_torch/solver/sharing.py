@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -18,34 +17,34 @@ from torch import Tensor
 from directshape_torch.solver.damped_solve import damped_solution, damped_step, is_finite, newton_step
 
 
-class Sharing(Protocol):
-    """What B problems have in common; `members` (B,) bool says which of them count."""
+class Sharing:
+    """What B problems have in common, here nothing: each is a group of its own. `members` (B,) bool says who counts."""
 
     def damped_step(self, hessian: Tensor, gradient: Tensor, damping: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
         """The step (B, D) of `(H + mu diag(H)) step = -g`, and where (B,) there is one; see `damped_step`.
 
         A member without a step of its own unknowns does not spoil that of the others.
         """
-        ...
+        return damped_step(hessian, gradient, damping)
 
     def newton_step(self, J: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """The step (B, D) of `J step = -g`, differentiable by the gradient alone, and where (B,) there is one.
 
         J (B, D, D) is that of each problem's own gradient by its own unknowns; a group's is the sum.
         """
-        ...
+        return newton_step(J, gradient)
 
     def total(self, values: Tensor, members: Tensor) -> Tensor:
         """For each problem the sum of values (B,) over its group."""
-        ...
+        return values
 
     def largest(self, values: Tensor, members: Tensor) -> Tensor:
         """For each problem the largest of the values (B,), at least 0, of its group."""
-        ...
+        return values
 
     def any(self, flags: Tensor) -> Tensor:
         """For each problem whether flags (B,) bool hold anywhere in its group."""
-        ...
+        return flags
 
     def with_others(self, information: Tensor, members: Tensor) -> Tensor:
         """Fisher matrices of each problem, from those of all (B, D, D), with what the others of its group say.
@@ -53,65 +52,31 @@ class Sharing(Protocol):
         The inverse is each problem's block of the inverse of the group's matrix. Unknowns of another problem are none
         of it.
         """
-        ...
+        return information
 
     def of_problems(self, numbers: Sequence[int]) -> Sharing:
         """That of fewer problems."""
-        ...
-
-
-class Independent:
-    """Problems that share nothing: each is a group of its own."""
-
-    def damped_step(self, hessian: Tensor, gradient: Tensor, damping: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
-        return damped_step(hessian, gradient, damping)
-
-    def newton_step(self, J: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        return newton_step(J, gradient)
-
-    def total(self, values: Tensor, members: Tensor) -> Tensor:
-        return values
-
-    def largest(self, values: Tensor, members: Tensor) -> Tensor:
-        return values
-
-    def any(self, flags: Tensor) -> Tensor:
-        return flags
-
-    def with_others(self, information: Tensor, members: Tensor) -> Tensor:
-        return information
-
-    def of_problems(self, numbers: Sequence[int]) -> Independent:
         return self
 
 
-INDEPENDENT = Independent()
+INDEPENDENT = Sharing()
 
 
 @dataclass(frozen=True)
-class Groups:
-    """B problems in G groups, which share some of their D unknowns and step by one dense system of N unknowns a group.
+class Groups(Sharing):
+    """B problems in G groups, which share some of their D unknowns and step by one dense system of N a group."""
 
-    Attributes:
-        group, place: (B,) of each problem, as the host knows it: its group, and where it stands there.
-        own, shared: (P,) and (K,) numbers of the unknowns.
-        of_next: (Q,) numbers of those that are the first own ones of the problem in the next place of the group;
-            constants where nobody stands there.
-        of_problem: (B,) the group on the device.
-        rows: (G, F) the problem in each place; an empty place repeats the first.
-        filled: (G, F) bool.
-        column: (B, D) of each unknown in the system of its group.
-    """
-
-    group: tuple[int, ...]
-    place: tuple[int, ...]
-    own: Tensor
-    shared: Tensor
+    group: tuple[int, ...]  # (B,) of each problem, as the host knows it
+    place: tuple[int, ...]  # (B,) where it stands there
+    own: Tensor  # (P,) numbers of the unknowns of a problem by itself
+    shared: Tensor  # (K,) of those that a group has in common
+    # (Q,) numbers of those that are the first own ones of the problem in the next place of the group; constants where
+    # nobody stands there
     of_next: Tensor
-    of_problem: Tensor
-    rows: Tensor
-    filled: Tensor
-    column: Tensor
+    of_problem: Tensor  # (B,) the group on the device
+    rows: Tensor  # (G, F) the problem in each place; an empty place repeats the first
+    filled: Tensor  # (G, F) bool
+    column: Tensor  # (B, D) of each unknown in the system of its group
 
     @classmethod
     def of(

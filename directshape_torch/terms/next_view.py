@@ -77,19 +77,12 @@ class LookedUp(NamedTuple):
 
 @dataclass(frozen=True)
 class NextView(Term):
-    """The term; see module.
+    """The term; see module."""
 
-    Attributes:
-        weight: of the term.
-        stereo: the photometric term of the B views, whose pixels and surfaces these are.
-        next_views: of these views.
-        fixed: what is fixed in the stage that has begun.
-    """
-
-    weight: float
-    stereo: Photometric
-    next_views: NextViews
-    fixed: NextImage | None = None
+    weight: float  # of the term
+    stereo: Photometric  # the photometric term of the B views, whose pixels and surfaces these are
+    next_views: NextViews  # of these views
+    fixed: NextImage | None = None  # what is fixed in the stage that has begun
 
     names = (NEXT_VIEW_NAME,)
 

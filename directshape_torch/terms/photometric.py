@@ -72,19 +72,12 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True)
 class Photometric(Term):
-    """The term; see module. Before the first stage the pixel set is empty.
+    """The term; see module. Before the first stage the pixel set is empty."""
 
-    Attributes:
-        config: weight and forms.
-        cars: B cars.
-        left: what pixel sets are made of; None where no further stage begins.
-        fixed: the pixel set of the stage.
-    """
-
-    config: PhotometricConfig
-    cars: CarBatch
-    left: LeftPixels | None
-    fixed: PixelSet | None = None
+    config: PhotometricConfig  # weight and forms
+    cars: CarBatch  # B cars
+    left: LeftPixels | None  # what pixel sets are made of; None where no further stage begins
+    fixed: PixelSet | None = None  # the pixel set of the stage
 
     names = ("photometric",)
 

@@ -94,23 +94,14 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True)
 class LeftPixels:
-    """What pixel sets are made of: all packed pixels of the left image, and both images.
+    """What pixel sets are made of: all packed pixels of the left image, and both images."""
 
-    Attributes:
-        pixels: P packed pixels.
-        packed: how they fill the blocks of a `Sight`.
-        rays: of these blocks.
-        pyramid: both images at every level that a stage asks for.
-        hidden_right: where nearer instances cover the right image; None: nowhere.
-        mask_left: (detections of the call, H, W).
-    """
-
-    pixels: PixelSamples
-    packed: Rows
-    rays: Rays
-    pyramid: tuple[GreyPair, ...]
-    hidden_right: OcclusionMap | None
-    mask_left: Tensor
+    pixels: PixelSamples  # P packed pixels
+    packed: Rows  # how they fill the blocks of a `Sight`
+    rays: Rays  # of these blocks
+    pyramid: tuple[GreyPair, ...]  # both images at every level that a stage asks for
+    hidden_right: OcclusionMap | None  # where nearer instances cover the right image; None: nowhere
+    mask_left: Tensor  # (detections of the call, H, W)
 
     @classmethod
     def of(

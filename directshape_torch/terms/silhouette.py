@@ -52,25 +52,15 @@ _MARGIN_EXPONENT_AFTER_WIDER = 10.0
 
 @dataclass(frozen=True)
 class MaskRows:
-    """The rays of both images with what the masks say, in blocks; shared by both forms of the projection.
+    """The rays of both images with what the masks say, in blocks; shared by both forms of the projection."""
 
-    Attributes:
-        blocks: M blocks, first those of the left image, then of the right one.
-        rays: of these blocks.
-        side: (M,) 0 for the left image, 1 for the right one.
-        foreground: (M, 64) probability of the mask, clamped.
-        filled: (M, 64) 1 in filled places, else 0.
-        weight: (M,) float64, lambda over the number of rays that the car has in this image.
-        left_counts: (B,) blocks of the left image, which the host knows.
-    """
-
-    blocks: Blocks
-    rays: Rays
-    side: Tensor
-    foreground: Tensor
-    filled: Tensor
-    weight: Tensor
-    left_counts: tuple[int, ...]
+    blocks: Blocks  # M blocks, first those of the left image, then of the right one
+    rays: Rays  # of these blocks
+    side: Tensor  # (M,) 0 for the left image, 1 for the right one
+    foreground: Tensor  # (M, 64) probability of the mask, clamped
+    filled: Tensor  # (M, 64) 1 in filled places, else 0
+    weight: Tensor  # (M,) float64, lambda over the number of rays that the car has in this image
+    left_counts: tuple[int, ...]  # (B,) blocks of the left image, which the host knows
 
     @classmethod
     def of_pixels(
@@ -151,21 +141,13 @@ def contour_zeta(cars: CarBatch, stage: StageConfig) -> Tensor:
 
 @dataclass(frozen=True)
 class Silhouettes(Term):
-    """The term of both images, with the projection by closest approach; see module.
+    """The term of both images, with the projection by closest approach; see module."""
 
-    Attributes:
-        config: weight and forms.
-        cars: B cars.
-        rows: their rays.
-        bounds_obj: (2, 3) of the prior.
-        zeta: (M, 1) per metre; set when a stage begins.
-    """
-
-    config: SilhouetteConfig
-    cars: CarBatch
-    rows: MaskRows
-    bounds_obj: Tensor
-    zeta: Tensor
+    config: SilhouetteConfig  # weight and forms
+    cars: CarBatch  # B cars
+    rows: MaskRows  # their rays
+    bounds_obj: Tensor  # (2, 3) of the prior
+    zeta: Tensor  # (M, 1) per metre; set when a stage begins
 
     names = ("silhouette_left", "silhouette_right")
 

@@ -42,7 +42,7 @@ def test_heights_are_above_the_plane() -> None:
     assert 0.5 <= height.min() < 0.55
     assert 0.95 < height.max() <= 1.0
     everything = CAMERA_HEIGHT_M - points_of().points_cam[:, 1]
-    assert len(points) == int(((everything >= 0.5) & (everything <= 1.0)).sum())
+    assert len(points.points_cam) == int(((everything >= 0.5) & (everything <= 1.0)).sum())
 
 
 def test_distances_are_along_the_ground_from_the_centre_of_the_detection() -> None:
@@ -52,7 +52,7 @@ def test_distances_are_along_the_ground_from_the_centre_of_the_detection() -> No
     points = points_of(replace(ALL, max_distance_m=1.6), T_cam_obj=lifted)
     offset = (points.points_cam - detections.T_cam_obj[points.object_index, :3, 3])[:, [0, 2]].norm(dim=-1)
     assert 1.5 < offset.max() <= 1.6
-    assert 0 < len(points) < len(points_of())
+    assert 0 < len(points.points_cam) < len(points_of().points_cam)
 
 
 def test_without_a_mask_or_by_option_the_box_counts() -> None:
