@@ -23,10 +23,8 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.geometry.stereo_camera import StereoCamera
 from directshape_torch.io.kitti_calibration import KittiCalibration
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
-from directshape_torch.scene_check.car_evidence import CarBoxes
-from directshape_torch.scene_check.check_images import PairMatches, check_calibration, check_pair, match_pair
+from directshape_torch.scene_check.check_images import PairMatches, check_calibration, check_pair
 from directshape_torch.scene_check.check_places import check_distances
-from directshape_torch.scene_check.conventions import AS_DOCUMENTED, BoxConvention, all_conventions
 from directshape_torch.scene_check.finding import CheckReport, Finding
 
 SIZE_HW = (400, 1200)
@@ -87,17 +85,6 @@ def test_rows_may_differ_as_the_calibration_says() -> None:
     assert check_pair(shifted, camera(calibration(right=other_centre)), SIZE_HW, "") == []
 
 
-def test_features_of_a_shifted_texture_match_where_they_should() -> None:
-    import cv2
-
-    random = np.random.default_rng(0)
-    left = cv2.resize(random.integers(0, 255, (40, 60, 3), dtype=np.uint8), (480, 320), interpolation=cv2.INTER_CUBIC)
-    found = match_pair(left, np.roll(left, (3, -8), axis=(0, 1)))
-    assert len(found) > 50
-    assert np.median(found.uv_left - found.uv_right, axis=0) == pytest.approx([8, -3], abs=0.1)
-    assert len(match_pair(np.zeros_like(left), left)) == 0
-
-
 @pytest.mark.parametrize(
     ("found", "expected"),
     [
@@ -113,31 +100,6 @@ def test_calibrations(found: KittiCalibration, expected: list[str]) -> None:
     findings = check_calibration(*numbers_of(found), SIZE_HW, "frame 1")
     assert [finding.check for finding in findings] == expected
     assert all(finding.where == "frame 1" or "of calib.txt" in finding.where for finding in findings)
-
-
-def test_every_convention_can_be_undone() -> None:
-    """A box written in a convention is the documented one again; there are 6 x 3 x 6 x 6 of them, and 24 factors."""
-    conventions = list(all_conventions())
-    assert len(conventions) == len(set(conventions)) == 648 + 24
-    assert conventions[0] == BoxConvention()
-    assert conventions[0].deviations == {}
-
-    def boxes(location: list[float], hwl: list[float], yaw: float) -> CarBoxes:
-        return CarBoxes(np.array([location]), np.array([hwl]), np.array([yaw]), np.zeros(1), np.zeros((1, 4)))
-
-    lidar = BoxConvention(
-        "LiDAR's: x forward, y left, z up",
-        "centre of the box",
-        "opposite sign and offset by 90 degrees (LiDAR's)",
-        "l w h",
-    )
-    # 20 m ahead, 3 m to the left, centre 0.85 m below the sensor, driving straight ahead.
-    kitti = lidar.to_kitti(boxes([20.0, 3.0, -0.85], [4.0, 1.6, 1.5], 0.0))
-    assert kitti.location.tolist() == [[-3.0, 0.85 + 0.75, 20.0]]
-    assert kitti.hwl.tolist() == [[1.5, 1.6, 4.0]]
-    assert kitti.rotation_y.tolist() == [-np.pi / 2]
-    assert BoxConvention(yaw="degrees").to_kitti(boxes([0.0, 0, 1], [1.0, 1, 1], 180.0)).rotation_y.tolist() == [np.pi]
-    assert AS_DOCUMENTED not in lidar.deviations.values()
 
 
 def test_distances_tell_the_baseline_from_the_boxes() -> None:

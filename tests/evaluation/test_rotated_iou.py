@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from directshape_torch.errors import InputError
 from directshape_torch.evaluation.rotated_iou import bev_iou, iou_3d
@@ -82,28 +80,6 @@ def test_equals_opencv_on_random_boxes():
     areas = (a[:, 2] * a[:, 3]).numpy(), (b[:, 2] * b[:, 3]).numpy()
     assert (shared > 0).mean() > 0.3  # the comparison is not one of zeros
     np.testing.assert_allclose(bev_iou(a, b).numpy(), shared / (areas[0] + areas[1] - shared), atol=5e-4)
-
-
-_coordinate = st.floats(-50, 50)
-_box = st.tuples(_coordinate, _coordinate, st.floats(0.1, 20), st.floats(0.1, 20), st.floats(-7, 7))
-
-
-@settings(max_examples=60, deadline=None)
-@given(a=_box, b=_box, shift=st.tuples(_coordinate, _coordinate), turn=st.floats(-4, 4))
-def test_laws(a: tuple[float, ...], b: tuple[float, ...], shift: tuple[float, float], turn: float):
-    first, second = _boxes(a), _boxes(b)
-    overlap = bev_iou(first, second).item()
-    assert 0 <= overlap <= 1
-    assert bev_iou(second, first).item() == pytest.approx(overlap, abs=1e-9)
-    assert bev_iou(first, first).item() == pytest.approx(1, abs=1e-12)
-
-    def move(boxes: torch.Tensor) -> torch.Tensor:
-        x, z = boxes[:, 0], boxes[:, 1]
-        c, s = math.cos(turn), math.sin(turn)
-        place = [c * x + s * z + shift[0], -s * x + c * z + shift[1]]
-        return torch.stack([*place, boxes[:, 2], boxes[:, 3], boxes[:, 4] + turn], dim=-1)
-
-    assert bev_iou(move(first), move(second)).item() == pytest.approx(overlap, abs=1e-9)
 
 
 def test_iou_3d_hand_derived():

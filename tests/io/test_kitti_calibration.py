@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.io.kitti_calibration import read_calibration, read_plane, to_stereo_camera
@@ -35,22 +34,6 @@ def test_layouts_give_the_same_projections(tmp_path: Path, text: str) -> None:
     assert calibration.P3[1, 3] == 2.199936
     assert calibration.R0_rect is not None
     assert calibration.R0_rect.shape == (3, 3)
-
-
-def test_offsets_by_hand(tmp_path: Path) -> None:
-    calibration = read_calibration(write(tmp_path, OBJECT))
-    camera = to_stereo_camera([calibration, calibration], dtype=torch.float64)
-    # K t = P[:, 3] solved from the last row upwards: t_z = P[2,3], t_x = (P[0,3] - c_x t_z) / f, and so on.
-    t2_z, t3_z = 0.002745884, 0.002729905
-    t2 = [(44.85728 - 609.5593 * t2_z) / 721.5377, (0.2163791 - 172.854 * t2_z) / 721.5377, t2_z]
-    t3 = [(-339.5242 - 609.5593 * t3_z) / 721.5377, (2.199936 - 172.854 * t3_z) / 721.5377, t3_z]
-    assert camera.num_frames == 2
-    torch.testing.assert_close(camera.t_cam_ref[1], torch.tensor(t2, dtype=torch.float64), rtol=0, atol=1e-12)
-    expected = torch.tensor(t3, dtype=torch.float64) - torch.tensor(t2, dtype=torch.float64)
-    torch.testing.assert_close(camera.T_right_cam[0, :3, 3], expected, rtol=0, atol=1e-12)
-    # KITTI's right camera is 2.7 mm off vertically.
-    assert camera.T_right_cam[0, 1, 3].item() == pytest.approx(0.0027, abs=1e-4)
-    assert to_stereo_camera([calibration]).K_left.dtype == torch.float32
 
 
 @pytest.mark.parametrize(

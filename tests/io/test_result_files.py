@@ -24,17 +24,6 @@ WALKER = "Pedestrian  0 0 0.5 1 2 3 4 1.8 0.6 0.6 1 1.7 9 0 1e-3\t"
 BOX = (-2.0, 1.5, 1.61, 3.9, 2.5, -1e-6, 4.25, -1.75)
 
 
-def test_result_reads_back_as_the_refined_box(tmp_path: Path) -> None:
-    (tmp_path / "in.txt").write_text(CAR)
-    objects = read_objects(tmp_path / "in.txt")
-    write_result_text(tmp_path / "out.txt", objects, {0: BOX})
-    (again,) = read_objects(tmp_path / "out.txt", with_score=True)
-    assert again.hwl == BOX[1:4]
-    assert again.location_ref == (2.5, 0.0, 4.25)
-    assert (again.rotation_y, again.alpha, again.score) == (-1.75, -2.0, 0.9)
-    assert again.box_2d == objects[0].box_2d
-
-
 def test_nothing_refined_is_a_copy_byte_for_byte(tmp_path: Path) -> None:
     content = f"{CAR}\r\n{WALKER}\r\n".encode()
     (tmp_path / "in.txt").write_bytes(content)

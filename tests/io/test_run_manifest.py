@@ -17,6 +17,7 @@ from directshape_torch.io.run_manifest import (
     check_resume,
     hash_fields,
     hash_prior,
+    hash_tensors,
     read_manifest,
     write_manifest,
 )
@@ -97,6 +98,12 @@ def test_a_prior_has_the_same_hash_however_it_is_stored(tmp_path: Path) -> None:
     assert hashes == {hash_prior(prior)}
     prior.basis[0, 0, 0, 0] += 1e-3
     assert hash_prior(prior) not in hashes
+
+
+def test_names_and_shapes_of_tensors_count() -> None:
+    tensor = torch.arange(6.0)
+    same = [{"a": tensor}, {"b": tensor}, {"a": tensor.reshape(2, 3)}, {"a": tensor, "b": tensor}]
+    assert len({hash_tensors(tensors) for tensors in same}) == 4
 
 
 def test_every_tensor_of_a_field_counts() -> None:
