@@ -25,8 +25,9 @@ from directshape_torch.observation.extents import MASK_THRESHOLD
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.sdf_to_mesh import sdf_to_mesh
 from directshape_torch.status import Status
+from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.visualize.car_figures import WORST_SILHOUETTE
-from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour, blue_white_red, picture_of
+from directshape_torch.visualize.drawing import BLUE, GREEN, GREY, ORANGE, Colour, blue_white_red
 from directshape_torch.visualize.refinement_trace import (
     CarResiduals,
     PixelResiduals,
@@ -143,7 +144,7 @@ def _log_images(stream: _Stream, loaded: LoadedFrame) -> None:
     stream.log("world/cam", rr.Pinhole(image_from_camera=K_image, resolution=[width, height], camera_xyz=axes))
     sides = ((_LEFT, frame.images_left, detections.mask_left), (_RIGHT, frame.images_right, detections.mask_right))
     for entity, images, masks in sides:
-        stream.log(entity, rr.Image(picture_of(images[0])).compress(jpeg_quality=_JPEG_QUALITY))
+        stream.log(entity, rr.Image(rgb8(images[0])).compress(jpeg_quality=_JPEG_QUALITY))
         numbers = np.zeros(tuple(masks.shape[1:]), dtype=np.uint16)
         for mask, detected in zip(masks, loaded.detected_objects, strict=True):
             numbers[(mask > MASK_THRESHOLD).cpu().numpy()] = detected.line_number

@@ -26,14 +26,7 @@ def near_side_depth(
     uv_left: Tensor,  # (P, 2) pixels
     K_left: Tensor,  # (3, 3)
 ) -> Tensor:  # (P,)
-    """Depth at left pixels of the band of bumpers and doors, 10 cm within a box; NaN where a ray misses it.
-
-    Examples:
-        >>> K, T_cam_obj = torch.tensor([[700.0, 0, 600], [0, 700, 180], [0, 0, 1]]), torch.eye(4)
-        >>> T_cam_obj[:3, 3] = torch.tensor([0.0, 1.6, 22.0])
-        >>> near_side_depth(T_cam_obj, torch.tensor([1.5, 1.6, 4.0]), torch.tensor([[600.0, 215], [100, 215]]), K)
-        tensor([21.3000,     nan])
-    """
+    """Depth at left pixels of the band of bumpers and doors, 10 cm within a box; NaN where a ray misses it."""
     T_obj_cam, rays_cam = inverse(T_cam_obj), rays_from_pixels(uv_left, K_left)
     height, width, length = dimensions_hwl
     half = torch.stack([length / 2 - _SETBACK_M, height, width / 2 - _SETBACK_M])
@@ -63,16 +56,7 @@ def size_error(
 ) -> float:
     """Relative error of the box's depth by the height of its mask, above 0 where it stands too far.
 
-    Returns:
-        0 where it is not known: the image ends there, the mask is small, or something else hides or extends it (20 %).
-
-    Examples:
-        >>> K, T_cam_obj = torch.tensor([[700.0, 0, 100], [0, 700, 50], [0, 0, 1]]), torch.eye(4)
-        >>> T_cam_obj[:3, 3] = torch.tensor([0.0, 1.6, 30.0])
-        >>> mask = torch.zeros(120, 200, dtype=torch.bool)
-        >>> mask[51:88, 60:140] = True
-        >>> round(size_error(T_cam_obj, torch.tensor([1.5, 1.6, 4.0]), mask, K), 3)
-        0.052
+    It is 0 where it is not known: the image ends there, the mask is small, or something hides or extends it (20 %).
     """
     v, u = mask.nonzero().unbind(dim=1)
     height, width = mask.shape
@@ -111,9 +95,7 @@ _MEDIAN_TO_MEAN = 1.57  # variance of a median over that of a mean
 def observe_detections(frames: FrameBatch, detections: Detections) -> Tensor:  # (N, 8)
     """One row (`COLUMNS`, float64, CPU) for each car 5 to 70 m ahead whose near side is matched consistently.
 
-    Args:
-        frames: F frames; a disparity field of their camera is not used.
-        detections: B cars. Of one with a left mask only the pixels of the mask are looked at.
+    A disparity field of the camera is not used; of a car with a left mask only the pixels of the mask are looked at.
     """
     rows = [row for frame in range(len(frames)) for row in _rows_of_frame(frames, detections, frame)]
     return torch.stack(rows) if rows else torch.zeros(0, len(COLUMNS), dtype=torch.float64)

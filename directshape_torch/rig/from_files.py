@@ -103,12 +103,7 @@ def _rig_of_first(dataset: StereoDataset, frame_ids: Sequence[str], rigs: list[R
 
 
 def _evenly(frame_ids: Sequence[str]) -> list[str]:
-    """All of them, so that the first N are spread over the whole: in the order of their bit-reversed numbers.
-
-    Examples:
-        >>> "".join(_evenly("abcdefgh"))
-        'aecgbfdh'
-    """
+    """All of them, so that the first N are spread over the whole: in the order of their bit-reversed numbers."""
     num_bits = max(1, (len(frame_ids) - 1).bit_length())
     return [frame_ids[k] for k in sorted(range(len(frame_ids)), key=lambda k: f"{k:0{num_bits}b}"[::-1])]
 
@@ -132,15 +127,7 @@ def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
 
 
 def chosen_frames(known: Sequence[str], frames: Sequence[int | str] | None) -> list[str]:
-    """The wanted frames among those that are known, a number for a name with leading zeros; all if `frames` is None.
-
-    Raises:
-        InputError: one of them is not known.
-
-    Examples:
-        >>> chosen_frames(["000107", "007322"], [107])
-        ['000107']
-    """
+    """The wanted frames among those that are known, a number for a name with leading zeros; all if `frames` is None."""
     if frames is None:
         return list(known)
     by_word = {word: name for name in known for word in (name, int(name) if name.isdecimal() else name)}
@@ -151,11 +138,7 @@ def chosen_frames(known: Sequence[str], frames: Sequence[int | str] | None) -> l
 
 
 def observe_frame(root: Path, frame_id: str, truth: Path, source: TruthSource) -> Frame:
-    """Read one frame and measure its disparities where the truth is known.
-
-    Raises:
-        DataFormatError: a file is missing or damaged.
-    """
+    """Read one frame and measure its disparities where the truth is known."""
     training = root / "training"
     calibration = read_calibration(training / "calib" / f"{frame_id}.txt")
     left, right = read_pair(*(find_image(training / name, frame_id) for name in ("image_2", "image_3")))
@@ -179,11 +162,7 @@ def add_truth(rigs: list[RigEstimate], source: TruthSource, frames: Sequence[Fra
 
 
 def known_depth_from_lidar(path: Path, calibration: KittiCalibration, rig: Rig) -> Tensor:
-    """Scan points (P, 3) u, v, depth that fall into the left image and are not hidden from the camera.
-
-    Raises:
-        DataFormatError: see `read_scan`.
-    """
+    """Scan points (P, 3) u, v, depth that fall into the left image and are not hidden from the camera."""
     points_cam = read_scan(path, calibration, to_stereo_camera([calibration], dtype=torch.float64))
     points_cam = points_cam[(points_cam[:, 2] > _DEPTH_RANGE_M[0]) & (points_cam[:, 2] < _DEPTH_RANGE_M[1])]
     known = torch.cat([project(points_cam, rig.K_left), points_cam[:, 2:]], dim=1)
@@ -273,12 +252,9 @@ def observe_motion(
     """Read the frames one after the other and collect what they show.
 
     Args:
-        sequence: of one rig.
+        sequence: of one rig; an image that is not as large as those before it raises `DataFormatError`.
         height_m: of the camera above the road; None leaves the road out.
         frame_ids: the sequence's own, as an iterator that shows progress, say.
-
-    Raises:
-        DataFormatError: an image is missing or damaged, or not as large as those before it.
     """
     constraints: list[FieldConstraint] = []
     waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)

@@ -57,17 +57,8 @@ class PixelEvidence(NamedTuple):
 
 
 def pixel_evidence(observations: Tensor, size_wh: tuple[int, int], num_frames: int = 1) -> PixelEvidence:
-    """Reweighted least squares (Tukey), each part of the image counting alike.
-
-    Args:
-        observations: (P, 4) u, v, measured minus true disparity, measured minus true row in the right image; pixels of
-            one rig, float64.
-        size_wh: width and height of its images.
-        num_frames: that they are from.
-
-    Raises:
-        InputError: fewer than 50 observations.
-    """
+    """Reweighted least squares (Tukey) on the observations (P, 4) of `observe_disparity`, each part of the image
+    counting alike; fewer than 50 raise `InputError`."""
     if len(observations) < _SMALLEST_NUMBER:
         raise InputError(
             "observations",
@@ -82,12 +73,7 @@ def pixel_evidence(observations: Tensor, size_wh: tuple[int, int], num_frames: i
 
 
 def hull(uv: Tensor) -> Tensor:  # (P, 2) -> (M, 2)
-    """Convex polygon of at most 24 corners round pixels, never beyond them.
-
-    Examples:
-        >>> len(hull(torch.tensor([[0.0, 0], [9, 0], [9, 9], [5, 5], [0, 9]])))
-        4
-    """
+    """Convex polygon of at most 24 corners round pixels, never beyond them."""
     import cv2
 
     corners = cv2.convexHull(uv.numpy().astype(np.float32))

@@ -18,7 +18,6 @@ from torch import Tensor
 from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
 
 BIAS, SETBACK = NUM_COEFFICIENTS, NUM_COEFFICIENTS + 1
-NUM_UNKNOWNS = NUM_COEFFICIENTS + 2
 
 # Rectification leaves this much, pixels, by degree: more towards the edges than in the middle; the rows less. A rig may
 # be better than that, or exact: each of these factors is as likely.
@@ -57,14 +56,7 @@ def solve_offsets(
     information: Tensor,  # (10, 10) of the field coefficients by other evidence
     vector: Tensor,  # (10,)
 ) -> Posterior:
-    """Mean and covariance of all unknowns; without any evidence those of the priors.
-
-    Examples:
-        >>> nothing = torch.zeros(10, 10).double(), torch.zeros(10).double()
-        >>> found = solve_offsets(torch.zeros(0, 8).double(), (1242, 375), 387.0, *nothing)
-        >>> round(float(found.covariance[0, 0].sqrt()), 3)
-        0.229
-    """
+    """Mean and covariance of all unknowns; without any evidence those of the priors."""
     u_v, d, offset, sigma = rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4]
     A = torch.cat([polynomial_basis(u_v, size_wh), d[:, None], d[:, None] ** 2 / focal_baseline], dim=1)
     grid = torch.meshgrid(_DEPTH_NOISE, _CONSTANT_NOISE, _FIELD_SCALES, indexing="ij")
@@ -101,10 +93,8 @@ def solve_rows(
     return mean[0]
 
 
-def _bias_by_size(
-    size_error: Tensor,  # (N,) 0 where not known
-) -> tuple[float, float]:
-    """The detector's relative depth bias by the sizes of masks, and its standard deviation."""
+def _bias_by_size(size_error: Tensor) -> tuple[float, float]:
+    """The detector's relative depth bias by the sizes of masks (N,), 0 where not known, and its standard deviation."""
     known = size_error[size_error != 0]
     if not len(known):
         return 0.0, math.inf

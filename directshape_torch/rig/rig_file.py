@@ -27,11 +27,7 @@ _EXACT = [[0.0] * NUM_COEFFICIENTS] * NUM_COEFFICIENTS
 
 
 def save_rigs(path: Path | str, rigs: Sequence[RigEstimate]) -> None:
-    """Write the estimates of one or several rigs; a reader sees the old file or the new one, never half of it.
-
-    Raises:
-        OSError: the folder cannot be made or written.
-    """
+    """Write the estimates of one or several rigs; a reader sees the old file or the new one, never half of it."""
     entries = [{**rig.content(), "says": str(rig)} for rig in rigs]
     write_json(path, {"schema": RIGS, "schema_version": SCHEMA_VERSION, "rigs": entries})
 
@@ -50,11 +46,7 @@ def load_rigs(path: Path | str) -> list[RigEstimate]:
 
 
 def save_field(field: DisparityField, path: Path | str) -> None:
-    """Write a field by itself, for one that is given and not estimated.
-
-    Raises:
-        OSError: the folder cannot be made or written.
-    """
+    """Write a field by itself, for one that is given and not estimated."""
     tensors = {name: getattr(field, name).double().cpu().tolist() for name in TENSOR_SHAPES}
     known = {"size_wh": list(field.size_wh), "provenance": dict(field.provenance)}
     write_json(path, {"schema": FIELD, "schema_version": SCHEMA_VERSION, **known, **tensors})
@@ -89,11 +81,7 @@ def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
 
 
 def holds_rigs(path: Path | str) -> bool:
-    """Whether a JSON file is one of estimates, and not of `save_field`.
-
-    Raises:
-        DataFormatError: it is missing or damaged.
-    """
+    """Whether a JSON file is one of estimates, and not of `save_field`."""
     return _read(path).get("schema") == RIGS
 
 

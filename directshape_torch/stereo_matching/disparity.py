@@ -45,7 +45,7 @@ def match_disparity(
     """
     import cv2
 
-    check_pair(image_left, image_right)
+    _check_pair(image_left, image_right)
     if num_disparities <= 0 or num_disparities % 16:
         raise InputError("num_disparities", "a positive multiple of 16", str(num_disparities))
     # The padding keeps the leftmost columns, whose matches lie outside of the right image for large disparities only.
@@ -73,12 +73,8 @@ def match_disparity(
     return disparity
 
 
-def check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8]) -> None:
-    """Raise `InputError` unless both are RGB images (H, W, 3) of uint8 and of one size.
-
-    Examples:
-        >>> check_pair(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5, 3), np.uint8))
-    """
+def _check_pair(image_left: NDArray[np.uint8], image_right: NDArray[np.uint8]) -> None:
+    """Raise `InputError` unless both are RGB images (H, W, 3) of uint8 and of one size."""
     for name, image in (("image_left", image_left), ("image_right", image_right)):
         if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             raise InputError(name, "an RGB image (H, W, 3) of uint8", f"{image.shape} of {image.dtype}")
@@ -92,20 +88,6 @@ def with_disparity(frames: FrameBatch, needed: Tensor | None = None) -> FrameBat
     Args:
         frames: F frames; the images pass through the CPU as 8-bit images.
         needed: numbers of the frames to match, in any order and number; the others get NaN. None: all.
-
-    Examples:
-        >>> from directshape_torch.geometry.stereo_camera import StereoCamera
-        >>> from directshape_torch.scene import GroundPlane
-        >>> K = torch.tensor([[[700.0, 0, 40], [0, 700.0, 20], [0, 0, 1]]])
-        >>> T_right_cam = torch.eye(4)[None].clone()
-        >>> T_right_cam[0, 0, 3] = -0.5
-        >>> camera = StereoCamera(K, K, T_right_cam, torch.zeros(1, 3))
-        >>> left = torch.rand(1, 3, 40, 80, generator=torch.Generator().manual_seed(0))
-        >>> right = left.roll(-4, dims=3)
-        >>> ground = GroundPlane.from_camera_height(1.65)
-        >>> frames = FrameBatch(left, right, torch.tensor([[40, 80]]), camera, ground, ("0",))
-        >>> with_disparity(frames).disparity[0, 20, 40]
-        tensor(4.)
     """
     if frames.disparity is not None:
         return frames

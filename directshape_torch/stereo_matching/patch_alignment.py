@@ -48,15 +48,6 @@ def align_patches(
 
     Returns:
         pixels (P, 2) in the other image, and (P,) bool: converged near the start, textured, inside of both images.
-
-    Examples:
-        >>> u, v = torch.meshgrid(torch.arange(60.0), torch.arange(20.0), indexing="xy")
-        >>> first, other = (100 + 50 * torch.sin((u - shift) / 3) + 30 * torch.cos(v / 2) for shift in (0.0, 2.3))
-        >>> uv = torch.tensor([[30.0, 10.0]])
-        >>> start = uv + torch.tensor([2.0, 0.0])
-        >>> found, reliable = align_patches(first, other, uv, start, PatchLimits(4, 1.0, (0.1, 0.1)))
-        >>> round(float(found[0, 0]), 1), bool(reliable)
-        (32.3, True)
     """
     offsets = torch.arange(-limits.radius_px, limits.radius_px + 1, dtype=uv.dtype, device=uv.device)
     patch = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), dim=-1).reshape(-1, 2)
@@ -117,11 +108,7 @@ class MatchedPair(NamedTuple):
         image_left: NDArray[np.uint8],  # (H, W, 3) RGB
         image_right: NDArray[np.uint8],  # (H, W, 3)
     ) -> Self:
-        """Match two images, float64.
-
-        Raises:
-            InputError: see `match_disparity`.
-        """
+        """Match two images, float64; raises as `match_disparity`."""
         matched = torch.from_numpy(match_disparity(image_left, image_right)).double()
         images = (torch.from_numpy(np.ascontiguousarray(image)) for image in (image_left, image_right))
         left, right = (grey_levels(image.permute(2, 0, 1).double()[None] / 255)[0] for image in images)

@@ -24,8 +24,9 @@ from directshape_torch.observation.refinable import without_empty_masks
 from directshape_torch.refinement.ray_cast import cast
 from directshape_torch.shape.sdf_grid import zero_level_extents
 from directshape_torch.shape.shape_prior import ShapePrior
+from directshape_torch.stereo_matching.disparity import rgb8
 from directshape_torch.terms.cars import CarState
-from directshape_torch.visualize.drawing import Picture, Window, picture_of, pixel_grid
+from directshape_torch.visualize.drawing import Picture, Window, pixel_grid
 from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 Array = NDArray[np.float64]
@@ -74,7 +75,7 @@ class CarView:
     def image(self, side: Side) -> Picture:
         """(H, W, 3) RGB uint8."""
         frame = self.loaded.frame
-        return picture_of((frame.images_left if side == "left" else frame.images_right)[0])
+        return rgb8((frame.images_left if side == "left" else frame.images_right)[0])
 
     def window(self, side: Side) -> Window:
         """The region whose pixels speak about the car and a little around it; the whole image where there is none."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from directshape_torch.geometry.box3d import BOX_EDGES
 from directshape_torch.scene import FrameBatch
+from directshape_torch.stereo_matching.disparity import rgb8
 
 Picture = npt.NDArray[np.uint8]
 Array = npt.NDArray[np.floating[Any]]
@@ -32,12 +33,6 @@ _SHIFT = 4
 _FARTHEST_PX = 1e5
 
 
-def picture_of(image: Tensor) -> Picture:
-    """An image (3, h, w) in [0, 1] as a picture (h, w, 3); what is not a number is black."""
-    levels = (255 * image.detach().nan_to_num().clamp(0, 1)).round().to(torch.uint8)
-    return np.ascontiguousarray(levels.permute(1, 2, 0).cpu().numpy())
-
-
 @dataclass(frozen=True)
 class View:
     """A picture with the intrinsics that its pixels have: an image, or an enlarged part of one."""
@@ -48,7 +43,7 @@ class View:
     @classmethod
     def of_frame(cls, frame: FrameBatch) -> View:
         """The left image of a frame."""
-        return cls(picture_of(frame.images_left[0]), frame.camera.K_left[0].double().cpu().numpy())
+        return cls(rgb8(frame.images_left[0]), frame.camera.K_left[0].double().cpu().numpy())
 
     def part(self, window: Window, scale: float) -> View:
         """A window, enlarged; beyond the picture it is black."""
