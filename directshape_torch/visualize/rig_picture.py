@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 _TITLE_HEIGHT_PX = 34
 _CONTOUR_STEP_PX = 0.25
-# Pixels of known depth are many, cars are few.
-_FEW, _DOT_RADIUS_PX, _DOT_RADIUS_OF_FEW_PX = 500, 2, 6
+_DOT_RADIUS_PX = 6
 
 
 def draw_rigs(
@@ -43,12 +42,13 @@ def draw_disparity_field(
     uv_left: Tensor,  # (P, 2) pixels of the data
     bias_px: Tensor,  # (P,) measured minus true disparity there
 ) -> Picture:  # (3 * (H + title), W, 3) RGB
-    """Three panels, blue negative, white zero, red positive: the field, the data before, the data after."""
+    """The field, and where there are any data, these before it and after: blue negative, white zero, red positive."""
     values, after = _field_values(field), bias_px - field.bias(uv_left)
     most = max(float(np.abs(values).max()), float(bias_px.abs().quantile(0.9)) if len(bias_px) else 0.0)
     limit = max(0.5, math.ceil(2 * most) / 2)
-    panels = [_titled(f"measured - true disparity [px], colours +-{limit:g}", _field_panel(field, values, limit))]
-    for name, data in (("before", bias_px), ("after", after)):
+    colours = f"blue -{limit:g} px, white 0, red +{limit:g} px; the grey line is drawn round the data"
+    panels = [_titled(f"measured less true disparity: {colours}", _field_panel(field, values, limit))]
+    for name, data in (("before the field is taken off", bias_px), ("after", after)) if len(bias_px) else ():
         panels.append(_titled(_summary(name, data), _data_panel(field, uv_left, data, limit)))
     return np.concatenate(panels)
 
@@ -75,23 +75,24 @@ def _field_panel(field: DisparityField, values: NDArray[np.float64], limit: floa
 
 
 def _draw_contour(panel: Picture, outline: NDArray[Any], level: float) -> None:
-    """The outline less the parts that only follow the picture's border, with its level written in the middle."""
+    """The outline less the parts that only follow the picture's border, with its level half-way up the picture."""
     height, width = panel.shape[:2]
     points = outline[((outline > 0) & (outline < np.array([width - 1, height - 1]))).all(axis=1)]
     panel[points[:, 1], points[:, 0]] = 0
     room = points[(points[:, 0] < width - 60) & (points[:, 1] > 16)]
-    if len(room) > 40:
-        place = room[len(room) // 2].tolist()
-        cv2.putText(panel, f"{level:.2f}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, BLACK, 1, cv2.LINE_AA)
+    while len(room) > 40:
+        place = room[np.abs(room[:, 1] - height // 2).argmin()]
+        cv2.putText(panel, f"{level:.2f}", place.tolist(), cv2.FONT_HERSHEY_SIMPLEX, 0.45, BLACK, 1, cv2.LINE_AA)
+        # Once more on the other side of a valley.
+        room = room[np.abs(room[:, 0] - place[0]) > width // 3]
 
 
 def _data_panel(field: DisparityField, uv_left: Tensor, values_px: Tensor, limit: float) -> Picture:
     width, height = field.size_wh
     panel = np.full((height, width, 3), 225, np.uint8)
     colours = blue_white_red(values_px.double().cpu().numpy(), limit).tolist()
-    radius = _DOT_RADIUS_PX if len(values_px) > _FEW else _DOT_RADIUS_OF_FEW_PX
     for place, colour in zip(uv_left.round().long().cpu().tolist(), colours, strict=True):
-        cv2.circle(panel, place, radius, colour, -1)
+        cv2.circle(panel, place, _DOT_RADIUS_PX, colour, -1)
     return _with_hull(panel, field)
 
 
@@ -109,8 +110,6 @@ def _titled(title: str, panel: Picture) -> Picture:
 
 
 def _summary(name: str, values_px: Tensor) -> str:
-    if len(values_px) == 0:
-        return f"{name}: no data"
     median = values_px.median()
     spread = float((values_px - median).abs().median())
-    return f"{name}: {len(values_px)} points, median {float(median):+.3f} px, MAD {spread:.3f} px"
+    return f"{len(values_px)} cars, {name}: median {float(median):+.3f} px, MAD {spread:.3f} px"
