@@ -6,7 +6,7 @@ import gc
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -15,7 +15,7 @@ from directshape_torch.batch.frame_groups import FrameGroup
 from directshape_torch.batch.frame_outputs import failed_entry, write_frame_outputs
 from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.run_log import OutputLostError
-from directshape_torch.batch.run_summary import CallTiming, RunTimings, peak_device_memory_mb, peak_memory_mb
+from directshape_torch.batch.run_summary import RunTimings, peak_device_memory_mb, peak_memory_mb
 from directshape_torch.compile import cars_ahead
 from directshape_torch.errors import CompilationError, DirectShapeError, MissingDependencyError
 from directshape_torch.io.frame_collation import collate, split_by_rig
@@ -47,14 +47,9 @@ class RunJob:
 class GroupReport:
     """What became of a group."""
 
-    # What `summary.json` says of its frames, in the order in which they ended.
-    ends: dict[str, FrameEntry] = field(default_factory=dict)
-    calls: list[CallTiming] = field(default_factory=list)  # of the refiner
+    ends: dict[str, FrameEntry]  # what `summary.json` says of its frames, in the order in which they ended
+    timings: RunTimings  # of its calls and of this process so far
     num_halved: int = 0  # calls that did not work and were tried again with half of the frames
-    # Time that the processor spent on it, reading and writing included, whatever else the machine did.
-    cpu_s: float = 0.0
-    peak_memory_mb: float | None = None  # of the process so far, where the system tells
-    peak_device_memory_mb: float | None = None  # of the graphics card so far
     stopped: str | None = None  # why no other frame could be refined either, or None
 
 
@@ -69,9 +64,9 @@ def refine_group(job: RunJob, group: FrameGroup) -> GroupReport:
         step.refine(group.frame_ids)
     except _STOPS_THE_RUN as error:
         step.report.stopped = _reason(error)
-    step.report.cpu_s = time.process_time() - cpu_start_s
-    device = job.refiner.prior.origin.device
-    step.report.peak_memory_mb, step.report.peak_device_memory_mb = peak_memory_mb(), peak_device_memory_mb(device)
+    timings = step.report.timings
+    timings.cpu_s = time.process_time() - cpu_start_s
+    timings.peak_mb, timings.peak_device_mb = peak_memory_mb(), peak_device_memory_mb(timings.device)
     return step.report
 
 
@@ -80,7 +75,7 @@ class _GroupStep:
 
     def __init__(self, job: RunJob, group: FrameGroup) -> None:
         self.job, self.group = job, group
-        self.report = GroupReport()
+        self.report = GroupReport({}, RunTimings(job.refiner.prior.origin.device))
 
     def refine(self, frame_ids: Sequence[str]) -> None:
         """Together, or by halves where that does not work, down to the frame that is the cause."""
@@ -136,9 +131,8 @@ class _GroupStep:
         prior = self.job.refiner.prior.origin
         frames, detections = collate([loaded for loaded, _ in batch])
         frames, detections = frames.to(prior.device, prior.dtype), detections.to(prior.device, prior.dtype)
-        timings = RunTimings(prior.device, self.report.calls)
         # Said anew before each call, so that it does not matter which calls this process had before.
-        with cars_ahead(self.job.expected_cars), timings.measure(frames.frame_ids, len(detections)):
+        with cars_ahead(self.job.expected_cars), self.report.timings.measure(frames.frame_ids, len(detections)):
             result: RefinementResult = self.job.refiner(frames, detections)
         return result
 

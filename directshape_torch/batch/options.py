@@ -1,4 +1,4 @@
-"""What a run over a data set is asked for besides the refinement itself."""
+"""What a run over a data set is asked for besides the refinement itself, and who is told of it."""
 
 from __future__ import annotations
 
@@ -13,29 +13,40 @@ MeshFormat = Literal["ply", "glb"]
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Outputs and size of the steps of `refine_dataset`.
+    """Outputs of `refine_dataset`, and who does the work.
 
     Attributes:
         meshes: write the surface of each refined car as "ply" or "glb"; None writes none.
         overlays: write a picture of each frame, before and after.
         batch_frames: frames refined together in one call.
+        workers: processes that refine side by side. None: this process alone.
+        threads: of each of them. None: this process keeps what it has, a worker gets 1.
+        retries: how often frames whose worker died are tried again before they count as failed.
 
     Raises:
-        InputError: an unknown mesh format, or a batch without frames.
+        InputError: an unknown mesh format, or a number that is too small.
 
     Examples:
         >>> RefineOptions(meshes="ply", overlays=True).outputs
         ('data', 'shapes', 'meshes_ply', 'overlays')
+        >>> RefineOptions(workers=4).threads_per_worker
+        1
     """
 
     meshes: MeshFormat | None = None
     overlays: bool = False
     batch_frames: int = 1
+    workers: int | None = None
+    threads: int | None = None
+    retries: int = 1
 
     def __post_init__(self) -> None:
         if self.meshes is not None and self.meshes not in get_args(MeshFormat):
             raise InputError("meshes", f"one of {', '.join(get_args(MeshFormat))}, or None", repr(self.meshes))
-        _check_at_least(1, "batch_frames", self.batch_frames)
+        for name, least in (("batch_frames", 1), ("workers", 1), ("threads", 1), ("retries", 0)):
+            number = getattr(self, name)
+            if number is not None and number < least:
+                raise InputError(name, f"at least {least}", str(number))
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -43,45 +54,10 @@ class RefineOptions:
         meshes = () if self.meshes is None else (f"meshes_{self.meshes}",)
         return ("data", "shapes", *meshes, *(("overlays",) if self.overlays else ()))
 
-
-@dataclass(frozen=True)
-class WorkerOptions:
-    """Who does the work of `refine_dataset`.
-
-    Attributes:
-        workers: processes that refine side by side. None: this process alone.
-        threads: of each of them. None: this process keeps what it has, a worker gets 1.
-        retries: how often frames whose worker died are tried again before they count as failed.
-
-    Raises:
-        InputError: less than one worker or thread, or negative retries.
-
-    Examples:
-        >>> WorkerOptions(workers=4).threads_per_worker
-        1
-        >>> WorkerOptions().in_this_process
-        True
-    """
-
-    workers: int | None = None
-    threads: int | None = None
-    retries: int = 1
-
-    def __post_init__(self) -> None:
-        for name, least in (("workers", 1), ("threads", 1), ("retries", 0)):
-            number = getattr(self, name)
-            if number is not None:
-                _check_at_least(least, name, number)
-
-    @property
-    def in_this_process(self) -> bool:
-        """Whether no other process takes part."""
-        return self.workers is None
-
     @property
     def threads_per_worker(self) -> int | None:
         """The number to set, or None to leave it."""
-        return self.threads if self.in_this_process or self.threads is not None else 1
+        return 1 if self.workers is not None and self.threads is None else self.threads
 
 
 class RunObserver:
@@ -92,8 +68,3 @@ class RunObserver:
 
     def finished(self, frame_id: str, failure: str | None) -> None:
         """A frame is done, or failed for the given reason."""
-
-
-def _check_at_least(least: int, name: str, number: int) -> None:
-    if number < least:
-        raise InputError(name, f"at least {least}", str(number))

@@ -14,7 +14,7 @@ import torch
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups, track_windows
 from directshape_torch.batch.frame_outputs import failed_entry
 from directshape_torch.batch.group_refinement import GroupReport, RunJob, limited_threads
-from directshape_torch.batch.options import RefineOptions, RunObserver, WorkerOptions
+from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.resumption import OUTPUT_FOLDERS, EarlierResults, remove_results, remove_unfinished_files
 from directshape_torch.batch.run_log import RunBeginning, RunLog, digit_warnings, read_log
 from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_warnings, write_timings
@@ -39,7 +39,6 @@ def refine_dataset(
     out_dir: Path | str,
     options: RefineOptions | None = None,
     observer: RunObserver | None = None,
-    workers: WorkerOptions | None = None,
     *,
     fresh: bool = False,
 ) -> RunSummary:
@@ -53,9 +52,8 @@ def refine_dataset(
         dataset: the frames, in the dtype of the refiner.
         refiner: on any device.
         out_dir: gets `data`, `shapes`, `summary.json`, `run.jsonl`, `timings.json` and what the options ask for.
-        options: kinds of outputs and frames in a call.
+        options: kinds of outputs, frames in a call, other processes; default this process.
         observer: is told of each frame.
-        workers: other processes; default this process.
         fresh: remove what earlier runs have written there and start again.
 
     Raises:
@@ -64,56 +62,53 @@ def refine_dataset(
         InputError: the folder would overwrite the detections, or a folder in it is a link.
         DirectShapeError: the run cannot go on: the disk is full, workers die before they finish anything.
     """
-    out_dir, options, workers = Path(out_dir), options or RefineOptions(), workers or WorkerOptions()
+    out_dir, options = Path(out_dir), options or RefineOptions()
     _check_out_dir(dataset, out_dir)
-    with RunLog(out_dir) as log, limited_threads(workers.threads if workers.in_this_process else None):
+    with RunLog(out_dir) as log, limited_threads(options.threads if options.workers is None else None):
         remove_unfinished_files(out_dir)
         is_cleared = fresh and remove_results(out_dir, (_TIMINGS,))
-        manifest = run_manifest(dataset, refiner, hash_prior(refiner.prior), options.batch_frames)
+        manifest = run_manifest(dataset, refiner, options.batch_frames)
         earlier = EarlierResults(out_dir, manifest, options.outputs, is_cleared)
-        return _Run(dataset, refiner, earlier, log, options, observer or RunObserver(), workers).execute()
+        # Of all frames, also of those that are finished: after an interruption the decision must be the same.
+        num_cars = expected_cars(dataset, dataset.frame_ids)
+        job = RunJob(dataset, refiner, out_dir, options, manifest.hash, manifest.sha256["prior"], num_cars)
+        return _Run(job, earlier, log, observer or RunObserver()).execute()
 
 
 class _Run:
     """One run, as the process that was started by the user sees it."""
 
-    def __init__(
-        self,
-        dataset: StereoDataset,
-        refiner: DirectShapeRefiner,
-        earlier: EarlierResults,
-        log: RunLog,
-        options: RefineOptions,
-        observer: RunObserver,
-        who: WorkerOptions,
-    ) -> None:
-        self.dataset, self.earlier, self.log, self.options = dataset, earlier, log, options
-        self.observer, self.who, self.out_dir = observer, who, earlier.out_dir
-        self.timings = RunTimings(refiner.prior.origin.device)
-        manifest = earlier.manifest
-        # Of all frames, also of those that are finished: after an interruption the decision must be the same.
-        num_cars = expected_cars(dataset, dataset.frame_ids)
-        prior_sha256 = manifest.sha256["prior"] or ""
-        self.job = RunJob(dataset, refiner, self.out_dir, options, manifest.hash, prior_sha256, num_cars)
-        self.digit_warnings: tuple[str, ...] = ()
+    def __init__(self, job: RunJob, earlier: EarlierResults, log: RunLog, observer: RunObserver) -> None:
+        self.job, self.earlier, self.log, self.observer = job, earlier, log, observer
+        self.dataset, self.options, self.out_dir = job.dataset, job.options, job.out_dir
+        self.frames = earlier.manifest.frames
+        self.timings = RunTimings(job.refiner.prior.origin.device)
+        self.warnings: list[str] = []
         self.num_halved = 0
 
     def execute(self) -> RunSummary:
         before, now = read_log(self.out_dir), RunBeginning(self._work(), len(self.dataset.frame_ids))
-        self.digit_warnings = digit_warnings(None if before is None else before.beginning, now)
         self.log.begin(now)
         resumed: list[str] = []
         try:
             resumed += self.earlier.finished_frames(self.dataset)
             groups = self._groups(resumed)
+            if groups and resumed and before is not None:
+                self.warnings += digit_warnings(before.beginning, now)
             self.log.refining(len(resumed))
             self.observer.started([name for group in groups for name in group.frame_ids if name in group.wanted])
-            self._refine(groups)
+            if groups:
+                self._refine(groups)
         except BaseException as error:
             # What is finished stays finished. On a full disk even this fails, and the files tell the next run.
             with contextlib.suppress(OSError, DirectShapeError):
+                # Workers have ended the frames that they had, and nobody heard of it.
+                self.earlier.take_in(set(done_frames(self.out_dir)).intersection(self.dataset.frame_ids))
                 self._end(resumed, str(error) or type(error).__name__)
             raise
+        self._look_for_files()
+        if has_tracks(self.dataset):
+            write_tracks(self.out_dir, sorted(set(self.dataset.frame_ids).difference(self.earlier.manifest.failed)))
         return self._end(resumed, None)
 
     def _groups(self, finished: Collection[str]) -> list[FrameGroup]:
@@ -123,11 +118,8 @@ class _Run:
         return frame_groups(dataset.frame_ids, size, finished)
 
     def _refine(self, groups: Sequence[FrameGroup]) -> None:
-        if not groups:
-            return
-        start = time.perf_counter()
-        workers = self._workers()
-        dispatch = GroupDispatch(groups, workers, self.who.retries, self._finished)
+        start, workers = time.perf_counter(), self._workers()
+        dispatch = GroupDispatch(groups, workers, self.options.retries, self._finished)
         try:
             for report in dispatch.reports():
                 self._take_in(report)
@@ -138,15 +130,14 @@ class _Run:
             self._note(frame_id, failed_entry(reason))
 
     def _workers(self) -> Workers:
-        who, threads = self.who, self.who.threads_per_worker
-        if who.in_this_process:
+        number, threads = self.options.workers, self.options.threads_per_worker
+        if number is None:
             return ThisProcess(self.job)
-        self.timings.threads, self.timings.workers = threads or 1, who.workers or 1
-        return LocalWorkers(self.job, self.timings.workers, threads)
+        self.timings.threads, self.timings.workers = threads or 1, number
+        return LocalWorkers(self.job, number, threads)
 
     def _take_in(self, report: GroupReport) -> None:
-        self.timings.add(report.calls, report.peak_memory_mb, report.peak_device_memory_mb)
-        self.timings.cpu_s += report.cpu_s
+        self.timings.add(report.timings)
         self.num_halved += report.num_halved
         for frame_id, entry in report.ends.items():
             self._note(frame_id, entry)
@@ -154,28 +145,20 @@ class _Run:
             raise DirectShapeError(report.stopped)
 
     def _note(self, frame_id: str, entry: FrameEntry) -> None:
-        self.earlier.manifest.frames[frame_id] = entry
+        self.frames[frame_id] = entry
         self.log.frame(frame_id, entry.get("reason"))
         self.observer.finished(frame_id, entry.get("reason"))
 
     def _finished(self, frame_ids: Collection[str]) -> Collection[str]:
         """Which frames are finished after all; for the group of a worker that died."""
-        found = []
-        for frame_id in sorted(frame_ids):
-            if (entry := self.earlier.entry(frame_id)) is not None:
-                self._note(frame_id, entry)
-                found.append(frame_id)
-        return found
+        found = {frame_id: self.earlier.entry(frame_id) for frame_id in sorted(frame_ids)}
+        done = {frame_id: entry for frame_id, entry in found.items() if entry is not None}
+        for frame_id, entry in done.items():
+            self._note(frame_id, entry)
+        return done
 
     def _end(self, resumed: Sequence[str], reason: str | None) -> RunSummary:
         """Write what is known at the end of the run, whatever end that is."""
-        if reason is None:
-            self._look_for_files()
-            if has_tracks(self.dataset):
-                write_tracks(self.out_dir, sorted(set(self.dataset.frame_ids).difference(self.earlier.manifest.failed)))
-        else:
-            # Workers have ended the frames that they had, and nobody heard of it.
-            self.earlier.take_in(set(done_frames(self.out_dir)).intersection(self.dataset.frame_ids))
         if self.timings.calls:
             write_timings(self.out_dir / _TIMINGS, self.timings)
         self.earlier.write()
@@ -190,40 +173,32 @@ class _Run:
         for frame_id in self.dataset.frame_ids:
             if frame_id not in failed and not all(path(self.out_dir, frame_id).is_file() for path in paths):
                 reason = f"its files are not in {self.out_dir}: was the folder moved or emptied during the run?"
-                self.earlier.manifest.frames[frame_id] = failed_entry(reason)
+                self.frames[frame_id] = failed_entry(reason)
 
     def _summary(self, resumed: Sequence[str]) -> RunSummary:
-        manifest, wanted = self.earlier.manifest, self.dataset.frame_ids
-        frames = {frame_id: manifest.frames[frame_id] for frame_id in wanted if frame_id in manifest.frames}
-        warnings = (*find_warnings(frames, sorted(self.dataset.classes)), *self._own_warnings(bool(resumed)))
-        failed = {frame_id: reason for frame_id, reason in manifest.failed.items() if frame_id in frames}
-        return RunSummary(frames, tuple(resumed), failed, warnings, self.timings)
-
-    def _own_warnings(self, has_resumed: bool) -> list[str]:
-        found = list(self.digit_warnings) if self.timings.calls and has_resumed else []
+        frames = {frame_id: self.frames[frame_id] for frame_id in self.dataset.frame_ids if frame_id in self.frames}
+        warnings = [*find_warnings(frames, sorted(self.dataset.classes)), *self.warnings]
         if remade := self.earlier.remade:
-            found.append(f"files of {len(remade)} finished frames were damaged or gone and made again: {_some(remade)}")
+            some = ", ".join(remade[:5]) + (" .." if len(remade) > 5 else "")
+            warnings.append(f"files of {len(remade)} finished frames were damaged or gone and made again: {some}")
         if self.num_halved:
-            found.append(
+            warnings.append(
                 f"{self.num_halved} calls did not work with all of their frames and were halved: the last digits of "
                 "their results may differ from those of a run that has the memory"
             )
-        return found
+        failed = {frame_id: reason for frame_id, reason in self.earlier.manifest.failed.items() if frame_id in frames}
+        return RunSummary(frames, tuple(resumed), failed, tuple(warnings), self.timings)
 
     def _work(self) -> dict[str, Any]:
-        who = self.who
+        options = self.options
         return {
-            "where": "this process" if who.in_this_process else "processes",
-            "workers": 1 if who.in_this_process else who.workers,
-            "threads": who.threads_per_worker or torch.get_num_threads(),
+            "where": "this process" if options.workers is None else "processes",
+            "workers": options.workers or 1,
+            "threads": options.threads_per_worker or torch.get_num_threads(),
             "device": self.timings.device.type,
-            "batch_frames": self.options.batch_frames,
-            "outputs": list(self.options.outputs),
+            "batch_frames": options.batch_frames,
+            "outputs": list(options.outputs),
         }
-
-
-def _some(frame_ids: Sequence[str]) -> str:
-    return ", ".join(frame_ids[:5]) + (" .." if len(frame_ids) > 5 else "")
 
 
 def expected_cars(dataset: StereoDataset, frame_ids: Sequence[str]) -> int:
@@ -243,9 +218,7 @@ def has_tracks(dataset: StereoDataset) -> bool:
     return dataset.sequence_of(dataset.frame_ids[0]) is not None
 
 
-def run_manifest(
-    dataset: StereoDataset, refiner: DirectShapeRefiner, prior_sha256: str, batch_frames: int = 1
-) -> RunManifest:
+def run_manifest(dataset: StereoDataset, refiner: DirectShapeRefiner, batch_frames: int = 1) -> RunManifest:
     """What the results of a run depend on, besides the files of each frame.
 
     Device, kinds of outputs and, without tracks, batch size are left out: they do not change what is computed.
@@ -261,7 +234,7 @@ def run_manifest(
         settings["track_frames"] = batch_frames
     if refiner.extra_terms:
         settings["extra_terms"] = [_described(make) for make in refiner.extra_terms]
-    hashes = SharedHashes(prior=prior_sha256, stereo_bias=hash_fields(dataset.disparity_fields))
+    hashes = SharedHashes(prior=hash_prior(refiner.prior), stereo_bias=hash_fields(dataset.disparity_fields))
     return RunManifest(package_version(), settings, hashes)
 
 

@@ -97,31 +97,18 @@ class RunBeginning:
 
 
 @dataclass(frozen=True)
-class FrameLine:
-    """A frame has ended, well or for the given reason."""
+class RunEvent:
+    """A later line: a frame has ended, what earlier runs left has been checked, or the run has ended."""
 
-    frame: str
     at: float
-    failure: str | None = None
-
-
-@dataclass(frozen=True)
-class Refining:
-    """What earlier runs left has been checked: so many frames are done."""
-
-    resumed: int
-    at: float
-
-
-@dataclass(frozen=True)
-class RunEnd:
-    """The last line: frames that are done, and why others are not."""
-
-    end: Literal["finished", "stopped"]
-    at: float
-    done: int
-    failed: Mapping[str, str]
-    reason: str | None
+    frame: str | None = None
+    failure: str | None = None  # why the frame is not done
+    resumed: int | None = None  # frames that earlier runs had done
+    end: Literal["finished", "stopped"] | None = None
+    # Of the end: frames that are done, why others are not, and why the run was stopped.
+    done: int = 0
+    failed: Mapping[str, str] = field(default_factory=dict)
+    reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -129,9 +116,9 @@ class LogContents:
     """What a log says of the latest run."""
 
     beginning: RunBeginning  # its first line
-    frames: Mapping[str, FrameLine]  # the ends of frames so far, by name
-    refining: Refining | None  # after the check of what earlier runs left, or None
-    end: RunEnd | None  # or None; a run that was killed says nothing
+    frames: Mapping[str, RunEvent]  # the ends of frames so far, by name
+    refining: RunEvent | None  # after the check of what earlier runs left, or None
+    end: RunEvent | None  # or None; a run that was killed says nothing
 
 
 class RunLog:
@@ -177,26 +164,23 @@ class RunLog:
 
     def refining(self, resumed: int) -> None:
         """What earlier runs left is checked."""
-        self._append(asdict(Refining(resumed, time.time())))
+        self._append({"resumed": resumed, "at": time.time()})
 
     def frame(self, frame_id: str, failure: str | None) -> None:
         """A frame has ended."""
-        self._append(asdict(FrameLine(frame_id, time.time(), failure)))
+        self._append({"frame": frame_id, "at": time.time(), "failure": failure})
 
     def end(self, done: int, failed: Mapping[str, str], reason: str | None) -> None:
         """The run has ended; of one that was stopped with the reason."""
-        self._append(
-            asdict(RunEnd("finished" if reason is None else "stopped", time.time(), done, dict(failed), reason))
-        )
+        end = "finished" if reason is None else "stopped"
+        self._append({"end": end, "at": time.time(), "done": done, "failed": dict(failed), "reason": reason})
 
     def _append(self, content: Mapping[str, Any]) -> None:
         """All of a line or, where that fails, nothing."""
         file = self._file
         assert file is not None, "the folder is held"
-        length, rest = (
-            os.fstat(file.fileno()).st_size,
-            memoryview(json.dumps(content, allow_nan=False).encode() + b"\n"),
-        )
+        length = os.fstat(file.fileno()).st_size
+        rest = memoryview(json.dumps(content, allow_nan=False).encode() + b"\n")
         try:
             while rest:
                 rest = rest[file.write(rest) :]
@@ -267,11 +251,17 @@ def read_log(out_dir: Path) -> LogContents | None:
     first, is_whole, rest = read_bytes(path).partition(b"\n")
     if not is_whole and first[: len(_BEGINNING)] == _BEGINNING[: len(first)]:  # cut short, or not yet written
         return None
-    lines = [found for line in rest.splitlines() if (found := _line(path, line)) is not None]
-    frames = {found.frame: found for found in lines if isinstance(found, FrameLine)}
-    refining = next((found for found in lines if isinstance(found, Refining)), None)
-    end = next((found for found in lines if isinstance(found, RunEnd)), None)
-    return LogContents(_beginning(path, first), frames, refining, end)
+    beginning = _beginning(path, first)
+    events = []
+    for line in rest.splitlines():
+        with suppress(DataFormatError):  # it was cut short
+            events.append(record_of(path, RunEvent, parse_json(path, line)))
+    return LogContents(
+        beginning,
+        {event.frame: event for event in events if event.frame is not None},
+        next((event for event in events if event.resumed is not None), None),
+        next((event for event in events if event.end is not None), None),
+    )
 
 
 def _beginning(path: Path, line: bytes) -> RunBeginning:
@@ -283,16 +273,6 @@ def _beginning(path: Path, line: bytes) -> RunBeginning:
     if version != LOG_SCHEMA_VERSION:
         raise DataFormatError(path, f"schema version is {shown(version)}, known is {LOG_SCHEMA_VERSION}", cure=cure)
     return record_of(path, RunBeginning, content, cure)
-
-
-def _line(path: Path, line: bytes) -> FrameLine | Refining | RunEnd | None:
-    """None for one that was cut short."""
-    with suppress(DataFormatError):
-        content = parse_json(path, line)
-        names = content if isinstance(content, dict) else ()
-        kind = next((kind for name, kind in (("frame", FrameLine), ("resumed", Refining)) if name in names), RunEnd)
-        return record_of(path, kind, content)  # type: ignore[return-value]
-    return None
 
 
 def digit_warnings(before: RunBeginning | None, now: RunBeginning) -> tuple[str, ...]:

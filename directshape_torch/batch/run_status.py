@@ -54,7 +54,7 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     # It may have ended since it was read.
     run = run if is_alive else read_log(Path(out_dir)) or run
     end, is_alive = run.end, is_alive and run.end is None
-    resumed = 0 if run.refining is None else run.refining.resumed
+    resumed = (run.refining.resumed if run.refining else None) or 0
     failed = {name: line.failure for name, line in run.frames.items() if line.failure is not None}
     num_done = resumed + len(run.frames) - len(failed)
     num_left = run.beginning.num_frames - resumed - len(run.frames)
@@ -62,7 +62,7 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     rate = None if end is not None else _rate(run, times, (time.time() if now is None else now) if is_alive else None)
     going = "checking" if run.refining is None else "running"
     return RunStatus(
-        state=end.end if end is not None else going if is_alive else "killed",
+        state=(end.end if end else None) or (going if is_alive else "killed"),
         owner=run.beginning.owner if is_alive else None,
         work=run.beginning.work,
         num_frames=run.beginning.num_frames,

@@ -53,33 +53,29 @@ class RunTimings:
         seconds = time.perf_counter() - start
         self.calls.append(CallTiming(tuple(frame_ids), num_cars, seconds, num_forms() - forms))
 
-    def add(self, calls: Sequence[CallTiming], peak_mb: float | None, peak_device_mb: float | None) -> None:
+    def add(self, other: RunTimings) -> None:
         """Take in what a worker says."""
-        self.calls += calls
-        self.peak_mb = _larger(self.peak_mb, peak_mb)
-        self.peak_device_mb = _larger(self.peak_device_mb, peak_device_mb)
+        self.calls += other.calls
+        self.cpu_s += other.cpu_s
+        self.peak_mb = _larger(self.peak_mb, other.peak_mb)
+        self.peak_device_mb = _larger(self.peak_device_mb, other.peak_device_mb)
 
     @property
     def num_frames(self) -> int:
         return sum(len(call.frame_ids) for call in self.calls)
 
     @property
-    def num_cars(self) -> int:
-        return sum(call.num_cars for call in self.calls)
-
-    @property
-    def refine_s(self) -> float:
-        return sum(call.refine_s for call in self.calls)
-
-    @property
     def ms_per_car(self) -> float | None:
         """Mean over the cars of all calls, or None where there was none."""
-        return 1000 * self.refine_s / self.num_cars if self.num_cars else None
+        return self._ms_per(sum(call.num_cars for call in self.calls))
 
     @property
     def ms_per_frame(self) -> float | None:
         """Mean over the frames of all calls, or None where there was none."""
-        return 1000 * self.refine_s / self.num_frames if self.num_frames else None
+        return self._ms_per(self.num_frames)
+
+    def _ms_per(self, number: int) -> float | None:
+        return 1000 * sum(call.refine_s for call in self.calls) / number if number else None
 
 
 def write_timings(path: Path, timings: RunTimings) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from directshape_torch.batch.options import RefineOptions, WorkerOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import format_summary
 from directshape_torch.cli.options import (
@@ -100,10 +100,9 @@ def _add_workers(group: argparse._ArgumentGroup) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Refine, write, report."""
-    workers = WorkerOptions(args.workers, args.threads, args.retries)
     default_frames = _TRACK_FRAMES if args.tracks else 1
     batch_frames = default_frames if args.batch_frames is None else args.batch_frames
-    options = RefineOptions(args.meshes, args.overlays, batch_frames)
+    options = RefineOptions(args.meshes, args.overlays, batch_frames, args.workers, args.threads, args.retries)
     chosen = [] if args.method is None else [f"method={args.method}"]
     extra = [] if args.lidar is None else [LidarPoints()]
     refiner = make_refiner(args.config, [*args.set, *chosen], args.prior, args.device, extra)
@@ -118,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         dataset = replace(dataset, disparity_fields=tuple(rig.field for rig in rigs))
         refiner.rig = RigEstimates(rigs)
     with _Progress(args.out, rigs if are_new else None) as progress:
-        summary = refine_dataset(dataset, refiner, args.out, options, progress, workers, fresh=args.fresh)
+        summary = refine_dataset(dataset, refiner, args.out, options, progress, fresh=args.fresh)
     for warning in summary.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     print(format_summary(summary))

@@ -27,13 +27,13 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
         DataFormatError: a field is missing, unknown, or not of its type; names file, field, type and value.
 
     Examples:
-        >>> from directshape_torch.batch.run_log import FrameLine
-        >>> record_of("a.json", FrameLine, {"frame": "000107", "at": 0.5}).frame
+        >>> from directshape_torch.batch.run_log import RunEvent
+        >>> record_of("a.json", RunEvent, {"frame": "000107", "at": 0.5}).frame
         '000107'
-        >>> record_of("a.json", FrameLine, {"frame": 107, "at": 0.5})
+        >>> record_of("a.json", RunEvent, {"frame": 107, "at": 0.5})
         Traceback (most recent call last):
         ...
-        directshape_torch.errors.DataFormatError: a.json: frame: expected str, got 107
+        directshape_torch.errors.DataFormatError: a.json: frame: expected str or nothing, got 107
     """
     if not isinstance(content, dict):
         raise DataFormatError(path, f"{where.rstrip('.')} expected an object, got {shown(content)}".strip(), cure=cure)

@@ -19,7 +19,7 @@ from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset
 
-from directshape_torch.batch.options import RunObserver, WorkerOptions
+from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_log import log_path, read_log
 from directshape_torch.errors import DirectShapeError
@@ -198,4 +198,4 @@ def _ended(root: Path, out: Path, observer: RunObserver | None = None) -> str:
 
 
 def _run(root: Path, out: Path, observer: RunObserver | None = None) -> Any:
-    return refine_dataset(dataset(root), QuickRefiner(root), out, observer=observer, workers=WorkerOptions(threads=1))
+    return refine_dataset(dataset(root), QuickRefiner(root), out, RefineOptions(threads=1), observer)

@@ -21,7 +21,7 @@ from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 from helpers.quick_runs import dataset
 
-from directshape_torch.batch.options import WorkerOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 
 FRAMES = tuple(f"{number:06d}" for number in range(6))
@@ -122,4 +122,4 @@ def _outlive(workers: list[int], patience_s: float) -> bool:
 
 
 def _resume(root: Path, out: Path) -> Any:
-    return refine_dataset(dataset(root), QuickRefiner(root), out, workers=WorkerOptions(threads=1))
+    return refine_dataset(dataset(root), QuickRefiner(root), out, RefineOptions(threads=1))

@@ -20,7 +20,7 @@ from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
 import directshape_torch
-from directshape_torch.batch.options import RefineOptions, WorkerOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_log import RunLog, log_path
 from directshape_torch.batch.run_status import read_status
@@ -41,9 +41,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def refine(root: Path, out: Path, options: RefineOptions | None = None, fresh: bool = False) -> RunSummary:
+def refine(root: Path, out: Path, fresh: bool = False, **options: int) -> RunSummary:
     dataset = open_dataset("kitti", root, root / "detections", root / "masks")
-    return refine_dataset(dataset, QuickRefiner(root), out, options, workers=WorkerOptions(threads=1), fresh=fresh)
+    return refine_dataset(dataset, QuickRefiner(root), out, RefineOptions(threads=1, **options), fresh=fresh)
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +188,7 @@ def test_frames_without_an_entry_in_the_summary_are_finished(root: Path, tmp_pat
     summary = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
     one = open_dataset("kitti", root, root / "detections", root / "masks", frames=FRAMES[:1])
-    assert refine_dataset(one, QuickRefiner(root), out, workers=WorkerOptions(threads=1)).resumed == FRAMES[:1]
+    assert refine_dataset(one, QuickRefiner(root), out, RefineOptions(threads=1)).resumed == FRAMES[:1]
     assert result_files(out) == result_files(undisturbed)
 
 
@@ -208,13 +208,12 @@ def test_a_file_whose_bytes_have_changed_is_made_again(
 
 
 def test_frames_of_a_group_that_was_cut_get_the_bytes_of_the_whole_group(root: Path, tmp_path: Path) -> None:
-    options = RefineOptions(batch_frames=3)
-    refine(root, tmp_path / "whole", options)
+    refine(root, tmp_path / "whole", batch_frames=3)
     shutil.copytree(tmp_path / "whole", tmp_path / "cut")
     for path in (tmp_path / "cut").glob(f"*/{FRAMES[1]}.*"):
         path.unlink()
     kept = (tmp_path / "cut" / "data" / f"{FRAMES[0]}.txt").stat().st_ino
-    summary = refine(root, tmp_path / "cut", options)
+    summary = refine(root, tmp_path / "cut", batch_frames=3)
     assert summary.resumed == (FRAMES[0], *FRAMES[2:])
     assert [call.frame_ids for call in summary.timings.calls] == [FRAMES[:3]]
     assert (tmp_path / "cut" / "data" / f"{FRAMES[0]}.txt").stat().st_ino == kept
@@ -238,5 +237,5 @@ def test_other_threads_than_before_are_a_warning(root: Path, tmp_path: Path, und
     (out / "data" / "000002.txt").unlink()
     assert any(
         "batch_frames: 1 in the previous run, 2 now; the last digits" in warning
-        for warning in refine(root, out, RefineOptions(batch_frames=2)).warnings
+        for warning in refine(root, out, batch_frames=2).warnings
     )

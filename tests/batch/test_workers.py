@@ -7,16 +7,17 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 import pytest
+import torch
 from helpers.faulty_refiners import DeadlyRefiner, HungryRefiner, QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.group_refinement import GroupReport
-from directshape_torch.batch.options import RefineOptions, RunObserver, WorkerOptions
+from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_status import read_status
-from directshape_torch.batch.run_summary import RunSummary
+from directshape_torch.batch.run_summary import RunSummary, RunTimings
 from directshape_torch.batch.workers import GroupDispatch, WorkerDiedError
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.stereo_dataset import open_dataset
@@ -44,7 +45,9 @@ class Imagined:
             return [(group, WorkerDiedError("killed"))]
         done = [frame_id for frame_id in group.frame_ids if frame_id in group.wanted]
         self.written += done
-        return [(group, GroupReport({frame_id: {"state": "done"} for frame_id in done}))]
+        return [
+            (group, GroupReport({frame_id: {"state": "done"} for frame_id in done}, RunTimings(torch.device("cpu"))))
+        ]
 
     def close(self) -> None:
         pass
@@ -112,19 +115,18 @@ def refine(
     root: Path,
     out: Path,
     refiner: DirectShapeRefiner,
-    batch_frames: int,
-    who: WorkerOptions,
     listener: RunObserver | None = None,
+    **options: int,
 ) -> RunSummary:
     dataset = open_dataset("kitti", root, root / "detections", root / "masks")
-    return refine_dataset(dataset, refiner, out, RefineOptions("ply", batch_frames=batch_frames), listener, who)
+    return refine_dataset(dataset, refiner, out, RefineOptions("ply", **options), listener)
 
 
 def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root: Path, tmp_path: Path) -> None:
-    refine(root, tmp_path / "one", QuickRefiner(root), 2, WorkerOptions(threads=1))
+    refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=2, threads=1)
     listener = Listener()
     deadly = DeadlyRefiner(root, tmp_path, once=[FRAMES[3]])
-    summary = refine(root, tmp_path / "two", deadly, 2, WorkerOptions(workers=2), listener)
+    summary = refine(root, tmp_path / "two", deadly, listener, batch_frames=2, workers=2)
     assert (tmp_path / FRAMES[3]).exists(), "nobody was killed"
     assert summary.exit_code == 0
     assert sorted(listener.ended) == [(frame_id, True) for frame_id in FRAMES]
@@ -140,25 +142,25 @@ def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root:
 def test_a_frame_that_kills_its_worker_fails_and_the_others_go_on(root: Path, tmp_path: Path) -> None:
     deadly = DeadlyRefiner(root, tmp_path, always=[FRAMES[1]])
     listener = Listener()
-    summary = refine(root, tmp_path / "out", deadly, 1, WorkerOptions(workers=1, retries=0), listener)
+    summary = refine(root, tmp_path / "out", deadly, listener, batch_frames=1, workers=1, retries=0)
     assert summary.exit_code == 1
     assert summary.failed == {FRAMES[1]: "its worker died each of 1 times (killed, out of memory or crashed)"}
     assert sorted(listener.ended) == [(frame_id, frame_id != FRAMES[1]) for frame_id in FRAMES]
     # The next run tries it again, here in this process, and all is as if nothing had happened.
-    again = refine(root, tmp_path / "out", QuickRefiner(root), 1, WorkerOptions(threads=1))
+    again = refine(root, tmp_path / "out", QuickRefiner(root), batch_frames=1, threads=1)
     assert (again.exit_code, len(again.resumed)) == (0, 4)
-    refine(root, tmp_path / "one", QuickRefiner(root), 1, WorkerOptions(threads=1))
+    refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=1, threads=1)
     assert result_files(tmp_path / "out") == result_files(tmp_path / "one")
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of memory are those of Linux")
 def test_a_worker_without_the_memory_for_a_call_halves_it(root: Path, tmp_path: Path) -> None:
-    summary = refine(root, tmp_path / "hungry", HungryRefiner(root), 4, WorkerOptions(workers=1))
+    summary = refine(root, tmp_path / "hungry", HungryRefiner(root), batch_frames=4, workers=1)
     assert summary.exit_code == 0
     # 4 = 2 + 2 and each 2 = 1 + 1; the fifth frame is alone from the start.
     assert any(warning.startswith("3 calls did not work with all of their frames") for warning in summary.warnings)
     assert sorted(call.frame_ids for call in summary.timings.calls) == [(frame_id,) for frame_id in FRAMES]
-    refine(root, tmp_path / "one", QuickRefiner(root), 1, WorkerOptions(threads=1))
+    refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=1, threads=1)
     assert result_files(tmp_path / "hungry") == result_files(tmp_path / "one")
 
 
@@ -167,4 +169,4 @@ def test_what_cannot_be_sent_to_a_worker_says_so(root: Path, tmp_path: Path) -> 
         """Of this function: another process cannot import it."""
 
     with pytest.raises(DirectShapeError, match=r"cannot be sent to other processes.*Nameless"):
-        refine(root, tmp_path, Nameless(root), 1, WorkerOptions(workers=1))
+        refine(root, tmp_path, Nameless(root), batch_frames=1, workers=1)

@@ -6,7 +6,7 @@ import signal
 import sys
 from pathlib import Path
 
-from directshape_torch.batch.options import WorkerOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.io.stereo_dataset import open_dataset
 from helpers.faulty_refiners import SlowRefiner
@@ -14,7 +14,7 @@ from helpers.faulty_refiners import SlowRefiner
 
 def main(root: Path, out_dir: Path) -> None:
     dataset = open_dataset("kitti", root, root / "detections", root / "masks")
-    refine_dataset(dataset, SlowRefiner(root), out_dir, workers=WorkerOptions(workers=2))
+    refine_dataset(dataset, SlowRefiner(root), out_dir, RefineOptions(workers=2))
 
 
 if __name__ == "__main__":

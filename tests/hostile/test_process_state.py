@@ -22,7 +22,7 @@ from helpers.quick_runs import dataset, refiner
 from helpers.synthetic_scene import cached_street
 
 from directshape_torch import DirectShapeRefiner, RigEstimate, check_scene, fit_shape, load_config
-from directshape_torch.batch.options import RefineOptions, WorkerOptions
+from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DirectShapeError
@@ -63,9 +63,9 @@ def forward(_: Path, __: Path) -> None:
 
 
 def run(root: Path, out: Path) -> None:
-    options = RefineOptions("ply", overlays=True)
+    options = RefineOptions("ply", overlays=True, threads=2)
     one = dataset(root, frames=["000000"])
-    refine_dataset(one, refiner(root), out / "out", options, workers=WorkerOptions(threads=2))
+    refine_dataset(one, refiner(root), out / "out", options)
 
 
 def data_options(root: Path) -> list[str]:
@@ -83,7 +83,7 @@ def failing_command(root: Path, out: Path) -> None:
 
 def failing_run(root: Path, _: Path) -> None:
     with pytest.raises(DirectShapeError):
-        refine_dataset(dataset(root), refiner(root), root / "detections", workers=WorkerOptions(threads=2))
+        refine_dataset(dataset(root), refiner(root), root / "detections", RefineOptions(threads=2))
 
 
 def priors(_: Path, out: Path) -> None:

@@ -21,7 +21,7 @@ from helpers.output_folders import result_files
 from helpers.quick_runs import dataset
 
 import directshape_torch
-from directshape_torch.batch.options import RunObserver, WorkerOptions
+from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_status import read_status
 from directshape_torch.batch.run_summary import RunSummary
@@ -29,11 +29,11 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder, done_frames
 
-THREADS = WorkerOptions(threads=1)
+ALONE = RefineOptions(threads=1)
 
 
-def refine(root: Path, out: Path, workers: WorkerOptions = THREADS, observer: RunObserver | None = None) -> RunSummary:
-    return refine_dataset(dataset(root), QuickRefiner(root), out, observer=observer, workers=workers)
+def refine(root: Path, out: Path, options: RefineOptions = ALONE, observer: RunObserver | None = None) -> RunSummary:
+    return refine_dataset(dataset(root), QuickRefiner(root), out, options, observer)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def test_workers_that_are_killed_as_they_start(shared_kitti: Path, tmp_path: Pat
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
-    summary = refine(shared_kitti, tmp_path / "out", WorkerOptions(workers=1, retries=2))
+    summary = refine(shared_kitti, tmp_path / "out", RefineOptions(workers=1, retries=2))
     killer.join()
     assert (len(killed), summary.exit_code) == (2, 0)
     assert result_files(tmp_path / "out") == result_files(undisturbed)
