@@ -53,13 +53,6 @@ class ProfileFigures(NamedTuple):
     ambiguous: Tensor
 
 
-class CostPair(NamedTuple):
-    """Costs (B,) on the two curves."""
-
-    before: Tensor
-    after: Tensor
-
-
 @dataclass(frozen=True)
 class DisparityProfile(CarRecord):
     """Photometric cost of B cars over n offsets of their disparity, with the pixels of the final stage.
@@ -91,14 +84,14 @@ class DisparityProfile(CarRecord):
         return self.offsets_px[-1]
 
     @property
-    def lowest(self) -> CostPair:
-        """The least cost of each curve; NaN where there is none."""
-        return CostPair(self.cost_before.amin(dim=1), self.cost_after.amin(dim=1))
+    def lowest(self) -> tuple[Tensor, Tensor]:
+        """The least cost (B,) of each curve; NaN where there is none."""
+        return self.cost_before.amin(dim=1), self.cost_after.amin(dim=1)
 
-    def cost_at(self, offset_px: float) -> CostPair:
-        """Costs at the sample next to an offset."""
+    def cost_at(self, offset_px: float) -> tuple[Tensor, Tensor]:
+        """Costs (B,) of both curves at the sample next to an offset."""
         column = (self.offsets_px - offset_px).abs().argmin(dim=0, keepdim=True)
-        return CostPair(*(cost.index_select(1, column)[:, 0] for cost in (self.cost_before, self.cost_after)))
+        return self.cost_before.index_select(1, column)[:, 0], self.cost_after.index_select(1, column)[:, 0]
 
     @property
     def before(self) -> ProfileFigures:

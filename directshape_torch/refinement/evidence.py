@@ -234,9 +234,9 @@ def _total(costs: Tensor, chosen: list[bool]) -> Tensor:
 def _profile(profile: DisparityProfile) -> dict[str, Tensor]:
     """How sharply the images know the disparity at the end, and how far they pulled the input."""
     before, after = profile.figures
-    lowest = profile.lowest
-    here, *sides = (profile.cost_at(offset_px) for offset_px in (0.0, -1.0, 1.0))
-    rise_after, fall_before = torch.minimum(sides[0].after, sides[1].after) / lowest.after, here.before / lowest.before
+    lowest_before, lowest_after = profile.lowest
+    to_the_sides = torch.minimum(*(profile.cost_at(offset_px)[1] for offset_px in (-1.0, 1.0)))
+    rise_after, fall_before = to_the_sides / lowest_after, profile.cost_at(0.0)[0] / lowest_before
     return {
         # A flat curve has no width: no offset of its range is any worse.
         "log_profile_sigma": after.sigma_px.minimum(profile.range_px).log(),

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from directshape_torch.refinement.outcome import Outcome, judged, outcome_of
 from directshape_torch.refinement.problem import CarProblem
-from directshape_torch.solver.backward import attached_state
 from directshape_torch.solver.damped_solve import damped_step
 from directshape_torch.solver.gauss_newton import Minimum, minimise
 from directshape_torch.solver.problem import put_rows, take_rows
@@ -91,7 +90,21 @@ def _of_all_members(in_track: Minimum[CarState]) -> Minimum[CarState]:
 
 
 def _attached(problem: CarProblem, cars: CarBatch, start: CarState, minimum: Minimum[CarState]) -> CarState:
-    return attached_state(problem, start, minimum, problem.config.backward, cars.detection_row)
+    """The states of a minimum, with the graph of the backward mode for every car that was refined."""
+    refined = is_refined(minimum.status)
+    rows = refined.nonzero()[:, 0]
+    if not torch.is_grad_enabled() or not len(rows):
+        return minimum.state
+    from directshape_torch.solver.differentiate import implicit_state, unrolled_state
+
+    part, backward, names = problem.of_problems(refined), problem.config.backward, cars.detection_row[rows]
+    if backward.mode == "unroll":
+        first = take_rows(start, rows)
+        state = unrolled_state(part, first, minimum, rows, backward.unroll_iterations, names)
+    else:
+        exact, limit = backward.mode == "implicit", backward.max_remaining_step
+        state = implicit_state(part, minimum, rows, exact=exact, max_remaining_step=limit, names=names)
+    return put_rows(minimum.state, rows, state)
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ from directshape_torch.config import SamplingMode
 from directshape_torch.io.figure_files import figure_picture, new_figure, write_animation, write_figure
 from directshape_torch.io.instance_masks import SIDES
 from directshape_torch.observation.occlusion import Side, occlusion_map
-from directshape_torch.observation.packing import car_regions
+from directshape_torch.observation.packing import car_regions, sampled_pixels
 from directshape_torch.observation.refinable import without_empty_masks
-from directshape_torch.observation.sampling import sampled_pixels
 from directshape_torch.visualize.car_view import CarView, draw_lines, footprint_of_corners
 from directshape_torch.visualize.drawing import Picture
 from directshape_torch.visualize.refinement_trace import PixelResiduals, car_residuals

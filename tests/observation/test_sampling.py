@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from directshape_torch.config import SamplingConfig, SamplingMode
-from directshape_torch.observation.sampling import sampled_pixels
+from directshape_torch.observation.packing import sampled_pixels
 
 SIZES = torch.tensor([[70, 150], [64, 101]])
 MODES: tuple[SamplingMode, ...] = get_args(SamplingMode)

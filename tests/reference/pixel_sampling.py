@@ -9,7 +9,7 @@ from torch import Tensor
 
 from directshape_torch.config import SamplingConfig, SamplingMode
 from directshape_torch.image.grey_levels import gradient_magnitude_of_part
-from directshape_torch.observation.sampling import cell_sides
+from directshape_torch.observation.packing import cell_sides
 
 
 def gradient_magnitude(
