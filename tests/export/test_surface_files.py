@@ -14,6 +14,7 @@ import pytest
 import torch
 from helpers.disparity_maps import write_disparity
 from helpers.finished_run import FinishedRun
+from helpers.quick_runs import dataset
 from numpy.typing import NDArray
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
@@ -22,7 +23,6 @@ from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
-from directshape_torch.io.stereo_dataset import open_dataset
 
 Floats = NDArray[np.float64]
 LINES = (1, 3)
@@ -224,66 +224,56 @@ def test_what_shares_no_shape_does_not_move(finished: FinishedRun, tmp_path: Pat
     assert moving == ["track_000007_part2"]
 
 
-def test_ply_surface_is_the_zero_level_of_the_npz(finished: FinishedRun, exported: Path) -> None:
-    car = 1
-    ply = PlyData.read(str(exported / "ply" / f"000001_{LINES[car]}.ply"))
-    vertex = ply["vertex"]
-    points, normals = (
-        np.stack([vertex[name] for name in names], 1).astype(float) for names in ("xyz", ("nx", "ny", "nz"))
-    )
-    assert np.abs(distances(finished, "000001", car, points)).max() < 0.02
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
-    faces = np.stack(ply["face"]["vertex_indices"])
-    assert faces.max() == len(points) - 1
-    seen = vertex["color_source"] == SEEN
-    rgb = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
-    np.testing.assert_allclose(rgb[seen], image_at(finished, "000001", points[seen]), atol=1.01)
-    assert seen.any()
+def ply(path: Path, columns: Sequence[str] = "xyz") -> Floats:
+    """Columns of a PLY file's vertices."""
+    vertex = PlyData.read(str(path))["vertex"]
+    return np.stack([vertex[name] for name in columns], 1).astype(float)
+
+
+RGB, NORMAL = ("red", "green", "blue"), ("nx", "ny", "nz")
+
+
+def test_ply_has_the_surface_and_the_colours_of_glb(exported: Path) -> None:
+    file, path = glb(exported / "glb" / "000001.glb"), exported / "ply" / "000001_3.ply"
+    np.testing.assert_allclose(ply(path), file.attribute("car_3", "POSITION"), atol=1e-5)
+    np.testing.assert_allclose(ply(path, NORMAL), file.attribute("car_3", "NORMAL"), atol=1e-5)
+    np.testing.assert_allclose(ply(path, RGB), srgb(file.attribute("car_3", "COLOR_0")[:, :3]), atol=0.01)
+    np.testing.assert_array_equal(ply(path, ["color_source"]), file.attribute("car_3", "_COLOR_SOURCE"))
+    faces = np.stack(PlyData.read(str(path))["face"]["vertex_indices"])
+    np.testing.assert_array_equal(faces, file.attribute("car_3", "indices").reshape(-1, 3))
 
 
 def test_points_lie_evenly_on_the_surface(finished: FinishedRun, exported: Path) -> None:
-    vertex = PlyData.read(str(exported / "points" / "000000_1.ply"))["vertex"]
-    assert vertex.count == 3000
-    points, normals = (
-        np.stack([vertex[name] for name in names], 1).astype(float) for names in ("xyz", ("nx", "ny", "nz"))
-    )
+    path = exported / "points" / "000000_1.ply"
+    points = ply(path)
+    assert len(points) == 3000
     assert np.abs(distances(finished, "000000", 0, points)).max() < 0.02
-    outside = distances(finished, "000000", 0, points + 0.05 * normals)
+    outside = distances(finished, "000000", 0, points + 0.05 * ply(path, NORMAL))
     assert (outside > distances(finished, "000000", 0, points)).mean() > 0.999
     # The two halves of a symmetric surface have equal areas: 1500 points each, give or take four standard deviations.
     T = finished.state("000000")["T_cam_obj"][0].astype(np.float64)
     left = ((points - T[:3, 3]) @ T[:3, 2] > 0).sum()
     assert abs(left - 1500) < 110
-    seen = vertex["color_source"] == SEEN
-    rgb = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
-    np.testing.assert_allclose(rgb[seen], image_at(finished, "000000", points[seen]), atol=1.01)
+    seen = ply(path, ["color_source"])[:, 0] == SEEN
+    np.testing.assert_allclose(ply(path, RGB)[seen], image_at(finished, "000000", points[seen]), atol=1.01)
     assert 0.1 < seen.mean() < 0.5
 
 
 def test_stereo_points_are_those_of_the_disparity_map(finished: FinishedRun, tmp_path: Path) -> None:
     """A map of constant disparity puts every point of a mask at the depth f b / d."""
     write_disparity(tmp_path / "maps" / "000000.png", np.full((120, 160), 10.0))
-    dataset = open_dataset(
-        "kitti",
-        finished.root,
-        finished.root / "detections",
-        finished.root / "masks",
-        frames=["000000"],
-        disparity_dir=tmp_path / "maps",
-    )
-    export_run(RunFolder(finished.out, [0]), tmp_path, ["points"], replace(finished.inputs(), dataset=dataset))
-    vertex = PlyData.read(str(tmp_path / "points" / "000000_1_stereo.ply"))["vertex"]
-    points = np.stack([vertex[name] for name in "xyz"], 1).astype(float)
-    loaded = dataset.load("000000")
+    maps = dataset(finished.root, frames=["000000"], disparity_dir=tmp_path / "maps")
+    export_run(RunFolder(finished.out, [0]), tmp_path, ["points"], replace(finished.inputs(), dataset=maps))
+    path = tmp_path / "points" / "000000_1_stereo.ply"
+    points = ply(path)
     # z_right = z + 0.004, so that the disparity is f 0.53 / z to first order.
     np.testing.assert_allclose(points[:, 2], 150 * 0.53 / 10, rtol=5e-3)
-    mask = loaded.detections.mask_left[0].numpy() > 0.5
+    mask = maps.load("000000").detections.mask_left[0].numpy() > 0.5
     u, v = (np.rint(points[:, k] / points[:, 2] * 150 + c).astype(int) for k, c in ((0, 77), (1, 50)))
     assert mask[v, u].all()
     assert len(points) > 0.5 * mask.sum()
-    rgb = np.stack([vertex[name] for name in ("red", "green", "blue")], 1)
     bgr = cv2.imread(str(finished.root / "training/image_2/000000.png"))
-    np.testing.assert_allclose(rgb, bgr[v, u][:, ::-1], atol=1)
+    np.testing.assert_allclose(ply(path, RGB), bgr[v, u][:, ::-1], atol=1)
 
 
 def test_without_images_everything_is_grey(finished: FinishedRun, tmp_path: Path) -> None:

@@ -101,22 +101,20 @@ def show_scene(browser: Chrome) -> Any:
     return scene
 
 
-def test_hostile_names_are_text(opened: Chrome) -> None:
+def test_hostile_names_are_text_and_the_picture_of_the_rig_fits(opened: Chrome) -> None:
     assert OUT_NAME in find(opened, "h1").text
     assert OUT_NAME in opened.title
     assert set(texts(opened, ".open-car span:first-child")) == set(FRAMES)
     assert set(texts(opened, "#frame-choice option")) == set(FRAMES)
     assert CAR_TYPE in texts(opened, "#car-rows td")
     assert opened.execute_script("return document.querySelectorAll('main img[src=x], main script, h1 svg').length") == 0
-
-
-def test_the_picture_of_the_rig_fits(opened: Chrome) -> None:
+    # The picture of the rig is far wider than the page, and fits.
     opened.execute_script("document.querySelector('#rig details').open = true")
     until(lambda: opened.execute_script("return document.querySelector('#rig img').complete"))
     assert 0 < find(opened, "#rig img").size["width"] <= 1280
 
 
-def test_sort_by_click_and_by_key(opened: Chrome) -> None:
+def test_sort_by_click_and_by_key_and_filter(opened: Chrome) -> None:
     head = opened.find_element("xpath", "//th[button[starts-with(., 'Distance')]]")
     button = head.find_element("css selector", "button")
 
@@ -133,23 +131,17 @@ def test_sort_by_click_and_by_key(opened: Chrome) -> None:
     assert distances() == sorted(distances())
     assert len(set(distances())) > 1
     assert len(opened.find_elements("css selector", "th[aria-sort=ascending], th[aria-sort=descending]")) == 1
-
-
-def test_filter(opened: Chrome) -> None:
     find(opened, "#search").send_keys("ONERROR")
     assert set(texts(opened, ".open-car span:first-child")) == {FRAMES[0]}
     assert find(opened, "#car-count").text == "2 of 2 cars shown, 6 in all"
 
 
-def test_thumbnails_come_into_view(opened: Chrome) -> None:
+def test_thumbnails_come_into_view_and_open_a_car_with_its_residual_maps(opened: Chrome) -> None:
     image = find(opened, "#car-rows img.thumbnail")
     opened.execute_script("arguments[0].scrollIntoView()", image)
     until(lambda: opened.execute_script("return arguments[0].naturalWidth", image) > 20)
     assert FIRST_FRAME in image.get_attribute("alt")
     assert opened.execute_script("return [...document.images].every((image) => image.alt !== '')")
-
-
-def test_open_car_and_its_residual_maps(opened: Chrome) -> None:
     find(opened, ".open-car").click()
     dialog = find(opened, "#car-dialog")
     assert dialog.is_displayed()
