@@ -14,21 +14,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers.disparity_maps import write_disparity
+from helpers.exact_disparity import exact_disparity
 from helpers.kitti_folder import CODE, write_data_set
-from helpers.synthetic_scene import TWO_CARS, stereo_camera
+from helpers.synthetic_scene import TWO_CARS, street
 
 from directshape_torch.cli.main import main
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import BootstrapSettings
 from directshape_torch.evaluation.evaluate_shapes import ShapeScores, evaluate_shapes
 from directshape_torch.evaluation.matching import CountedLabels
-from directshape_torch.files.atomic_files import write_png
 from directshape_torch.geometry.box3d import pose_from_kitti
-from directshape_torch.geometry.camera import rays_from_pixels
-from directshape_torch.geometry.projection import disparity_of_depth
+from directshape_torch.geometry.projection import depth_from_disparity
 from directshape_torch.io.kitti_calibration import read_calibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import poses_cam, read_objects
-from directshape_torch.io.mask_files import FrameJsonMasks
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.shape.load_prior import load_prior
 from directshape_torch.shape.pca_prior import PCAShapePrior
@@ -40,35 +39,16 @@ FEW = BootstrapSettings(num_draws=200)
 T_CAM_OBJ = pose_from_kitti(torch.tensor(TWO_CARS[0], dtype=torch.float64), torch.tensor(TWO_CARS[1]).double())
 
 
-def surface_depth(prior: PCAShapePrior, car: int, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Depths at pixels of a car by a search in steps of 4 mm, with nothing of the library's ray casting."""
-    camera = stereo_camera(160, 120, 150.0)
-    rays = rays_from_pixels(torch.from_numpy(np.stack([u, v], -1)).double(), camera.K_left[0])
-    T_obj_cam = torch.linalg.inv(T_CAM_OBJ[car])
-    depths = torch.arange(float(T_CAM_OBJ[car, 2, 3]) - 3, float(T_CAM_OBJ[car, 2, 3]) + 3, 0.004, dtype=torch.float64)
-    points = depths[None, :, None] * rays[:, None]
-    points_obj = points @ T_obj_cam[:3, :3].T + T_obj_cam[:3, 3]
-    flat = points_obj.reshape(-1, 3)
-    shape = prior.bind(torch.tensor(CODE, dtype=torch.float64))
-    inside = shape.value(flat, torch.full((len(flat),), car)).view(len(u), -1) < 0
-    return depths[inside.to(torch.uint8).argmax(dim=1)].numpy() - 0.002
-
-
 def write_truth(root: Path, prior: PCAShapePrior) -> None:
-    """True disparities and depths; the cars are the same in every frame."""
-    masks = FrameJsonMasks(root / "masks").read(FRAMES[0], (120, 160))
-    depth = np.zeros((120, 160))
-    for car, mask in enumerate(mask for mask in masks if mask.side == "left"):
-        v, u = np.nonzero(np.asarray(mask.probability) > 0.5)
-        depth[v, u] = surface_depth(prior, car, v, u)
-    camera = stereo_camera(160, 120, 150.0)
-    v, u = np.nonzero(depth)
-    uv, calibration = torch.from_numpy(np.stack([u, v], -1)).double(), (camera.K_left[0], camera.K_right[0])
-    disparity = np.zeros((120, 160))
-    disparity[v, u] = disparity_of_depth(uv, torch.from_numpy(depth[v, u]), *calibration, camera.T_right_cam[0])[:, 0]
+    """True disparities and depths, with nothing of the library's ray casting; the cars are the same in every frame."""
+    scene = street(prior, *TWO_CARS, code=torch.tensor(CODE, dtype=torch.float64))
+    camera, disparity = scene.frames.camera, exact_disparity(prior, scene)[0]
+    v, u = torch.meshgrid(torch.arange(120.0), torch.arange(160.0), indexing="ij")
+    uv = torch.stack([u, v], dim=-1).double()
+    depth = depth_from_disparity(uv, disparity, camera.K_left[0], camera.K_right[0], camera.T_right_cam[0])
     for frame_id in FRAMES:
         for folder, values in (("disp_occ_0", disparity), ("depth_2", depth)):
-            write_png(root / "training" / folder / f"{frame_id}.png", np.rint(256 * values).astype(np.uint16))
+            write_disparity(root / "training" / folder / f"{frame_id}.png", values.numpy())
 
 
 def write_perfect(source: Path, target: Path) -> None:
