@@ -18,7 +18,14 @@ from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_bytes, write_png
 from directshape_torch.files.mesh_files import T_GLTF_CAM
 from directshape_torch.geometry.box3d import alpha_from_kitti
-from directshape_torch.io.result_files import RefinedBox, ShapeArrays, read_shapes, write_result_text, write_shapes
+from directshape_torch.io.result_files import (
+    RefinedBox,
+    ShapeArrays,
+    read_shapes,
+    track_name,
+    write_result_text,
+    write_shapes,
+)
 from directshape_torch.io.run_folder import (
     FrameRecord,
     frame_entry,
@@ -30,7 +37,6 @@ from directshape_torch.io.run_folder import (
 )
 from directshape_torch.io.run_manifest import FrameEntry, hash_bytes
 from directshape_torch.io.stereo_dataset import LoadedFrame
-from directshape_torch.io.track_files import track_name
 from directshape_torch.refinement.result import RefinementResult
 
 if TYPE_CHECKING:

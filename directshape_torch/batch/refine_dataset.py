@@ -21,10 +21,10 @@ from directshape_torch.batch.run_summary import RunSummary, RunTimings, find_war
 from directshape_torch.batch.workers import GroupDispatch, LocalWorkers, ThisProcess, Workers
 from directshape_torch.errors import DirectShapeError, InputError
 from directshape_torch.io.config_files import config_to_mapping
+from directshape_torch.io.result_files import read_shapes, write_tracks
 from directshape_torch.io.run_folder import done_frames, overlay_path, result_path, shapes_path
 from directshape_torch.io.run_manifest import FrameEntry, RunManifest, SharedHashes, hash_fields, hash_prior
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.io.track_files import write_tracks
 from directshape_torch.refinement.scene_problem import TermFactory
 from directshape_torch.refiner import DirectShapeRefiner
 
@@ -108,7 +108,8 @@ class _Run:
             raise
         self._look_for_files()
         if has_tracks(self.dataset):
-            write_tracks(self.out_dir, sorted(set(self.dataset.frame_ids).difference(self.earlier.manifest.failed)))
+            done = sorted(set(self.dataset.frame_ids).difference(self.earlier.manifest.failed))
+            write_tracks(self.out_dir, (read_shapes(shapes_path(self.out_dir, frame_id)) for frame_id in done))
         return self._end(resumed, None)
 
     def _groups(self, finished: Collection[str]) -> list[FrameGroup]:

@@ -157,9 +157,6 @@ def remove_results(out_dir: Path, others: Iterable[str]) -> bool:
 
     Returns:
         Whether there was a summary; without one nothing is removed.
-
-    Raises:
-        DataFormatError: the folder has a summary that cannot be read, so nobody knows which files are results.
     """
     previous = read_manifest(summary_path(out_dir))
     if previous is None:

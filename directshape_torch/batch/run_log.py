@@ -240,11 +240,7 @@ def log_path(out_dir: Path) -> Path:
 
 
 def read_log(out_dir: Path) -> LogContents | None:
-    """The latest run into a folder, also while it goes on; None where none has begun.
-
-    Raises:
-        DataFormatError: a file of that name is of another version, or not ours.
-    """
+    """The latest run into a folder, also while it goes on; None where none has begun."""
     path = log_path(out_dir)
     if not path.is_file():
         return None

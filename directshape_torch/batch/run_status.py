@@ -43,9 +43,6 @@ def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
     Args:
         out_dir: the output folder.
         now: seconds since 1970; default the clock.
-
-    Raises:
-        DataFormatError: no run has been there.
     """
     run = read_log(Path(out_dir))
     if run is None:

@@ -7,14 +7,46 @@ iteration, and how it would drift by silhouettes alone. docs/inspect.md shows th
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.cli.inspect_cars import inspect_frame, inspect_tracks
 from directshape_torch.cli.options import add_data_options, add_refiner_options, dataset_of, frame_id_of, make_refiner
+from directshape_torch.cli.progress import Bar
 from directshape_torch.errors import InputError
-from directshape_torch.io.figure_files import check_figures
+from directshape_torch.evaluation.matching import match_to_labels
+from directshape_torch.files.atomic_files import write_png
+from directshape_torch.io.figure_files import check_figures, write_animation
+from directshape_torch.io.frame_collation import collate
+from directshape_torch.io.kitti_labels import box_corners_cam
+from directshape_torch.io.result_files import track_name
 from directshape_torch.io.stereo_dataset import LoadedFrame, StereoDataset
+from directshape_torch.refiner import DirectShapeRefiner
+from directshape_torch.visualize.car_figures import (
+    write_drift_figure,
+    write_iteration_animation,
+    write_residual_figure,
+    write_sampling_figure,
+)
+from directshape_torch.visualize.car_view import CarView
+from directshape_torch.visualize.drawing import Picture, View, draw_box, draw_contour, draw_text
+from directshape_torch.visualize.drawn_car import DrawnCar, drawn_cars
+from directshape_torch.visualize.overlay import overlay_of_frame
+from directshape_torch.visualize.refinement_trace import RefinementTrace, trace_refinement, without_photometry
+
+_SIZE_PX = (480, 360)
+_SECONDS_A_FRAME = 0.4
+_MARGIN = 1.3
+_FIGURES: dict[str, Callable[[Path, CarView], None]] = {
+    "sampling.png": write_sampling_figure,
+    "residuals.png": write_residual_figure,
+    "iterations.gif": write_iteration_animation,
+}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -73,3 +105,116 @@ def _rows(loaded: LoadedFrame, line: int | None) -> list[int]:
         known = ", ".join(map(str, lines)) or "none"
         raise InputError("--car", f"the line of a car of frame {loaded.frame_id}: {known}", str(line))
     return [lines.index(line)]
+
+
+def inspect_frame(
+    loaded: LoadedFrame,
+    refiner: DirectShapeRefiner,
+    rows: Sequence[int],
+    out_dir: Path,
+    *,
+    must_refine: bool = False,
+) -> None:
+    """Refine all cars of a frame and draw some: `FRAME.png`, and a folder `FRAME_LINE` a car.
+
+    Args:
+        loaded: the frame, on the CPU.
+        refiner: on the CPU too.
+        rows: of the detections to draw.
+        out_dir: made where it is missing.
+        must_refine: draw nothing where one of them cannot be refined.
+
+    Raises:
+        InputError: such a car was not refined; says why.
+    """
+    trace = trace_refinement(refiner, loaded.frame, loaded.detections)
+    _report(loaded, trace, rows, must_refine)
+    write_png(out_dir / f"{loaded.frame_id}.png", overlay_of_frame(loaded, trace.result))
+    drawn = [row for row in rows if trace.place_of(row) >= 0]
+    silhouettes = silhouette_trace(refiner, loaded) if drawn else None
+    truth = true_corners_cam(loaded)
+    for row in Bar(drawn, unit="car", desc=f"frame {loaded.frame_id}", file=sys.stderr):
+        folder, view = out_dir / f"{loaded.frame_id}_{line_of(loaded, row)}", CarView(loaded, trace, row, truth[row])
+        for name, write in _FIGURES.items():
+            write(folder / name, view)
+        if silhouettes is not None and silhouettes.place_of(row) >= 0:
+            write_drift_figure(folder / "drift.png", view, CarView(loaded, silhouettes, row, truth[row]))
+
+
+def silhouette_trace(refiner: DirectShapeRefiner, loaded: LoadedFrame) -> RefinementTrace | None:
+    """Of a refinement by silhouettes and priors alone; None where the refiner lacks one of the paper's terms."""
+    config = refiner.config
+    if config.method != "direct" or not (config.photometric.weight > 0 and config.silhouette.weight > 0):
+        return None
+    return trace_refinement(without_photometry(refiner), loaded.frame, loaded.detections)
+
+
+def _report(loaded: LoadedFrame, trace: RefinementTrace, rows: Sequence[int], must_refine: bool) -> None:
+    """A line a car: how it ended, its cost before and after."""
+    result = trace.result
+    for row in rows:
+        status = result.status[row]
+        name = f"frame {loaded.frame_id} car {line_of(loaded, row)}"
+        if trace.place_of(row) < 0:
+            if must_refine:
+                raise InputError("--car", "a car that can be refined", f"{status.name} ({status.value})")
+            print(f"{name}: not refined, {status.name}: {status.value}")
+            continue
+        before, after = (float(costs[row].sum()) for costs in (result.cost_before, trace.costs[-1]))
+        moved = int(trace.accepted[:, row].sum())
+        print(f"{name}: {status.name}, cost {before:.2f} -> {after:.2f} in {moved} steps")
+
+
+def line_of(loaded: LoadedFrame, row: int) -> int:
+    """Number of the line of a detection in its file."""
+    return loaded.detected_objects[row].line_number
+
+
+def true_corners_cam(loaded: LoadedFrame) -> list[NDArray[np.float64] | None]:
+    """Corners (8, 3) of the labelled box of each detection, or None."""
+    labels = loaded.labels or []
+    partners = match_to_labels(loaded.detected_objects, labels)
+    corners = box_corners_cam(labels, loaded.frame.camera.t_cam_ref[0]).numpy()
+    return [None if partner < 0 else corners[partner] for partner in partners]
+
+
+def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, out_dir: Path) -> list[Path]:
+    """Refine frames in one call and write `track_NAME.gif` for each car that several of them show.
+
+    Args:
+        loaded: frames of one rig, whose cars have tracks; on the CPU.
+        refiner: on the CPU too.
+        out_dir: made where it is missing.
+    """
+    with torch.no_grad():
+        result = refiner(*collate(loaded))
+    pictures: dict[str, list[Picture]] = {}
+    first_row = 0
+    for item in loaded:
+        ids, part = item.detections.track_id, result[first_row : first_row + len(item.detections)]
+        for car, number in zip(drawn_cars(item, part)[1], [] if ids is None else ids.tolist(), strict=True):
+            pictures.setdefault(track_name(item.sequence or "", number), []).append(_picture(item, car))
+        first_row += len(item.detections)
+    paths = []
+    for name, frames in pictures.items():
+        if name and len(frames) > 1:
+            paths.append(out_dir / f"track_{name}.gif")
+            write_animation(paths[-1], frames, [_SECONDS_A_FRAME] * len(frames))
+    return paths
+
+
+def _picture(item: LoadedFrame, car: DrawnCar) -> Picture:
+    """The car's part of the left image, with its box and contour; all of one size."""
+    image = View.of_frame(item.frame)
+    ahead = car.corners_cam[car.corners_cam[:, 2] > 0.5]
+    pixels = image.project(ahead if len(ahead) else np.array([[0.0, 0.0, 1.0]]))
+    (u0, v0), (u1, v1) = pixels.min(axis=0), pixels.max(axis=0)
+    height = round(max(_MARGIN * (v1 - v0), _MARGIN * (u1 - u0) * _SIZE_PX[1] / _SIZE_PX[0], 12.0) / 3) * 3
+    width = height * 4 // 3
+    left, top = round((u0 + u1 - width) / 2), round((v0 + v1 - height) / 2)
+    view = image.part((left, top, left + width, top + height), _SIZE_PX[0] / width)
+    draw_box(view, car.corners_cam, car.colour)
+    if car.surface is not None:
+        draw_contour(view, car.surface, car.colour)
+    draw_text(view.picture, f"{item.frame_id}: {car.distance_m:.1f} m, {car.status}", (8, 20))
+    return view.picture

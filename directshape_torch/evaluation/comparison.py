@@ -14,9 +14,8 @@ from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.evaluation.bootstrap import BootstrapSettings, CarBootstrap, Estimate, MetricSummary, Statistic
 from directshape_torch.evaluation.matching import CountedLabels, files_of_frames, match_to_labels, named_frames
 from directshape_torch.evaluation.pose_error import CarErrors, errors_of
-from directshape_torch.io.kitti_labels import KittiObject
+from directshape_torch.io.kitti_labels import FrameObjects, KittiObject
 from directshape_torch.io.result_files import read_shapes
-from directshape_torch.io.tracking_files import FrameObjects
 
 WORSE_BY_BEV_IOU = 0.05
 # Depth of the label along the optical axis, metres; the last bin is open.

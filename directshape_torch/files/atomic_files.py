@@ -26,9 +26,6 @@ def write_bytes(path: Path | str, content: bytes, durable: bool = False) -> None
         content: its bytes.
         durable: wait for the disk, so that not even a power cut leaves a file of another length.
 
-    Raises:
-        OSError: the folder cannot be made or written; the old file, if any, is then untouched.
-
     Examples:
         >>> import tempfile
         >>> folder = tempfile.mkdtemp()
@@ -69,21 +66,13 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 def write_json(path: Path | str, value: Any, durable: bool = False) -> None:
-    """Write `value` as JSON with sorted keys and a final newline; NaN and infinity are refused, JSON has none.
-
-    Raises:
-        ValueError: `value` holds a number that JSON cannot express.
-    """
+    """Write `value` as JSON with sorted keys and a final newline; NaN and infinity are refused, JSON has none."""
     text = json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n"
     write_bytes(path, text.encode("utf-8"), durable)
 
 
 def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write a compressed npz whose bytes depend on the arrays alone (`numpy.savez` stores the time of day).
-
-    Raises:
-        ValueError: an array of Python objects, which would need pickle.
-    """
+    """Write a compressed npz whose bytes depend on the arrays alone (`numpy.savez` stores the time of day)."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, array in arrays.items():
@@ -97,11 +86,7 @@ def write_npz(path: Path | str, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def write_png(path: Path | str, image: NDArray[Any]) -> None:
-    """Write an image, (H, W) grey or (H, W, 3) RGB, uint8 or uint16, as PNG.
-
-    Raises:
-        OSError: OpenCV cannot encode the array.
-    """
+    """Write an image, (H, W) grey or (H, W, 3) RGB, uint8 or uint16, as PNG."""
     import cv2
 
     image = np.asarray(image)

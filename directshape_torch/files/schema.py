@@ -23,9 +23,6 @@ def record_of(path: Path | str, cls: type[_RecordT], content: Any, cure: str = "
         content: the object.
         where: in the file, before the name of a field, such as "objects[0].".
 
-    Raises:
-        DataFormatError: a field is missing, unknown, or not of its type; names file, field, type and value.
-
     Examples:
         >>> from directshape_torch.batch.run_log import RunEvent
         >>> record_of("a.json", RunEvent, {"frame": "000107", "at": 0.5}).frame

@@ -55,11 +55,7 @@ class FrameLayout(ABC):
 
     @abstractmethod
     def plane_ref(self, frame_id: str) -> NDArray[np.float64]:
-        """The plane (a, b, c, d) of that file, see `read_plane`.
-
-        Raises:
-            DataFormatError: there is none, or it is damaged.
-        """
+        """The plane (a, b, c, d) of that file, see `read_plane`."""
 
     @abstractmethod
     def detection_path(self, frame_id: str) -> Path: ...
@@ -106,11 +102,7 @@ class FrameLayout(ABC):
 
 
 def existing_folder(path: Path, problem: str, cure: str = "check the path") -> Path:
-    """The path itself.
-
-    Raises:
-        DataFormatError: it is no folder.
-    """
+    """The path itself."""
     if not path.is_dir():
         raise DataFormatError(path, problem, cure=cure)
     return path

@@ -29,11 +29,7 @@ IMAGE_ENDINGS = ("png", "jpg", "jpeg")
 
 
 def read_rgb(path: Path | str) -> NDArray[np.uint8]:
-    """Read a PNG or JPEG file as RGB, uint8 (H, W, 3).
-
-    Raises:
-        DataFormatError: the file is missing, cut short, damaged, no image, or of more than 67 megapixels; says which.
-    """
+    """Read a PNG or JPEG file as RGB, uint8 (H, W, 3)."""
     import cv2
 
     bgr = _decode(path, cv2.IMREAD_COLOR)
@@ -41,11 +37,7 @@ def read_rgb(path: Path | str) -> NDArray[np.uint8]:
 
 
 def read_pair(left_path: Path, right_path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Both images of a rectified pair, see `read_rgb`.
-
-    Raises:
-        DataFormatError: one of them is missing or damaged, or they differ in size.
-    """
+    """Both images of a rectified pair, see `read_rgb`."""
     left, right = read_rgb(left_path), read_rgb(right_path)
     if left.shape != right.shape:
         raise DataFormatError(
@@ -57,11 +49,7 @@ def read_pair(left_path: Path, right_path: Path) -> tuple[NDArray[np.uint8], NDA
 
 
 def read_single_channel(path: Path | str) -> NDArray[Any]:
-    """Read a one-channel PNG as it is stored, uint8 or uint16 (H, W).
-
-    Raises:
-        DataFormatError: the file is missing, damaged, or has several channels.
-    """
+    """Read a one-channel PNG as it is stored, uint8 or uint16 (H, W)."""
     import cv2
 
     image = _decode(path, cv2.IMREAD_UNCHANGED)
@@ -79,9 +67,6 @@ def read_disparity(
     Args:
         path: of the PNG; any stereo method writes such files for KITTI.
         size_hw: height and width of the left image; None for any.
-
-    Raises:
-        DataFormatError: missing, damaged, not one channel of 16 bits, of another size, or without a single disparity.
     """
     stored = read_single_channel(path)
     if stored.dtype != np.uint16:

@@ -57,9 +57,6 @@ def read_calibration(path: Path | str) -> KittiCalibration:
 
     Args:
         path: text file of lines `name: numbers`, the colon being optional.
-
-    Raises:
-        DataFormatError: a line does not hold as many numbers as its matrix, or P2 or P3 is missing.
     """
     matrices: dict[str, Any] = {}
     for line in read_lines(path):
@@ -74,11 +71,7 @@ def read_calibration(path: Path | str) -> KittiCalibration:
 
 
 def read_velo_to_cam(path: Path | str) -> NDArray[np.float64]:
-    """LiDAR to camera 0, (3, 4), metres, from `calib_velo_to_cam.txt` of the raw recordings (lines `R:` and `T:`).
-
-    Raises:
-        DataFormatError: one of them is missing or does not hold its numbers.
-    """
+    """LiDAR to camera 0, (3, 4), metres, from `calib_velo_to_cam.txt` of the raw recordings (lines `R:` and `T:`)."""
     found: dict[str, NDArray[np.float64]] = {}
     for line in read_lines(path):
         words = line.text.split()
@@ -104,10 +97,6 @@ def to_stereo_camera(
         calibrations: one a frame.
         disparity_field: residual disparity of the rig, shared by the frames, or None.
         dtype: of the tensors; the arithmetic is float64.
-
-    Raises:
-        DataFormatError: the right camera of a file is not to the right of its left one (flipped baseline), or its
-            matrices have no inverse.
     """
     if not calibrations:
         raise InputError("calibrations", "at least one frame", "none")
@@ -132,12 +121,7 @@ def camera_of_rig(
     size_wh: tuple[int, int],
     dtype: torch.dtype = torch.float32,
 ) -> StereoCamera:
-    """The stereo camera of a frame, with the disparity field of its rig where there are fields.
-
-    Raises:
-        DataFormatError: see `to_stereo_camera`; or the calibration is of images of another size.
-        InputError: all fields are of other rigs.
-    """
+    """The stereo camera of a frame, with the disparity field of its rig where there are fields."""
     calibration.check_size(size_wh)
     rig = to_stereo_camera([calibration], dtype=torch.float64)
     field = _field_of_rig(fields, size_wh, rig)
@@ -182,9 +166,6 @@ def read_plane(path: Path | str) -> NDArray[np.float64]:
 
     Returns:
         (4,) float64: unit normal and offset in metres.
-
-    Raises:
-        DataFormatError: there is no line of four numbers, or the plane is upright.
     """
     lines = read_lines(path)
     if not lines:
@@ -193,11 +174,7 @@ def read_plane(path: Path | str) -> NDArray[np.float64]:
 
 
 def upright_plane(path: Path | str, plane: NDArray[np.float64], line: Line | None = None) -> NDArray[np.float64]:
-    """A plane (a, b, c, d) normalised and with its normal up (b < 0).
-
-    Raises:
-        DataFormatError: the plane leans by more than 60 degrees; names the file and the line, if there is one.
-    """
+    """A plane (a, b, c, d) normalised and with its normal up (b < 0)."""
     length = float(np.linalg.norm(plane[:3]))
     # A ground that leans by more than 60 degrees is a mistake in the order or the frame of the coefficients.
     if not abs(plane[1]) > 0.5 * length:

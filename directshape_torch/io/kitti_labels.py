@@ -1,18 +1,22 @@
-"""Label and result files of KITTI's object benchmark."""
+"""Label and result files of KITTI's object benchmark (one a frame) and of its tracking benchmark (one a sequence)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from directshape_torch.errors import InputError
 from directshape_torch.files.read_files import Line, read_lines
 from directshape_torch.geometry.box3d import box_corners, pose_from_kitti
+from directshape_torch.io.instance_masks import file_of_frame
 
-_CURE = "write one object a line: type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
+_COLUMNS = "type truncated occluded alpha u_min v_min u_max v_max h w l x y z rotation_y [score]"
+_CURE = f"write one object a line: {_COLUMNS}"
+_MOST_DIGITS = 9
 # KITTI writes these where a box has no 3D part (DontCare, 2D detectors).
 _NO_LOCATION_M = -1000.0
 
@@ -46,10 +50,6 @@ def read_objects(path: Path | str, with_score: bool | None = None) -> list[Kitti
     Args:
         path: text file, one object a line.
         with_score: True for results (16 columns), False for labels (15), None for either.
-
-    Raises:
-        DataFormatError: a line has another number of columns or something that is no finite number; names the file,
-            the line and its text.
     """
     return [parse_object(path, line, with_score) for line in read_lines(path)]
 
@@ -123,3 +123,70 @@ def box_corners_cam(
     """
     dimensions_hwl = torch.tensor([o.hwl for o in objects], dtype=torch.float64).reshape(-1, 3)
     return box_corners(poses_cam(objects, t_cam_ref.double()), dimensions_hwl)
+
+
+def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
+    """The objects of every frame number that occurs, with their tracks.
+
+    Their `raw_line` leaves frame and track out and their `line_number` counts within the frame, as in its own file.
+
+    Args:
+        path: of a label file (17 columns) or a result file (18 columns, the score last).
+    """
+    frames: dict[int, list[KittiObject]] = {}
+    for line in read_lines(path):
+        words = line.text.split()
+        if len(words) not in (17, 18) or not _is_number(words[0]) or not _is_number(words[1].removeprefix("-")):
+            problem = f"expected 17 or 18 columns beginning with the numbers of frame and track, got {len(words)}"
+            raise line.error(path, problem, f"write one object a line: frame track {_COLUMNS}")
+        text = " ".join(words[2:])
+        objects = frames.setdefault(int(words[0]), [])
+        found = parse_object(path, Line(line.number, text, text))
+        objects.append(replace(found, track_id=int(words[1]), line_number=len(objects) + 1))
+    return frames
+
+
+class FrameObjects:
+    """Objects frame by frame, of files of frames or of the tracking benchmark, each of which is read once."""
+
+    def __init__(self) -> None:
+        self._sequences: dict[Path, dict[int, list[KittiObject]]] = {}
+
+    def path(self, source: Path, frame_id: str) -> Path:
+        """The file of a frame.
+
+        Args:
+            source: a folder of `FRAME.txt` or `SEQUENCE.txt`, or one with `data` of them, or the file of a sequence.
+            frame_id: `FRAME`, or `SEQUENCE_NNNNNN`.
+        """
+        of_frame, sequence = file_of_frame(source, f"{frame_id}.txt"), frame_id.rpartition("_")[0]
+        of_sequence = source if source.is_file() else file_of_frame(source, f"{sequence}.txt")
+        return of_sequence if not of_frame.is_file() and of_sequence.is_file() else of_frame
+
+    def read(self, path: Path, frame_id: str) -> list[KittiObject]:
+        """The objects of a frame in a file that `path` named; raises as `of_sequence`."""
+        return read_objects(path) if path.stem == frame_id else self.of_sequence(path, frame_id)
+
+    def of_sequence(self, path: Path, frame_id: str) -> list[KittiObject]:
+        """The objects of a frame in a file of the tracking benchmark."""
+        number = frame_number(frame_id)
+        if path not in self._sequences:
+            self._sequences[path] = read_tracking_objects(path)
+        return self._sequences[path].get(number, [])
+
+
+def frame_number(frame_id: str) -> int:
+    """The number of a frame in its sequence, of `NNNNNN` or `SEQUENCE_NNNNNN`.
+
+    Examples:
+        >>> frame_number("0005_000012")
+        12
+    """
+    number = frame_id.rpartition("_")[2]
+    if not _is_number(number.lstrip("0") or number[-1:]):
+        raise InputError("frames", "names that end with numbers, for a file of their sequence", repr(frame_id))
+    return int(number)
+
+
+def _is_number(word: str) -> bool:
+    return word.isdecimal() and len(word) <= _MOST_DIGITS

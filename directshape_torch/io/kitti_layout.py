@@ -20,10 +20,9 @@ from directshape_torch.io.frame_layout import (
 from directshape_torch.io.image_files import find_image
 from directshape_torch.io.instance_masks import InstanceMask, MaskSource, file_of_frame
 from directshape_torch.io.kitti_calibration import KittiCalibration, read_calibration, read_plane, read_velo_to_cam
-from directshape_torch.io.kitti_labels import KittiObject, read_objects
+from directshape_torch.io.kitti_labels import FrameObjects, KittiObject, frame_number, read_objects
 from directshape_torch.io.mask_files import mask_source
 from directshape_torch.io.motion_files import of_line, read_poses, read_times
-from directshape_torch.io.tracking_files import FrameObjects, frame_number
 
 
 @dataclass(frozen=True)
@@ -94,9 +93,6 @@ class KittiLayout(FrameLayout):
             `SEQUENCE/data/NNNNNN.txt` or `data/SEQUENCE_NNNNNN.txt`; in either case also `SEQUENCE.txt`, a result or
             label file of the tracking benchmark.
         single: whether there is no prefix.
-
-    Raises:
-        DataFormatError: there is no such folder.
     """
 
     def __init__(
@@ -276,11 +272,7 @@ class KittiMasks:
 
 
 def object_layout(root: Path | str, detections_dir: Path | str) -> KittiLayout:
-    """KITTI's object benchmark: `root/training` with image_2, image_3, calib, label_2, planes; detections apart.
-
-    Raises:
-        DataFormatError: a folder is missing.
-    """
+    """KITTI's object benchmark: `root/training` with image_2, image_3, calib, label_2, planes; detections apart."""
     training = Path(root) / "training"
     if not training.is_dir():
         raise DataFormatError(root, "holds no folder 'training' in KITTI's layout", cure="check the path")
@@ -290,9 +282,6 @@ def object_layout(root: Path | str, detections_dir: Path | str) -> KittiLayout:
 def stereo2015_layout(root: Path | str, detections_dir: Path | str) -> KittiLayout:
     """KITTI Stereo 2015 (and Scene Flow 2015): two consecutive pairs a scene, `NNNNNN_10` and `NNNNNN_11`, in
     `root/training`, `root/testing` or `root`. Detections, masks and planes of the first may be called `NNNNNN`, too.
-
-    Raises:
-        DataFormatError: a folder is missing.
     """
     candidates = [Path(root) / "training", Path(root) / "testing", Path(root)]
     found = [folder for folder in candidates if (folder / "calib_cam_to_cam").is_dir()]
@@ -305,9 +294,6 @@ def stereo2015_layout(root: Path | str, detections_dir: Path | str) -> KittiLayo
 def tracking_layout(root: Path | str, detections_dir: Path | str) -> KittiLayout:
     """A tracking sequence (`root/image_02/NNNNNN.png`, `image_03`, `calib.txt`, `label_02.txt`, `planes`), or the
     benchmark (`root/training` or `root` with `image_02/SEQUENCE/NNNNNN.png`, `image_03`, `calib/SEQUENCE.txt` ..).
-
-    Raises:
-        DataFormatError: neither.
     """
     root = Path(root)
     if image_stems(root / "image_02"):
@@ -326,9 +312,6 @@ def tracking_layout(root: Path | str, detections_dir: Path | str) -> KittiLayout
 def raw_layout(root: Path | str, detections_dir: Path | str) -> KittiLayout:
     """A rectified drive of KITTI's raw data (`root/image_02/data/NNNNNNNNNN.png`, `image_03`; calibration in
     `calib_cam_to_cam.txt` beside or in it), or a folder of such drives, of one day or of days.
-
-    Raises:
-        DataFormatError: neither.
     """
     root = Path(root)
     single = (root / "image_02" / "data").is_dir()

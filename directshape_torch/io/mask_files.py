@@ -158,9 +158,6 @@ class CocoFileMasks:
 def mask_source(directory: Path | str) -> FrameJsonMasks | InstancePngMasks:
     """The reader that fits a folder of masks: instance PNG if it holds `instance_2` (or `instance_02`), else one json
     a frame.
-
-    Raises:
-        DataFormatError: it is no folder.
     """
     directory = Path(directory)
     if not directory.is_dir():
@@ -172,11 +169,7 @@ def mask_source(directory: Path | str) -> FrameJsonMasks | InstancePngMasks:
 
 
 def read_coco_list(path: Path) -> list[Mapping[str, Any]]:
-    """The entries of a COCO result file.
-
-    Raises:
-        DataFormatError: it is missing, no JSON, or no list of objects.
-    """
+    """The entries of a COCO result file."""
     entries = read_json(path)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise DataFormatError(

@@ -21,9 +21,6 @@ def read_times(path: Path | str) -> NDArray[np.float64]:
     Args:
         path: of `times.txt` of KITTI's odometry benchmark (seconds), or `timestamps.txt` of its raw recordings (dates
             with times of day).
-
-    Raises:
-        DataFormatError: a line is neither, or time does not go on.
     """
     lines = read_lines(path)
     seconds: NDArray[np.float64] = np.array([_seconds(path, line) for line in lines], dtype=np.float64)
@@ -38,9 +35,6 @@ def read_poses(path: Path | str) -> NDArray[np.float64]:
 
     Args:
         path: of a file as of KITTI's odometry benchmark: rows of a matrix (3, 4), a line a frame.
-
-    Raises:
-        DataFormatError: a line does not hold 12 finite numbers, or no rotation.
     """
     lines = read_lines(path)
     T_world_ref = np.tile(np.eye(4), (len(lines), 1, 1))
@@ -50,11 +44,7 @@ def read_poses(path: Path | str) -> NDArray[np.float64]:
 
 
 def of_line(path: Path, values: NDArray[np.float64], number: int) -> NDArray[np.float64]:
-    """What a file says of the frame of a number, from 0.
-
-    Raises:
-        DataFormatError: it has no line for it.
-    """
+    """What a file says of the frame of a number, from 0."""
     if number >= len(values):
         problem = f"has {len(values)} lines and none for frame {number}"
         raise DataFormatError(path, problem, cure="write a line for each frame of the sequence, from frame 0 on")

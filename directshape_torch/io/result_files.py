@@ -1,9 +1,9 @@
-"""What a refinement leaves behind for each frame: a KITTI result file, and states with shapes as npz (schema 3)."""
+"""What a refinement leaves behind: KITTI result files, states and shapes of frames (schema 3), tracks through them."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -18,6 +18,7 @@ from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.status import Status
 
 SHAPES_SCHEMA_VERSION = 3
+TRACK_SCHEMA_VERSION = 1
 _AGAIN = "refine the frame again"
 
 Floats = NDArray[np.floating[Any]]
@@ -59,9 +60,6 @@ def write_result_text(
         path: usually `OUT/data/NNNNNN.txt`.
         input_objects: the lines of the detection file.
         refined: for indices into `input_objects` the refined box; all other lines are copied byte for byte.
-
-    Raises:
-        InputError: an index without an input line, or a box that is not finite.
     """
     unknown = sorted(set(refined) - set(range(len(input_objects))))
     if unknown:
@@ -142,9 +140,6 @@ def check_shapes(arrays: Any, sizes: Mapping[str, int]) -> None:
     Args:
         arrays: the dataclass.
         sizes: by the letters of the declarations.
-
-    Raises:
-        InputError: one has not.
     """
     for entry in fields(arrays):
         shape = tuple(sizes.get(str(size), size) for size in entry.metadata.get("shape", ()))
@@ -168,20 +163,12 @@ def write_arrays(path: Path | str, content: Any, version: int) -> None:
 
 
 def read_shapes(path: Path | str) -> ShapeArrays:
-    """Read a file of `write_shapes`.
-
-    Raises:
-        DataFormatError: it is no such file, of another schema version, or changed since it was written.
-    """
+    """Read a file of `write_shapes`."""
     return read_arrays(path, ShapeArrays, SHAPES_SCHEMA_VERSION)
 
 
 def read_arrays(path: Path | str, kind: type[_Arrays], version_read: int) -> _Arrays:
-    """Read a file of `write_arrays` as the dataclass `kind`, whose `statuses` are names of `Status`.
-
-    Raises:
-        DataFormatError: it is no such file, of another schema version, or changed since it was written.
-    """
+    """Read a file of `write_arrays` as the dataclass `kind`, whose `statuses` are names of `Status`."""
     arrays = read_npz(path, cure=_AGAIN)
     sha256 = arrays.pop("sha256", None)
     is_whole = sha256 is not None and sha256.tolist() == _hash_arrays(arrays)
@@ -226,3 +213,100 @@ def _from_text(array: NDArray[Any]) -> Any:
 def _decimal(number: float) -> str:
     """Four decimals, a tenth of a millimetre, without a negative zero."""
     return f"{round(float(number), 4) + 0.0:.4f}"
+
+
+@dataclass(frozen=True)
+class TrackArrays:
+    """A car in F frames, K codes, D = 6 + K; each view as its frame's `ShapeArrays` has it."""
+
+    track: str
+    prior_sha256: str  # of the shape prior whose codes these are
+    # Its shape, that of the refined view which knows it best; NaN where no view was refined.
+    code: Floats = field(metadata=shaped("K"))
+    code_covariance: Floats = field(metadata=shaped("K", "K"))  # of it
+    dimensions_hwl: Floats = field(metadata=shaped(3))  # of that shape, metres
+    frame_ids: tuple[str, ...] = field(metadata=shaped("F"))  # text, in the order of the frames
+    input_lines: NDArray[np.int64] = field(metadata=shaped("F"))  # line numbers in the detection files, from 1
+    statuses: tuple[str, ...] = field(metadata=shaped("F"))  # text
+    # 0 for views that share a shape, 1, 2 .. for later ones that cannot be the same car, -1 for a view that shares
+    # with none.
+    parts: NDArray[np.int64] = field(metadata=shaped("F"))
+    # Object to left camera, and to the frame of the labels.
+    T_cam_obj: Floats = field(metadata=shaped("F", 4, 4))
+    T_ref_obj: Floats = field(metadata=shaped("F", 4, 4))
+    # And boxes_rotation_y (F,): the boxes of the result lines.
+    boxes_hwl: Floats = field(metadata=shaped("F", 3))
+    boxes_location_ref: Floats = field(metadata=shaped("F", 3))
+    boxes_rotation_y: Floats = field(metadata=shaped("F"))
+    # One and the same in all views of a call; views that were not trusted keep their own.
+    codes: Floats = field(metadata=shaped("F", "K"))
+    # In the tangent (v, omega, code) of the solver; NaN where there is none.
+    covariances: Floats = field(metadata=shaped("F", "D", "D"))
+
+    def __post_init__(self) -> None:
+        check_shapes(self, {"F": len(self.frame_ids), "K": self.codes.shape[-1], "D": 6 + self.codes.shape[-1]})
+
+
+def track_name(sequence: str, track_id: int) -> str:
+    """What the files of a track are called.
+
+    Examples:
+        >>> track_name("", 7), track_name("0005", 31), track_name("0005", -1)
+        ('000007', '0005_000031', '')
+    """
+    if track_id < 0:
+        return ""
+    return f"{sequence}_{track_id:06d}" if sequence else f"{track_id:06d}"
+
+
+def track_path(out_dir: Path | str, track: str) -> Path:
+    """The file of a track."""
+    return Path(out_dir) / "tracks" / f"{track}.npz"
+
+
+def read_track(path: Path | str) -> TrackArrays:
+    """Read a file of `write_tracks`."""
+    return read_arrays(path, TrackArrays, TRACK_SCHEMA_VERSION)
+
+
+def write_tracks(out_dir: Path | str, frames: Iterable[ShapeArrays]) -> None:
+    """Write the file of every track that goes through some finished frames of a run, in their order."""
+    views: dict[str, list[tuple[ShapeArrays, int]]] = {}
+    for shapes in frames:
+        for car, track in enumerate(shapes.tracks):
+            if track:
+                views.setdefault(track, []).append((shapes, car))
+    for track, cars in views.items():
+        write_arrays(track_path(out_dir, track), _track(track, cars), TRACK_SCHEMA_VERSION)
+
+
+def _track(track: str, views: list[tuple[ShapeArrays, int]]) -> TrackArrays:
+    def stacked(name: str) -> NDArray[np.float64]:
+        return np.stack([getattr(shapes, name)[car] for shapes, car in views])
+
+    statuses = tuple(shapes.statuses[car] for shapes, car in views)
+    codes, covariances = stacked("codes"), stacked("covariances")
+    is_refined = np.array([Status[status].is_refined for status in statuses])
+    # A view that was not refined knows nothing, and a covariance that is not finite says nothing.
+    variance = np.trace(covariances[:, 6:, 6:], axis1=1, axis2=2)
+    best = int(np.argmin(np.where(is_refined & np.isfinite(variance), variance, np.inf)))
+    unknown = 1.0 if is_refined.any() else np.nan
+    boxes_hwl = stacked("boxes_hwl")
+    return TrackArrays(
+        track=track,
+        prior_sha256=views[0][0].prior_sha256,
+        code=codes[best] * unknown,
+        code_covariance=covariances[best, 6:, 6:] * unknown,
+        dimensions_hwl=boxes_hwl[best] * unknown,
+        frame_ids=tuple(shapes.frame_id for shapes, _ in views),
+        input_lines=stacked("input_lines").astype(np.int64),
+        statuses=statuses,
+        parts=stacked("track_parts").astype(np.int64),
+        T_cam_obj=stacked("T_cam_obj"),
+        T_ref_obj=stacked("T_ref_obj"),
+        boxes_hwl=boxes_hwl,
+        boxes_location_ref=stacked("boxes_location_ref"),
+        boxes_rotation_y=stacked("boxes_rotation_y"),
+        codes=codes,
+        covariances=covariances,
+    )

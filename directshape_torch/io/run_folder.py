@@ -94,9 +94,6 @@ def read_record(path: Path, shapes: ShapeArrays) -> FrameRecord:
 
     Args:
         path: the file of `shapes`, for messages.
-
-    Raises:
-        DataFormatError: there is none, or it names files outside of the output folder.
     """
     record = record_of(path, FrameRecord, parse_json(path, shapes.made_of, _AGAIN, "was not written by a run"), _AGAIN)
     if wrong := [name for name in record.files if not _FILE.fullmatch(name)]:
@@ -114,9 +111,6 @@ def read_done(
         frame_id: the frame.
         run: hash of the manifest.
         outputs: kinds of files that must be there with the bytes that were written.
-
-    Raises:
-        DataFormatError: a file is missing, damaged, changed, of another frame or of another run.
     """
     path = shapes_path(out_dir, frame_id)
     shapes = read_shapes(path)
@@ -206,10 +200,6 @@ class RunFolder:
     Attributes:
         manifest: what its results were made of.
         frame_ids: the chosen frames that are done, in order.
-
-    Raises:
-        DataFormatError: it is no such folder.
-        InputError: a frame that is asked for is not done.
     """
 
     def __init__(self, path: Path | str, frames: Iterable[str | int] | None = None) -> None:
@@ -227,21 +217,13 @@ class RunFolder:
         return tuple(self.setting("classes"))
 
     def setting(self, name: str) -> Any:
-        """A setting of the run, by its name at the top of `config`.
-
-        Raises:
-            DataFormatError: the summary does not have it.
-        """
+        """A setting of the run, by its name at the top of `config`."""
         if name not in self.manifest.config:
             raise DataFormatError(summary_path(self.path), f"has no setting {name!r}")
         return self.manifest.config[name]
 
     def refiner_config(self) -> RefinerConfig:
-        """The settings of the refinement.
-
-        Raises:
-            DataFormatError: the summary does not have them, or one of them cannot be.
-        """
+        """The settings of the refinement."""
         try:
             return config_from_mapping(RefinerConfig, self.setting("refiner"))
         except ConfigError as error:

@@ -93,11 +93,7 @@ def hash_bytes(content: bytes) -> str:
 
 
 def hash_file(path: Path | str) -> str:
-    """The sha256 of a file, hexadecimal; remembered while its size and time of change stay the same.
-
-    Raises:
-        DataFormatError: it cannot be read.
-    """
+    """The sha256 of a file, hexadecimal; remembered while its size and time of change stay the same."""
     path = Path(path)
     if not path.is_file():
         return hash_bytes(read_bytes(path))

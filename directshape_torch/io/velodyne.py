@@ -26,9 +26,6 @@ def read_scan(path: Path | str, calibration: KittiCalibration, camera: StereoCam
         path: see `read_points`.
         calibration: with R0_rect and Tr_velo_to_cam.
         camera: of the one frame.
-
-    Raises:
-        DataFormatError: as `read_points`; the calibration does not say where the scanner is.
     """
     if calibration.R0_rect is None or calibration.Tr_velo_to_cam is None:
         missing = "R0_rect" if calibration.R0_rect is None else "Tr_velo_to_cam"
@@ -47,9 +44,6 @@ def read_points(path: Path | str) -> NDArray[np.float64]:
     Args:
         path: KITTI's `.bin`, little-endian float32, four a point: x, y, z, reflectance; or `.npy`, an array (P, 3 or
             more).
-
-    Raises:
-        DataFormatError: the file is empty, damaged, cut, or holds coordinates that are not finite.
     """
     if Path(path).suffix == ".npy":
         points = read_npy(path)

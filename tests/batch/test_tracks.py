@@ -16,10 +16,9 @@ from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import ResumeError
-from directshape_torch.io.result_files import read_shapes
+from directshape_torch.io.result_files import read_shapes, read_track, track_path
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.io.track_files import read_track, track_path
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from directshape_torch.cli.demo import demo_dataset
-from directshape_torch.cli.inspect_cars import silhouette_trace
+from directshape_torch.cli.inspect import silhouette_trace
 from directshape_torch.cli.main import main
 from directshape_torch.io.config_files import load_config
 from directshape_torch.refiner import DirectShapeRefiner

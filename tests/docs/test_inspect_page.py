@@ -6,7 +6,7 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
-from directshape_torch.cli.inspect_cars import _FIGURES
+from directshape_torch.cli.inspect import _FIGURES
 from directshape_torch.visualize.refinement_trace import RefinementTrace
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -30,12 +30,12 @@ from directshape_torch.geometry.disparity_field import DisparityField
 from directshape_torch.io.image_files import read_disparity
 from directshape_torch.io.instance_masks import MaskSource
 from directshape_torch.io.kitti_calibration import read_calibration
+from directshape_torch.io.kitti_labels import read_tracking_objects
 from directshape_torch.io.mask_files import CocoFileMasks, InstancePngMasks
 from directshape_torch.io.motion_files import read_poses, read_times
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 from directshape_torch.io.stereo_dataset import LayoutName, open_dataset
-from directshape_torch.io.tracking_files import read_tracking_objects
 from directshape_torch.io.velodyne import read_points, read_scan
 from directshape_torch.refinement.quality import load_trust_model
 from directshape_torch.report.make_report import make_report

@@ -12,8 +12,7 @@ import pytest
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.atomic_files import write_png
-from directshape_torch.io.folder_json import read_frame, read_rig
-from directshape_torch.io.folder_layout import FolderLayout, FolderMasks
+from directshape_torch.io.folder_layout import FolderLayout, FolderMasks, read_frame, read_rig
 from directshape_torch.io.instance_masks import MaskSizeError
 from directshape_torch.io.kitti_calibration import camera_of_rig
 

@@ -14,10 +14,9 @@ from helpers.layouts import SEQUENCE, write, write_folder, write_sequence
 from directshape_torch.errors import DataFormatError, InputError
 from directshape_torch.files.read_files import Line
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.kitti_labels import KittiObject, parse_object
+from directshape_torch.io.kitti_labels import KittiObject, parse_object, read_tracking_objects
 from directshape_torch.io.stereo_dataset import open_dataset
 from directshape_torch.io.track_association import associate
-from directshape_torch.io.tracking_files import read_tracking_objects
 
 FRAMES = ("000000", "000001")
 
