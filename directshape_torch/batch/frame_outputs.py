@@ -54,15 +54,8 @@ def write_frame_outputs(
 ) -> FrameEntry:
     """Write what the options ask for; the shapes come last, so that where they exist the frame is complete.
 
-    Args:
-        out_dir: the output folder.
-        loaded: the frame.
-        result: of the frame's detections.
-        run, prior_sha256, inputs: hashes of the manifest, of the shape prior and of the frame's input files.
-        options: kinds of files.
-
-    Returns:
-        The frame's entry in `summary.json`.
+    `run`, `prior_sha256` and `inputs` are hashes of the manifest, of the shape prior and of the frame's input files.
+    Returns the frame's entry in `summary.json`.
     """
     path = shapes_path(out_dir, loaded.frame_id)
     earlier = _earlier_record(path, run, inputs)

@@ -41,20 +41,11 @@ OUTPUT_FOLDERS = ("data", "shapes", "meshes", "overlays", "tracks")
 
 
 class EarlierResults:
-    """The results of earlier runs, which this one goes on with.
-
-    Args:
-        out_dir: the output folder.
-        manifest: settings and hashes of this run, without frames.
-        outputs: kinds of files that each frame is to have.
-        is_cleared: the results of earlier runs were just removed, and what is left is no result.
+    """The results of earlier runs, which this one goes on with; raises `ResumeError` where it cannot.
 
     Attributes:
         manifest: with the frames of earlier runs.
         remade: frames whose files have been removed or damaged since they were finished, after `finished_frames`.
-
-    Raises:
-        ResumeError: the folder holds results of other settings, or results without a summary.
     """
 
     def __init__(self, out_dir: Path, manifest: RunManifest, outputs: Sequence[str], is_cleared: bool = False) -> None:
@@ -149,15 +140,7 @@ def remove_unfinished_files(out_dir: Path) -> None:
 
 
 def remove_results(out_dir: Path, others: Iterable[str]) -> bool:
-    """Remove what runs have written into a folder, and nothing else.
-
-    Args:
-        out_dir: the output folder.
-        others: further files of runs, beside the summary.
-
-    Returns:
-        Whether there was a summary; without one nothing is removed.
-    """
+    """Remove what runs have written into a folder, and nothing else; without a summary, and False, nothing."""
     previous = read_manifest(summary_path(out_dir))
     if previous is None:
         return False

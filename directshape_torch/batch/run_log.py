@@ -124,12 +124,7 @@ class LogContents:
 class RunLog:
     """Holds a folder while the body runs; the operating system lets go of it however the process ends.
 
-    Args:
-        out_dir: the output folder; made where it is missing.
-
-    Raises:
-        RunInProgressError: another process holds it.
-        DataFormatError: something else has the log's name.
+    Raises `RunInProgressError` where another process holds it.
     """
 
     def __init__(self, out_dir: Path) -> None:

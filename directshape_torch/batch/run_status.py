@@ -38,12 +38,7 @@ class RunStatus:
 
 
 def read_status(out_dir: Path | str, now: float | None = None) -> RunStatus:
-    """The status of the latest run into a folder.
-
-    Args:
-        out_dir: the output folder.
-        now: seconds since 1970; default the clock.
-    """
+    """The status of the latest run into a folder, at a time (seconds since 1970), by default now."""
     run = read_log(Path(out_dir))
     if run is None:
         raise DataFormatError(out_dir, "has no run.jsonl, so no run of 'directshape refine' is or was here")

@@ -45,15 +45,8 @@ class Workers(Protocol):
 class GroupDispatch:
     """The groups of a run on their way through some workers.
 
-    Args:
-        groups: in the order of the data set.
-        workers: who refines them.
-        retries: how often a group whose worker died is handed out again; then by halves, down to single frames.
-        finished: tells which of some frames have been noted as finished, after a death.
-
-    Attributes:
-        num_deaths: of workers so far.
-        lost: frames whose worker died each time, with the reason.
+    A group whose worker died is handed out again `retries` times, then by halves, down to single frames, without what
+    `finished` notes to be done after all. `lost` are the frames whose worker died each time, with the reason.
     """
 
     def __init__(
@@ -144,14 +137,6 @@ class LocalWorkers:
 
     Processes are spawned and not forked: threads of PyTorch do not survive a fork. They end with their parent, however
     that ends.
-
-    Args:
-        job: sent to each of them once.
-        num_workers: how many.
-        threads: of each.
-
-    Raises:
-        DirectShapeError: the data set or the refiner cannot be sent to another process.
     """
 
     def __init__(self, job: RunJob, num_workers: int, threads: int | None) -> None:

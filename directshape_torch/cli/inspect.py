@@ -115,17 +115,9 @@ def inspect_frame(
     *,
     must_refine: bool = False,
 ) -> None:
-    """Refine all cars of a frame and draw some: `FRAME.png`, and a folder `FRAME_LINE` a car.
+    """Refine all cars of a frame and draw those of some rows: `FRAME.png`, and a folder `FRAME_LINE` a car; on the CPU.
 
-    Args:
-        loaded: the frame, on the CPU.
-        refiner: on the CPU too.
-        rows: of the detections to draw.
-        out_dir: made where it is missing.
-        must_refine: draw nothing where one of them cannot be refined.
-
-    Raises:
-        InputError: such a car was not refined; says why.
+    Raises `InputError` where one `must_refine` and was not; says why.
     """
     trace = trace_refinement(refiner, loaded.frame, loaded.detections)
     _report(loaded, trace, rows, must_refine)
@@ -179,13 +171,7 @@ def true_corners_cam(loaded: LoadedFrame) -> list[NDArray[np.float64] | None]:
 
 
 def inspect_tracks(loaded: Sequence[LoadedFrame], refiner: DirectShapeRefiner, out_dir: Path) -> list[Path]:
-    """Refine frames in one call and write `track_NAME.gif` for each car that several of them show.
-
-    Args:
-        loaded: frames of one rig, whose cars have tracks; on the CPU.
-        refiner: on the CPU too.
-        out_dir: made where it is missing.
-    """
+    """Refine frames in one call, on the CPU, and write `track_NAME.gif` for each car that several of them show."""
     with torch.no_grad():
         result = refiner(*collate(loaded))
     pictures: dict[str, list[Picture]] = {}

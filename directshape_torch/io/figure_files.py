@@ -19,14 +19,7 @@ _GIF_COLOURS = 255
 
 
 def check_figures(purpose: str) -> None:
-    """Find out before the work is done that its pictures could not be drawn.
-
-    Args:
-        purpose: what is drawn, for the message.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """Raise `MissingDependencyError` before the work is done whose pictures, of that purpose, could not be drawn."""
     try:
         importlib.import_module("matplotlib.figure")
     except ImportError as error:

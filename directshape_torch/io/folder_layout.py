@@ -145,10 +145,6 @@ class FolderLayout(FrameLayout):
     """`root/left`, `root/right`, `root/rig.json` and `root/frames/ID.json`; labels, planes and masks are in the latter.
 
     The frame of boxes and planes is the left camera's: `ref` is `cam`.
-
-    Args:
-        root: the folder.
-        frames_dir: folder of the frames' JSON files; default `root/frames`.
     """
 
     detection_file_name = "ID.json"

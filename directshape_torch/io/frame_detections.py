@@ -38,17 +38,8 @@ def build_detections(
 ) -> tuple[Detections, tuple[int, ...], tuple[int, ...]]:
     """The objects to refine, with masks matched one to one; all other instances become occluders.
 
-    Args:
-        objects: every line of the detection file.
-        masks: instances of both images.
-        camera: places the boxes in the images.
-        size_hw: of the images.
-        classes: types to refine.
-        given: which instance belongs to which line, where that is known; None: matched by overlap.
-
-    Returns:
-        The B detections; for each input line the index of its detection or -1; the tracks (B,) of the left masks, -1
-        for none.
+    Masks belong to lines as `given` says, else by overlap. Returns the B detections; for each input line the index of
+    its detection or -1; the tracks (B,) of the left masks, -1 for none.
     """
     is_chosen = [o.type in classes and o.has_box_3d for o in objects]
     chosen = [o for o, wanted in zip(objects, is_chosen, strict=True) if wanted]

@@ -19,14 +19,7 @@ from directshape_torch.io.mask_files import mask_source
 
 
 class FrameLayout(ABC):
-    """Finds and reads the files of a frame, all but images and masks, whose readers the layouts share.
-
-    Its methods say what those of each layout do.
-
-    Attributes:
-        detections_dir: the folder that detections are read from.
-        detection_file_name: what detection files are called, for messages.
-    """
+    """Finds and reads the files of a frame, all but images and masks, whose readers the layouts share."""
 
     detections_dir: Path
     detection_file_name: str

@@ -62,12 +62,7 @@ def read_disparity(
     path: Path | str,
     size_hw: tuple[int, int] | None = None,
 ) -> NDArray[np.float32]:  # (H, W)
-    """Read `u_left - u_right` of each left pixel, pixels, from 16-bit PNG of disparity x 256; NaN where unknown (0).
-
-    Args:
-        path: of the PNG; any stereo method writes such files for KITTI.
-        size_hw: height and width of the left image; None for any.
-    """
+    """Read `u_left - u_right` of each left pixel, pixels, from 16-bit PNG of disparity x 256; NaN where unknown (0)."""
     stored = read_single_channel(path)
     if stored.dtype != np.uint16:
         raise DataFormatError(

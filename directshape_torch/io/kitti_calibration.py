@@ -55,8 +55,7 @@ class KittiCalibration:
 def read_calibration(path: Path | str) -> KittiCalibration:
     """Read a KITTI calibration file (object `calib/NNNNNN.txt`, tracking `calib.txt`, raw `calib_cam_to_cam.txt`).
 
-    Args:
-        path: text file of lines `name: numbers`, the colon being optional.
+    Lines are `name: numbers`, the colon being optional.
     """
     matrices: dict[str, Any] = {}
     for line in read_lines(path):
@@ -91,13 +90,7 @@ def to_stereo_camera(
     disparity_field: DisparityField | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> StereoCamera:
-    """The stereo cameras of F frames: `K = P2[:, :3]`, `x_cam = x_ref + K^-1 P2[:, 3]`, right camera from P3.
-
-    Args:
-        calibrations: one a frame.
-        disparity_field: residual disparity of the rig, shared by the frames, or None.
-        dtype: of the tensors; the arithmetic is float64.
-    """
+    """The stereo cameras of F frames: `K = P2[:, :3]`, `x_cam = x_ref + K^-1 P2[:, 3]`, right camera from P3."""
     if not calibrations:
         raise InputError("calibrations", "at least one frame", "none")
     for calibration in calibrations:
@@ -161,11 +154,7 @@ def _check_baseline(calibration: KittiCalibration) -> None:
 def read_plane(path: Path | str) -> NDArray[np.float64]:
     """Read a plane `(a, b, c, d)`, `a x_ref + b y_ref + c z_ref + d = 0`, normalised and with its normal up (b < 0).
 
-    Args:
-        path: text file whose last line is `a b c d`; lines before it are a header.
-
-    Returns:
-        (4,) float64: unit normal and offset in metres.
+    The last line of the file is `a b c d`; lines before it are a header.
     """
     lines = read_lines(path)
     if not lines:

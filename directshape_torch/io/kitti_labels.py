@@ -45,12 +45,7 @@ class KittiObject:
 
 
 def read_objects(path: Path | str, with_score: bool | None = None) -> list[KittiObject]:
-    """Read a KITTI label or result file; an empty file gives an empty list.
-
-    Args:
-        path: text file, one object a line.
-        with_score: True for results (16 columns), False for labels (15), None for either.
-    """
+    """Read a KITTI label (15 columns) or result file (16, `with_score`), or by None either; empty files are fine."""
     return [parse_object(path, line, with_score) for line in read_lines(path)]
 
 
@@ -126,12 +121,9 @@ def box_corners_cam(
 
 
 def read_tracking_objects(path: Path | str) -> dict[int, list[KittiObject]]:
-    """The objects of every frame number that occurs, with their tracks.
+    """The objects of every frame number that occurs in a label (17 columns) or result file (18), with their tracks.
 
     Their `raw_line` leaves frame and track out and their `line_number` counts within the frame, as in its own file.
-
-    Args:
-        path: of a label file (17 columns) or a result file (18 columns, the score last).
     """
     frames: dict[int, list[KittiObject]] = {}
     for line in read_lines(path):
@@ -153,11 +145,9 @@ class FrameObjects:
         self._sequences: dict[Path, dict[int, list[KittiObject]]] = {}
 
     def path(self, source: Path, frame_id: str) -> Path:
-        """The file of a frame.
+        """The file of a frame `FRAME` or `SEQUENCE_NNNNNN`.
 
-        Args:
-            source: a folder of `FRAME.txt` or `SEQUENCE.txt`, or one with `data` of them, or the file of a sequence.
-            frame_id: `FRAME`, or `SEQUENCE_NNNNNN`.
+        `source` is a folder of `FRAME.txt` or `SEQUENCE.txt`, or one with `data` of them, or the file of a sequence.
         """
         of_frame, sequence = file_of_frame(source, f"{frame_id}.txt"), frame_id.rpartition("_")[0]
         of_sequence = source if source.is_file() else file_of_frame(source, f"{sequence}.txt")

@@ -18,9 +18,8 @@ from directshape_torch.numerics.checks import is_no_rotation
 def read_times(path: Path | str) -> NDArray[np.float64]:
     """Seconds (N,) from the first line on.
 
-    Args:
-        path: of `times.txt` of KITTI's odometry benchmark (seconds), or `timestamps.txt` of its raw recordings (dates
-            with times of day).
+    Of `times.txt` of KITTI's odometry benchmark (seconds), or `timestamps.txt` of its raw recordings (dates with times
+    of day).
     """
     lines = read_lines(path)
     seconds: NDArray[np.float64] = np.array([_seconds(path, line) for line in lines], dtype=np.float64)
@@ -33,8 +32,7 @@ def read_times(path: Path | str) -> NDArray[np.float64]:
 def read_poses(path: Path | str) -> NDArray[np.float64]:
     """Poses (N, 4, 4) of camera 0, the frame `ref` of boxes, in that of the first line: small numbers, for float32.
 
-    Args:
-        path: of a file as of KITTI's odometry benchmark: rows of a matrix (3, 4), a line a frame.
+    Lines are rows of a matrix (3, 4), as in KITTI's odometry benchmark.
     """
     lines = read_lines(path)
     T_world_ref = np.tile(np.eye(4), (len(lines), 1, 1))

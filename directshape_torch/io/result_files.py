@@ -54,13 +54,7 @@ def result_line(source: KittiObject, refined: RefinedBox) -> str:
 def write_result_text(
     path: Path | str, input_objects: Sequence[KittiObject], refined: Mapping[int, RefinedBox]
 ) -> None:
-    """Write a KITTI result file: one line per input line, in the same order.
-
-    Args:
-        path: usually `OUT/data/NNNNNN.txt`.
-        input_objects: the lines of the detection file.
-        refined: for indices into `input_objects` the refined box; all other lines are copied byte for byte.
-    """
+    """Write a KITTI result file: one line per input line, in their order; those not refined byte for byte."""
     unknown = sorted(set(refined) - set(range(len(input_objects))))
     if unknown:
         raise InputError("refined", f"indices of the {len(input_objects)} input lines", str(unknown))
@@ -135,12 +129,7 @@ class ShapeArrays:
 
 
 def check_shapes(arrays: Any, sizes: Mapping[str, int]) -> None:
-    """Whether the fields of a dataclass have the shapes that they declare by `shaped`.
-
-    Args:
-        arrays: the dataclass.
-        sizes: by the letters of the declarations.
-    """
+    """Raise `InputError` unless the fields of a dataclass have the shapes that they declare by `shaped`."""
     for entry in fields(arrays):
         shape = tuple(sizes.get(str(size), size) for size in entry.metadata.get("shape", ()))
         got = np.shape(getattr(arrays, entry.name))

@@ -90,11 +90,7 @@ def _kind(name: str) -> str:
 
 
 def read_record(path: Path, shapes: ShapeArrays) -> FrameRecord:
-    """The record in the shapes of a frame.
-
-    Args:
-        path: the file of `shapes`, for messages.
-    """
+    """The record in the shapes of a frame, which came from the file `path`."""
     record = record_of(path, FrameRecord, parse_json(path, shapes.made_of, _AGAIN, "was not written by a run"), _AGAIN)
     if wrong := [name for name in record.files if not _FILE.fullmatch(name)]:
         raise DataFormatError(path, f"names a file {wrong[0][:80]!r}", cure=_AGAIN)
@@ -106,11 +102,7 @@ def read_done(
 ) -> tuple[ShapeArrays, FrameRecord]:
     """The shapes of a frame that is done, and what its files were made of.
 
-    Args:
-        out_dir: the output folder.
-        frame_id: the frame.
-        run: hash of the manifest.
-        outputs: kinds of files that must be there with the bytes that were written.
+    Its files of the kinds `outputs` must be there with the bytes that were written, by the run of that hash.
     """
     path = shapes_path(out_dir, frame_id)
     shapes = read_shapes(path)

@@ -20,13 +20,7 @@ _NEAREST_M = 1.0
 
 
 def read_scan(path: Path | str, calibration: KittiCalibration, camera: StereoCamera) -> Tensor:
-    """All points of a scan (P, 3), float64, metres, in the left camera frame.
-
-    Args:
-        path: see `read_points`.
-        calibration: with R0_rect and Tr_velo_to_cam.
-        camera: of the one frame.
-    """
+    """All points of a scan (P, 3), float64, metres, in the left camera; its calibration says where the scanner is."""
     if calibration.R0_rect is None or calibration.Tr_velo_to_cam is None:
         missing = "R0_rect" if calibration.R0_rect is None else "Tr_velo_to_cam"
         raise DataFormatError(
@@ -41,9 +35,7 @@ def read_scan(path: Path | str, calibration: KittiCalibration, camera: StereoCam
 def read_points(path: Path | str) -> NDArray[np.float64]:
     """Points (P, 3), metres, in the frame of the file.
 
-    Args:
-        path: KITTI's `.bin`, little-endian float32, four a point: x, y, z, reflectance; or `.npy`, an array (P, 3 or
-            more).
+    KITTI's `.bin` is little-endian float32, four a point: x, y, z, reflectance; `.npy` is an array (P, 3 or more).
     """
     if Path(path).suffix == ".npy":
         points = read_npy(path)
