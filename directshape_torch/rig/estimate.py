@@ -94,11 +94,7 @@ class RigEstimate(nn.Module):
         self.add_rows(observe_detections(frames, detections))
 
     def add_rows(self, rows: Tensor) -> None:
-        """Take in reduced observations of detections, (N, 8) `rig.detections.COLUMNS`.
-
-        Raises:
-            InputError: they are none: of another shape, not finite, or of pixels far from any image.
-        """
+        """Take in reduced observations of detections, (N, 8) `rig.detections.COLUMNS`, else `InputError`."""
         check_shape("rows", rows, ("N", len(COLUMNS)), kind="floating")
         largest = float(rows.detach().abs().amax()) if len(rows) else 0.0
         if not largest <= _LARGEST_PX:
@@ -208,7 +204,7 @@ class RigEstimate(nn.Module):
         return True
 
     def content(self) -> dict[str, Any]:
-        """All that the estimate rests on, as numbers, lists and words; `of_content` takes it back."""
+        """All that the estimate rests on, for JSON; `of_content` takes it back."""
         size_wh, *matrices = (list(part) if isinstance(part, tuple) else part.tolist() for part in self._blank.rig)
         pixels = {kind: {n: _plain(x) for n, x in sums._asdict().items()} for kind, sums in self.pixels.items()}
         rig = dict(zip(("K_left", "K_right", "T_right_cam"), matrices, strict=True))
@@ -216,11 +212,7 @@ class RigEstimate(nn.Module):
 
     @classmethod
     def of_content(cls, content: Any) -> Self:
-        """The estimate that `content` was made of.
-
-        Raises:
-            InputError: it is no such content.
-        """
+        """The estimate that `content` was made of; raises `InputError` for what is no such content."""
         try:
             width, height = (int(n) for n in content["size_wh"])
             sizes = {"K_left": 3, "K_right": 3, "T_right_cam": 4}
@@ -239,11 +231,7 @@ class RigEstimate(nn.Module):
         return torch.tensor(list(json.dumps(self.content()).encode()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Of `get_extra_state`; nothing of what was known before stays.
-
-        Raises:
-            InputError: it is no such state.
-        """
+        """Of `get_extra_state`, else `InputError`; nothing of what was known before stays."""
         check_shape("state", state, ("n",))
         try:
             other = self.of_content(json.loads(bytes(state.tolist())))
@@ -312,11 +300,7 @@ def rig_among(rigs: list[RigEstimate], rig: Rig) -> RigEstimate:
 
 
 def to_tensor(entry: Mapping[str, Any], name: str, shape: tuple[int | None, ...]) -> Tensor:
-    """The numbers of that name in the content of a JSON file, float64; None in a shape is any number.
-
-    Raises:
-        ValueError: they are missing, none, not finite or of another shape.
-    """
+    """The numbers of that name in the content of a JSON file, float64, else `ValueError`; None is any size."""
     try:
         tensor = torch.tensor(entry[name], dtype=torch.float64)
     except DAMAGE as error:

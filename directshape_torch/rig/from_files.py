@@ -51,12 +51,8 @@ def estimate_rigs(
     """One estimate for each calibration among the frames of a data set, whichever of them are chosen.
 
     Frames with cars are taken evenly from all of them, at most 60 a rig, until the field is known to 0.06 px in the
-    middle of the cars. What cannot be read is passed over: it is reported when its turn comes.
-
-    Args:
-        dataset: a disparity field of its own is not used.
-        tell: called with the name of each frame that was looked at.
-        rigs: what is known already; the evidence is added to these, and new rigs join the list.
+    middle of the cars. What cannot be read is passed over: it is reported when its turn comes. The evidence is added to
+    the `rigs` that are known already, and new ones join the list; `tell` gets the name of each frame.
     """
     plain, rigs = replace(dataset, ground="camera_height", disparity_fields=()), [] if rigs is None else rigs
     for frame_ids in _frames_by_rig(plain):
@@ -109,11 +105,7 @@ def _evenly(frame_ids: Sequence[str]) -> list[str]:
 
 
 def truth_files(root: Path, source: TruthSource) -> dict[str, Path]:
-    """The files of a source by frame id; of a stereo pair 2015 the first image (`NNNNNN_10`) keeps its full name.
-
-    Raises:
-        DataFormatError: there is no `root/training` or no file of that kind in it.
-    """
+    """The files of a source by frame id; of a stereo pair 2015 the first image (`NNNNNN_10`) keeps its full name."""
     training = root / "training"
     if not training.is_dir():
         raise DataFormatError(root, "holds no folder 'training'", cure="give the folder above it, in KITTI's layout")
@@ -148,11 +140,7 @@ def observe_frame(root: Path, frame_id: str, truth: Path, source: TruthSource) -
 
 
 def add_truth(rigs: list[RigEstimate], source: TruthSource, frames: Sequence[Frame]) -> None:
-    """The evidence of observed frames to the estimates of their rigs; new rigs join the list.
-
-    Raises:
-        InputError: fewer than 50 pixels of known and measured disparity for one of the rigs.
-    """
+    """The evidence of observed frames to the estimates of their rigs; new rigs join the list."""
     of_rig: dict[RigEstimate, list[Frame]] = {}
     for frame in frames:
         of_rig.setdefault(rig_among(rigs, frame[0]), []).append(frame)
@@ -211,13 +199,8 @@ class StereoSequence:
 def open_sequence(root: Path, frames: Sequence[int | str] | None = None) -> StereoSequence:
     """The sequence in a folder with `image_02`, `image_03` and `calib.txt` (lines P2 and P3).
 
-    Args:
-        root: the folder.
-        frames: ids of the frames to use, or None for all; they must be consecutive frames of a moving car.
-
-    Raises:
-        DataFormatError: there is no calibration, or no left or right image of a frame.
-        InputError: one of `frames` has no image, or fewer than two frames are left.
+    `frames` are ids of consecutive frames of a moving car, None for all. Raises `DataFormatError` for a file that is
+    missing, `InputError` for fewer than two frames.
     """
     left, right = (_images(root, name) for name in ("image_02", "image_03"))
     chosen = tuple(sorted(chosen_frames(left, frames), key=_in_time))
@@ -249,12 +232,9 @@ def _in_time(frame_id: str) -> tuple[int, str]:
 def observe_motion(
     sequence: StereoSequence, height_m: float | None, frame_ids: Iterable[str] | None = None
 ) -> list[FieldConstraint]:
-    """Read the frames one after the other and collect what they show.
+    """Read the frames one after the other and collect what they show; without a camera height not of the road.
 
-    Args:
-        sequence: of one rig; an image that is not as large as those before it raises `DataFormatError`.
-        height_m: of the camera above the road; None leaves the road out.
-        frame_ids: the sequence's own, as an iterator that shows progress, say.
+    `frame_ids` are the sequence's own, as an iterator that shows progress, say.
     """
     constraints: list[FieldConstraint] = []
     waiting: deque[StereoFeatures] = deque(maxlen=max(STEPS) + 1)

@@ -2,10 +2,8 @@
 
 The left images of two frames alone give the camera's motion and the depth of every point, up to one common factor.
 Stereo gives the same depths with the rig's bias on them. So `measured disparity = s * (depth from motion)^-1 +
-bias(u, v)`, the factor s free: points of different depth in the same part of the image separate the two, and the
-constant of the field comes from the far ones, whose disparity is hardly more than the bias. What trades with the factor
-is a bias proportional to disparity: a wrong baseline, which no image shows, and on a road, where disparity is affine in
-v, the field's slope along v. The known height of the camera decides that one (`RoadConstraint`).
+bias(u, v)`, the factor s free: points of different depth in the same part of the image separate the two. What trades
+with the factor is a wrong baseline, and on a road the field's slope along v, which the camera's height decides.
 """
 
 from __future__ import annotations
@@ -101,11 +99,7 @@ def track_features(
     features: StereoFeatures,
     later: Sequence[NDArray[np.uint8]],  # the left images (H, W) of the frames that follow, in order
 ) -> list[MotionConstraint]:
-    """Follow corners into the later images that are `STEPS` away; steps that fail are left out.
-
-    Each later image is compared with the first one, not with the one before it, so errors do not add up. Where to look
-    is foretold from the motion so far.
-    """
+    """Follow corners into the later images that are `STEPS` away, each time from the first, so errors do not add up."""
     tracked = []
     foretold: NDArray[np.float32] | None = None
     for step, grey_later in enumerate(later[: max(STEPS)], start=1):

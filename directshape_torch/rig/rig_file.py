@@ -1,11 +1,4 @@
-"""JSON files of rigs: the estimates of a run with the evidence they rest on, and fields that are given.
-
-{"schema": "directshape rig", "schema_version": 1,
- "rigs": [{"size_wh": .., "K_left": .., "K_right": .., "T_right_cam": ..,   of which images
-           "rows": [[u, v, ..], ..],        one a detection, `rig.detections.COLUMNS`
-           "pixels": {"lidar": {..}, ..},   sums over pixels of known depth, by kind
-           "says": "rig: -0.44 +- 0.06 px .."}, ..]}
-"""
+"""JSON files of rigs (docs/file_formats.md): estimates with the evidence they rest on, and fields that are given."""
 
 from __future__ import annotations
 
@@ -72,16 +65,12 @@ def load_field(path: Path | str) -> DisparityField:
 
 
 def load_fields(path: Path | str) -> tuple[DisparityField, ...]:
-    """The disparity fields of a file of rigs, or the one of a file of `save_field`.
-
-    Raises:
-        DataFormatError: it is missing, damaged or neither of the two.
-    """
+    """The disparity fields of a file of rigs, or the one of a file of `save_field`; raises as `load_rigs`."""
     return tuple(rig.field for rig in load_rigs(path)) if holds_rigs(path) else (load_field(path),)
 
 
 def holds_rigs(path: Path | str) -> bool:
-    """Whether a JSON file is one of estimates, and not of `save_field`."""
+    """Whether a JSON file is one of estimates, and not of `save_field`; raises as `load_rigs`."""
     return _read(path).get("schema") == RIGS
 
 

@@ -1,14 +1,8 @@
 """The residual disparity field of a rig from its own images alone, no LiDAR and no labels.
 
-What the images show of the field, and what not:
-
-- *A road at known height, single frames.* Pitch and roll of the road are unknown in every frame, and disparity on a
-  plane is affine in the pixel: the field's constant and its slope along u are not seen at all, the slope along v as
-  well as the height is known (1 cm of 1.65 m: 0.4 px between the horizon and the lower edge), higher degrees well.
-- *Motion between frames* sees everything but a bias proportional to disparity, which is a wrong baseline.
-- *Rows* are off visibly: the vertical part needs no depth.
-
-So motion gives constant and slopes, the road and the camera's height what motion confuses with the length of the way.
+Motion between frames sees everything but a bias proportional to disparity, which is a wrong baseline. A road at known
+height, whose pitch and roll are unknown in every frame, sees neither the field's constant nor its slope along u, but
+that along v as well as the height is known (1 cm of 1.65 m: 0.4 px between the horizon and the lower edge).
 """
 
 from __future__ import annotations
@@ -164,13 +158,8 @@ def self_calibrate(
 ) -> SelfCalibration:
     """The field that explains all constraints best: robust Gauss-Newton, each constraint's own unknowns eliminated.
 
-    Args:
-        constraints: `MotionConstraint` and `RoadConstraint` of many frames of one rig, in their order in time.
-        num_frames: that the constraints are from.
-        on_step: called after each step, to show progress.
-
-    Raises:
-        InputError: no constraints, or the field is not determined by them (road alone, or a car that stands).
+    The constraints are of `num_frames` frames of one rig, in their order in time. Where they do not determine the field
+    (road alone, or a car that stands) `InputError` is raised.
     """
     cure = "give consecutive frames of a car that drives past still things (a road alone shows no constant, no slope)"
     if not constraints:
