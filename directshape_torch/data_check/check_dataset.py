@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.data_check.frame_parts import gather_evidence, numbers_of, read_parts
+from directshape_torch.data_check.frame_parts import FrameParts, gather_evidence, numbers_of, read_parts
 from directshape_torch.errors import DataFormatError, DirectShapeError, InputError
 from directshape_torch.io.stereo_dataset import StereoDataset
 from directshape_torch.rig.estimate import RigEstimate, rig_among
 from directshape_torch.rig.rig import Rig
 from directshape_torch.scene_check.car_evidence import FrameEvidence
 from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
-from directshape_torch.scene_check.check_scene import Pair, check_cars
+from directshape_torch.scene_check.check_scene import check_cars
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, found, names
 
 DEFAULT_MAX_FRAMES = 20
@@ -46,17 +46,22 @@ def check_dataset(
         raise InputError("max_frames", "at least 1", str(max_frames))
     chosen = spread(dataset.frame_ids, max_frames)
     findings = check_files(dataset)
-    seen = _Seen()
+    evidence: list[FrameEvidence] = []
+    num_cars = 0
     for frame_id in chosen:
-        findings += _check_frame(dataset, frame_id, seen)
+        parts, of_files = read_parts(dataset, frame_id)
+        of_frame, of_its_cars = _check_frame(parts, of_files)
+        findings += of_frame
+        evidence += of_its_cars
+        num_cars += len(parts.objects)
         tell(frame_id)
     nothing = found("no_cars", "all frames", "no detection of the chosen classes with a 3D box")
-    of_cars = check_cars(seen.evidence, seen.pairs) if seen.num_cars else [nothing]
+    of_cars = check_cars(evidence) if num_cars else [nothing]
     # Of boxes or images that are wrong an estimate would only say the same again.
     if not any(finding.severity == "error" for finding in (*findings, *of_cars)):
         of_cars += check_rig(dataset, chosen)
     findings += of_cars
-    return CheckReport(by_severity(findings), len(dataset), len(chosen), seen.num_cars)
+    return CheckReport(by_severity(findings), len(dataset), len(chosen), num_cars)
 
 
 def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
@@ -71,30 +76,19 @@ def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
     return tuple(frame_ids[index * len(frame_ids) // count] for index in range(count))
 
 
-@dataclass
-class _Seen:
-    """What the frames have shown so far; the images of those whose distances can be measured."""
-
-    evidence: list[FrameEvidence] = field(default_factory=list)
-    pairs: list[Pair | None] = field(default_factory=list)
-    num_cars: int = 0
-
-
-def _check_frame(dataset: StereoDataset, frame_id: str, seen: _Seen) -> list[Finding]:
-    parts, findings = read_parts(dataset, frame_id)
-    where = f"frame {frame_id}"
+def _check_frame(parts: FrameParts, findings: list[Finding]) -> tuple[list[Finding], list[FrameEvidence]]:
+    """All findings about a frame, and what it shows of its cars, nothing where its calibration is wrong."""
+    where = f"frame {parts.frame_id}"
     if parts.calibration is not None:
         findings += check_calibration(*numbers_of(parts.calibration), parts.size_hw, where)
     # A wrong calibration must not spoil what the images say by themselves.
     usable = not names(findings) & SPOILS_CAMERA
     if parts.pair is not None:
         findings += check_images(*parts.pair, parts.camera if usable else None, where)
-    seen.num_cars += len(parts.objects)
-    evidence = gather_evidence(parts)
-    if evidence is not None and usable:
-        seen.evidence.append(evidence)
-        seen.pairs.append(None if names(findings) & SPOILS_PAIR else parts.pair)
-    return findings
+    evidence = gather_evidence(parts) if usable else None
+    if evidence is None:
+        return findings, []
+    return findings, [replace(evidence, pair=None if names(findings) & SPOILS_PAIR else parts.pair)]
 
 
 def check_files(dataset: StereoDataset) -> list[Finding]:

@@ -18,8 +18,7 @@ from directshape_torch.io.instance_masks import SIDES, InstanceMask, MaskSizeErr
 from directshape_torch.io.kitti_calibration import KittiCalibration, to_stereo_camera
 from directshape_torch.io.kitti_labels import KittiObject
 from directshape_torch.io.stereo_dataset import StereoDataset
-from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence
-from directshape_torch.scene_check.check_scene import Pair
+from directshape_torch.scene_check.car_evidence import CarBoxes, FrameEvidence, Pair
 from directshape_torch.scene_check.finding import Finding, unreadable
 
 _Part = TypeVar("_Part")

@@ -92,7 +92,7 @@ def _information(
 ) -> tuple[Tensor, Tensor]:
     """Tukey's biweight from a start that is the median alone; its scale shrinks from the residuals' spread to the
     accuracy of the patches, because the outliers are one-sided."""
-    sigma = torch.tensor([COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=basis.dtype)
+    sigma = by_degree(COEFFICIENT_SIGMA_PX)
     coefficients = torch.zeros(NUM_COEFFICIENTS, dtype=basis.dtype)
     coefficients[0] = offset_px.median()
     scale, weight = torch.zeros_like(sigma[0]), balance
@@ -101,11 +101,21 @@ def _information(
         spread = (_TO_SIGMA * residual.abs().median()).clamp_min(_SMALLEST_SCALE_PX)
         shrunk = torch.minimum(scale, (_SHRINK * scale).clamp_min(_PATCH_SCALE_PX))
         scale = spread if iteration < _FIRST_ITERATIONS else shrunk
-        weight = balance * (1 - (residual / (_TUKEY * scale)) ** 2).clamp_min(0) ** 2
+        weight = balance * tukey_weight(residual, scale)
         H = basis.T @ (weight[:, None] * basis) + torch.diag(scale**2 / sigma**2)
         coefficients = torch.linalg.solve(H, basis.T @ (weight * offset_px))
     share = (_INDEPENDENT_PER_FRAME * num_frames / weight.sum()).clamp_max(1.0) / scale.clamp_min(_PATCH_SCALE_PX) ** 2
     return share * basis.T @ (weight[:, None] * basis), share * basis.T @ (weight * offset_px)
+
+
+def by_degree(sigma: tuple[float, ...]) -> Tensor:
+    """Standard deviations (10,) of the coefficients from those of each degree."""
+    return torch.tensor([sigma[i + j] for i, j in EXPONENTS], dtype=torch.float64)
+
+
+def tukey_weight(distances: Tensor, scale: float | Tensor) -> Tensor:
+    """Tukey's biweight, (P,) in [0, 1], for residuals in standard deviations that are `scale` times too large."""
+    return (1 - (distances / (_TUKEY * scale)) ** 2).clamp_min(0) ** 2
 
 
 def _cell_index(uv: Tensor, size_wh: tuple[int, int]) -> Tensor:

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
+from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
+from directshape_torch.rig.pixels import by_degree
 
 BIAS, SETBACK = NUM_COEFFICIENTS, NUM_COEFFICIENTS + 1
 
@@ -63,7 +64,7 @@ def solve_offsets(
     s, s0, scale = (x.reshape(-1) for x in grid)
     variance = (s[:, None] * d) ** 2 + s0[:, None] ** 2 + sigma**2
     own_sigma = torch.stack([_BIAS_OVER_NOISE * s, torch.full_like(s, _SETBACK_SIGMA_M)], dim=1)
-    prior_sigma = torch.cat([scale[:, None] * _by_degree(_FIELD_SIGMA_PX), own_sigma], dim=1)
+    prior_sigma = torch.cat([scale[:, None] * by_degree(_FIELD_SIGMA_PX), own_sigma], dim=1)
     H_prior, b_prior = torch.diag_embed(1 / prior_sigma**2), torch.zeros_like(prior_sigma[0])
     H_prior[:, :NUM_COEFFICIENTS, :NUM_COEFFICIENTS] += information
     b_prior[:NUM_COEFFICIENTS] += vector
@@ -88,7 +89,7 @@ def solve_rows(
     """Coefficients of the row offsets, pixels."""
     variance = (rows[:, 6] ** 2 + _ROW_NOISE_PX**2)[None]
     basis = polynomial_basis(rows[:, :2], size_wh)
-    H_prior = (torch.diag(1 / _by_degree(_ROW_SIGMA_PX) ** 2) + information)[None]
+    H_prior = (torch.diag(1 / by_degree(_ROW_SIGMA_PX) ** 2) + information)[None]
     _, mean, _ = _student_t(basis, rows[:, 5], variance, H_prior, vector)
     return mean[0]
 
@@ -119,10 +120,6 @@ def _student_t(
     per_point = variance.log() + (_DEGREES_OF_FREEDOM + 1) * torch.log1p(squared / _DEGREES_OF_FREEDOM)
     of_prior = ((mean[:, None] @ H_prior)[:, 0] * mean).sum(dim=1) - 2 * mean @ b_prior
     return H, mean, -0.5 * (per_point.sum(dim=1) + of_prior + torch.linalg.slogdet(H)[1])
-
-
-def _by_degree(sigma: tuple[float, ...]) -> Tensor:
-    return torch.tensor([sigma[i + j] for i, j in EXPONENTS], dtype=torch.float64)
 
 
 def _log_prior(noise: Tensor, middle_and_spread: tuple[float, float]) -> Tensor:

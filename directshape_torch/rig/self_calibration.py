@@ -18,16 +18,15 @@ from torch import Tensor
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.camera import rays_from_pixels
-from directshape_torch.geometry.disparity_field import EXPONENTS, NUM_COEFFICIENTS, polynomial_basis
+from directshape_torch.geometry.disparity_field import NUM_COEFFICIENTS, polynomial_basis
 from directshape_torch.geometry.projection import warp_to_right
-from directshape_torch.rig.pixels import COEFFICIENT_SIGMA_PX, PixelEvidence, pixel_evidence
+from directshape_torch.rig.pixels import COEFFICIENT_SIGMA_PX, PixelEvidence, by_degree, pixel_evidence, tukey_weight
 from directshape_torch.rig.rig import Rig
 from directshape_torch.stereo_matching.patch_alignment import MatchedPair
 from directshape_torch.stereo_matching.plane_from_points import fit_ground_plane
 
 # Standard deviation of a patch's disparity, pixels.
 PATCH_SIGMA_PX = 0.12
-_TUKEY = 4.685
 # Points of one frame share their scene, its errors and those of the model: they count as so many independent ones.
 _INDEPENDENT_POINTS = 60
 _NUM_ITERATIONS = 150
@@ -124,11 +123,6 @@ class FieldConstraint(ABC):
         return self.seen[:, 0] - uv_right[:, 0], J_pixel_depth[:, 0] / inverse_depth**2
 
 
-def tukey_weight(distances: Tensor, scale: float) -> Tensor:
-    """Tukey's biweight, (P,) in [0, 1], for residuals in standard deviations that are `scale` times too large."""
-    return (1 - (distances / (_TUKEY * scale)) ** 2).clamp_min(0) ** 2
-
-
 class SelfCalibration(NamedTuple):
     """A field from images alone."""
 
@@ -180,7 +174,7 @@ def self_calibrate(
 
 def _solve(constraints: Sequence[FieldConstraint], on_step: Callable[[], object]) -> _Solution:
     current, scales = list(constraints), [5.0] * len(constraints)
-    sigma = torch.tensor([COEFFICIENT_SIGMA_PX[i + j] for i, j in EXPONENTS], dtype=torch.float64)
+    sigma = by_degree(COEFFICIENT_SIGMA_PX)
     H_prior, coefficients = torch.diag(1 / sigma**2), torch.zeros_like(sigma)
     H, converged = H_prior, False
     for iteration in range(_NUM_ITERATIONS):

@@ -18,6 +18,7 @@ from directshape_torch.scene import Detections, FrameBatch, boxes_around
 Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 Floats = NDArray[np.float64]
+Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # left and right image, (H, W, 3) RGB
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class FrameEvidence:
     camera: StereoCamera  # of the frame
     size_hw: tuple[int, int]  # of its images
     has_masks: bool  # whether the frame's masks could be read
+    pair: Pair | None = None  # its images, where distances can be measured by them
 
 
 def evidence_of_scene(frames: FrameBatch, detections: Detections) -> list[FrameEvidence]:

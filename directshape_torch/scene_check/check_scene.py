@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from directshape_torch.numerics.checks import check_type
 from directshape_torch.scene import Detections, FrameBatch
-from directshape_torch.scene_check.car_evidence import FrameEvidence, evidence_of_scene
+from directshape_torch.scene_check.car_evidence import FrameEvidence, Pair, evidence_of_scene
 from directshape_torch.scene_check.check_boxes import check_box_2d, check_boxes, check_corners
 from directshape_torch.scene_check.check_images import SPOILS_CAMERA, SPOILS_PAIR, check_calibration, check_images
 from directshape_torch.scene_check.check_masks import check_masks
@@ -17,9 +17,6 @@ from directshape_torch.scene_check.check_places import check_distances, check_he
 from directshape_torch.scene_check.finding import CheckReport, Finding, by_severity, names
 from directshape_torch.scene_check.finding import found as found_mistake
 from directshape_torch.stereo_matching.disparity import rgb8
-
-# Left and right image, (H, W, 3) RGB.
-Pair = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 
 def check_scene(frames: FrameBatch, detections: Detections, match_images: bool = True) -> CheckReport:
@@ -79,14 +76,16 @@ def check_scene(frames: FrameBatch, detections: Detections, match_images: bool =
             found += check_images(*pair, one.camera if usable else None, f"frame {one.frame_id}")
     found += _mask_sizes(frames, detections)
     if usable and not names(found) & {"mask_size"}:
-        found += check_cars(evidence, [None if names(found) & SPOILS_PAIR else pair for pair in pairs])
+        spoilt = bool(names(found) & SPOILS_PAIR)
+        found += check_cars(
+            [replace(one, pair=None if spoilt else pair) for one, pair in zip(evidence, pairs, strict=True)]
+        )
     return CheckReport(by_severity(found), len(frames), len(frames), len(detections))
 
 
-def check_cars(frames: Sequence[FrameEvidence], pairs: Sequence[Pair | None]) -> list[Finding]:
-    """Boxes, masks and distances, each only where what it rests on was found right; a pair is None if not usable."""
-    measured = [measure_cars(frame, *pair) for frame, pair in zip(frames, pairs, strict=True) if pair is not None]
-    cars = np.concatenate([np.empty((0, 3)), *measured])
+def check_cars(frames: Sequence[FrameEvidence]) -> list[Finding]:
+    """Boxes, masks and distances, each only where what it rests on was found right."""
+    cars = np.concatenate([np.empty((0, 3)), *(measure_cars(one, *one.pair) for one in frames if one.pair is not None)])
     frames = [frame for frame in frames if len(frame.boxes)]
     swapped = check_swapped(cars)
     if swapped:
