@@ -114,12 +114,7 @@ def compiling(mode: CompileMode, num_cars: int) -> Iterator[None]:
 
 @contextmanager
 def cars_ahead(num_cars: int) -> Iterator[None]:
-    """Tell the `compiling` regions inside how many cars their job has in all, at least roughly.
-
-    Examples:
-        >>> with cars_ahead(5000), compiling("off", num_cars=7):
-        ...     pass
-    """
+    """Tell the `compiling` regions inside how many cars their job has in all, at least roughly."""
     token = _job.set(num_cars)
     try:
         yield
@@ -146,24 +141,13 @@ def _is_fit(tensor: Tensor) -> bool:
 
 
 def num_forms() -> int:
-    """How many forms of functions this process has compiled, or loaded from the disk.
-
-    Examples:
-        >>> num_forms()
-        0
-    """
+    """How many forms of functions this process has compiled, or loaded from the disk."""
     return _process.forms
 
 
 @functools.cache
 def compiler_problem() -> str | None:
-    """Why nothing can be compiled here, or None if it can; tried once with a function of one line.
-
-    Examples:
-        >>> problem = compiler_problem()
-        >>> problem is None or isinstance(problem, str)
-        True
-    """
+    """Why nothing can be compiled here, or None if it can; tried once with a function of one line."""
     traced: list[int] = []
     try:
         # In a thread of its own, which has none of the caller's modes.
@@ -191,12 +175,7 @@ def _mark(tensor: Tensor, axis: int) -> None:
 
 
 def with_varying(value: _T, axes_of: Callable[[Tensor], Iterable[int]]) -> _T:
-    """The same tensor, named tuple or dataclass with the sizes marked that vary from call to call.
-
-    Args:
-        value: anything; what holds no tensors is returned as it is.
-        axes_of: the axes of a tensor whose sizes may vary.
-    """
+    """The same tensor, named tuple or dataclass, with the axes marked whose sizes vary from call to call."""
 
     def of_record(record: Any) -> Any:
         if not is_dataclass(record) or isinstance(record, type):

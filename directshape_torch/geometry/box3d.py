@@ -26,12 +26,7 @@ def pose_from_kitti(
     location: Tensor,  # (*, 3) bottom centre of the box, metres
     rotation_y: Tensor,  # (*,) radians
 ) -> Tensor:
-    """`T_a_obj` (*, 4, 4) of a KITTI box, in the frame a of its location (`ref` for labels and result files).
-
-    Examples:
-        >>> pose_from_kitti(torch.tensor([1.0, 1.6, 20.0]), torch.tensor(0.3))[:3, 3]
-        tensor([ 1.0000,  1.6000, 20.0000])
-    """
+    """`T_a_obj` (*, 4, 4) of a KITTI box, in the frame a of its location (`ref` for labels and result files)."""
     return from_rotation_translation(rotation_about_y(rotation_y), location)
 
 

@@ -144,13 +144,7 @@ class DisparityField:
         self,
         uv_left: Tensor,  # (*, 2) pixels of the full-resolution left image
     ) -> Tensor:  # (*,)
-        """Measured minus true disparity, pixels, in the dtype of `uv_left`; beyond the hull that of its nearest point.
-
-        Examples:
-            >>> K, T = torch.eye(3), torch.eye(4)
-            >>> DisparityField.constant(0.25, (640, 480), K, K, T).bias(torch.zeros(2, 3, 2)).shape
-            torch.Size([2, 3])
-        """
+        """Measured minus true disparity, pixels, in the dtype of `uv_left`; beyond the hull that of its border."""
         return self.offsets(uv_left)[0]
 
     def vertical(

@@ -84,19 +84,11 @@ _regions = _Regions()
 
 @contextmanager
 def full_precision(device_type: str) -> Iterator[None]:
-    """No autocast, and no products of float32 with fewer digits, whatever the user has allowed for a network.
+    """No autocast on devices of a type, and no products of float32 with fewer digits, whatever the user has allowed.
 
     Half precision cannot hold pixel coordinates, and TF32, which `torch.set_float32_matmul_precision("high")` allows
     on a graphics card, rounds a coordinate of 30 m to 2 cm. The user's setting is put back at the end. Other than
     autocast it belongs to the process: in the meantime the products of its other threads are exact, too.
-
-    Args:
-        device_type: of the tensors, as in `torch.autocast`.
-
-    Examples:
-        >>> with torch.autocast("cpu"), full_precision("cpu"):
-        ...     (torch.eye(2) @ torch.eye(2)).dtype
-        torch.float32
     """
     _regions.enter()
     try:

@@ -24,12 +24,7 @@ def is_forward_mode() -> bool:
 
 
 def is_within_transform() -> bool:
-    """Whether a transform of `torch.func` is at work: what is computed now has no numbers that could be read.
-
-    Examples:
-        >>> torch.func.grad(lambda x: x * is_within_transform())(torch.tensor(2.0)).item(), is_within_transform()
-        (1.0, False)
-    """
+    """Whether a transform of `torch.func` is at work: what is computed now has no numbers that could be read."""
     return torch._C._functorch.maybe_current_level() is not None
 
 
@@ -37,13 +32,6 @@ def as_constant(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Mark a function whose result, a tensor or a named tuple of some, is a constant to whoever differentiates.
 
     `torch.no_grad` holds back gradients alone: the tangents of a forward mode pass through it.
-
-    Examples:
-        >>> @as_constant
-        ... def doubled(x: torch.Tensor) -> torch.Tensor:
-        ...     return 2 * x
-        >>> torch.func.jvp(lambda x: x + doubled(x), (torch.ones(1),), (torch.ones(1),))
-        (tensor([3.]), tensor([1.]))
     """
 
     @functools.wraps(function)

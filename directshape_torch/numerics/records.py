@@ -84,13 +84,6 @@ class TensorRecord(Record):
     Raises:
         InputError: a tensor is none, not dense, or of another shape or kind; floating-point ones differ in dtype or
             device.
-
-    Examples:
-        >>> from directshape_torch.scene import GroundPlane
-        >>> GroundPlane(torch.zeros(5, 3), torch.ones(4), ("file",) * 5)
-        Traceback (most recent call last):
-        ...
-        directshape_torch.errors.InputError: offset: expected shape (5,), got (4,)
     """
 
     def __post_init__(self) -> None:

@@ -79,11 +79,6 @@ class DisparityProfile(CarRecord):
         return cls(offsets, nan, nan, nan[:, 0])
 
     @property
-    def range_px(self) -> Tensor:
-        """The largest offset, a number without axes."""
-        return self.offsets_px[-1]
-
-    @property
     def lowest(self) -> tuple[Tensor, Tensor]:
         """The least cost (B,) of each curve; NaN where there is none."""
         return self.cost_before.amin(dim=1), self.cost_after.amin(dim=1)
@@ -102,13 +97,6 @@ class DisparityProfile(CarRecord):
     def after(self) -> ProfileFigures:
         """Figures of the curve at the end; a good fit has its minimum near 0 and no other that is as low."""
         return profile_figures(self.offsets_px, self.cost_after, self.num_pixels)
-
-    @property
-    def figures(self) -> tuple[ProfileFigures, ProfileFigures]:
-        """`before` and `after` in one go."""
-        cost, pixels = torch.cat([self.cost_before, self.cost_after]), torch.cat([self.num_pixels, self.num_pixels])
-        both = [figure.tensor_split(2) for figure in profile_figures(self.offsets_px, cost, pixels)]
-        return ProfileFigures(*(x[0] for x in both)), ProfileFigures(*(x[1] for x in both))
 
 
 def profile_offsets(range_px: float = 3.0, step_px: float = 0.25) -> Tensor:

@@ -89,12 +89,7 @@ def view_in_words(alpha_rad: float) -> str:
 
 
 def direction_in_words(direction: Sequence[float]) -> str:
-    """The largest parts of a direction (7,); a minus says that the one falls as the other grows.
-
-    Examples:
-        >>> direction_in_words([0.0, 0.02, 0.0, 0.0, 0.1, 0.99, 0.0])
-        'width alone'
-    """
+    """The largest parts of a direction (7,); a minus says that the one falls as the other grows."""
     order = sorted(range(len(direction)), key=lambda i: -abs(direction[i]))
     first = direction[order[0]]
     named = [i for i in order if abs(direction[i] / first) >= _NAMED_SHARE][:3]
@@ -111,18 +106,12 @@ def covariance_of(fisher: Tensor) -> Tensor:
     Silhouette pixels count with weight 1 (not the solver's 1/r), sums run over effective pixels (not means). It is
     uncalibrated: multiply by the s^2 fitted on data with ground truth.
     """
-    factor, regular = cholesky_of_regular(fisher)
-    covariance = torch.cholesky_inverse(factor)
-    return torch.where(regular[:, None, None], covariance, torch.nan)
-
-
-def cholesky_of_regular(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Lower factors (B, D, D), and where (B,) a matrix has one; the identity stands for the others."""
-    finite = matrix.flatten(1).isfinite().all(1)
-    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], matrix, identity))
+    finite = fisher.flatten(1).isfinite().all(1)
+    identity = torch.eye(fisher.shape[-1], dtype=fisher.dtype, device=fisher.device)
+    factor, info = torch.linalg.cholesky_ex(torch.where(finite[:, None, None], fisher, identity))
     regular = finite & (info == 0)
-    return torch.where(regular[:, None, None], factor, identity), regular
+    covariance = torch.cholesky_inverse(torch.where(regular[:, None, None], factor, identity))
+    return torch.where(regular[:, None, None], covariance, torch.nan)
 
 
 def without_offset(information: Tensor, num_kept: int) -> Tensor:

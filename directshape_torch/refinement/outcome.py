@@ -11,7 +11,6 @@ from directshape_torch.config import AcceptanceConfig
 from directshape_torch.geometry import se3
 from directshape_torch.numerics.records import CarRecord, placed
 from directshape_torch.refinement.disparity_profile import DisparityProfile, disparity_profile
-from directshape_torch.refinement.evidence import Course, fit_quality
 from directshape_torch.refinement.observability import (
     Observability,
     covariance_of,
@@ -20,7 +19,7 @@ from directshape_torch.refinement.observability import (
     without_offset,
 )
 from directshape_torch.refinement.problem import CarProblem, CarStage
-from directshape_torch.refinement.quality import FitQuality, bundled_trust_model
+from directshape_torch.refinement.quality import Course, FitQuality, bundled_trust_model, fit_quality
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.solver.problem import where_rows
 from directshape_torch.status import Status, is_refined
@@ -122,7 +121,6 @@ def outcome_of(problem: CarProblem, initial: CarState, minimum: Minimum[CarState
         seen=minimum.seen_end,
         covariance=covariance,
         covariance_xyz_yaw=covariance_xyz_yaw(covariance, end.T_obj_cam),
-        unsettled=minimum.status == Status.max_iterations.code,
         profile=disparity_profile(stage.photometric, at_input, at_end, len(cars), end.code),
         detector_sigma=detector_pose_sigma(problem.config.priors, cars)[:, 0].detach(),
     )

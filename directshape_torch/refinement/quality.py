@@ -7,7 +7,8 @@ refined cars with truth by `scripts/calibrate_quality.py`; `assets/trust_model.j
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -18,60 +19,46 @@ from torch import Tensor
 
 from directshape_torch.errors import DataFormatError
 from directshape_torch.files.read_files import read_json
-from directshape_torch.geometry.box3d import viewing_axes
+from directshape_torch.geometry import se3
+from directshape_torch.geometry.box3d import rotation_y_from_pose, viewing_axes, wrap_angle
 from directshape_torch.numerics.records import CarRecord, Dense
 from directshape_torch.numerics.tensors import constant_like
+from directshape_torch.refinement.disparity_profile import DisparityProfile
+from directshape_torch.refinement.problem import CarStage
+from directshape_torch.rows import CarSums
+from directshape_torch.shape.shape_prior import DimensionsDerivative
+from directshape_torch.terms.cars import CarState
+from directshape_torch.terms.photometric import Photometric
+from directshape_torch.terms.silhouette import MaskRows
+from directshape_torch.terms.term import Figures, Part, Sight
 
 SCHEMA = "directshape_torch.trust_model/1"
 BUNDLED = Path(__file__).parents[1] / "assets" / "trust_model.json"
 # Beyond this many standard deviations of the cars of the fit nothing was learnt: the figure there holds.
 _KNOWN_SIGMAS = 3.0
+_TINY = 1e-9
+# Round figures of the calibration: what the sigmas are short of, and the least errors of length, width and heading.
+_SIGMA_FACTOR = 2.0
+_SIGMA_FLOORS = (0.05, 0.04, 0.01, 0.1, 0.03)
 
 EVIDENCE_NAMES = (
-    "log_depth",
-    "log_sigma_depth",
-    "log_sigma_side",
-    "log_sigma_yaw",
-    "log_expected_misfit",
-    "log_expected_gain",
-    "moved_depth",
-    "turned",
-    "log_moved_sigmas",
-    "length_change",
-    "mask_misfit_left",
-    "mask_misfit_right",
-    "log_photometric_error",
-    "unmatched_share",
-    "log_support",
-    "log_silhouette_cost",
-    "log_prior_cost",
-    "silhouette_decrease",
-    "photometric_decrease",
     "relative_decrease",
-    "log_conflict",
-    "code_size",
-    "unsettled",
-    "log_profile_sigma",
-    "log_profile_offset",
-    "log_profile_contrast",
-    "profile_offset_before",
-    "log_profile_fall_before",
-    "outside_basin",
+    "turned",
+    "log_expected_gain",
+    "log_sigma_yaw",
     "log_detector_sigma",
+    "mask_misfit_left",
+    "log_profile_contrast",
+    "log_profile_fall_before",
 )
-"""Columns of the evidence; `docs/results.md` says which of them the bundled model reads.
+"""Columns of the evidence.
 
-`log_depth` metres over 20; `log_sigma_*` of the uncalibrated covariance, along and across the viewing ray in the ground
-plane (metres) and of the heading (radians); `log_expected_misfit` the share of the box, seen from above, that these
-sigmas let one expect to be wrong, `log_expected_gain` by how much more it would be at the input; `moved_depth` motion
-along the viewing ray, metres; `turned` radians; `log_moved_sigmas` Mahalanobis length of the motion; `length_change`
-metres; `mask_misfit_*` one minus the overlap with the mask; `*_decrease` log of cost before over cost after;
-`log_conflict` share of the cost that photometry alone would still gain by a step; `code_size` root mean square;
-`unsettled` 1 where the iterations ran out. Of the disparity profile at the end: `log_profile_sigma` and
-`log_profile_offset` of its minimum, pixels, `log_profile_contrast`, how much more a pixel of disparity to the better
-side costs, `outside_basin` 1 where a ridge lies between the state and the minimum. Of the one at the input:
-`profile_offset_before` of its minimum, pixels, and `log_profile_fall_before`, cost there over that at the minimum.
-`log_detector_sigma` of what the detector's depth is known to be off by, as a share of the depth.
+`relative_decrease` log of cost before over cost after; `turned` radians; `log_expected_gain` by how much less of the
+box, seen from above, the uncalibrated covariance lets one expect to be wrong than at the input; `log_sigma_yaw` of that
+covariance, radians; `log_detector_sigma` of what the detector's depth is known to be off by, as a share of the depth;
+`mask_misfit_left` one minus the overlap with the mask. Of the disparity profiles: `log_profile_contrast`, how much more
+a pixel of disparity to the better side costs at the end, and `log_profile_fall_before`, cost at the input over that at
+the minimum.
 """
 
 
@@ -196,3 +183,140 @@ def _head(content: Mapping[str, Any]) -> LogisticHead:
     if any(len(value) != len(columns) for value in values.values()):
         raise ValueError(f"{len(columns)} columns need as many {', '.join(numbers)}")
     return LogisticHead(columns, **values, bias=float(content["bias"]))
+
+
+@dataclass(frozen=True)
+class Course:
+    """The course of a refinement of B cars, as far as the evidence needs it."""
+
+    stage: CarStage  # the last one
+    before: CarState  # input
+    after: CarState  # final state
+    detector_hwl: Tensor  # (B, 3) metres, of the input
+    cost_before: Tensor  # (B, T) of the input, at the final stage
+    cost_after: Tensor  # (B, T) of the final state
+    figures: Figures  # of the energy at the final state
+    seen: Sight  # what the rays see there
+    covariance: Tensor  # (B, D, D) in the tangent of `retract`, uncalibrated
+    covariance_xyz_yaw: Tensor  # (B, 4, 4), uncalibrated
+    profile: DisparityProfile  # photometric cost over the disparity
+    detector_sigma: Tensor  # (B,) metres, of the input along the viewing ray; not finite where nobody knows it
+
+
+@torch.no_grad()
+def fit_quality(course: Course) -> FitQuality:
+    """Figures of B cars at the end of a refinement."""
+    stage = course.stage
+    left, right = mask_ious(stage.problem.masks, course.seen)
+    nan = torch.full_like(left, torch.nan)
+    photometric, at = stage.photometric, stage.photometric_part(course.figures)
+    both = (nan, nan) if photometric is None or at is None else photometric_agreement(photometric, at)
+    evidence = evidence_of(course, left)
+    return FitQuality(left, right, *both, evidence, *_probabilities(stage.problem.term_names, evidence))
+
+
+def _probabilities(term_names: Sequence[str], evidence: Tensor) -> tuple[Tensor, Tensor]:
+    """Probabilities (B,) of a better and of a not worse box; the model knows the terms of the method "direct" alone."""
+    if not {"silhouette_left", "photometric"} <= set(term_names) or "point_cloud" in term_names:
+        unknown = torch.full_like(evidence[:, 0], torch.nan)
+        return unknown, unknown
+    model = bundled_trust_model()
+    return model.better(evidence), model.not_worse(evidence)
+
+
+def mask_ious(masks: MaskRows, seen: Sight) -> Tensor:
+    """Overlap (2, B) of shape and mask over the pixels of the left and the right image."""
+    distance = seen.field.value(seen.closest.points_obj, masks.rays.owner)
+    counts = masks.filled.to(torch.float64)
+    covered, masked = seen.closest.crosses & (distance < 0), masks.foreground > 0.5
+    both, either = ((x * counts).sum(dim=1) for x in (covered & masked, covered | masked))
+    num_cars = len(masks.blocks.counts)
+    sums = CarSums.of(masks.rays.owner + num_cars * masks.side, 2 * num_cars)
+    overlap, union = sums.sum(torch.stack([both, either], dim=1)).unbind(dim=1)
+    return torch.where(union > 0, overlap / union, torch.nan).view(2, num_cars)
+
+
+def photometric_agreement(term: Photometric, at: Part) -> tuple[Tensor, Tensor]:
+    """Mean absolute residual (B,) in grey levels of the usable pixels, and their share (B,) of the pixel set."""
+    fixed, usable = term.pixel_set, at.where.usable
+    in_set = usable & (fixed.rows.pixel_weight > 0)
+    weight = in_set[..., None] * fixed.rows.neighbour_weight.movedim(0, -1)
+    per_block = [(weight * at.residual.abs()).sum(dim=(1, 2)), weight.sum(dim=(1, 2)), in_set.sum(dim=1)]
+    table = torch.stack([x.to(torch.float64) for x in per_block], dim=1)
+    error, total, compared = CarSums.of(fixed.blocks.owner, len(term.cars)).sum(table).unbind(dim=1)
+    nothing = torch.full_like(total, torch.nan)
+    share = torch.where(fixed.support > 0, compared / fixed.support.clamp_min(1), nothing)
+    return torch.where(total > 0, error / total.clamp_min(1), nothing), share
+
+
+def evidence_of(course: Course, mask_iou_left: Tensor) -> Tensor:
+    """The evidence (B, E), float64, columns `EVIDENCE_NAMES`; NaN where a figure does not exist."""
+    columns = _motion(course) | _costs(course) | {"mask_misfit_left": 1 - mask_iou_left}
+    return torch.stack([columns[name].to(torch.float64) for name in EVIDENCE_NAMES], dim=1)
+
+
+def _motion(course: Course) -> dict[str, Tensor]:
+    """How far the box was turned, and what the motion is worth in shares of itself."""
+    T_obj_cam = torch.stack([course.before.T_obj_cam, course.after.T_obj_cam]).to(torch.float64)
+    T_cam_obj = se3.inverse(T_obj_cam)
+    T_before, T_after = T_cam_obj
+    dimensions = course.stage.problem.prior.dimensions_and_derivative(course.after.code)
+    hwl = dimensions.hwl.to(torch.float64)
+    heading_before, heading_after = rotation_y_from_pose(T_cam_obj)
+    turned = wrap_angle(heading_after - heading_before)
+    shift_cam = T_after[:, :3, 3] - T_before[:, :3, 3]
+    shift_obj = (shift_cam[:, None] @ T_after[:, :3, :3])[:, 0]
+    change_wl = (hwl - course.detector_hwl)[:, 1:]
+    motion = torch.cat([shift_obj[:, 0::2], turned[:, None], change_wl.flip(1)], dim=1)
+    gain = _expected_gain(motion, _footprint_sigmas(course, dimensions), hwl)
+    # A share of the depth; NaN where nobody knows it.
+    sigma, depth = course.detector_sigma, T_before[:, 2, 3]
+    is_known = sigma.isfinite() & (sigma > 0)
+    return {
+        "log_sigma_yaw": 0.5 * course.covariance_xyz_yaw[:, 3, 3].clamp_min(_TINY**2).log(),
+        "log_expected_gain": (gain + 0.005).log(),
+        "turned": turned.abs(),
+        "log_detector_sigma": torch.where(is_known, (sigma.to(depth) / depth.clamp_min(1.0)).log(), torch.nan),
+    }
+
+
+def _footprint_sigmas(course: Course, dimensions: DimensionsDerivative) -> Tensor:
+    """Standard deviations (B, 5) along and across the car, of its heading, length and width, of the right size."""
+    J = dimensions.J_hwl_code[:, 1:].flip(1).to(torch.float64)
+    C = course.covariance
+    size_variance = (J @ C[:, 6:, 6:] * J).sum(dim=2)
+    variance = torch.cat([C.diagonal(dim1=1, dim2=2)[:, 0:6:2], size_variance], dim=1)
+    return (variance * _SIGMA_FACTOR**2 + constant_like(_SIGMA_FLOORS, variance).square()).sqrt()
+
+
+def _expected_gain(motion: Tensor, sigma: Tensor, hwl: Tensor) -> Tensor:
+    """By how much (B,) the expected misfit of footprints whose errors are normal is larger at the input.
+
+    Motions of the output against the input and sigmas of the output (B, 5) are along and across the car, of heading,
+    length and width.
+    """
+    _, width, length = hwl.clamp_min(0.1).unbind(1)
+    # IoU falls by twice the shift over the side, by the change of a side over itself, and by the corners cut in a turn.
+    turn = 0.5 * (length / width + width / length)
+    per_length, per_width = 1 / length, 1 / width
+    loss = torch.stack([2 * per_length, 2 * per_width, turn, per_length, per_width], dim=1)
+    # E|x| of x ~ N(0, sigma^2) and of N(motion, sigma^2).
+    at_output = sigma * math.sqrt(2 / math.pi)
+    ratio = motion / sigma
+    at_input = at_output * torch.exp(-0.5 * ratio.square()) + motion * torch.erf(ratio / math.sqrt(2))
+    return (loss * (at_input - at_output)).sum(1).clamp_min(0)
+
+
+def _costs(course: Course) -> dict[str, Tensor]:
+    """What the energy fell by, how sharply the images know the disparity, and how far they pulled the input."""
+    # (2, B): before and after.
+    paid = torch.stack([course.cost_before, course.cost_after]).permute(2, 0, 1).sum(dim=0)
+    log_before, log_after = paid.clamp_min(_TINY).log()
+    profile = course.profile
+    lowest_before, lowest_after = profile.lowest
+    to_the_sides = torch.minimum(*(profile.cost_at(offset_px)[1] for offset_px in (-1.0, 1.0)))
+    return {
+        "relative_decrease": log_before - log_after,
+        "log_profile_contrast": (to_the_sides / lowest_after).log(),
+        "log_profile_fall_before": (profile.cost_at(0.0)[0] / lowest_before).log(),
+    }

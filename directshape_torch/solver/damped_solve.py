@@ -17,20 +17,10 @@ def damped_step(
     gradient: Tensor,  # (B, D)
     damping: Tensor,  # (B,) Marquardt's mu
 ) -> tuple[Tensor, Tensor]:
-    """Solve `(H + mu diag(H)) step = -g` (Marquardt) by Cholesky.
+    """Solve `(H + mu diag(H)) step = -g` (Marquardt) by Cholesky; of the symmetric H the lower triangle is read.
 
-    Args:
-        hessian: symmetric; the lower triangle is read.
-        gradient, damping: see above.
-
-    Returns:
-        The steps (B, D), zero where there is none, and `solvable` (B,): false where the system is singular or not
-        finite. Never raises and never synchronises with the device.
-
-    Examples:
-        >>> step, solvable = damped_step(torch.eye(2)[None], torch.ones(1, 2), torch.zeros(1))
-        >>> step
-        tensor([[-1., -1.]])
+    Returns the steps (B, D), zero where there is none, and `solvable` (B,): false where the system is singular or not
+    finite. Never raises and never synchronises with the device.
     """
     step, solvable = damped_solution(hessian, -gradient.unsqueeze(2), damping)
     return step.squeeze(2), solvable
@@ -41,13 +31,7 @@ def damped_solution(
     right: Tensor,  # (B, D, R)
     damping: Tensor,  # (B,)
 ) -> tuple[Tensor, Tensor]:
-    """Solve `(M + mu diag(M)) X = right`, as `damped_step` does, for several columns: X (B, D, R), and where (B,).
-
-    Examples:
-        >>> damped_solution(2 * torch.eye(2)[None], torch.ones(1, 2, 1), torch.zeros(1))[0]
-        tensor([[[0.5000],
-                 [0.5000]]])
-    """
+    """Solve `(M + mu diag(M)) X = right`, as `damped_step` does, for several columns: X (B, D, R), and where (B,)."""
     # Jacobi scaling: metres, radians and standard deviations differ by orders of magnitude in curvature. What is
     # scaled to 1 has the damping itself on its diagonal.
     scale = floored_diagonal(matrix).rsqrt()
@@ -70,12 +54,7 @@ def floored_diagonal(matrix: Tensor) -> Tensor:
 
 
 def is_finite(sums: Tensor) -> Tensor:
-    """Where sums are finite, and with them everything that was added: two small operations, `isfinite` is four.
-
-    Examples:
-        >>> is_finite(torch.tensor([1.0, torch.inf, torch.nan]))
-        tensor([ True, False, False])
-    """
+    """Where sums are finite, and with them everything that was added: two small operations, `isfinite` is four."""
     zeros = sums - sums
     return torch.eq(zeros, zeros)
 
@@ -110,14 +89,9 @@ def newton_step(
     J: Tensor,  # (B, D, D) of the gradient by the unknowns
     gradient: Tensor,  # (B, D)
 ) -> tuple[Tensor, Tensor]:
-    """Solve `J step = -g`, differentiable by the gradient alone.
+    """The steps (B, D) of `J step = -g`, zero where there is none, and where (B,) there is one.
 
-    Returns:
-        The steps (B, D), zero where there is none, and where (B,) there is one.
-
-    Examples:
-        >>> newton_step(2 * torch.eye(2)[None], torch.ones(1, 2))
-        (tensor([[-0.5000, -0.5000]]), tensor([True]))
+    Differentiable by the gradient alone.
     """
     step, regular = general_solution(J.detach(), -gradient.unsqueeze(2))
     return step.squeeze(2), regular
@@ -127,12 +101,7 @@ def general_solution(
     matrix: Tensor,  # (B, D, D), of any kind
     right: Tensor,  # (B, D, R)
 ) -> tuple[Tensor, Tensor]:
-    """Solve `M X = right`: X (B, D, R), zero where there is none, and where (B,) there is one.
-
-    Examples:
-        >>> general_solution(torch.zeros(1, 1, 1), torch.ones(1, 1, 1))
-        (tensor([[[0.]]]), tensor([False]))
-    """
+    """Solve `M X = right`: X (B, D, R), zero where there is none, and where (B,) there is one."""
     info = torch.linalg.lu_factor_ex(matrix)[2]
     regular = (info == 0) & matrix.flatten(1).isfinite().all(dim=1)
     # Where there is no solution the system is replaced, so that no NaN passes into gradients.

@@ -85,15 +85,7 @@ class March(NamedTuple):
 def marched_views(
     left: Rays, right: Rays, bounds_obj: Tensor, num_samples: int, field: Field, T_obj_cam: Tensor
 ) -> tuple[Closest, Hits]:
-    """Where the rays of both images come closest, left ones first, and where those of the left one enter: constants.
-
-    Args:
-        left, right: rays of the two images.
-        bounds_obj: (2, 3) of the prior.
-        num_samples: of a march.
-        field: of B cars.
-        T_obj_cam: (B, 4, 4) their poses.
-    """
+    """Where the rays of both images come closest, left ones first, and where those of the left one enter: constants."""
     pairs = zip(left, right, (0, 0, 1), strict=True)
     both = Rays(*(torch.cat([x, y], dim=axis) for x, y, axis in pairs))
     rays, num_left = both.in_objects(T_obj_cam), len(left.owner)
@@ -289,14 +281,8 @@ def _secant_slope(step: Tensor, sdf_before: Tensor, sdf: Tensor, slope: Tensor) 
 def surface_depth(field: Field, owner: Tensor, rays: ObjectRays, depth: Tensor, usable: Tensor) -> Tensor:
     """The depth (M, R) of the surface as a differentiable function of rays and shape, by two Newton steps.
 
-    Args:
-        field: signed distances.
-        owner: (M,) car of each block.
-        rays: (M, R) in the frames of their cars.
-        depth: (M, R) on the surface, or next to it, a constant.
-        usable: (M, R) bool, where there is a surface; elsewhere the depth is returned.
-
-    One step has the right first derivative but a wrong second one.
+    From a depth on the surface or next to it, a constant, which is returned where none is `usable`. One step has the
+    right first derivative but a wrong second one.
     """
     for _ in range(2):
         at = field.derivatives(rays.at(depth), owner)

@@ -24,12 +24,7 @@ def quadratic(residual: Tensor) -> RobustValue:
 
 
 def huber(residual: Tensor, corner: float) -> RobustValue:
-    """Huber's norm: `r^2 / 2` inside the corner, `corner (|r| - corner / 2)` outside.
-
-    Examples:
-        >>> huber(torch.tensor(3.0), 2.0).rho
-        tensor(4.)
-    """
+    """Huber's norm: `r^2 / 2` inside the corner, `corner (|r| - corner / 2)` outside."""
     magnitude = residual.abs()
     # Both pieces in one, without a choice: up to the corner the magnitude itself stands for it.
     inner, outer = magnitude.clamp_max(corner), magnitude.clamp_min(corner)

@@ -343,12 +343,7 @@ def product_residual(
 
 
 def log_one_minus_exp(x: Tensor) -> Tensor:
-    """`log(1 - exp(x))` for x < 0 without cancellation (Maechler's two branches), finite for x -> 0.
-
-    Examples:
-        >>> log_one_minus_exp(torch.tensor(-0.6931472))
-        tensor(-0.6931)
-    """
+    """`log(1 - exp(x))` for x < 0 without cancellation (Maechler's two branches), finite for x -> 0."""
     x = x.clamp_max(-torch.finfo(x.dtype).tiny)
     near_zero = x > -0.6931471805599453
     by_expm1 = torch.log(-torch.expm1(torch.where(near_zero, x, torch.full_like(x, -0.5))))

@@ -10,10 +10,9 @@ from helpers.problems import DEFAULT, begun_stage, figures_at, photometric_of
 from helpers.synthetic_scene import cached_street, disturbed
 
 from directshape_torch.config import RefinerConfig
-from directshape_torch.refinement.evidence import _probabilities, mask_ious, photometric_agreement
 from directshape_torch.refinement.outcome import outcome_of
 from directshape_torch.refinement.problem import CarStage
-from directshape_torch.refinement.quality import EVIDENCE_NAMES
+from directshape_torch.refinement.quality import EVIDENCE_NAMES, _probabilities, mask_ious, photometric_agreement
 from directshape_torch.solver.gauss_newton import Minimum
 from directshape_torch.status import Status
 from directshape_torch.terms.cars import CarBatch, CarState

@@ -20,13 +20,13 @@ from directshape_torch.refinement.quality import (
     load_trust_model,
 )
 
-HEAD = LogisticHead(("log_depth", "turned"), (0.5, 0.1), (2.0, 0.05), (1.0, -2.0), 0.25)
+HEAD = LogisticHead(("log_sigma_yaw", "turned"), (0.5, 0.1), (2.0, 0.05), (1.0, -2.0), 0.25)
 MODEL = TrustModel(HEAD, HEAD, (2.0, 3.0, 1.0, 0.5), (0.1, 0.2, 0.0, 0.01), {"made_by": "a test"})
 
 
-def evidence(log_depth: float, turned: float) -> torch.Tensor:
+def evidence(log_sigma_yaw: float, turned: float) -> torch.Tensor:
     row = torch.full((1, len(EVIDENCE_NAMES)), torch.nan, dtype=torch.float64)
-    row[0, EVIDENCE_NAMES.index("log_depth")] = log_depth
+    row[0, EVIDENCE_NAMES.index("log_sigma_yaw")] = log_sigma_yaw
     row[0, EVIDENCE_NAMES.index("turned")] = turned
     return row
 
@@ -70,7 +70,7 @@ def test_damaged_files_are_refused(tmp_path: Path) -> None:
     for change, words in (
         ({"schema": "other/1"}, "has schema 'other/1'"),
         ({"sigma_floors": [0.1]}, "not four sigmas"),
-        ({"better": {**content["better"], "columns": ["log_depth", "colour"]}}, "unknown columns .'colour'."),
+        ({"better": {**content["better"], "columns": ["log_sigma_yaw", "colour"]}}, "unknown columns .'colour'."),
         ({"better": {**content["better"], "weights": [1.0]}}, "2 columns need as many"),
     ):
         path.write_text(json.dumps(content | change))
