@@ -109,7 +109,7 @@ def write_animation(path: Path | str, frames: Sequence[NDArray[np.uint8]], secon
         raise MissingDependencyError("pillow", "plot", "writing an animation") from error
     # One palette for all frames, or colours that stay would flicker.
     together = Image.fromarray(np.concatenate([*frames]))
-    palette = together.quantize(_GIF_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    palette = together.quantize(_GIF_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     pictures = [Image.fromarray(f).quantize(palette=palette, dither=Image.Dither.NONE) for f in frames]
     content = io.BytesIO()
     durations = [round(1000 * s) for s in seconds]
