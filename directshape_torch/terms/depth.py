@@ -229,7 +229,7 @@ def _first_bracket(marched: March, closest_depth: Tensor, closest_sdf: Tensor) -
     """
     depths, sdf, crosses = marched
     inside = sdf < 0
-    first = inside.to(torch.uint8).max(dim=0, keepdim=True).indices
+    first = inside.to(sdf.dtype).max(dim=0, keepdim=True).indices
     behind, behind_sdf, is_inside = (x.gather(0, first)[0] for x in (depths, sdf, inside))
     is_closest = (closest_sdf < 0) & ((closest_depth < behind) | ~is_inside)
     behind = torch.where(is_closest, closest_depth, behind)
