@@ -10,7 +10,7 @@ from pathlib import Path
 import directshape_torch
 from directshape_torch.errors import InputError
 from directshape_torch.io.frame_collation import collate
-from directshape_torch.io.stereo_dataset import LoadedFrame, open_dataset
+from directshape_torch.io.stereo_dataset import LoadedFrame
 from directshape_torch.scene import Detections, FrameBatch
 
 _DETECTORS = {"rendered": "stereo", "kitti": "noisy_stereo"}
@@ -49,7 +49,15 @@ def demo_scene() -> Scene:
 
 
 def _scene(root: Path, detector: str, max_frames: int | None) -> Scene:
-    dataset = open_dataset("kitti", root, root / "detections" / detector, root / "training" / "masks")
+    where = root, root / "detections" / detector, root / "training" / "masks"
+    try:
+        from directshape_torch.io.stereo_dataset import open_dataset
+    except ImportError:  # in an older version, which this one is compared with, a layout is a class
+        from directshape_torch.io.kitti_dataset import KittiStereoDataset  # type: ignore[import-not-found]
+
+        dataset = KittiStereoDataset(*where)
+    else:
+        dataset = open_dataset("kitti", *where)
     loaded = (dataset.load(frame_id) for frame_id in dataset.frame_ids)
     with_cars = (frame for frame in loaded if len(frame.detections))
     return Scene(root.name, tuple(itertools.islice(with_cars, max_frames)))
