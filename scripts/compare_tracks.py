@@ -45,6 +45,7 @@ from directshape_torch.rig.estimate import RigEstimates
 from directshape_torch.rig.rig_file import load_rigs
 
 _WORSE = 0.05
+_WITHIN_SIGMAS = 2.0
 _DISTANCES_M = (0.0, 12.0, 20.0, 30.0, np.inf)
 
 
@@ -57,6 +58,8 @@ class CarOfFrame:
         given_track: of the detection, another one with `--swap`.
         part: see `RefinementResult.track_part`.
         not_worse: probability of that against the input, NaN where none is known.
+        along_sigmas, yaw_sigmas: errors along the viewing ray and of the axis in standard deviations that the result
+            says; NaN where it says none.
     """
 
     sequence: str
@@ -75,6 +78,8 @@ class CarOfFrame:
     length_m: float
     near_m: float
     far_m: float
+    along_sigmas: float
+    yaw_sigmas: float
     seconds: float
 
     @property
@@ -134,7 +139,7 @@ def _cars(
     boxes = boxes[[first_row + k for k in rows]]
     errors, before = pose_errors(boxes, true), pose_errors(boxes_of([objects[k] for k in rows]), true)
     reach, true_reach = _reach(boxes, true), _reach(true, true)
-    status = result.status
+    status, sigma = result.status, result.sigma_xyz_yaw
     given, part = _track_id(item).tolist(), result.track_part.tolist()
     for number, k in enumerate(rows):
         label, row = labels[partners[k]], first_row + k
@@ -156,6 +161,8 @@ def _cars(
             length_m=float(errors.length_m[number]),
             near_m=near,
             far_m=far,
+            along_sigmas=float(errors.along_m[number].abs() / sigma[row, 0:3:2].norm()),
+            yaw_sigmas=float(errors.yaw_axis_deg[number].deg2rad() / sigma[row, 3]),
             seconds=seconds,
         )
 
@@ -224,9 +231,9 @@ def table(found: Sequence[CarOfFrame], turn_deg: float) -> list[str]:
 
 
 _HEADING = (
-    "| frames | refined | BEV IoU, input | BEV IoU | worse than input, promised and found | worse than alone "
-    "| length, rms | near face, rms | far face, rms | s a car and frame |",
-    "|---|---|---|---|---|---|---|---|---|---|",
+    "| frames | refined | BEV IoU, input | BEV IoU | worse than input, promised and found | worse, better than alone "
+    "| length, rms and median | near face, rms | far face, rms | within 2 sigma: depth, axis | s a car and frame |",
+    "|---|---|---|---|---|---|---|---|---|---|---|",
 )
 _DISTANCE_NAMES = ("0 to 12 m", "12 to 20 m", "20 to 30 m", "beyond")
 
@@ -253,7 +260,10 @@ def _line(cars: Sequence[CarOfFrame], alone: Sequence[CarOfFrame]) -> str:
     shares = [f"{np.mean(iou < other - _WORSE):.1%}" for other in (iou_input, iou_alone)]
     trusted = [car.not_worse for car in cars if car.refined]
     shares[0] = f"{np.sum(1 - np.array(trusted)) / len(cars):.1%}, {shares[0]}"
+    shares[1] += f", {np.mean(iou > iou_alone + _WORSE):.1%}"
     rms = [f"{_rms([getattr(car, name) for car in cars]):.3f} m" for name in ("length_m", "near_m", "far_m")]
+    rms[0] += f", {np.median([abs(car.length_m) for car in cars]):.3f} m"
+    sigmas = np.array([(car.along_sigmas, car.yaw_sigmas) for car in cars if car.refined])
     seconds = np.mean([car.seconds for car in cars])
     refined = f"{np.mean([car.refined for car in cars]):.1%}"
     cells = [
@@ -263,6 +273,7 @@ def _line(cars: Sequence[CarOfFrame], alone: Sequence[CarOfFrame]) -> str:
         f"{iou.mean():.3f}",
         *shares,
         *rms,
+        ", ".join(f"{share:.0%}" for share in (sigmas < _WITHIN_SIGMAS).mean(axis=0)),
         f"{seconds:.2f}",
     ]
     return "| " + " | ".join(cells) + " |"

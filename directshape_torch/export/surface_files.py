@@ -43,7 +43,7 @@ class GlbExporter(Exporter):
             shapes = painted.frame.shapes
             key = shapes.tracks[one.car], int(shapes.track_parts[one.car])
             if key[0] and key[1] >= 0:
-                self._moving.setdefault(key, _MovingCar()).add(painted, index)
+                self._moving.setdefault(key, _MovingCar()).add(painted, index, _time_s(source))
 
     def finish(self) -> None:
         self._write(list(self._moving))
@@ -76,6 +76,13 @@ def frame_glb(painted: PaintedFrame, loaded: LoadedFrame | None) -> bytes:
     return _glb(scene)
 
 
+def _time_s(source: FrameSource) -> float:
+    """When the frame was taken, NaN where nobody knows."""
+    dataset = source.inputs.dataset
+    time_s = None if dataset is None else dataset.layout.motion(source.frame_id)[0]
+    return np.nan if time_s is None else time_s
+
+
 def _sequence(track: str) -> str:
     """What the names of the track and of its frames begin with, "" for a single sequence."""
     return track.rpartition("_")[0]
@@ -86,11 +93,13 @@ class _MovingCar:
 
     def __init__(self) -> None:
         self.T_cam_obj: dict[str, NDArray[np.float64]] = {}
+        self.time_s: list[float] = []
         self._depth_m = np.inf
 
-    def add(self, painted: PaintedFrame, index: int) -> None:
+    def add(self, painted: PaintedFrame, index: int, time_s: float) -> None:
         T_cam_obj = painted.cars[index].T_cam_obj.double().numpy()
         self.T_cam_obj[painted.frame.frame_id] = T_cam_obj
+        self.time_s.append(time_s)
         if T_cam_obj[2, 3] < self._depth_m:
             self._depth_m, self._nearest = float(T_cam_obj[2, 3]), (painted, index)
 
@@ -108,7 +117,9 @@ class _MovingCar:
         place(frame_to=_CAMERA, matrix=T_GLTF_CAM)
         _add(scene, _CAR, mesh, paint, _CAMERA)
         numbers = image_numbers([frame_id.removeprefix(f"{sequence}_") for frame_id in self.T_cam_obj])
-        seconds, T_views = _SECONDS_A_FRAME * np.array(list(numbers.values())), np.stack(list(self.T_cam_obj.values()))
+        seconds, T_views = np.array(self.time_s), np.stack(list(self.T_cam_obj.values()))
+        if np.isnan(seconds).any():
+            seconds = _SECONDS_A_FRAME * np.array(list(numbers.values()))
         return _glb(scene, lambda buffers, tree: _animate(buffers, tree, seconds - seconds[0], T_views))
 
 

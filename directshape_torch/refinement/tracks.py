@@ -24,12 +24,9 @@ from directshape_torch.terms.next_view import NextView, NextViews
 from directshape_torch.terms.photometric import Photometric
 from directshape_torch.terms.term import Term
 
-# What the family of shapes says is known once, however many views there are; each detection's dimensions are a
-# measurement of their own.
-_KNOWN_ONCE = "shape"
-# Two halves of a track are of one car unless shapes of their own save more than this, twice the cost: of 22 tracks on
-# which this was tried one shape costs 6.9 at most.
-_MOST_SAVED = 8.0
+# Two parts of a track are of one car unless shapes of their own save more than this, twice the cost: of a
+# hundred tracks on which this was tried one shape costs 8.1 at most.
+_MOST_SAVED = 9.0
 # Of a track, times those of the last stage.
 _MORE_ITERATIONS = 2
 
@@ -115,8 +112,7 @@ class Together:
     problem: CarProblem  # of these R views, its last stage alone
     agreement: Groups  # whose codes are one
     cars: CarBatch  # the views, with times and cameras of their track
-    gradient: Tensor  # (R, D) of what each adds to the cost of its track, where it ended by itself
-    hessian: Tensor  # (R, D, D) of the same
+    hessian: Tensor  # (R, D, D) of what each adds to the cost of its track, where it ended by itself
     part: Tensor  # (R,) of its track, 0 unless it was split
     next_view: Tensor  # (R,) number of the next view of its part in time, of the last one its own
 
@@ -127,7 +123,7 @@ class Together:
         """
         number = torch.arange(6, 6 + alone.code.shape[1], device=alone.code.device)
         step = torch.zeros_like(self.hessian[:, 0]).index_copy(1, number, alone.code.to(self.hessian.dtype))
-        slope = self.gradient - (self.hessian @ step[:, :, None])[:, :, 0]
+        slope = -(self.hessian @ step[:, :, None])[:, :, 0]
         undamped, everybody = torch.zeros_like(slope[:, 0]), torch.ones_like(slope[:, 0], dtype=torch.bool)
         to_agreement, _ = self.agreement.damped_step(self.hessian, slope, undamped, everybody)
         max_code = self.problem.config.solver.max_code
@@ -152,7 +148,10 @@ def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], jo
         return None
     hessian = minimum.after.hessian.sum(dim=1)
     _, solvable = damped_step(hessian, hessian[:, 0], torch.zeros_like(minimum.after.cost))
-    says, has_any = _Quadratics.of(problem, minimum)
+    own, shared = own_and_shared(problem, hessian.device)
+    # All slopes of a minimum add up to nothing.
+    A, _, has_any = said_of_shared(hessian, torch.zeros_like(hessian[:, 0]), own, shared)
+    says = _Quadratics(A, A @ minimum.end.code.to(A)[:, :, None])
     # Of each view its group, its place there, the view in the next place, and the number of the part of its track.
     views_of_parts: dict[int, tuple[int, int, int, int]] = {}
     for views in _tracks(cars, joins & solvable & has_any):
@@ -166,18 +165,12 @@ def together(problem: CarProblem, cars: CarBatch, minimum: Minimum[CarState], jo
     group, place, after, parts = zip(*(views_of_parts[row] for row in numbers), strict=True)
     index = torch.tensor(numbers, device=hessian.device)
     keep = torch.zeros_like(solvable).index_fill(0, index, True)
-    own, shared = own_and_shared(problem, hessian.device)
     sharing = Groups.of(group, own, shared, place=place)
     part_number = torch.tensor(parts, device=hessian.device)
     next_view = torch.tensor([numbers.index(row) for row in after], device=hessian.device)
-    once = _once(problem, sharing)
-    # Each by itself ended where its slopes add up to nothing: what is left is that of what counts less from here on.
-    slopes, curvatures = minimum.after.gradient[index], minimum.after.hessian[index]
-    gradient = ((once - 1)[:, :, None] * slopes).sum(dim=1)
-    hessian = (once[:, :, None, None] * curvatures).sum(dim=1)
     timed_views = timed(sharing, cars.of_cars(keep))
     of_track = in_tracks(problem.of_problems(keep), sharing, timed_views, take_rows(minimum.end, index), next_view)
-    return Together(keep, of_track, sharing, timed_views, gradient, hessian, part_number, next_view)
+    return Together(keep, of_track, sharing, timed_views, hessian[index], part_number, next_view)
 
 
 def own_and_shared(problem: CarProblem, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -203,30 +196,16 @@ def _tracks(cars: CarBatch, usable: Tensor) -> list[list[int]]:
 class _Quadratics:
     """What each of B views says of its code about where it ended, its pose following: `c^T A c / 2 - b^T c`."""
 
-    A: Tensor  # (B, K, K), without what is known beforehand of shapes
-    b: Tensor  # (B, K, 1), likewise
-    known: Tensor  # (B, K, K) which is this, about the mean shape
-
-    @classmethod
-    def of(cls, problem: CarProblem, minimum: Minimum[CarState]) -> tuple[_Quadratics, Tensor]:
-        """And where (B,) there are any."""
-        own, shared = own_and_shared(problem, minimum.status.device)
-        is_known = torch.tensor([name == _KNOWN_ONCE for name in problem.term_names], device=own.device)
-        curvatures, slopes = minimum.after.hessian, minimum.after.gradient
-        # All slopes of a minimum add up to nothing.
-        known, of_known = curvatures[:, is_known].sum(dim=1), slopes[:, is_known].sum(dim=1)
-        A, right, has_any = said_of_shared(curvatures.sum(dim=1) - known, -of_known, own, shared)
-        b = A @ minimum.end.code.to(A)[:, :, None] + right[:, :, None]
-        return cls(A, b, known[:, shared[:, None], shared]), has_any
+    A: Tensor  # (B, K, K)
+    b: Tensor  # (B, K, 1)
 
     def saved(self, views: list[int]) -> list[float]:
         """Twice the cost that is saved if before and after each cut in time have a shape of their own."""
         index = torch.tensor(views, device=self.A.device)
         A, b = (x.index_select(0, index).cumsum(dim=0) for x in (self.A, self.b))
-        known = self.known.index_select(0, index).mean(dim=0)
 
         def twice_least(A: Tensor, b: Tensor) -> Tensor:
-            solution: Tensor = torch.linalg.solve_ex(A + known, b)[0]
+            solution: Tensor = torch.linalg.solve_ex(A, b)[0]
             return -(b * solution).sum(dim=(1, 2))
 
         together = twice_least(A[-1:], b[-1:])
@@ -246,35 +225,25 @@ def _of_one_car(views: list[int], says: _Quadratics) -> list[list[int]]:
     return _of_one_car(views[: cut + 1], says) + _of_one_car(views[cut + 1 :], says)
 
 
-def _once(problem: CarProblem, sharing: Groups) -> Tensor:
-    """How much of each column of the cost (R, T) counts, so that a track knows once what is known of its shape."""
-    share = _share(sharing)
-    columns = [share if name == _KNOWN_ONCE else torch.ones_like(share) for name in problem.term_names]
-    return torch.stack(columns, dim=1)
-
-
-def _share(sharing: Groups) -> Tensor:
-    """One over the number of views in the group of each (R,), float64."""
-    everybody = sharing.everybody
-    return 1 / sharing.total(everybody.to(torch.float64), everybody)
-
-
 def in_tracks(problem: CarProblem, sharing: Groups, views: CarBatch, alone: CarState, next_view: Tensor) -> CarProblem:
     """The last stage of a problem of R views: one shape in each group, a path where times are known, each view seen in
     the next."""
-    factors = _once(problem, sharing) if problem.factors is None else _once(problem, sharing) * problem.factors
+    everybody = sharing.everybody
+    one = everybody.to(torch.float64)
+    factors = one[:, None].expand(-1, len(problem.term_names)) if problem.factors is None else problem.factors
     last = problem.config.stages[-1]
     # Views that look at each other take more steps to settle.
     last = replace(last, max_iterations=_MORE_ITERATIONS * last.max_iterations)
     config = replace(problem.config, stages=(last,))
     terms: list[Term] = [*motion_terms(config.tracks, views)]
-    columns = [hold_of_path(config.tracks, sharing, views, alone), _share(sharing)] if terms else []
+    # A track has one acceleration, whoever its views are.
+    columns = [hold_of_path(config.tracks, sharing, views, alone), 1 / sharing.total(one, everybody)] if terms else []
     num_path = NUM_PATH if terms else 0
     stereo = next((term for term in problem.terms if isinstance(term, Photometric)), None)
     num_next = int(stereo is not None and config.tracks.next_view_weight > 0)
     if stereo is not None and num_next:
         terms.append(NextView(config.tracks.next_view_weight, stereo, NextViews.of(views, next_view)))
-        columns.append(torch.ones_like(factors[:, 0]))
+        columns.append(one)
     own = len(problem.terms) - problem.num_extra
     before = sum(len(term.names) for term in problem.terms[:own])
     first = len(sharing.own) + len(sharing.shared)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from directshape_torch.export.export_run import export_run
 from directshape_torch.export.painted_cars import MIRRORED, NEUTRAL, NEUTRAL_RGB, SEEN
+from directshape_torch.io.kitti_layout import KittiLayout
 from directshape_torch.io.result_files import read_shapes, write_shapes
 from directshape_torch.io.run_folder import RunFolder
 
@@ -188,7 +189,13 @@ def with_tracks(
     return RunFolder(folder)
 
 
-def test_a_car_moves_through_the_poses_of_its_track(finished: FinishedRun, tmp_path: Path) -> None:
+@pytest.mark.parametrize("interval_s", [None, 0.25])
+def test_a_car_moves_through_the_poses_of_its_track(
+    finished: FinishedRun, tmp_path: Path, interval_s: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if interval_s is not None:
+        motion = {"000000": (7.0, None), "000001": (7.0 + interval_s, None)}
+        monkeypatch.setattr(KittiLayout, "motion", lambda _, frame_id: motion[frame_id])
     run = with_tracks(finished, tmp_path / "run", ("000007", ""), [(0, -1), (0, -1)])
     export_run(run, tmp_path, ["glb"], finished.inputs())
     assert sorted(path.stem for path in (tmp_path / "glb").iterdir()) == ["000000", "000001", "track_000007"]
@@ -197,7 +204,7 @@ def test_a_car_moves_through_the_poses_of_its_track(finished: FinishedRun, tmp_p
     samplers = {each.target.path: animation.samplers[each.sampler] for each in animation.channels}
     assert all(file.gltf.nodes[each.target.node].name == "car" for each in animation.channels)
     times = file.gltf.accessors[samplers["rotation"].input]
-    assert (times.min, times.max) == ([0.0], pytest.approx([0.1]))
+    assert (times.min, times.max) == ([0.0], pytest.approx([interval_s or 0.1]))
     translation, rotation = (
         file.numbers(samplers[path].output).astype(np.float64) for path in ("translation", "rotation")
     )

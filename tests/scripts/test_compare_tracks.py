@@ -7,7 +7,9 @@ from dataclasses import replace
 import torch
 from compare_tracks import CarOfFrame, _reach, _turning, table
 
-CAR = CarOfFrame("0001", "0001_000000", 3, 1, 3, 0, 14.0, -3.1, True, "converged", 0.9, 0.6, 0.8, 0.1, 0.02, -0.2, 0.5)
+CAR = CarOfFrame(
+    "0001", "0001_000000", 3, 1, 3, 0, 14.0, -3.1, True, "converged", 0.9, 0.6, 0.8, 0.1, 0.02, -0.2, 1.5, 2.5, 0.5
+)
 
 
 def test_faces_are_where_the_box_begins_and_ends_along_the_ray() -> None:
@@ -31,6 +33,7 @@ def test_the_table_compares_the_same_cars() -> None:
     lines = table([CAR, other, together], turn_deg=20.0)
     assert lines[1] == "all cars (1 views):"
     row = next(line for line in lines if line.startswith("| 2 |"))
-    assert row == "| 2 | 100.0% | 0.600 | 0.700 | 10.0%, 0.0% | 100.0% | 0.000 m | 0.020 m | 0.200 m | 0.50 |"
+    faces = "0.000 m, 0.000 m | 0.020 m | 0.200 m"
+    assert row == f"| 2 | 100.0% | 0.600 | 0.700 | 10.0%, 0.0% | 100.0%, 0.0% | {faces} | 100%, 0% | 0.50 |"
     assert "2 frames: 1 of 1 tracks split" in lines
     assert lines[-1] == "| 2 | - | 2.0, 20.0 cm (1) | - | - |"
