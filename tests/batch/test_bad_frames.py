@@ -15,7 +15,7 @@ from helpers.output_folders import result_files
 from helpers.quick_runs import dataset, refine, refiner
 
 from directshape_torch.batch.options import RefineOptions, RunObserver
-from directshape_torch.batch.refine_dataset import refine_dataset, run_manifest
+from directshape_torch.batch.refine_dataset import run_manifest
 from directshape_torch.batch.resumption import EarlierResults
 from directshape_torch.errors import DirectShapeError
 from directshape_torch.io.result_files import read_shapes
@@ -64,7 +64,7 @@ def test_an_unforeseen_error_fails_its_frame_alone(shared_kitti: Path, tmp_path:
                 raise ZeroDivisionError("of this frame alone")
             return super().forward(frames, *args)
 
-    summary = refine_dataset(dataset(shared_kitti), Sensitive(shared_kitti), tmp_path, RefineOptions(batch_frames=3))
+    summary = refine(shared_kitti, tmp_path, Sensitive(shared_kitti), batch_frames=3)
     assert summary.failed == {FRAMES[1]: "ZeroDivisionError: of this frame alone"}
 
 
@@ -74,7 +74,7 @@ def test_too_little_memory_says_what_to_do(shared_kitti: Path, tmp_path: Path, m
 
     too_big = refiner(shared_kitti)
     monkeypatch.setattr(too_big, "forward", no_memory)
-    summary = refine_dataset(dataset(shared_kitti), too_big, tmp_path, RefineOptions(batch_frames=2))
+    summary = refine(shared_kitti, tmp_path, too_big, batch_frames=2)
     assert summary.exit_code == 1
     assert list(summary.failed) == list(FRAMES)
     assert "too little memory for 1 frame in a call (OutOfMemoryError: CUDA" in summary.failed["000002"]
@@ -89,9 +89,7 @@ def test_a_call_that_does_not_fit_is_halved(shared_kitti: Path, tmp_path: Path) 
                 raise RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory")
             return super().forward(frames, *args)
 
-    summary = refine_dataset(
-        dataset(shared_kitti), Small(shared_kitti), tmp_path / "halved", RefineOptions(batch_frames=3)
-    )
+    summary = refine(shared_kitti, tmp_path / "halved", Small(shared_kitti), batch_frames=3)
     assert summary.exit_code == 0
     # 3 = 2 + 1, and 2 = 1 + 1.
     assert any(warning.startswith("2 calls did not work with all of their frames") for warning in summary.warnings)
@@ -128,7 +126,7 @@ def test_a_full_disk_stops_the_run_and_the_next_goes_on(
             monkeypatch.setattr("directshape_torch.batch.group_refinement.write_frame_outputs", full)
 
     with pytest.raises(DirectShapeError, match=r"cannot write to .*No space left.*run the same command again"):
-        refine_dataset(dataset(shared_kitti), refiner(shared_kitti), tmp_path, observer=Filler())
+        refine(shared_kitti, tmp_path, observer=Filler())
     monkeypatch.undo()
     summary = refine(shared_kitti, tmp_path)
     assert (summary.resumed, summary.exit_code) == (FRAMES[:1], 0)

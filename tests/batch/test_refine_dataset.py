@@ -16,7 +16,7 @@ from helpers.quick_runs import dataset, refine
 
 from directshape_torch import compile as compile_module
 from directshape_torch.batch.options import RefineOptions
-from directshape_torch.batch.refine_dataset import expected_cars, refine_dataset
+from directshape_torch.batch.refine_dataset import expected_cars
 from directshape_torch.errors import InputError
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.kitti_labels import read_objects
@@ -149,7 +149,7 @@ def test_a_long_run_compiles_from_its_first_frame_and_a_short_one_never(
     monkeypatch.setattr("directshape_torch.batch.refine_dataset.expected_cars", lambda *_: 5000)
     # The number is what counts here; compiling for it would take minutes.
     watched = Watched(PCAShapePrior.load(kitti_copy / "prior.npz"), load_config(None, [*FEW_STEPS, "compile=off"]))
-    refine_dataset(dataset(kitti_copy), watched, tmp_path)
+    refine(kitti_copy, tmp_path, watched)
     # The same for every call: neither the calls before nor an interruption change what is compiled.
     assert counts == [5000, 5000]
     assert compile_module._job.get() is None

@@ -9,9 +9,8 @@ import pytest
 from helpers.faulty_refiners import FEW_STEPS
 from helpers.kitti_folder import FRAMES
 from helpers.output_folders import result_files
-from helpers.quick_runs import dataset, refine, refiner
+from helpers.quick_runs import refine
 
-from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.errors import ResumeError
 from directshape_torch.io.config_files import load_config
 from directshape_torch.io.run_folder import RunFolder
@@ -40,7 +39,7 @@ def test_an_interrupted_run_continues_to_the_same_files(shared_kitti: Path, tmp_
                 raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        refine_dataset(dataset(shared_kitti), refiner(shared_kitti), tmp_path / "a", observer=Impatient())
+        refine(shared_kitti, tmp_path / "a", observer=Impatient())
     assert not (tmp_path / "a" / "data" / f"{FRAMES[1]}.txt").exists()
     summary = refine(shared_kitti, tmp_path / "a")
     assert summary.resumed == (FRAMES[0],)
@@ -88,7 +87,7 @@ def test_another_prior_or_input_is_named(kitti_copy: Path, tmp_path: Path) -> No
     prior = PCAShapePrior.load(kitti_copy / "prior.npz")
     prior.mean += 0.001
     with pytest.raises(ResumeError, match="sha256 of 'prior'"):
-        refine_dataset(dataset(kitti_copy), DirectShapeRefiner(prior, load_config(None, FEW_STEPS)), tmp_path / "out")
+        refine(kitti_copy, tmp_path / "out", DirectShapeRefiner(prior, load_config(None, FEW_STEPS)))
     (kitti_copy / "masks" / "000001.json").write_text("[]")
     with pytest.raises(ResumeError, match="frame 000001: sha256 of 'masks_0'"):
         refine(kitti_copy, tmp_path / "out")

@@ -11,10 +11,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import quick_runs
 from helpers.faulty_refiners import QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
@@ -24,11 +26,10 @@ from directshape_torch.batch.options import RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_log import RunLog, log_path
 from directshape_torch.batch.run_status import read_status
-from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.errors import DirectShapeError, RunInProgressError
 from directshape_torch.io.run_folder import done_frames
-from directshape_torch.io.stereo_dataset import open_dataset
 
+refine = partial(quick_runs.refine, threads=1)
 FRAMES = tuple(f"{number:06d}" for number in range(6))
 TESTS = Path(__file__).parent.parent
 _PATIENCE_S = 120.0
@@ -39,11 +40,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti")
     write_data_set(root, FRAMES)
     return root
-
-
-def refine(root: Path, out: Path, fresh: bool = False, **options: int) -> RunSummary:
-    dataset = open_dataset("kitti", root, root / "detections", root / "masks")
-    return refine_dataset(dataset, QuickRefiner(root), out, RefineOptions(threads=1, **options), fresh=fresh)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +183,7 @@ def test_frames_without_an_entry_in_the_summary_are_finished(root: Path, tmp_pat
     out = Path(shutil.copytree(undisturbed, tmp_path / "out"))
     summary = json.loads((out / "summary.json").read_text())
     (out / "summary.json").write_text(json.dumps({**summary, "frames": {}}))
-    one = open_dataset("kitti", root, root / "detections", root / "masks", frames=FRAMES[:1])
+    one = quick_runs.dataset(root, frames=FRAMES[:1])
     assert refine_dataset(one, QuickRefiner(root), out, RefineOptions(threads=1)).resumed == FRAMES[:1]
     assert result_files(out) == result_files(undisturbed)
 

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import quick_runs
 from helpers.faulty_refiners import DeadlyRefiner, HungryRefiner, QuickRefiner
 from helpers.kitti_folder import write_data_set
 from helpers.output_folders import result_files
 
 from directshape_torch.batch.frame_groups import FrameGroup, frame_groups
 from directshape_torch.batch.group_refinement import GroupReport
-from directshape_torch.batch.options import RefineOptions, RunObserver
-from directshape_torch.batch.refine_dataset import refine_dataset
+from directshape_torch.batch.options import RunObserver
 from directshape_torch.batch.run_status import read_status
-from directshape_torch.batch.run_summary import RunSummary, RunTimings
+from directshape_torch.batch.run_summary import RunTimings
 from directshape_torch.batch.workers import GroupDispatch, WorkerDiedError
 from directshape_torch.errors import DirectShapeError
-from directshape_torch.io.stereo_dataset import open_dataset
-from directshape_torch.refiner import DirectShapeRefiner
 
 
 class Imagined:
@@ -93,6 +92,7 @@ def test_workers_that_never_finish_anything_end_the_run() -> None:
     assert run.num_deaths == 6
 
 
+refine = partial(quick_runs.refine, meshes="ply")
 FRAMES = tuple(f"{number:06d}" for number in range(5))
 
 
@@ -111,22 +111,11 @@ class Listener(RunObserver):
         self.ended.append((frame_id, failure is None))
 
 
-def refine(
-    root: Path,
-    out: Path,
-    refiner: DirectShapeRefiner,
-    listener: RunObserver | None = None,
-    **options: int,
-) -> RunSummary:
-    dataset = open_dataset("kitti", root, root / "detections", root / "masks")
-    return refine_dataset(dataset, refiner, out, RefineOptions("ply", **options), listener)
-
-
 def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root: Path, tmp_path: Path) -> None:
     refine(root, tmp_path / "one", QuickRefiner(root), batch_frames=2, threads=1)
     listener = Listener()
     deadly = DeadlyRefiner(root, tmp_path, once=[FRAMES[3]])
-    summary = refine(root, tmp_path / "two", deadly, listener, batch_frames=2, workers=2)
+    summary = refine(root, tmp_path / "two", deadly, observer=listener, batch_frames=2, workers=2)
     assert (tmp_path / FRAMES[3]).exists(), "nobody was killed"
     assert summary.exit_code == 0
     assert sorted(listener.ended) == [(frame_id, True) for frame_id in FRAMES]
@@ -142,7 +131,7 @@ def test_two_workers_of_which_one_is_killed_write_the_bytes_of_one_process(root:
 def test_a_frame_that_kills_its_worker_fails_and_the_others_go_on(root: Path, tmp_path: Path) -> None:
     deadly = DeadlyRefiner(root, tmp_path, always=[FRAMES[1]])
     listener = Listener()
-    summary = refine(root, tmp_path / "out", deadly, listener, batch_frames=1, workers=1, retries=0)
+    summary = refine(root, tmp_path / "out", deadly, observer=listener, batch_frames=1, workers=1, retries=0)
     assert summary.exit_code == 1
     assert summary.failed == {FRAMES[1]: "its worker died each of 1 times (killed, out of memory or crashed)"}
     assert sorted(listener.ended) == [(frame_id, frame_id != FRAMES[1]) for frame_id in FRAMES]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from directshape_torch.batch.options import RefineOptions
+from directshape_torch.batch.options import RefineOptions, RunObserver
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import RunSummary
 from directshape_torch.config import RefinerConfig
@@ -23,5 +23,16 @@ def refiner(root: Path, config: RefinerConfig | None = None) -> DirectShapeRefin
     return DirectShapeRefiner(PCAShapePrior.load(root / "prior.npz"), config or few_steps())
 
 
-def refine(root: Path, out: Path, *, config: RefinerConfig | None = None, **options: Any) -> RunSummary:
-    return refine_dataset(dataset(root), refiner(root, config), out, RefineOptions(**options))
+def refine(
+    root: Path,
+    out: Path,
+    made: DirectShapeRefiner | None = None,
+    *,
+    config: RefinerConfig | None = None,
+    observer: RunObserver | None = None,
+    fresh: bool = False,
+    **options: Any,
+) -> RunSummary:
+    """By a refiner of one's own, or a quick one."""
+    made = made or refiner(root, config)
+    return refine_dataset(dataset(root), made, out, RefineOptions(**options), observer, fresh=fresh)
