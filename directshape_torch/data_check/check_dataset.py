@@ -65,12 +65,7 @@ def check_dataset(
 
 
 def spread(frame_ids: Sequence[str], count: int | None) -> tuple[str, ...]:
-    """At most `count` of the frames, evenly spread, the first among them.
-
-    Examples:
-        >>> spread("abcdefgh", 3)
-        ('a', 'c', 'f')
-    """
+    """At most `count` of the frames, evenly spread, the first among them."""
     if count is None or count >= len(frame_ids):
         return tuple(frame_ids)
     return tuple(frame_ids[index * len(frame_ids) // count] for index in range(count))

@@ -120,17 +120,7 @@ class MatchedPair(NamedTuple):
         disparity: Tensor,  # (P,) start, pixels
         row_shift: Tensor,  # (P,) start of v_left - v_right, pixels
     ) -> RefinedDisparity:
-        """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset.
-
-        Examples:
-            >>> u = torch.arange(60, dtype=torch.float64)
-            >>> rows = 30 * torch.cos(u[:20, None] / 2)
-            >>> left, right = (100 + 50 * torch.sin((u + shift) / 3) + rows for shift in (0.0, 7.3))
-            >>> pair = MatchedPair(left, right, torch.full_like(left, 7.0))
-            >>> found = pair.aligned(torch.tensor([[30.0, 10.0]]).double(), u[7:8], u[:1])
-            >>> round(float(found.disparity), 1), bool(found.reliable)
-            (7.3, True)
-        """
+        """Align a 9 x 9 patch round each left pixel with the right image, robustly, free of gain and offset."""
         start = uv_left - torch.stack([disparity, row_shift], dim=-1)
         uv_right, reliable = align_patches(self.grey_left, self.grey_right, uv_left, start, _OF_DISPARITY)
         disparity, row_shift = (uv_left - uv_right).unbind(dim=-1)

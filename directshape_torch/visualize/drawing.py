@@ -105,12 +105,7 @@ def pixel_grid(window: Window, columns: int) -> Tensor:
 
 
 def blue_white_red(values: Array, limit: float) -> Array:
-    """Colours (*, 3), 0 .. 255: blue from -limit on, white at 0, red from the limit on; nothing for NaN.
-
-    Examples:
-        >>> blue_white_red(np.array([-9.0, 0.0, 1.0]), 2.0).tolist()
-        [[49.0, 87.0, 200.0], [245.0, 245.0, 245.0], [229.5, 146.0, 142.0]]
-    """
+    """Colours (*, 3), 0 .. 255: blue from -limit on, white at 0 and for NaN, red from the limit on."""
     share = np.clip(np.nan_to_num(values) / limit, -1, 1)[..., None]
     white, red, blue = (np.array(c, dtype=np.float64) for c in ((245, 245, 245), (214, 47, 39), (49, 87, 200)))
     return np.asarray(white + np.abs(share) * (np.where(share > 0, red, blue) - white))
