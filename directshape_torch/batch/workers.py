@@ -29,6 +29,9 @@ class WorkerDiedError(Exception):
     """The process that worked on a group ended without an answer."""
 
 
+_Outcomes = list[tuple[FrameGroup, GroupReport | WorkerDiedError]]
+
+
 class Workers(Protocol):
     """Refine groups of frames: `capacity` at once; `close` lets those at hand come to their end."""
 
@@ -37,7 +40,7 @@ class Workers(Protocol):
 
     def hand_out(self, group: FrameGroup) -> None: ...
 
-    def next_reports(self) -> list[tuple[FrameGroup, GroupReport | WorkerDiedError]]: ...
+    def next_reports(self) -> _Outcomes: ...
 
     def close(self) -> None: ...
 
@@ -111,7 +114,7 @@ class ThisProcess:
         """Note it."""
         self._handed_out.append(group)
 
-    def next_reports(self) -> list[tuple[FrameGroup, GroupReport | WorkerDiedError]]:
+    def next_reports(self) -> _Outcomes:
         """Refine the group."""
         group = self._handed_out.popleft()
         return [(group, refine_group(self._job, group))]
@@ -166,7 +169,7 @@ class LocalWorkers:
             # It is dead, as its pipe tells whoever waits for the report.
             return
 
-    def next_reports(self) -> list[tuple[FrameGroup, GroupReport | WorkerDiedError]]:
+    def next_reports(self) -> _Outcomes:
         """Wait for any process.
 
         Raises:

@@ -12,8 +12,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
-from directshape_torch.batch.options import RefineOptions
+from directshape_torch.batch.options import MeshFormat, RefineOptions
 from directshape_torch.batch.refine_dataset import refine_dataset
 from directshape_torch.batch.run_summary import format_summary
 from directshape_torch.cli.options import (
@@ -62,7 +63,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def _add_outputs(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--out", type=Path, required=True, metavar="DIR", help="gets data, shapes, summary.json ..")
-    group.add_argument("--meshes", choices=("ply", "glb"), help="write the surface of each refined car")
+    group.add_argument("--meshes", choices=get_args(MeshFormat), help="write the surface of each refined car")
     group.add_argument("--overlays", action="store_true", help="write a picture of each frame, before and after")
     group.add_argument(
         "--fresh", action="store_true", help="remove the results that runs have left in DIR, start again"

@@ -8,6 +8,7 @@ from dataclasses import fields
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
 from directshape_torch.errors import InputError
 from directshape_torch.geometry.disparity_field import DisparityField
@@ -70,10 +71,8 @@ def _disparities(maps: Sequence[Tensor | None], size_hw: tuple[int, int]) -> Ten
 
 
 def _points(clouds: Sequence[Tensor | None]) -> Tensor | None:
-    known = _all_or_none(clouds, "LiDAR points")
-    most = max((points.shape[1] for points in known), default=0)
-    grown = [pad(points, (0, 0, 0, most - points.shape[1]), value=torch.nan) for points in known]
-    return torch.cat(grown) if grown else None
+    known = [points[0] for points in _all_or_none(clouds, "LiDAR points")]
+    return pad_sequence(known, batch_first=True, padding_value=torch.nan) if known else None
 
 
 def _all_or_none(parts: Sequence[Tensor | None], what: str) -> list[Tensor]:

@@ -349,7 +349,8 @@ def _chosen_frames(
         known = wanted
     if not known:
         files = f"detection file {layout.detection_file_name} in {layout.detections_dir}"
-        raise InputError("frames", f"at least one {files if split is None else f'frame in {split}'}", "none")
+        cure = "name the folder that holds these files" if split is None else ""
+        raise InputError("frames", f"at least one {files if split is None else f'frame in {split}'}", "none", cure)
     for frame_id in known:
         if not is_frame_id(frame_id):
             where = "frames" if split is None else f"{split}, frames"
