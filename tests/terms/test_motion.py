@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -108,13 +109,20 @@ def test_the_fitted_path_is_the_cheapest_for_views_where_they_are() -> None:
     assert summed.abs().max() < 1e-6 * float(cost(path).detach() + 1)
 
 
-def drive(time_s: Tensor | None, T_world_cam: Tensor | None = None) -> tuple[FrameBatch, Detections]:
-    """Three frames of a car that goes straight on, from boxes that are off."""
+@cache
+def seen() -> tuple[FrameBatch, Detections]:
+    """Three frames of a car that goes straight on, with boxes that are off; nobody changes it."""
     prior, code = ellipsoid_prior(), torch.tensor([[0.5, -0.4, 0.3]], dtype=torch.float64)
-    seen = [street(prior, [(-1.0, CAMERA_HEIGHT_M, 9.0 + n)], [1.3], code) for n in range(3)]
-    detections = joined_detections([view.detections for view in seen], (120, 160))
-    frames = replace(joined_frames([view.frames for view in seen]), time_s=time_s, T_world_cam=T_world_cam)
-    return frames, replace(disturbed(detections), track_id=torch.zeros(3, dtype=torch.long))
+    views = [street(prior, [(-1.0, CAMERA_HEIGHT_M, 9.0 + n)], [1.3], code) for n in range(3)]
+    detections = joined_detections([view.detections for view in views], (120, 160))
+    track = replace(disturbed(detections), track_id=torch.zeros(3, dtype=torch.long))
+    return joined_frames([view.frames for view in views]), track
+
+
+def drive(time_s: Tensor | None, T_world_cam: Tensor | None = None) -> tuple[FrameBatch, Detections]:
+    """They at these times, from a camera that goes there."""
+    frames, detections = seen()
+    return replace(frames, time_s=time_s, T_world_cam=T_world_cam), detections
 
 
 def refined(
