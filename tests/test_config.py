@@ -146,10 +146,6 @@ def test_round_trip() -> None:
     assert config_from_mapping(RefinerConfig, config_to_mapping(config)) == config
 
 
-def test_numbers_that_yaml_reads_as_text() -> None:
-    assert load_config(None, ["priors.tilt_weight=1e7"]).priors.tilt_weight == 1e7
-
-
 def test_on_and_off_are_words_though_yaml_reads_truth_values(tmp_path: Path) -> None:
     file = tmp_path / "off.yaml"
     file.write_text("compile: off\n")
@@ -205,10 +201,3 @@ def test_errors_name_file_and_overrides(tmp_path: Path) -> None:
     )
     with pytest.raises(ConfigError, match=r"^refiner\.solver\.max_code: expected a finite number, above 0, got 0\.0$"):
         config_from_mapping(RefinerConfig, {"solver": {"max_code": 0}}, "refiner.")
-
-
-def test_a_file_that_is_no_text_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "picture.yaml"
-    path.write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(ConfigError, match=r"picture\.yaml: cannot be read as a YAML configuration"):
-        load_config(path)

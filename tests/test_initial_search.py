@@ -56,13 +56,6 @@ def _cars(scene: Street) -> CarBatch:
     return CarBatch.from_scene(scene.frames, scene.detections)
 
 
-def test_no_offsets_are_no_search() -> None:
-    prior, scene = cached_street()
-    problem, initial = DirectShapeRefiner(prior, DEFAULT).problem(scene.frames, scene.detections)
-    start = search_start(problem, initial, _cars(scene).search_moves(SearchConfig((), ())))
-    assert torch.equal(start.T_obj_cam, initial.T_obj_cam)
-
-
 def test_a_perfect_start_is_kept() -> None:
     scene = cached_street()[1]
     problem, initial = DirectShapeRefiner(ellipsoid_prior(), DEFAULT).problem(scene.frames, scene.detections)

@@ -141,14 +141,6 @@ def test_without_a_map_the_images_are_matched() -> None:
     assert centre_errors(result.T_cam_obj)[0] < 0.5 * centre_errors(detections.T_cam_obj)[0]
 
 
-def test_float32() -> None:
-    prior, scene = measured_street(torch.float32)
-    result = DirectShapeRefiner(prior, GEOMETRIC)(scene.frames, disturbed(scene.detections, 0.25, 0.08))
-    assert result.T_cam_obj.dtype == torch.float32
-    reference = refine(GEOMETRIC, *scene_of())
-    torch.testing.assert_close(result.T_cam_obj.double(), reference.T_cam_obj, rtol=0, atol=0.02)
-
-
 @pytest.mark.parametrize("mode", ["implicit", "unroll"])
 def test_gradients_reach_the_disparity(mode: Any) -> None:
     """A wider disparity brings the car nearer: the derivative of depth by all disparities is `-z^2 / (f b)`."""

@@ -13,13 +13,7 @@ from kornia.geometry import camera as kornia_camera
 from kornia.geometry.camera.pinhole import PinholeCamerasList
 
 from directshape_torch.errors import (
-    ConfigError,
-    DataFormatError,
-    DirectShapeError,
     InputError,
-    MeshError,
-    MissingDependencyError,
-    ResumeError,
 )
 from directshape_torch.geometry import se3
 from directshape_torch.geometry.projection import project
@@ -126,22 +120,6 @@ def test_wrong_frames_are_named(changes: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError) as error:
         replace(cached_street()[1].frames, **changes)
     assert text in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "wrong"),
-    [
-        ("T_cam_obj", torch.zeros(2, 3, 4)),
-        ("dimensions_hwl", torch.zeros(3, 3)),
-        ("box_2d", torch.zeros(2, 5)),
-        ("score", torch.zeros(2, 1)),
-        ("mask_right", torch.zeros(2, 50, 160)),
-        ("has_mask_left", torch.zeros(3, dtype=torch.bool)),
-    ],
-)
-def test_wrong_detections_are_named(name: str, wrong: torch.Tensor) -> None:
-    with pytest.raises(InputError, match=f"{name}: expected shape"):
-        replace(cached_street()[1].detections, **{name: wrong})
 
 
 @pytest.mark.parametrize(
@@ -329,11 +307,6 @@ def test_moving_to_a_dtype_keeps_integers_and_masks() -> None:
     assert frames.frame_ids == scene.frames.frame_ids
 
 
-def test_occluders_have_as_many_masks_as_depths() -> None:
-    with pytest.raises(InputError, match="depth_m"):
-        Occluders(torch.zeros(2).long(), torch.zeros(2, 4, 4), torch.zeros(2, 4, 4), torch.zeros(3), torch.zeros(2))
-
-
 def test_whoever_hides_cars_hides_whichever_are_chosen() -> None:
     masks = torch.zeros(3, 120, 160)
     occluders = Occluders(torch.zeros(3).long(), masks, masks, torch.ones(3), torch.ones(3))
@@ -353,12 +326,3 @@ def test_status_codes_are_stable_and_messages_advise() -> None:
     assert [s.name for s in Status if s.is_refined] == ["converged", "max_iterations"]
     assert all(Status.from_code(s.code) is s for s in Status)
     assert len({s.value for s in Status}) == len(Status)
-
-
-def test_errors_share_a_base_and_say_where() -> None:
-    kinds = (InputError, DataFormatError, ConfigError, MeshError, ResumeError, MissingDependencyError)
-    assert all(issubclass(kind, DirectShapeError) for kind in kinds)
-    error = DataFormatError("a/000001.txt", "expected 15 columns", line_number=3, line="Car 0", cure="check it")
-    assert str(error) == "a/000001.txt, line 3: expected 15 columns: 'Car 0'; check it"
-    missing = MissingDependencyError("mitsuba", "render", "rendering")
-    assert "pip install 'directshape_torch[render]'" in str(missing)

@@ -128,12 +128,12 @@ TARGETS: dict[str, Target] = {
     "rays": Target(
         "directshape_torch/geometry/camera.py",
         ("rays_from_pixels", "right_rays"),
-        ("tests/geometry/test_pinhole.py", "tests/geometry/test_stereo.py"),
+        ("tests/geometry/test_stereo.py",),
     ),
     "projection": Target(
         "directshape_torch/geometry/projection.py",
         ("project", "warp_to_right"),
-        ("tests/geometry/test_pinhole.py", "tests/geometry/test_stereo.py"),
+        ("tests/geometry/test_stereo.py",),
     ),
     "bilinear": Target(
         "directshape_torch/image/interpolate.py",
@@ -188,7 +188,7 @@ TARGETS: dict[str, Target] = {
     "bracket": Target(
         "directshape_torch/terms/depth.py",
         ("Bracket.between", "Bracket.probed", "_line_zero"),
-        ("tests/shape/test_bracket.py", _MINIMUM),
+        ("tests/shape/test_ray_minimum.py", _MINIMUM),
     ),
     "neural_prior": Target(
         "directshape_torch/shape/neural_prior.py",

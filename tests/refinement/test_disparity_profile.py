@@ -71,16 +71,6 @@ def test_the_minimum_is_where_the_right_image_was_moved_to(shift_px: int) -> Non
     assert (profile.after.sigma_px < 0.1).all()
 
 
-def test_a_profile_is_never_differentiated_and_its_offsets_belong_to_it() -> None:
-    scene = far_street()
-    frames = replace(scene.frames, images_right=scene.frames.images_right.clone().requires_grad_())
-    stage, state = begun(frames, scene)
-    profile = profile_at(stage, state, state)
-    assert not profile.cost_after.requires_grad
-    profile.offsets_px.zero_()
-    assert torch.equal(profile_at(stage, state, state).offsets_px, OFFSETS)
-
-
 def test_a_car_that_begins_too_far_away_is_pulled_nearer() -> None:
     scene = far_street()
     stage, truth = begun(scene.frames, scene)
@@ -89,50 +79,6 @@ def test_a_car_that_begins_too_far_away_is_pulled_nearer() -> None:
     found = profile_at(stage, start, truth)
     torch.testing.assert_close(found.before.offset_px, torch.full((2,), 1.5).double(), atol=0.15, rtol=0)
     torch.testing.assert_close(found.after.offset_px, torch.zeros(2).double(), atol=0.05, rtol=0)
-
-
-def test_the_term_at_rigidly_moved_states_agrees() -> None:
-    """The slow way: a car moved along its ray and marched anew; of a far car all surface moves by one disparity."""
-    scene = far_street()
-    # Without the rim, which a car further away leaves: 2 px of disparity are 10 % of its size.
-    inner = 1 - torch.nn.functional.max_pool2d(1 - scene.detections.mask_left[:, None], 9, 1, 4)[:, 0]
-    scene = replace(scene, detections=replace(scene.detections, mask_left=inner))
-    stage, state = begun(scene.frames, scene)
-    profile = profile_at(stage, state, state, max_pixels=10**6)
-    fixed, surface = photometric_of(stage).pixel_set, surface_at(stage, state)
-    assert surface is not None
-    for car, origin_depth in enumerate((60.0, 72.0)):
-        # The side that is seen is nearer than the origin, so that its disparity changes by more.
-        mine = fixed.filled & (fixed.blocks.owner == car)[:, None]
-        nearer = float(origin_depth / surface.depth[mine].mean()) ** 2
-        for offset in (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0):
-            moved = move_by_disparity(state, torch.full((2,), 2200 * 0.53).double(), offset / nearer)
-            slow = photometric_cost(stage, moved)[car]
-            fast = profile.cost_after[car, int(offset / 0.25) + 12]
-            torch.testing.assert_close(fast, slow, rtol=0.04, atol=1e-6)
-
-
-def _zigzag(u: Tensor) -> Tensor:
-    """Period 4 px, so that its samples at whole pixels hold all of it."""
-    return 100 + 40 * ((u - 4 * (u / 4).round()).abs() - 1)
-
-
-def test_repeated_texture_is_ambiguous() -> None:
-    """Stripes of 4 px, the car between two of them: minima at -2 and 2 px, equally low."""
-    scene = far_street()
-    stage, state = begun(scene.frames, scene)
-    term, surface = photometric_of(stage), surface_at(stage, state)
-    assert surface is not None
-    rows = term.pixel_set.rows
-    u, _, w = rows.along_ray * surface.depth + rows.along_baseline[:, None]
-    right = _zigzag(torch.arange(280).double()).repeat(200)
-    striped = rows._replace(intensity_left=_zigzag(u / w + 2), right=rows.right._replace(pixels=right))
-    fixed = replace(term, fixed=term.pixel_set._replace(rows=striped))
-    stage = replace(stage, terms=tuple(fixed if t is term else t for t in stage.terms))
-    figures = profile_at(stage, state, state).after
-    assert figures.ambiguous.all()
-    torch.testing.assert_close(figures.offset_px.abs(), torch.full((2,), 2.0).double(), atol=0.1, rtol=0)
-    assert (figures.distinctness < 1.2).all()
 
 
 def _figures(cost: Tensor, pixels: float = 100.0) -> dict[str, float]:

@@ -16,7 +16,7 @@ from directshape_torch.errors import InputError
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.shape.check_prior import check_prior
 from directshape_torch.shape.sdf_grid import GridShape
-from directshape_torch.shape.shape_prior import DimensionsDerivative, SdfDerivatives
+from directshape_torch.shape.shape_prior import SdfDerivatives
 
 AUTOGRAD = replace(DEFAULT, solver=replace(DEFAULT.solver, jacobian="autograd"))
 
@@ -56,12 +56,6 @@ class TransposedCodeDerivative(Wrapped):
         return Transposed(shape.values, shape.basis, shape.origin, shape.spacing_m)
 
 
-class NoDimensionsDerivative(Wrapped):
-    def dimensions_and_derivative(self, code: Tensor) -> DimensionsDerivative:
-        at = self.inner.dimensions_and_derivative(code)
-        return at._replace(J_hwl_code=torch.full_like(at.J_hwl_code, torch.nan))
-
-
 class Detached(Wrapped):
     """Derivatives of its own, but none that autograd could find."""
 
@@ -93,7 +87,6 @@ def test_a_wrapped_prior_without_fault_is_taken() -> None:
         (nn.Linear(1, 1), r"prior: expected a ShapePrior, got Linear without \['num_codes', 'bounds_obj'"),
         (WithoutDerivatives(), r"expected a BoundShape, got OnlyValues without \['value_and_derivatives'\]"),
         (TransposedCodeDerivative(), r"J_value_code: expected a tensor of shape \(1, 3\) at one point, got \(3, 1\)"),
-        (NoDimensionsDerivative(), r"dimensions_and_derivative: J_hwl_code: expected finite numbers, got \[\[\[nan"),
     ],
 )
 def test_a_prior_without_gradients_is_refused(prior: nn.Module, message: str) -> None:
@@ -117,14 +110,6 @@ def test_derivatives_need_a_graph_too(config: RefinerConfig) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_ours_has_the_graphs(kind: str) -> None:
     check_prior(prior_of(kind), by_autograd=True)
-
-
-def test_a_refiner_can_be_made_in_inference_mode() -> None:
-    with torch.inference_mode():
-        DirectShapeRefiner(ellipsoid_prior(), DEFAULT)
-    prior = ellipsoid_prior()
-    with torch.inference_mode():
-        DirectShapeRefiner(prior, AUTOGRAD)
 
 
 def test_tensors_of_inference_mode_are_refused_where_a_graph_is_needed() -> None:

@@ -120,18 +120,6 @@ def test_the_inside_is_negative_and_the_bounds_are_outside(kind: str) -> None:
     assert (shape.value(corners, owners(8, 1)) > 0.1).all()
 
 
-def test_nothing_gives_nothing(kind: str) -> None:
-    prior = prior_of(kind)
-    none = prior.initial_code(0)
-    at = prior.bind(none).value_and_derivatives(torch.zeros(0, 3, dtype=torch.float64), owners(0))
-    assert at.value.shape == (0,)
-    assert at.gradient.shape == (0, 3)
-    assert at.J_value_code.shape == (0, prior.num_codes)
-    assert prior.bind(none).value(torch.zeros(0, 3, dtype=torch.float64), owners(0)).shape == (0,)
-    assert prior.values(none).shape[0] == 0
-    assert prior.dimensions_and_derivative(none).J_hwl_code.shape == (0, 3, prior.num_codes)
-
-
 def test_a_nan_point_or_code_touches_no_other(kind: str) -> None:
     prior = prior_of(kind)
     code, points, index = codes(prior, "typical"), points_in(prior, 10), owners(10)

@@ -1,4 +1,4 @@
-"""Trilinear lookups in every form against a slow loop over the corners, autograd and one another."""
+"""Grids: lookups in every form against a slow loop over the corners and autograd, blocks of points, the zero level."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ from collections.abc import Callable
 import pytest
 import torch
 import torch.autograd.forward_ad as fwAD
+from helpers.ellipsoids import ellipsoid_prior
+from helpers.priors import KINDS, prior_of
 from torch import Tensor
 
-from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup
+from directshape_torch.errors import InputError
+from directshape_torch.shape.field import PackedField, field_of
+from directshape_torch.shape.sdf_grid import GridField, GridShape, Lookup, zero_level_extents
 
 ORIGIN = torch.tensor([-1.0, -2.0, 0.5], dtype=torch.float64)
 SPACING = 0.4
@@ -169,3 +173,85 @@ def test_the_gradient_can_be_traced() -> None:
     field, at, owner = random_shape().field, points(20).mT.reshape(3, 2, 10), torch.arange(2)
     traced = torch.compile(field.gradient, backend="eager", fullgraph=True)
     torch.testing.assert_close(traced(at, owner), field.gradient(at, owner), rtol=1e-12, atol=1e-12)
+
+
+OWNERS = torch.tensor([0, 2, 1])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("leading", [(), (5,)])
+def test_blocks_are_packed_points(kind: str, leading: tuple[int, ...]) -> None:
+    """Value, gradient and code derivative, of points inside and outside of the bounds."""
+    prior = prior_of(kind)
+    shape = prior.bind(0.5 * torch.randn(3, prior.num_codes, dtype=torch.float64))
+    points = 2 * torch.randn(3, *leading, 3, 64, dtype=torch.float64)
+    field, packed = field_of(shape), PackedField(shape)
+    assert isinstance(field, GridField) is isinstance(shape, GridShape)
+    at, expected = field.derivatives(points, OWNERS), packed.derivatives(points, OWNERS)
+    for x, y in zip(at, expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(field.value(points, OWNERS), at.value)
+    torch.testing.assert_close(field.gradient(points, OWNERS), at.gradient)
+    assert at.value.shape == (*leading, 3, 64)
+
+
+def test_curvature_along_rays_by_differences() -> None:
+    """Inside one cell, where the distance along a ray is a polynomial."""
+    prior = ellipsoid_prior()
+    shape = prior.bind(prior.initial_code(3))
+    direction = torch.randn(3, 3, 64, dtype=torch.float64)
+    # All rays pass the middles of cells at depth 1.
+    middle = prior.origin + 0.2 * (torch.tensor([12.0, 6.0, 7.0]) + 0.5)
+    centre = middle.view(3, 1, 1) - direction
+    step = torch.tensor([-0.01, 0.0, 0.01], dtype=torch.float64).view(3, 1, 1)
+    points = centre[:, None] + (1 + step) * direction[:, None]
+    before, here, after = field_of(shape).value(points, OWNERS)
+    depth = torch.ones(3, 64, dtype=torch.float64)
+    for block in range(64):
+        one = slice(block, block + 1)
+        found = field_of(shape).curvature_along(OWNERS, centre[:, :, one], direction[:, :, one], depth[:, one])
+        expected = ((before - 2 * here + after) / 0.01**2)[:, one]
+        torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6)
+
+
+def box_sdf(
+    half: tuple[float, float, float], centre: tuple[float, float, float], count: int = 25, spacing: float = 0.1
+):
+    x = torch.arange(count, dtype=torch.float64) * spacing - 0.5 * spacing * (count - 1)
+    nodes = torch.stack(torch.meshgrid(x, x, x, indexing="ij"), dim=-1)
+    q = (nodes - torch.tensor(centre, dtype=torch.float64)).abs() - torch.tensor(half, dtype=torch.float64)
+    return q.clamp_min(0).norm(dim=-1) + q.amax(dim=-1).clamp_max(0), x[0].expand(3), spacing
+
+
+def test_extents_of_boxes_between_nodes():
+    # A box's field is linear across its faces, so the crossing is exact: centre -+ half size.
+    boxes = [((0.33, 0.52, 0.71), (0.02, -0.07, 0.01)), ((0.61, 0.25, 0.4), (-0.11, 0.0, 0.13))]
+    values = torch.stack([box_sdf(*box)[0] for box in boxes])
+    _, origin, spacing = box_sdf(*boxes[0])
+    expected = torch.tensor(
+        [[[-0.31, -0.59, -0.70], [0.35, 0.45, 0.72]], [[-0.72, -0.25, -0.27], [0.50, 0.25, 0.53]]], dtype=torch.float64
+    )
+    torch.testing.assert_close(zero_level_extents(values, origin, spacing), expected, atol=1e-12, rtol=0)
+
+
+def test_gradient_is_that_of_the_moving_surface():
+    # Raising the field by e moves a face with unit gradient inwards by e: d upper / d e = -1, d lower / d e = +1.
+    values, origin, spacing = box_sdf((0.33, 0.52, 0.71), (0.02, -0.07, 0.01))
+    raise_by = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    extents = zero_level_extents((values + raise_by)[None], origin, spacing)
+    for corner, sign in ((0, 1.0), (1, -1.0)):
+        (slope,) = torch.autograd.grad(extents[0, corner, 1], raise_by, retain_graph=True)
+        assert slope.item() == pytest.approx(sign, abs=1e-9)
+
+
+def test_no_crossing_gives_nan_and_leaves_the_others_alone():
+    values, origin, spacing = box_sdf((0.33, 0.52, 0.71), (0.0, 0.0, 0.0))
+    both = zero_level_extents(torch.stack([values.abs() + 1, values]), origin, spacing)
+    assert both[0].isnan().all()
+    torch.testing.assert_close(both[1], zero_level_extents(values[None], origin, spacing)[0])
+
+
+def test_extents_of_nothing_and_wrong_shapes():
+    assert zero_level_extents(torch.zeros(0, 4, 4, 4), torch.zeros(3), 0.1).shape == (0, 2, 3)
+    with pytest.raises(InputError, match="values: expected shape"):
+        zero_level_extents(torch.zeros(4, 4, 4), torch.zeros(3), 0.1)

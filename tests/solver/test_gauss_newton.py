@@ -236,16 +236,6 @@ def test_the_end_is_known_whatever_the_status() -> None:
     assert (result.state.x == solution).all()
 
 
-def test_a_start_of_its_own_is_compared_with_the_input() -> None:
-    problem, solution = linear_problem(2, 3, [StageConfig(1.0, 0, 0)])
-    better = minimise(problem, start(2), DAMPED, Vector(solution))
-    assert (better.state.x == solution).all()
-    problem, _ = linear_problem(2, 3, [StageConfig(1.0, 0, 0)])
-    worse = minimise(problem, Vector(solution), DAMPED, start(2))
-    assert status_of(worse.status) == [Status.rejected_worse] * 2
-    assert (worse.state.x == solution).all()
-
-
 def test_no_problems() -> None:
     problem, _ = linear_problem(0, 3, ONE_STAGE)
     result = minimise(problem, start(0), DAMPED)

@@ -19,8 +19,6 @@ from directshape_torch.errors import InputError
 from directshape_torch.refinement.result import RefinementResult
 from directshape_torch.refiner import DirectShapeRefiner
 from directshape_torch.scene import Detections
-from directshape_torch.terms.cars import CarBatch
-from directshape_torch.terms.priors import detector_pose_sigma
 
 SIGMA = torch.tensor([0.3, 0.1, 0.05, 0.06], dtype=torch.float64)
 
@@ -66,17 +64,6 @@ def test_the_settings_say_the_same_as_the_detections() -> None:
     torch.testing.assert_close(costs[0], costs[1], rtol=1e-12, atol=0)
     assert costs[0].min() > 1
     assert (_refined(start, settings).T_cam_obj - _refined(start).T_cam_obj).abs().max() > 1e-3
-
-
-def test_the_detections_own_standard_deviations_come_first_and_shares_add_to_metres() -> None:
-    scene = cached_street()[1]
-    priors = _with_sigmas(along_share=0.03, along_m=0.4, vertical_m=0.2).priors
-    own = CarBatch.from_scene(scene.frames, _start(SIGMA.expand(2, 4)))
-    assert torch.equal(detector_pose_sigma(priors, own), SIGMA.expand(2, 4))
-    cars = replace(own, detector_pose_sigma=None, detector_T_cam_obj=own.detector_T_cam_obj.clone())
-    cars.detector_T_cam_obj[:, :3, 3] = torch.tensor([6.0, 1.6, 8.0], dtype=torch.float64)
-    expected = torch.tensor([0.5, math.inf, 0.2, math.inf], dtype=torch.float64).expand(2, 4)
-    torch.testing.assert_close(detector_pose_sigma(priors, cars), expected)
 
 
 def test_a_detector_without_error_gets_its_pose_back_and_one_without_knowledge_the_usual_result() -> None:
